@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, observations, play, simulate
@@ -18,12 +19,14 @@ from fgslam.backend.settings import (
     Isam2Settings,
 )
 from fgslam.backend.smoothers import admission, graph_builder
+from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
 from fgslam.evaluation.consistency import Nees, judge, landmark_nees, pose_nees
 from fgslam.factors import graphs
+from fgslam.factors.noise import plain
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.factory import make_estimator
 
@@ -114,6 +117,16 @@ class Failing:
 
     def update(self, *arguments: Any) -> None:
         raise RuntimeError(self._message)
+
+
+def counting(graph: Any, whole: WholeGraph) -> Any:
+    """Those of GTSAM's factors that count in a graph in arrays made of them, without kernels."""
+    left = np.zeros(graph.size(), np.bool_)
+    left[np.concatenate([kind.rows for kind in whole.kinds])[whole.weights <= 0.0]] = True
+    out = gtsam.NonlinearFactorGraph()
+    for row in np.flatnonzero(~left).tolist():
+        out.add(plain(graph.at(row)))
+    return out
 
 
 def position_sigma(covariance: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from fgslam.core.arrays import FloatArray
 
 _POSE, _LANDMARK = "x", "l"
 _TARGET, _VELOCITY, _HEIGHT = "t", "v", "h"
+_CHARACTER_AT = 56  # bits of a key below its character
 _FIRST_LANDMARK = int(gtsam.symbol(_LANDMARK, 0))
 
 
@@ -31,12 +32,12 @@ def landmark_key(variable: int) -> int:
 
 def is_pose(key: int) -> bool:
     """Whether a key is a pose's."""
-    return gtsam.Symbol(key).chr() == ord(_POSE)
+    return key >> _CHARACTER_AT == ord(_POSE)
 
 
 def number(key: int) -> int:
     """Frame or variable number of a key."""
-    return int(gtsam.Symbol(key).index())
+    return key & ((1 << _CHARACTER_AT) - 1)
 
 
 # --------------------------------------------------------------------------------------------

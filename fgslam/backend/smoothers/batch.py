@@ -74,9 +74,7 @@ class BatchSolver(WholeGraphSolver):
         if found.values is None:
             return ClosedLoop()
         self._values = found.values
-        graph, state = WholeGraph.of(
-            self._builder.kept_factors(), self._values, self._builder.kernel
-        )
+        graph, state = self._builder.whole_graph(self._values)
         covariance = reduced(graph.linear(state)).poses()[-1]
         here = reorthonormalise(state.poses[-1])
         return self._after_loop(allowed_parts(self._floor, here[None], covariance[None])[0])

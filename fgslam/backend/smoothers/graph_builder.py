@@ -12,7 +12,8 @@ import numpy as np
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.persistence import MeasurementNoise, Persistence, StatedNoise
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import triangulate
@@ -26,7 +27,8 @@ from fgslam.factors.motion import (
     point_prior,
     pose_prior,
 )
-from fgslam.factors.noise import Whitening, plain
+from fgslam.factors.noise import Whitening
+from fgslam.factors.stacked import whitening
 
 WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a weak prior
 _WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
@@ -72,11 +74,11 @@ class NewFactors:
 
     Attributes:
         frame: counted from 0.
-        graph: the factors.
+        graph: the factors, but for observations.
         values: initial values of the new variables.
         priors: landmark variables, mean (3,) and covariance (3, 3) of what is known of them
             beforehand; where no factors are made of it.
-        sightings: landmark variables and what was seen of them, for the same case.
+        sightings: landmark variables and what was seen of them.
     """
 
     frame: int
@@ -90,7 +92,8 @@ class GraphBuilder:
     """Poses, landmarks and factors of a run so far.
 
     Attributes:
-        graph: all factors; one taken out leaves an empty slot.
+        graph: all factors but observations; one taken out leaves an empty slot.
+        observed: the observations: frame, variable, measurement, covariance, whether taken out.
         admission: the landmarks, and which of them the graph holds.
         frames: those whose poses are in the graph, in time order.
         noise: of its landmark observations.
@@ -124,8 +127,13 @@ class GraphBuilder:
         self._weigh()
         self._rows: dict[int, list[int]] = {}
         self._id_of: list[int] = []
-        self._seen_frame: list[int] = []
-        self._seen_variable: list[int] = []
+        self.observed = GrowingColumns(
+            frame=np.empty(0, np.int64),
+            variable=np.empty(0, np.int64),
+            measurement=np.empty((0, 3)),
+            covariance=np.empty((0, 3, 3)),
+            gone=np.empty(0, np.bool_),
+        )
         self.graph = gtsam.NonlinearFactorGraph()
         self.admission = LandmarkAdmission(sensor, settings)
         self.frames: list[int] = []
@@ -164,6 +172,8 @@ class GraphBuilder:
         self._add_pose(new, tracked)
         self.frames.append(tracked.frame)
         self._add_observations(new, tracked, landmarks)
+        if self._remember:
+            self._remember_observed(new.sightings)
         return new
 
     def start_at(self, prior: Prediction) -> None:
@@ -177,8 +187,8 @@ class GraphBuilder:
             Its identity and sightings, in words.
         """
         for row in self._rows.pop(variable, []):
-            if self._remember:
-                self.graph.remove(row)
+            self.graph.remove(row)
+        self.observed["gone"][self.observed["variable"] == variable] = True
         words = self.describe(variable)
         self.admission.taken_out(self._id_of[variable], variable)
         return words
@@ -202,7 +212,7 @@ class GraphBuilder:
     def first_frames(self) -> IntArray:
         """(variables,) the first frame that saw each landmark variable; 0 where none is kept."""
         first = np.full(self.variables, np.iinfo(np.int64).max)
-        np.minimum.at(first, self._seen_variable, self._seen_frame)
+        np.minimum.at(first, self.observed["variable"], self.observed["frame"])
         return np.where(first < np.iinfo(np.int64).max, first, 0)
 
     def add_factor(self, factor: Any) -> int:
@@ -223,7 +233,7 @@ class GraphBuilder:
         """
         if not points or not isinstance(self._sensor, CameraRig):
             return []
-        frames, seen = np.array(self._seen_frame), np.array(self._seen_variable)
+        frames, seen = self.observed["frame"], self.observed["variable"]
         position = np.full((self.variables, 3), np.nan)
         position[list(points)] = list(points.values())
         offset = position[seen] - poses[frames, :3, 3]
@@ -247,14 +257,57 @@ class GraphBuilder:
         return {track.variable: place for track, place in zip(tracks, places, strict=True)}
 
     def kept_factors(self) -> Any:
-        """The graph without its empty slots, weighed as is known now what depends on the noise."""
+        """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
+        out = self._other_factors()
+        seen = self._kept_observed()
+        for frame, variable, measurement, covariance in zip(*seen, strict=True):
+            sighting = Sighting(int(frame), measurement, covariance)
+            out.add(self._observation(int(variable), sighting))
+        return out
+
+    def observation_factors(self, sightings: list[tuple[int, Sighting]]) -> Any:
+        """Factors of observations of landmark variables, weighed as is known now."""
+        out = gtsam.NonlinearFactorGraph()
+        for variable, sighting in sightings:
+            out.add(self._observation(variable, sighting))
+        return out
+
+    def whole_graph(
+        self, values: Any, kernel: KernelSettings | None = None
+    ) -> tuple[WholeGraph, State]:
+        """The same in arrays, at values of all variables; with another kernel where given."""
+        kernel = kernel or self.kernel
+        if not isinstance(self._sensor, CameraRig):
+            return WholeGraph.of(self.kept_factors(), values, kernel)
+        others = self._other_factors()
+        frames, variables, measured, covariances = self._kept_observed()
+        return WholeGraph.of_rig(
+            others,
+            values,
+            kernel,
+            (pose_key(0) + frames, landmark_key(0) + variables),
+            (measured, whitening(self._power * covariances)),
+            self._sensor,
+        )
+
+    def _kept_observed(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Frames (k,), variables (k,), measurements and covariances of what was not taken out."""
+        kept, seen = ~self.observed["gone"], self.observed
+        return (
+            seen["frame"][kept],
+            seen["variable"][kept],
+            seen["measurement"][kept],
+            seen["covariance"][kept],
+        )
+
+    def _other_factors(self) -> Any:
+        """Those that are no observations, without empty slots, weighed as is known now."""
         self._weigh()
-        models: dict[tuple[bytes, float], Any] = {}
         out = gtsam.NonlinearFactorGraph()
         for row in range(self.graph.size()):
             if self.graph.exists(row):
                 factor, then = self.graph.at(row), self._variance_of.get(row)
-                out.add(factor if then is None else self._weighed(factor, then, models))
+                out.add(factor if then is None else self._weighed(factor, then))
         return out
 
     # ----------------------------------------------------------------------------------------
@@ -263,24 +316,14 @@ class GraphBuilder:
         """New factors weigh what depends on the noise as is known now."""
         kernel = self.kernel
         self._power, self._persistence = self.noise.power, self.noise_factor**2
-        self._whitening = Whitening(kernel.name, kernel.width)
-        self._factors = landmark_factors(self._sensor, self._whitening)
+        self._factors = landmark_factors(self._sensor, Whitening(kernel.name, kernel.width))
 
-    def _weighed(self, factor: Any, then: float, models: dict[tuple[bytes, float], Any]) -> Any:
-        """An observation (with the kernel of now) or a guessed step, as is known now.
-
-        ``then`` is by what its variance was multiplied when it was made.
-        """
-        now = self._power if factor.dim() == 3 else self._persistence
-        if now == then:
-            return factor
-        covariance = plain(factor).noiseModel().covariance()
-        name = covariance.tobytes(), now / then
-        if name not in models:
-            scaled = now / then * covariance
-            gaussian = gtsam.noiseModel.Gaussian.Covariance
-            models[name] = (self._whitening.model if factor.dim() == 3 else gaussian)(scaled)
-        return factor.cloneWithNewNoiseModel(models[name])
+    def _weighed(self, step: Any, then: float) -> Any:
+        """A guessed step as is known now; ``then`` multiplied its variance when it was made."""
+        if self._persistence == then:
+            return step
+        covariance = self._persistence / then * step.noiseModel().covariance()
+        return step.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.Covariance(covariance))
 
     def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
         key = pose_key(new.frame)
@@ -319,7 +362,7 @@ class GraphBuilder:
             sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
             track = self.admission.sighted(identity, sighting)
             if track.variable >= 0:
-                self._observe(new, track, sighting)
+                new.sightings.append((track.variable, sighting))
             else:
                 track.waiting.append(sighting)
                 if self.admission.admits(identity, float(parallax[i])):
@@ -346,8 +389,7 @@ class GraphBuilder:
         elif parallax < WEAK_PARALLAX:
             sigma = _WEAK_PRIOR_RANGES * float(np.linalg.norm(position - wTc[:3, 3]))
             self._add_prior(new, track.variable, position, sigma**2 * np.eye(3))
-        for sighting in track.waiting:
-            self._observe(new, track, sighting)
+        new.sightings += [(track.variable, sighting) for sighting in track.waiting]
         track.waiting = []
 
     def _add_prior(
@@ -359,21 +401,26 @@ class GraphBuilder:
         else:
             new.priors.append((variable, mean, covariance))
 
-    def _observe(self, new: NewFactors, track: Track, sighting: Sighting) -> None:
-        if not self._remember:
-            new.sightings.append((track.variable, sighting))
-            return
-        factor = self._factors.factor(
+    def _observation(self, variable: int, sighting: Sighting) -> Any:
+        return self._factors.factor(
             pose_key(sighting.frame),
-            landmark_key(track.variable),
+            landmark_key(variable),
             sighting.measurement,
             self._power * sighting.covariance,
         )
-        row = self._push(new, factor)
-        self._rows[track.variable].append(row)
-        self._variance_of[row] = self._power
-        self._seen_frame.append(sighting.frame)
-        self._seen_variable.append(track.variable)
+
+    def _remember_observed(self, sightings: list[tuple[int, Sighting]]) -> None:
+        if not sightings:
+            return
+        self.observed.append(
+            {
+                "frame": np.array([s.frame for _, s in sightings]),
+                "variable": np.array([variable for variable, _ in sightings]),
+                "measurement": np.array([s.measurement for _, s in sightings]),
+                "covariance": np.array([s.covariance for _, s in sightings]),
+                "gone": np.zeros(len(sightings), np.bool_),
+            }
+        )
 
     def _push(self, new: NewFactors, factor: Any) -> int:
         new.graph.add(factor)

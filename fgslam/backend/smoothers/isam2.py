@@ -75,6 +75,7 @@ class Isam2Solver(WholeGraphSolver):
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Keeps a frame's factors for the next update."""
         self._graph.push_back(new.graph)
+        self._graph.push_back(self._builder.observation_factors(new.sightings))
         self._new_values.insert(new.values)
         self._answer = None
 

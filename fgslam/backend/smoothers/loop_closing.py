@@ -90,9 +90,7 @@ class GraphLoops:
         if misfit(constraint_factor(known), values) <= _AGREES:
             self._accept(known)
             return Acceptance(True, None, f"{what}: as expected, nothing moved")
-        graph, state = WholeGraph.of(
-            self._builder.kept_factors(), values, self._kernel or self._builder.kernel
-        )
+        graph, state = self._builder.whole_graph(values, self._kernel)
         state = minimum(graph, state)
         loops = [*self._accepted, known]
         guess = first_guess(self._builder, graph.values(state), drive.chain, loops)

@@ -15,10 +15,11 @@ import numpy as np
 from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded, lapack
 from scipy.sparse import block_array, bsr_matrix, csr_matrix, diags_array
 
-from fgslam.backend.smoothers.block_band import BlockBand, order
+from fgslam.backend.smoothers.block_cholesky import BlockCholesky, order
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
+from fgslam.factors.stacked import summed
 
 _UNDETERMINED = "the measurements do not determine all variables; no covariances"
 _ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
@@ -92,16 +93,20 @@ class GraphMarginals:
     Attributes:
         system: the graph.
         inverse: (m, 3, 3) of each landmark's own block.
-        band: (6n, 6n) the poses', reduced.
+        factor: of the poses' information (6n, 6n), reduced.
     """
 
     system: LinearSystem
     inverse: FloatArray
-    band: BlockBand
+    factor: BlockCholesky
 
     @staticmethod
-    def of(system: LinearSystem) -> GraphMarginals:
+    def of(system: LinearSystem, factor: BlockCholesky | None = None) -> GraphMarginals:
         """Eliminates the landmarks.
+
+        Args:
+            system: the graph.
+            factor: that of a system much like it, where steps are all that is asked for.
 
         Raises:
             EstimatorError: a landmark is not determined by its observations, or the poses are not.
@@ -112,16 +117,18 @@ class GraphMarginals:
             inverse = inverse_spd3(system.landmarks)
         if not (np.isfinite(inverse).all() and (inverse[:, [0, 1, 2], [0, 1, 2]] > 0.0).all()):
             raise EstimatorError("a landmark's observations do not determine it; no covariances")
+        if factor is not None:
+            return GraphMarginals(system, inverse, factor)
         information = system.poses.tobsr((6, 6))
         if system.coupling.nnz:
             information = information - _times(system.coupling, inverse) @ system.coupling.T
-        return GraphMarginals(system, inverse, BlockBand(information))
+        return GraphMarginals(system, inverse, BlockCholesky(information))
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum."""
         s = self.system
         pull = np.einsum("mij,mj->mi", self.inverse, s.landmark_gradient.reshape(-1, 3)).ravel()
-        poses = -self.band.solve((s.pose_gradient - s.coupling @ pull)[:, None])[:, 0]
+        poses = -self.factor.solve((s.pose_gradient - s.coupling @ pull)[:, None])[:, 0]
         follows = (s.coupling.T @ poses).reshape(-1, 3)
         landmarks = -pull - np.einsum("mij,mj->mi", self.inverse, follows).ravel()
         return np.concatenate([landmarks, poses])
@@ -129,7 +136,7 @@ class GraphMarginals:
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
         every = np.arange(len(self.system.pose_keys))
-        return self.band.inverse_blocks(every, every)
+        return self.factor.inverse_blocks(every, every)
 
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
@@ -137,11 +144,12 @@ class GraphMarginals:
         pose = np.repeat(np.arange(len(self.system.pose_keys)), np.diff(coupling.indptr))
         order = np.argsort(coupling.indices, kind="stable")
         pose, point, gain = pose[order], coupling.indices[order], coupling.data[order]
-        out = self.inverse.copy()
-        for one, other in _pairs(point, len(out)):
-            covariance = self.band.inverse_blocks(pose[one], pose[other])
-            np.add.at(out, point[one], np.swapaxes(gain[one], 1, 2) @ covariance @ gain[other])
-        return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
+        half, m = np.zeros_like(self.inverse), len(self.inverse)
+        for one, other in _pairs(point, m):
+            covariance = self.factor.inverse_blocks(pose[one], pose[other])
+            covariance[one == other] *= 0.5
+            half += summed(point[one], np.swapaxes(gain[one], 1, 2) @ covariance @ gain[other], m)
+        return np.asarray(self.inverse + half + np.swapaxes(half, 1, 2))
 
     def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
         """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
@@ -152,7 +160,7 @@ class GraphMarginals:
         seen = s.coupling.tocsc()[:, columns].toarray().reshape(len(gain), k, 3)
         inverse = self.inverse[landmarks]
         gain[:, 6:] = -np.einsum("pki,kij->pkj", seen, inverse).reshape(len(gain), 3 * k)
-        out = gain.T @ self.band.solve(gain)
+        out = gain.T @ self.factor.solve(gain)
         at = 6 + 3 * np.arange(k)[:, None] + np.arange(3)
         out[at[:, :, None], at[:, None, :]] += inverse
         return np.asarray(0.5 * (out + out.T))
@@ -173,19 +181,21 @@ def _times(coupling: bsr_matrix, blocks: FloatArray) -> bsr_matrix:
 
 
 def _pairs(group: IntArray, groups: int) -> Iterator[tuple[IntArray, IntArray]]:
-    """All pairs of rows of one group, from groups (k,) in ascending order; a few groups a time."""
+    """Pairs of rows of one group, each once, and each row with itself; a few groups a time.
+
+    Groups (k,) are in ascending order; the first row of a pair is not after the second.
+    """
     size = np.bincount(group, minlength=groups)
     first = np.concatenate([[0], np.cumsum(size)])
-    until = np.cumsum(size**2)
+    until = np.cumsum(size * (size + 1) // 2)
     low = 0
     while low < groups:
         done = until[low - 1] if low else 0
         high = max(low + 1, int(np.searchsorted(until, done + _PAIRS_AT_ONCE, "right")))
         rows = np.arange(first[low], first[high])
-        repeated = size[group[rows]]
+        repeated = first[group[rows] + 1] - rows
         one = np.repeat(rows, repeated)
-        start = np.repeat(np.cumsum(repeated) - repeated, repeated)
-        yield one, first[group[one]] + np.arange(len(one)) - start
+        yield one, one + np.arange(len(one)) - np.repeat(np.cumsum(repeated) - repeated, repeated)
         low = high
 
 

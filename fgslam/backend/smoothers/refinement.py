@@ -31,7 +31,7 @@ from fgslam.backend.smoothers.solver import (
     allowed_parts,
     solver_failed,
 )
-from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.backend.smoothers.whole_graph import Descent, State, WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
@@ -130,19 +130,20 @@ def trimmed(
     Returns:
         Values at the minimum, and the plain factors that were kept.
     """
-    gate = _GATE / noise_factor**2
+    gate, descent = _GATE / noise_factor**2, Descent()
     if graph.weights.all():  # else it is known already what fits, but for a few
         state = graph.minimum(state, effort.iterations, _ROUGH)
         control = _NEAR_BEGINS
         while control < _NEAR_ENDS:
             weights = truncated_weights(graph.squared(state) / gate, control)
-            state = graph.weighed(weights).minimum(state, 1, effort.tolerance)
+            weighed = graph.weighed(weights)
+            state = weighed.minimum(state, 1, effort.tolerance, descent=descent)
             control *= _NEAR_GROWS
-    return _settled(graph, state, gate, effort)
+    return _settled(graph, state, gate, effort, descent)
 
 
 def _settled(
-    graph: WholeGraph, state: State, gate: float, effort: Effort
+    graph: WholeGraph, state: State, gate: float, effort: Effort, descent: Descent
 ) -> tuple[State, WholeGraph]:
     """The minimum over what fits there: chosen and solved for by turns, until that is the same."""
     fits, kept = graph.weights > 0.0, graph.weighed(graph.weights)
@@ -151,8 +152,8 @@ def _settled(
         if (fits == before).all():
             break
         kept = graph.weighed(fits)
-        state = kept.minimum(state, 1, effort.tolerance)
-    return kept.minimum(state, effort.iterations, effort.tolerance), kept
+        state = kept.minimum(state, 1, effort.tolerance, descent=descent)
+    return kept.minimum(state, effort.iterations, effort.tolerance, descent=descent), kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +207,7 @@ class Refined:
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Solves, without landmarks that come out behind a camera or that nothing supports."""
-    graph, state = WholeGraph.of(builder.kept_factors(), values, builder.kernel)
+    graph, state = builder.whole_graph(values)
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)

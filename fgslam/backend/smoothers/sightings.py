@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose
 from fgslam.factors.landmark import FROM_MEASUREMENT
@@ -26,7 +26,7 @@ class Sightings(Protocol):
 
     @property
     def rows(self) -> IntArray:
-        """Of their factors in the graph (k,)."""
+        """Of their factors in the graph that they come from (k,)."""
         ...
 
     @property
@@ -37,6 +37,10 @@ class Sightings(Protocol):
     @property
     def points(self) -> IntArray:
         """Rows (k,) of their landmarks."""
+        ...
+
+    def of_points(self, kept: BoolArray) -> Sightings:
+        """Those of some landmarks, a mask (m,), which are counted anew."""
         ...
 
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
@@ -80,6 +84,18 @@ class StereoSightings:
         measured = np.column_stack([right, row, left - right])
         return StereoSightings(rows, poses, points, measured, roots @ FROM_MEASUREMENT, rig)
 
+    def of_points(self, kept: BoolArray) -> Sightings:
+        """See :class:`Sightings`."""
+        own, number = kept[self.points], np.cumsum(kept) - 1
+        return StereoSightings(
+            self.rows[own],
+            self.poses[own],
+            number[self.points[own]],
+            self.measured[own],
+            self.roots[own],
+            self.rig,
+        )
+
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
         """See :class:`Sightings`."""
         own, seen = poses[self.poses], points[self.points]
@@ -116,6 +132,13 @@ class FactorSightings:
             graph.add(plain(factor))
             keys.update(zip(factor.keys(), (pose, point), strict=True))
         return FactorSightings(rows, poses, points, graph, keys)
+
+    def of_points(self, kept: BoolArray) -> Sightings:
+        """See :class:`Sightings`."""
+        own, number = np.flatnonzero(kept[self.points]), np.cumsum(kept) - 1
+        factors = [self.graph.at(row) for row in own.tolist()]
+        points = number[self.points[own]]
+        return FactorSightings.of(factors, self.rows[own], self.poses[own], points)
 
     def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
         """See :class:`Sightings`."""

@@ -17,7 +17,14 @@ import numpy as np
 from scipy.sparse import bsr_matrix, csr_matrix
 
 from fgslam.backend.settings import KernelSettings
-from fgslam.backend.smoothers.marginals import LinearSystem, block_diagonal, reduced
+from fgslam.backend.smoothers.block_cholesky import BlockCholesky
+from fgslam.backend.smoothers.marginals import (
+    ChainMarginals,
+    GraphMarginals,
+    LinearSystem,
+    block_diagonal,
+    reduced,
+)
 from fgslam.backend.smoothers.sightings import (
     FactorSightings,
     Sightings,
@@ -25,12 +32,15 @@ from fgslam.backend.smoothers.sightings import (
     values_of,
 )
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.errors import EstimatorError
 from fgslam.core.levenberg import Damping
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose
-from fgslam.factors.noise import kernel_losses, kernel_weights, plain
+from fgslam.factors.noise import kernel_losses, kernel_weights
 from fgslam.factors.stacked import LinearRows
 
 PLAIN = KernelSettings("none")
+_SLOW = 0.1  # of the last step's gain: beyond, a kept system has become another
 _AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
 
@@ -44,10 +54,10 @@ class State:
     @staticmethod
     def of(values: Any) -> State:
         """Those of GTSAM values."""
-        poses, points = keys_of(values)
-        matrices = [values.atPose3(key).matrix() for key in poses]
-        places = [values.atPoint3(key) for key in points]
-        return State(np.array(matrices).reshape(-1, 4, 4), np.array(places).reshape(-1, 3))
+        flat = gtsam.utilities.extractPose3(values)
+        poses = np.tile(np.eye(4), (len(flat), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
+        return State(poses, np.array(gtsam.utilities.extractPoint3(values)).reshape(-1, 3))
 
     def moved(self, step: FloatArray) -> State:
         """After a step (3m + 6n,) of the landmarks and in the poses' tangent spaces."""
@@ -62,7 +72,6 @@ class WholeGraph:
     """Factors, and what each observation weighs.
 
     Attributes:
-        graph: all factors, as GTSAM has them.
         pose_keys, landmark_keys: of the variables, ascending.
         kinds: the observations.
         weights: (k,) of all observations, in the order of ``kinds``; 0: left out.
@@ -70,7 +79,6 @@ class WholeGraph:
         kernel: around each observation.
     """
 
-    graph: Any
     pose_keys: list[int]
     landmark_keys: list[int]
     kinds: list[Sightings]
@@ -80,7 +88,7 @@ class WholeGraph:
 
     @staticmethod
     def of(graph: Any, values: Any, kernel: KernelSettings = PLAIN) -> tuple[WholeGraph, State]:
-        """A graph without empty slots, whose observations have this kernel, and its values."""
+        """A graph of GTSAM's without empty slots, whose observations have this kernel."""
         poses, landmarks = keys_of(values)
         rows = {key: row for keys in (poses, landmarks) for row, key in enumerate(keys)}
         rest = gtsam.NonlinearFactorGraph()
@@ -101,8 +109,38 @@ class WholeGraph:
             factors, *which = zip(*each, strict=True)
             kinds.append(kind.of(list(factors), *(np.array(w, np.int64) for w in which)))
         weights = np.ones(sum(len(kind.rows) for kind in kinds))
-        whole = WholeGraph(graph, poses, landmarks, kinds, weights, rest, kernel)
-        return whole, State.of(values)
+        return WholeGraph(poses, landmarks, kinds, weights, rest, kernel), State.of(values)
+
+    @staticmethod
+    def of_rig(
+        others: Any,
+        values: Any,
+        kernel: KernelSettings,
+        keys: tuple[IntArray, IntArray],
+        measured: tuple[FloatArray, FloatArray],
+        rig: CameraRig,
+    ) -> tuple[WholeGraph, State]:
+        """Observations of a rig, and other factors.
+
+        Args:
+            others: GTSAM's, without empty slots.
+            values: of all variables.
+            kernel: around each observation.
+            keys: (k,) of the observations' poses and landmarks.
+            measured: (k, 3) column, row, disparity, and (k, 3, 3) roots of their information.
+            rig: the cameras.
+        """
+        poses, landmarks = keys_of(values)
+        of_pose, of_landmark = (
+            np.searchsorted(np.array(have, np.int64), which).astype(np.int64)
+            for have, which in zip((poses, landmarks), keys, strict=True)
+        )
+        rows = others.size() + np.arange(len(of_pose))
+        kinds: list[Sightings] = []
+        if len(rows):
+            kinds.append(StereoSightings(rows, of_pose, of_landmark, *measured, rig))
+        weights = np.ones(len(rows))
+        return WholeGraph(poses, landmarks, kinds, weights, others, kernel), State.of(values)
 
     # -- other graphs --------------------------------------------------------------------------
 
@@ -113,35 +151,27 @@ class WholeGraph:
 
     def without(self, rows: IntArray, state: State) -> tuple[WholeGraph, State]:
         """Without landmarks, by row, and their factors, at the state (of all) without them."""
+        kept = np.ones(len(self.landmark_keys), np.bool_)
+        kept[rows] = False
         gone = {self.landmark_keys[row] for row in rows.tolist()}
-        graph = gtsam.NonlinearFactorGraph()
-        for row in range(self.graph.size()):
-            if gone.isdisjoint(self.graph.at(row).keys()):
-                graph.add(self.graph.at(row))
-        values = self.values(state)
-        for key in gone:
-            values.erase(key)
-        found, left = WholeGraph.of(graph, values, self.kernel)
-        weights = self.weights[~np.isin(self._points, rows)]
-        return dataclasses.replace(found, weights=weights), left
+        rest = gtsam.NonlinearFactorGraph()
+        for row in range(self.rest.size()):
+            if gone.isdisjoint(self.rest.at(row).keys()):
+                rest.add(self.rest.at(row))
+        left = dataclasses.replace(
+            self,
+            landmark_keys=[key for key in self.landmark_keys if key not in gone],
+            kinds=[kind.of_points(kept) for kind in self.kinds],
+            weights=self.weights[kept[self._points]],
+            rest=rest,
+        )
+        return left, State(state.poses, state.points[kept])
 
     def plus(self, factor: Any) -> WholeGraph:
         """With one factor more, of poses alone."""
-        graph, rest = self.graph.clone(), self.rest.clone()
-        graph.add(factor)
+        rest = self.rest.clone()
         rest.add(factor)
-        return dataclasses.replace(self, graph=graph, rest=rest)
-
-    def kept(self) -> Any:
-        """GTSAM's factors that count, without kernels where this graph has none."""
-        left = np.zeros(self.graph.size(), np.bool_)
-        left[np.concatenate([kind.rows for kind in self.kinds])[self.weights <= 0.0]] = True
-        out = gtsam.NonlinearFactorGraph()
-        for row in np.flatnonzero(~left).tolist():
-            factor = self.graph.at(row)
-            bare = self.kernel.name == "none" and _observes(list(factor.keys()))
-            out.add(plain(factor) if bare else factor)
-        return out
+        return dataclasses.replace(self, rest=rest)
 
     def unseen(self) -> IntArray:
         """Rows of the landmarks of which no observation counts."""
@@ -220,7 +250,12 @@ class WholeGraph:
         return found[:-p], found[-p:]
 
     def minimum(
-        self, state: State, iterations: int, tolerance: float, enough: float = 0.0
+        self,
+        state: State,
+        iterations: int,
+        tolerance: float,
+        enough: float = 0.0,
+        descent: Descent | None = None,
     ) -> State:
         """The state at the minimum of the cost.
 
@@ -229,22 +264,19 @@ class WholeGraph:
             iterations: at most.
             tolerance: the end, where the cost falls by a smaller part of it.
             enough: the end, too, where it falls by less.
+            descent: goes on with this one, which has made steps on much the same graph.
         """
-        damping = Damping()
-        cost = self.cost(state)
+        descent = descent or Descent(keeps=False)
+        cost, gain = self.cost(state), np.inf
         for _ in range(iterations):
-            system = self.linear(state)
-            found = damping.step(cost, partial(self._tried, system, state))
+            found = descent.step(self, cost, state, gain)
             if found is None:
                 break
             before, (cost, state) = cost, found
-            if before - cost <= max(tolerance * before, enough):
+            gain = before - cost
+            if gain <= max(tolerance * before, enough):
                 break
         return state
-
-    def _tried(self, system: LinearSystem, state: State, damping: float) -> tuple[float, State]:
-        ahead = state.moved(reduced(system.damped(damping)).step())
-        return self.cost(ahead), ahead
 
     # -- its parts -------------------------------------------------------------------------------
 
@@ -316,11 +348,71 @@ class WholeGraph:
         return values_of(self._rest_rows, state.poses, state.points)
 
 
+class Descent:
+    """Steps towards the minimum, Gauss and Newton's or damped.
+
+    Near the minimum the poses' own system hardly changes from step to step: where it is kept, the
+    landmarks are eliminated anew, and its factor, which is most of the work, serves on.
+    """
+
+    def __init__(self, keeps: bool = True) -> None:
+        """No step yet; whether it keeps the poses' system."""
+        self._keeps = keeps
+        self._damping = Damping()
+        self._factor: BlockCholesky | None = None
+
+    def step(
+        self, graph: WholeGraph, cost: float, state: State, last_gain: float
+    ) -> tuple[float, State] | None:
+        """Cost and state after one step that does not raise the cost; None where none does.
+
+        Args:
+            graph: what is minimised.
+            cost: at the state.
+            state: before.
+            last_gain: by how much the step before lowered the cost; a kept system goes on as long
+                as each step gains a small part of that.
+        """
+        system = graph.linear(state)
+        if self._factor is not None:
+            found = self._kept(graph, state, system, self._factor)
+            if found is not None and 0.0 <= cost - found[0] <= _SLOW * last_gain:
+                return found
+            self._factor = None
+        return self._damping.step(cost, partial(self._tried, graph, state, system))
+
+    def _kept(
+        self, graph: WholeGraph, state: State, system: LinearSystem, factor: BlockCholesky
+    ) -> tuple[float, State] | None:
+        """The step by a kept system; None where a landmark has become undetermined."""
+        try:
+            return _after(graph, state, GraphMarginals.of(system.damped(0.0), factor))
+        except EstimatorError:
+            return None
+
+    def _tried(
+        self, graph: WholeGraph, state: State, system: LinearSystem, damping: float
+    ) -> tuple[float, State]:
+        solved = reduced(system.damped(damping))
+        if self._keeps and damping == 0.0 and isinstance(solved, GraphMarginals):
+            self._factor = solved.factor
+        return _after(graph, state, solved)
+
+
+def _after(
+    graph: WholeGraph, state: State, solved: GraphMarginals | ChainMarginals
+) -> tuple[float, State]:
+    ahead = state.moved(solved.step())
+    return graph.cost(ahead), ahead
+
+
 def keys_of(values: Any) -> tuple[list[int], list[int]]:
     """Keys of the poses and of the landmarks among GTSAM values, ascending."""
-    keys = list(values.keys())
-    poses = [key for key in keys if is_pose(key)]
-    return poses, [key for key in keys if not is_pose(key)]
+    poses: list[int] = []
+    landmarks: list[int] = []
+    for key in values.keys():  # noqa: SIM118 - GTSAM's values do not iterate
+        (poses if is_pose(key) else landmarks).append(key)
+    return poses, landmarks
 
 
 def _observes(keys: list[int]) -> bool:

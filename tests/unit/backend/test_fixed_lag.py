@@ -104,7 +104,7 @@ def test_factors_and_variables_do_not_grow_with_the_run() -> None:
                 len(window.landmarks.variables),
                 window.prior.hidden,
                 len(window.frames),
-                estimator._builder.graph.size() + len(estimator._builder._seen_frame),
+                estimator._builder.graph.size() + len(estimator._builder.observed),
                 len(estimator._builder.admission._recent),
             )
         )

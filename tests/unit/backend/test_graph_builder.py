@@ -26,7 +26,7 @@ from smoothing import (
 
 from fgslam.backend.settings import BatchSettings, GraphSettings
 from fgslam.backend.smoothers import admission
-from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
+from fgslam.backend.smoothers.graph_builder import GraphBuilder, NewFactors, TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
@@ -64,9 +64,10 @@ def known(points: dict[int, list[float]], sigma: float = 0.02) -> LandmarkMap:
     return LandmarkMap(ids, places, np.tile(sigma**2 * np.eye(3), (len(ids), 1, 1)))
 
 
-def landmarks_of(graph: object) -> list[tuple[int, ...]]:
-    """Keys of the factors that touch a landmark."""
-    factors = [graph.at(row) for row in range(graph.size()) if graph.exists(row)]
+def landmarks_of(made: GraphBuilder, new: NewFactors) -> list[tuple[int, ...]]:
+    """Keys of a frame's factors that touch a landmark."""
+    graphs = new.graph, made.observation_factors(new.sightings)
+    factors = [graph.at(row) for graph in graphs for row in range(graph.size())]
     return [tuple(f.keys()) for f in factors if not is_pose(f.keys()[-1])]
 
 
@@ -78,11 +79,11 @@ def test_a_landmark_waits_for_its_second_sighting_and_loses_none() -> None:
     points = {4: [0.2, 0.1, 3.0]}
     made = builder()
     first = made.add(frame(0, points, True), known(points))
-    assert landmarks_of(first.graph) == []
+    assert landmarks_of(made, first) == []
     assert [identity for identity, _ in made.admission.waiting()] == [4]
     second = made.add(frame(1, points), known(points))
     key = landmark_key(0)
-    assert landmarks_of(second.graph) == [(pose_key(0), key), (pose_key(1), key)]
+    assert landmarks_of(made, second) == [(pose_key(0), key), (pose_key(1), key)]
     assert list(made.admission.waiting()) == []
     np.testing.assert_array_equal(second.values.atPoint3(key), points[4])
 
@@ -100,7 +101,7 @@ def test_parallax_decides_between_waiting_a_weak_prior_and_none(
     made.add(frame(0, points, True), known(points, 10 * sigma))
     # One step nearer the range is 9.9 m.
     new = made.add(frame(1, points), known(points, 9.9 * sigma))
-    keys = landmarks_of(new.graph)
+    keys = landmarks_of(made, new)
     prior = (landmark_key(0),)
     assert {"waits": keys == [], "weak": prior in keys, "plain": len(keys) == 2}[expected]
     assert (prior in keys) == (expected == "weak")

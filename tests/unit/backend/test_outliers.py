@@ -9,7 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from smoothing import SMOOTHERS, answer, ate, drawn, run, wrong_matches
+from smoothing import SMOOTHERS, answer, ate, counting, drawn, run, wrong_matches
 
 from fgslam.backend.settings import BatchSettings, EstimatorSettings, KernelSettings
 from fgslam.backend.smoothers import admission
@@ -67,7 +67,7 @@ def solved(
 ) -> tuple[Any, Any]:
     """GTSAM's values and factors that a treatment of outliers ends with."""
     state, kept = method(*WholeGraph.of(graph, values, kernel), MINIMUM)
-    return kept.values(state), kept.kept()
+    return kept.values(state), counting(graph, kept)
 
 
 def residuals(graph: gtsam.NonlinearFactorGraph, values: object) -> FloatArray:

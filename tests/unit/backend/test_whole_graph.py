@@ -13,6 +13,7 @@ from smoothing import drawn, run, wrong_matches
 
 from fgslam.backend.filters.loop_correction import Constraint, constraint_factor
 from fgslam.backend.settings import BatchSettings, KernelSettings
+from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
 from fgslam.backend.smoothers.refinement import MINIMUM
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
@@ -24,19 +25,19 @@ KERNELS = pytest.mark.parametrize("name", ["none", "huber", "cauchy", "geman_mcc
 LOOPS = [(0, 14), (3, 17), (1, 19)]
 
 
-def problem(name: Any, seed: int = 0, wrong: float = 0.05) -> tuple[Any, Any, KernelSettings]:
-    """A drive's graph with loops, initial values and the kernel; some matches are wrong."""
+def problem(name: Any, seed: int = 0, wrong: float = 0.05) -> tuple[Any, Any, GraphBuilder]:
+    """A drive's graph with loops, initial values and the builder; some matches are wrong."""
     rng = np.random.default_rng(seed)
     increments = wrong_matches(drawn(seed, frames=20).increments, wrong, rng)
     kernel = KernelSettings(name, 3.0)
     estimator, _ = run(BatchSettings(kernel=kernel, trim=False, noise_factor=1.0), increments)
-    graph, values = estimator._builder.kept_factors(), estimator._solver._values
+    builder, values = estimator._builder, estimator._solver._values
     for before, after in LOOPS:
         motion = inverse(poses_of_frame(values, before)) @ poses_of_frame(values, after)
         motion = motion @ se3_exp(0.01 * rng.standard_normal(6))
         known = Constraint(before, after, motion, random_covariance(rng, 6, 0.01))
-        graph.add(constraint_factor(dataclasses.replace(known, doubted=True)))
-    return graph, values, kernel
+        builder.add_factor(constraint_factor(dataclasses.replace(known, doubted=True)))
+    return builder.kept_factors(), values, builder
 
 
 def by_gtsam(graph: Any, values: Any) -> Any:
@@ -48,8 +49,8 @@ def by_gtsam(graph: Any, values: Any) -> Any:
 
 @KERNELS
 def test_cost_and_gradient_are_those_of_the_factors(name: str) -> None:
-    graph, values, kernel = problem(name)
-    whole, state = WholeGraph.of(graph, values, kernel)
+    graph, values, builder = problem(name)
+    whole, state = builder.whole_graph(values)
     assert whole.cost(state) == pytest.approx(graph.error(values), rel=1e-12)
     system = whole.linear(state)
     expected: FloatArray = graph.linearize(values).gradientAtZero().vector()
@@ -60,9 +61,9 @@ def test_cost_and_gradient_are_those_of_the_factors(name: str) -> None:
 @KERNELS
 @pytest.mark.parametrize("seed", range(3))
 def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str, seed: int) -> None:
-    graph, values, kernel = problem(name, seed)
+    graph, values, builder = problem(name, seed)
     expected = by_gtsam(graph, values)
-    whole, state = WholeGraph.of(graph, values, kernel)
+    whole, state = builder.whole_graph(values)
     found = whole.minimum(state, MINIMUM.iterations, MINIMUM.tolerance)
     assert whole.cost(found) <= graph.error(expected) * (1.0 + 1e-6)
     if name in ("huber", "cauchy"):  # the others have minima beside each other
@@ -70,11 +71,29 @@ def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str, seed: int) -> 
 
 
 def test_both_eliminations_step_alike() -> None:
-    graph, values, _ = problem("none")
-    whole, state = WholeGraph.of(graph, values)
+    graph, values, builder = problem("none")
+    whole, state = builder.whole_graph(values)
     system = whole.linear(state)
     expected = graph.linearize(values).optimize().vector()
     for kind in (GraphMarginals, ChainMarginals):
         step = kind.of(system).step()
         np.testing.assert_allclose(step, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
     assert reduced(system).step().shape == expected.shape
+
+
+def test_graphs_of_arrays_and_of_factors_are_one_also_without_some_landmarks() -> None:
+    graph, values, builder = problem("cauchy")
+    kernel = builder.kernel
+    pairs = [builder.whole_graph(values), WholeGraph.of(graph, values, kernel)]
+    gone = np.array([0, 3, 7])
+    for (ours, state), (theirs, other) in (pairs, [w.without(gone, s) for w, s in pairs]):
+        assert ours.landmark_keys == theirs.landmark_keys
+        assert len(state.points) == len(ours.landmark_keys)
+        assert ours.cost(state) == pytest.approx(theirs.cost(other), rel=1e-12)
+        one, two = (w.linear(s) for w, s in ((ours, state), (theirs, other)))
+        size = np.abs(two.landmarks).max()
+        np.testing.assert_allclose(one.landmarks, two.landmarks, rtol=0, atol=1e-10 * size)
+        np.testing.assert_allclose(one.pose_gradient, two.pose_gradient, rtol=0, atol=1e-6)
+    assert len(pairs[0][0].landmark_keys) - len(gone) == len(
+        pairs[0][0].without(gone, pairs[0][1])[1].points
+    )
