@@ -186,3 +186,12 @@ def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:
 def _horizontal_weight(ratio: float) -> float:
     squared = ratio**2
     return squared / (1.0 + squared)
+
+
+def vertical_of(bTc: FloatArray) -> FloatArray:
+    """(3,) the vertical in a sensor's frame: its body's z axis; to be looked at, not computed with.
+
+    Where the body is the sensor itself, nothing is known of its tilt: then it is taken as level.
+    """
+    own = np.array_equal(bTc[:3, :3], np.eye(3))
+    return np.array([0.0, -1.0, 0.0]) if own else bTc[2, :3]

@@ -17,6 +17,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.sensors import vertical_of
 from fgslam.core.trajectories import read_covariances
 from fgslam.core.yaml_text import plain_values
 from fgslam.report.content import Picture
@@ -177,7 +178,7 @@ def _up(log: Path | None) -> FloatArray:
     if log is None:
         return _UP
     try:
-        return MeasurementLog.load(log).rig.bTc[2, :3]
+        return vertical_of(MeasurementLog.load(log).rig.bTc)
     except FgslamError:  # the page shows results; a log that cannot be replayed is no reason not to
         return _UP
 

@@ -21,7 +21,7 @@ from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Trajectory
 from fgslam.core.files import replacing
 from fgslam.core.measurements import Increment, moved_pixels
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, vertical_of
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.report.figures.palette import ON_DARK
 from fgslam.report.figures.traces import world_position_covariances
@@ -142,7 +142,7 @@ class Watcher:
         """What does not change: the world's axes, the cameras, how the parts are laid out."""
         rerun, stream, rig = self._rerun, self._stream, outputs.sequence.rig
         stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        level = rerun.Transform3D(mat3x3=level_axes(rig.bTc[2, :3]))
+        level = rerun.Transform3D(mat3x3=level_axes(vertical_of(rig.bTc)))
         stream.log("world/first_camera", level, static=True)
         lens = rerun.Pinhole(focal_length=[rig.fx, rig.fy], width=rig.width, height=rig.height)
         stream.log("world/first_camera/camera", lens, static=True)

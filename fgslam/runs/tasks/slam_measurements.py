@@ -10,6 +10,7 @@ import numpy as np
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, LandmarkMap
 from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.sensors import vertical_of
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
@@ -118,5 +119,5 @@ def _figures(
         matched=counts[0],
         inliers=counts[1],
         landmarks=counts[2],
-        up=recording.log.rig.bTc[2, :3],
+        up=vertical_of(recording.log.rig.bTc),
     )

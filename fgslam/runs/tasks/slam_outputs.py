@@ -15,6 +15,7 @@ from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.files import make_subfolder
 from fgslam.core.measurements import moved_pixels
 from fgslam.core.recordings import Sequence
+from fgslam.core.sensors import vertical_of
 from fgslam.evaluation.judging import Truth, closure_counts
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.content import Column, TextTable
@@ -378,7 +379,7 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
         matched=recorder.column("matched"),
         inliers=recorder.column("inliers"),
         landmarks=recorder.column("landmarks"),
-        up=outputs.sequence.rig.bTc[2, :3],
+        up=vertical_of(outputs.sequence.rig.bTc),
     )
 
 

@@ -16,7 +16,14 @@ import yaml
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import inverse, pose, so3_exp
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    inverse,
+    pose,
+    se3_exp,
+    so3_exp,
+)
+from fgslam.core.sensors import vertical_of
 
 WIDTH, HEIGHT = 160, 120
 INTRINSICS = ([150.0, 151.0, 78.0, 61.0], [149.0, 150.5, 81.0, 58.0])
@@ -314,3 +321,11 @@ def test_a_rig_without_baseline_is_refused() -> None:
     del values["baseline"]
     with pytest.raises(CalibrationError, match="baseline is nan"):
         StereoRig(**values)
+
+
+def test_the_vertical_is_the_body_s_and_of_a_camera_alone_the_image_s() -> None:
+    np.testing.assert_allclose(vertical_of(BODY_FORWARD_LEFT_UP_FROM_CAMERA), [0.0, -1.0, 0.0])
+    np.testing.assert_allclose(vertical_of(np.eye(4)), [0.0, -1.0, 0.0])
+    tilted = BODY_FORWARD_LEFT_UP_FROM_CAMERA @ se3_exp(np.array([0.3, 0.0, 0.0, 1.0, 2.0, 3.0]))
+    up = [0.0, -np.cos(0.3), np.sin(0.3)]
+    np.testing.assert_allclose(vertical_of(tilted), up, rtol=0, atol=1e-12)
