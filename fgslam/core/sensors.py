@@ -188,10 +188,15 @@ def _horizontal_weight(ratio: float) -> float:
     return squared / (1.0 + squared)
 
 
+_NEARLY_ITSELF = 1.0 + 2.0 * np.cos(np.deg2rad(45.0))
+"""Trace of a turn by 45 degrees: rectification turns a camera by less, a body's axes are further."""
+
+
 def vertical_of(bTc: FloatArray) -> FloatArray:
     """(3,) the vertical in a sensor's frame: its body's z axis; to be looked at, not computed with.
 
-    Where the body is the sensor itself, nothing is known of its tilt: then it is taken as level.
+    Where the body is the camera itself, raw or rectified, nothing is known of its tilt: then it is
+    taken as level, and its -y axis as the vertical.
     """
-    own = np.array_equal(bTc[:3, :3], np.eye(3))
-    return np.array([0.0, -1.0, 0.0]) if own else bTc[2, :3]
+    own = np.trace(bTc[:3, :3]) > _NEARLY_ITSELF
+    return -bTc[1, :3] if own else bTc[2, :3]

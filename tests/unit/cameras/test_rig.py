@@ -326,6 +326,8 @@ def test_a_rig_without_baseline_is_refused() -> None:
 def test_the_vertical_is_the_body_s_and_of_a_camera_alone_the_image_s() -> None:
     np.testing.assert_allclose(vertical_of(BODY_FORWARD_LEFT_UP_FROM_CAMERA), [0.0, -1.0, 0.0])
     np.testing.assert_allclose(vertical_of(np.eye(4)), [0.0, -1.0, 0.0])
+    rectified = se3_exp(np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(vertical_of(rectified), [0.0, -1.0, 0.0], rtol=0, atol=1e-12)
     tilted = BODY_FORWARD_LEFT_UP_FROM_CAMERA @ se3_exp(np.array([0.3, 0.0, 0.0, 1.0, 2.0, 3.0]))
     up = [0.0, -np.cos(0.3), np.sin(0.3)]
     np.testing.assert_allclose(vertical_of(tilted), up, rtol=0, atol=1e-12)
