@@ -189,7 +189,7 @@ def _horizontal_weight(ratio: float) -> float:
 
 
 _NEARLY_ITSELF = 1.0 + 2.0 * np.cos(np.deg2rad(45.0))
-"""Trace of a turn by 45 degrees: rectification turns a camera by less, a body's axes are further."""
+"""Trace of a turn by 45 degrees: rectification turns by less, a body's axes are further."""
 
 
 def vertical_of(bTc: FloatArray) -> FloatArray:
