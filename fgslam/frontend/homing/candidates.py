@@ -49,7 +49,7 @@ _SIZE_SIGMA = 0.35  # of ln of the ratio of sizes, of right candidates
 _SIZE_RANGE = 1.6  # that of wrong ones is even over so much: the planar gates admit a factor 2
 _NEAR_LEG = 0.05  # sine of the angle to the leg below which the distances' ratio says nothing
 _CELL_DEG = 2.0  # candidates within one cell in both views count as one
-_BLOCK_DEG, _BLOCK_FULL = 7.0, 6.0
+_BLOCK_DEG, BLOCK_FULL = 7.0, 6.0
 """Evidence s within a block of so many degrees of a view counts f ln(1 + s / f)."""
 
 
@@ -220,7 +220,7 @@ class GuidedScore:
 def _with_limit(evidence: FloatArray, blocks: IntArray) -> float:
     _, inverse = np.unique(blocks, return_inverse=True)
     sums = np.bincount(inverse.ravel(), evidence)
-    return float(np.sum(_BLOCK_FULL * np.log1p(sums / _BLOCK_FULL)))
+    return float(np.sum(BLOCK_FULL * np.log1p(sums / BLOCK_FULL)))
 
 
 def _blocks(bearing: FloatArray, elevation: FloatArray, degrees: float) -> IntArray:

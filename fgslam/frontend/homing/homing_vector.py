@@ -19,7 +19,7 @@ from fgslam.frontend.homing.matching import (
     log_likelihood_ratio,
     right_probability,
 )
-from fgslam.frontend.homing.refinement import HomingRefinement, Refined
+from fgslam.frontend.homing.refinement import HomingRefinement, Refined, spread_over
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest, TwoPointSamples, solve_two_point
 
@@ -195,14 +195,8 @@ class HomingSearch:
         Features all on one side leave a valley with several minima. Each solution within the
         competitors' angle weighs by its likelihood, tempered since residuals have common causes.
         """
-        best = refined[0]
-        near = [r for r in refined if not self.differ(r, best)]
-        lost = np.array([self._score_of(best) - self._score_of(r) for r in near])
-        weights = np.exp(-lost / _TEMPER)
-        offsets = wrap(np.array([r.parameters[:2] for r in near]) - best.parameters[:2])
-        spread = np.array([r.covariance[:2, :2] for r in near])
-        spread = spread + offsets[:, :, None] * offsets[:, None, :]
-        return np.asarray(np.tensordot(weights / np.sum(weights), spread, axes=1))
+        near = [r for r in refined if not self.differ(r, refined[0])]
+        return spread_over(near, np.array([self._score_of(r) for r in near]), _TEMPER)
 
     def differ(self, one: Refined, other: Refined) -> bool:
         """Whether two solutions are not one and the same."""

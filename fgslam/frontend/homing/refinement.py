@@ -54,6 +54,19 @@ class Refined:
     inliers: BoolArray
 
 
+def spread_over(near: list[Refined], scores: FloatArray, temper: float) -> FloatArray:
+    """(2, 2) covariance of direction and rotation, of the first of solutions near each other.
+
+    Each weighs by its likelihood exp(score), tempered: residuals have common causes, so that
+    ``temper`` units of the score count as one.
+    """
+    weights = np.exp((scores - scores[0]) / temper)
+    offsets = wrap(np.array([r.parameters[:2] for r in near]) - near[0].parameters[:2])
+    spread = np.array([r.covariance[:2, :2] for r in near])
+    spread = spread + offsets[:, :, None] * offsets[:, None, :]
+    return np.asarray(np.tensordot(weights / np.sum(weights), spread, axes=1))
+
+
 class HomingRefinement:
     """The matches, prepared for refining any number of hypotheses."""
 

@@ -15,10 +15,15 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.settings import OmniMatchingSettings
-from fgslam.frontend.homing.candidates import Candidates, GuidedScore, candidate_matches
+from fgslam.frontend.homing.candidates import (
+    BLOCK_FULL,
+    Candidates,
+    GuidedScore,
+    candidate_matches,
+)
 from fgslam.frontend.homing.homing_vector import INLIER_SIGMAS, LEAST_PARALLAX, HomingSearch
 from fgslam.frontend.homing.matching import match_features, planar_distances
-from fgslam.frontend.homing.refinement import HomingRefinement, Refined
+from fgslam.frontend.homing.refinement import HomingRefinement, Refined, spread_over
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest
 
@@ -108,7 +113,8 @@ class SecondLook:
         """The best of hypotheses (c, 2), direction and rotation, or why none is the answer."""
         best, *others = self._solutions(hypotheses)
         rivals = [other for other in others if self._differ(best, other)]
-        refusal = self._refusal(best, rivals[0].score if rivals else 0.0)
+        covariance = self._covariance(best, others)
+        refusal = self._refusal(best, rivals[0].score if rivals else 0.0, covariance)
         if refusal is not None:
             return refusal
         theta, psi = (float(v) for v in best.refined.parameters[:2])
@@ -118,7 +124,7 @@ class SecondLook:
         return TwoViewVector(
             theta,
             psi,
-            best.refined.covariance[:2, :2] + np.diag(floor**2),
+            covariance + np.diag(floor**2),
             inliers,
             len(rivals[0].rows) if rivals else 0,
         )
@@ -152,8 +158,17 @@ class SecondLook:
         apart = np.abs(wrap(one.refined.parameters[:2] - other.refined.parameters[:2]))
         return bool(np.max(apart) > np.deg2rad(self._settings.rival_angle_deg))
 
-    def _refusal(self, best: _Solution, rival: float) -> Refusal | None:
-        sigma = float(np.rad2deg(np.sqrt(best.refined.covariance[0, 0])))
+    def _covariance(self, best: _Solution, others: list[_Solution]) -> FloatArray:
+        """(2, 2) of the best solution, widened by those near it with nearly as much evidence.
+
+        What less than a block's evidence tells apart is undecided: its full evidence is the unit.
+        """
+        near = [best, *(other for other in others if not self._differ(best, other))]
+        scores = np.array([solution.score for solution in near])
+        return spread_over([solution.refined for solution in near], scores, BLOCK_FULL)
+
+    def _refusal(self, best: _Solution, rival: float, covariance: FloatArray) -> Refusal | None:
+        sigma = float(np.rad2deg(np.sqrt(covariance[0, 0])))
         support = len(best.rows)
         if support < self._settings.min_inliers or best.score < _LEAST_SCORE:
             reason = RefusalReason.TOO_FEW_INLIERS

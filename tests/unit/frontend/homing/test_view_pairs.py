@@ -19,6 +19,7 @@ from fgslam.frontend.homing.candidates import (
     edge_likeness,
 )
 from fgslam.frontend.homing.matching import match_sift, planar_distances
+from fgslam.frontend.homing.refinement import Refined, spread_over
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import EpipolarTest
 from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
@@ -100,6 +101,21 @@ def test_a_second_look_answers_where_the_nearest_descriptor_is_often_wrong() -> 
     assert len(answered) >= 5
     assert sum(isinstance(found, TwoViewVector) for found in once) < len(answered)
     assert max(map(off_deg, answered)) < 2.0
+
+
+def test_solutions_with_nearly_as_much_evidence_are_part_of_the_uncertainty() -> None:
+    def solution(theta: float, psi: float) -> Refined:
+        parameters = np.array([theta, psi, 0.0, 0.0, 0.0, 0.0, 0.0])
+        none = np.zeros(0)
+        return Refined(parameters, 0.01**2 * np.eye(7), none, none.astype(bool))
+
+    near = [solution(3.1, 0.0), solution(3.1 + 0.1 - 2.0 * np.pi, 0.0)]  # 0.1 on, over the seam
+    equal = spread_over(near, np.array([50.0, 50.0]), 6.0)
+    np.testing.assert_allclose(equal, np.diag([0.01**2 + 0.1**2 / 2, 0.01**2]), rtol=0, atol=1e-12)
+    less = spread_over(near, np.array([50.0, 50.0 - 6.0 * np.log(3.0)]), 6.0)  # a third as likely
+    np.testing.assert_allclose(less[0, 0], 0.01**2 + 0.1**2 / 4, rtol=0, atol=1e-12)
+    far = spread_over(near, np.array([500.0, 50.0]), 6.0)
+    np.testing.assert_allclose(far, 0.01**2 * np.eye(2), rtol=0, atol=1e-12)
 
 
 def test_views_that_share_nothing_are_refused() -> None:
