@@ -125,7 +125,7 @@ def _arrays(path: Path, key: str, value: Any, depth: int) -> Any:
 def _array(path: Path, key: str, block: Mapping[str, Any]) -> FloatArray:
     rows, columns, given = block["rows"], block["cols"], block["data"]
     data = flat_numbers(given)
-    whole = is_finite_number(rows) and is_finite_number(columns)
+    whole = all(is_finite_number(count) and count >= 0 for count in (rows, columns))
     cells = round(rows * columns) if whole else 0
     if data is None or not whole or len(data) % max(cells, 1) or bool(cells) != bool(len(data)):
         raise CalibrationError(
