@@ -31,8 +31,11 @@ TERMS = (
 )
 """Of each camera beside the reference, in units of the focal length.
 
-What all cameras share is taken as calibrated: a common focal length, which a straight drive hides,
-and a common radial term, which trades against it."""
+What all cameras share is taken as calibrated, as a straight drive hides it; see SHARED."""
+
+SHARED = ("column", "row", "focal", "decentring_x", "decentring_y", "radial", "baseline")
+"""What all cameras may share: the same terms, in all images alike, and the baseline's length,
+relative. A turn that they share is one of the robot."""
 
 EXPECTED_PX = 1.0
 """Displacement that a calibration is taken to leave, root mean square over the image: what the
@@ -98,11 +101,47 @@ def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> Float
     return out
 
 
+def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
+    """Displacements (k, 2 * cameras, 7) of pixels by a unit of each term of SHARED, pixels.
+
+    Arguments as for :func:`displacements`. A longer baseline is one with larger disparities.
+    """
+    focal = np.array([rig.fx, rig.fy])
+    rays = (pixels.reshape(-1, 2) - [rig.cx, rig.cy]) / focal
+    of_lens = focal[:, None] * _terms(rays)[..., [TERMS.index(name) for name in SHARED[:-1]]]
+    out = np.zeros((len(pixels), 2 * rig.cameras, len(SHARED)))
+    out[..., :-1] = of_lens.reshape(len(pixels), 2 * rig.cameras, -1)
+    out[:, 2, -1] = pixels[:, 1, 0] - pixels[:, 0, 0]
+    if rig.cameras == 3:
+        out[:, 5, -1] = pixels[:, 2, 1] - pixels[:, 0, 1]
+    return out
+
+
+def shared_information(rig: CameraRig, expected_px: float) -> FloatArray:
+    """Information (7, 7) about SHARED of images that are off by ``expected_px``, rms over them.
+
+    The baseline is known as well as the focal length, relative: both come from the size of a board.
+    """
+    jacobian = shared_displacements(rig, _grid(rig))[:, :2, :-1].reshape(-1, len(SHARED) - 1)
+    points = len(jacobian) // 2
+    scale = jacobian.shape[1] / (points * expected_px**2)
+    out = np.zeros((len(SHARED), len(SHARED)))
+    out[:-1, :-1] = scale * (jacobian.T @ jacobian)
+    focal = SHARED.index("focal")
+    out[-1, -1] = 1.0 / np.linalg.inv(out[:-1, :-1])[focal, focal]
+    return out
+
+
 def _grid_displacements(rig: CameraRig) -> FloatArray:
     """Displacements (k, 2 * cameras, p) at points spread over the image, by a unit of each term."""
+    return displacements(rig, _grid(rig))
+
+
+def _grid(rig: CameraRig) -> FloatArray:
+    """(k, cameras, 2) pixels spread over the image, the same in all cameras."""
     column, row = np.meshgrid(*(np.linspace(0, n - 1, _GRID) for n in (rig.width, rig.height)))
     grid = np.stack([column.ravel(), row.ravel()], axis=1)
-    return displacements(rig, np.repeat(grid[:, None], rig.cameras, axis=1))
+    return np.repeat(grid[:, None], rig.cameras, axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -18,6 +18,7 @@ from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import triangulate
 from fgslam.core.measurements import Observations, Odometry
+from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import RangeBearingFactors, StereoFactors
@@ -97,7 +98,6 @@ class GraphBuilder:
         admission: the landmarks, and which of them the graph holds.
         frames: those whose poses are in the graph, in time order.
         noise: of its landmark observations.
-        doubted: the rig, where it calibrates itself.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class GraphBuilder:
         self.noise: MeasurementNoise = (
             Persistence(sensor) if factor is None else StatedNoise(factor)
         )
-        self.doubted: CameraRig | None = None
+        self._applied: FloatArray | None = None
         self._variance_of: dict[int, float] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
@@ -151,8 +151,15 @@ class GraphBuilder:
 
     def corrects(self, correction: FloatArray | None) -> None:
         """Takes note of what a frame's measurements were corrected by; None: they were not."""
-        if correction is not None and isinstance(self._sensor, CameraRig):
-            self.doubted = self._sensor
+        if correction is not None:
+            self._applied = correction
+
+    @property
+    def doubted(self) -> RigCorrection | None:
+        """A rig that calibrates itself, with the correction applied last; None for a known one."""
+        if self._applied is None or not isinstance(self._sensor, CameraRig):
+            return None
+        return dataclasses.replace(RigCorrection.none(self._sensor), values=self._applied)
 
     @property
     def variables(self) -> int:

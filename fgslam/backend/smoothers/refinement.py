@@ -38,7 +38,7 @@ from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.sensors import CameraRig
+from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.threads import one_blas_thread
 from fgslam.factors.graphs import number, poses_of_frame
 
@@ -164,13 +164,13 @@ class Refined:
         graph: the factors that count.
         state: of all variables that are left.
         remarks: what was left out, in words.
-        rig: one that calibrates itself, which is in doubt; None for one that is known.
+        doubted: what was applied last to a rig that calibrates itself; None for a known one.
     """
 
     graph: WholeGraph
     state: State
     remarks: tuple[str, ...] = ()
-    rig: CameraRig | None = None
+    doubted: RigCorrection | None = None
 
     @property
     def variables(self) -> list[int]:
@@ -200,8 +200,8 @@ class Refined:
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
-        if self.rig is not None and self.graph.kinds:
-            return DoubtedMarginals.of(self.graph, self.state, self.rig)
+        if self.doubted is not None and self.graph.kinds:
+            return DoubtedMarginals.of(self.graph, self.state, self.doubted)
         return reduced(self.graph.linear(self.state))
 
 

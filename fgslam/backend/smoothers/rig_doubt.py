@@ -5,7 +5,9 @@ together: no average over landmarks and frames takes it out. The graph holds the
 (Schmidt 1966: a parameter that is considered, not estimated); here its covariance is carried to
 first order into poses and landmarks. It is that of the correction given the prior of any
 calibration and the graph's own measurements, so the sum is the marginal of a graph that had the
-correction as a variable. docs/derivations/measurement_noise.md.
+correction as a variable. What all cameras share (focal length, lens, baseline) is considered too,
+with a prior alone: each image is as far off as the images are found to be off against each other.
+docs/derivations/measurement_noise.md.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from fgslam.backend.smoothers.marginals import (
     ChainMarginals,
@@ -23,7 +26,13 @@ from fgslam.backend.smoothers.marginals import (
 )
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.rig_correction import displacements, prior_information
+from fgslam.core.rig_correction import (
+    RigCorrection,
+    displacements,
+    prior_information,
+    shared_displacements,
+    shared_information,
+)
 from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
 
 
@@ -33,8 +42,9 @@ class DoubtedMarginals:
 
     Attributes:
         held: the same with the correction held as it is.
-        gain: (3m + 6n, p) how landmarks and poses follow the correction's p terms.
-        correction: (p, p) covariance.
+        gain: (3m + 6n, p + q) how landmarks and poses follow the correction's p terms and the q
+            that all cameras share.
+        correction: (p + q, p + q) their covariance.
     """
 
     held: GraphMarginals | ChainMarginals
@@ -42,19 +52,20 @@ class DoubtedMarginals:
     correction: FloatArray
 
     @staticmethod
-    def of(graph: WholeGraph, state: State, rig: CameraRig) -> DoubtedMarginals:
-        """At a solution; the rig as calibrated.
+    def of(graph: WholeGraph, state: State, rig: RigCorrection) -> DoubtedMarginals:
+        """At a solution; ``rig`` with the correction that was applied to it.
 
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
         system = graph.linear(state)
-        held = reduced(system)
-        pull, own = graph.pulled(state, lambda measured: shifts(rig, measured))
+        held, prior, shared = reduced(system), prior_information(rig.rig), _shared(rig)
+        p, terms = len(prior), slice(len(prior) + len(shared))
+        pull, own = graph.pulled(state, lambda measured: shifts(rig.rig, measured)[..., terms])
         gain = np.column_stack([_step(held, system, one) for one in pull.T])
-        information = own + pull.T @ gain + prior_information(rig)
-        covariance = np.linalg.inv(0.5 * (information + information.T))
-        return DoubtedMarginals(held, gain, np.asarray(covariance))
+        information = (own + pull.T @ gain)[:p, :p] + prior
+        correction = np.linalg.inv(0.5 * (information + information.T))
+        return DoubtedMarginals(held, gain, np.asarray(block_diag(correction, shared)))
 
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
@@ -78,11 +89,20 @@ class DoubtedMarginals:
 
 
 def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
-    """(k, 3, p) by which a unit of each term displaces measurements (k, 3)."""
+    """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED."""
     ratio = vertical_to_horizontal(rig)
     pixels = (measured @ pixel_model(rig.cameras, ratio).T).reshape(-1, rig.cameras, 2)
     fuse = measurement_map("fused", rig.cameras, ratio)
-    return np.asarray(fuse @ displacements(rig, pixels))
+    of_pixels = (displacements(rig, pixels), shared_displacements(rig, pixels))
+    return np.asarray(fuse @ np.concatenate(of_pixels, axis=2))
+
+
+def _shared(correction: RigCorrection) -> FloatArray:
+    """(q, q) covariance of what nothing estimates; (0, 0) where the rig was not found to be off."""
+    against = correction.rms_px()
+    if not against:
+        return np.empty((0, 0))
+    return np.asarray(np.linalg.inv(shared_information(correction.rig, against / np.sqrt(2.0))))
 
 
 def _step(

@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
 from simulated import RIG
 from smoothing import drawn, run
 
@@ -14,34 +15,48 @@ from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals, shifts
 from fgslam.core import geometry as g
-from fgslam.core.rig_correction import prior_information
+from fgslam.core.arrays import FloatArray
+from fgslam.core.rig_correction import (
+    SHARED,
+    RigCorrection,
+    prior_information,
+    shared_displacements,
+    shared_information,
+    term_names,
+)
+from fgslam.evaluation.consistency import pose_nees
+
+EXACT = RigCorrection.none(RIG)
+OFF = dataclasses.replace(EXACT, values=0.3 / RIG.fx * np.eye(len(EXACT.values))[0])
+"""The left image 0.3 pixels to the right."""
+
+ALL = (*term_names(RIG), *SHARED)
 
 
 @cache
-def solved(shift: int | None = None, by: float = 0.0) -> Refined:
-    """A drive's graph at its minimum, its measurements displaced by one term of the correction."""
+def solved(seed: int = 3, shift: tuple[float, ...] = (0.0,) * len(ALL)) -> Refined:
+    """A drive's graph at its minimum, its measurements displaced by terms of the correction."""
     settings = BatchSettings(kernel=KernelSettings("none"), trim=False, noise_factor=1.0)
-    increments: list[Any] = drawn(3, frames=12).increments
-    if shift is not None:
-        increments = [displaced(increment, shift, by) for increment in increments]
+    increments = [displaced(each, np.array(shift)) for each in drawn(seed, frames=12).increments]
     estimator: Any = run(settings, increments)[0]
     found: Refined = estimator._solver._refined()
     return found
 
 
-def displaced(increment: Any, term: int, by: float) -> Any:
+def displaced(increment: Any, by: FloatArray) -> Any:
     seen = increment.observations
-    moved = seen.measurement + by * shifts(RIG, seen.measurement)[:, :, term]
+    moved = seen.measurement + shifts(RIG, seen.measurement) @ by
     observations = dataclasses.replace(seen, measurement=moved)
     return dataclasses.replace(increment, observations=observations)
 
 
 def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() -> None:
     refined = solved()
-    found = DoubtedMarginals.of(refined.graph, refined.state, RIG)
+    found = DoubtedMarginals.of(refined.graph, refined.state, EXACT)
     system = refined.graph.linear(refined.state)
     information = system.information.toarray()
-    pull, own = refined.graph.pulled(refined.state, lambda measured: shifts(RIG, measured))
+    p = len(EXACT.values)
+    pull, own = refined.graph.pulled(refined.state, lambda measured: shifts(RIG, measured)[..., :p])
     whole = np.block([[information, pull], [pull.T, own + prior_information(RIG)]])
     covariance = np.linalg.inv(whole)
     columns, k = system.columns, len(found.correction)
@@ -60,14 +75,51 @@ def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() ->
     np.testing.assert_allclose(found.correction, covariance[-k:, -k:], rtol=1e-5, atol=1e-12)
 
 
-def test_poses_move_with_a_wrong_rig_as_their_gains_say() -> None:
-    """By a yaw of the left camera of a tenth of a pixel; to first order."""
-    refined, by = solved(), 0.1 / RIG.fx
-    found = DoubtedMarginals.of(refined.graph, refined.state, RIG)
-    moved = solved(2, by)
+@pytest.mark.parametrize("term", ["left.yaw", "row", "focal", "radial", "baseline"])
+def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
+    """By some tenth of a pixel; to first order."""
+    by = 0.1 / RIG.fx * (np.array(ALL) == term)
+    refined, moved = solved(), solved(3, tuple(by))
+    found = DoubtedMarginals.of(refined.graph, refined.state, OFF)
     before, after = refined.state.poses, moved.state.poses
     steps = np.array([g.se3_log(step) for step in g.inverse(before) @ after])
-    gain = found.gain[found.held.system.columns :, 2].reshape(-1, 6)
+    gain = (found.gain[found.held.system.columns :] @ by).reshape(-1, 6)
     size = np.abs(steps).max()
-    assert size > 1e-4
-    np.testing.assert_allclose(by * gain, steps, rtol=0.0, atol=0.05 * size)
+    assert size > 5e-5
+    np.testing.assert_allclose(gain, steps, rtol=0.0, atol=0.05 * size)
+
+
+def test_an_image_is_taken_to_be_off_as_the_images_are_against_each_other() -> None:
+    information = shared_information(RIG, 0.2)
+    rng = np.random.default_rng(4)
+    drawn_terms = rng.multivariate_normal(np.zeros(len(SHARED)), np.linalg.inv(information), 4000)
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, RIG.width - 1, 9), np.linspace(0, RIG.height - 1, 9))
+    )
+    pixels = np.repeat(grid.reshape(2, -1).T[:, None], RIG.cameras, axis=1)
+    moved = shared_displacements(RIG, pixels)[:, :2, :-1] @ drawn_terms[:, :-1].T
+    assert np.sqrt((moved**2).sum(axis=1).mean()) == pytest.approx(0.2, rel=0.1)
+    focal = drawn_terms[:, SHARED.index("focal")].std()
+    assert drawn_terms[:, -1].std() == pytest.approx(focal, rel=0.05)
+
+
+def per_dof(poses: FloatArray, covariances: FloatArray, truth: FloatArray) -> float:
+    nees = pose_nees(poses, covariances, truth)
+    return float(nees.values.sum() / nees.dof.sum())
+
+
+def test_rigs_that_are_off_as_assumed_leave_consistent_poses() -> None:
+    """Calibrations drawn as off as they are taken to be; NEES of 12 drives."""
+    worse = dataclasses.replace(OFF, values=8.0 * OFF.values)
+    rng = np.random.default_rng(5)
+    found, held = [], []
+    for seed in range(12):
+        exact, truth = solved(seed), drawn(seed, frames=12).poses[1:]
+        assumed = DoubtedMarginals.of(exact.graph, exact.state, worse).correction
+        refined = solved(seed, tuple(rng.multivariate_normal(np.zeros(len(ALL)), assumed)))
+        poses = refined.poses()[1:]
+        doubted = DoubtedMarginals.of(refined.graph, refined.state, worse)
+        found.append(per_dof(poses, doubted.poses()[1:], truth))
+        held.append(per_dof(poses, doubted.held.poses()[1:], truth))
+    assert np.mean(held) > 2.0
+    assert 0.75 < np.mean(found) < 1.25
