@@ -126,6 +126,12 @@ MADE = {
 }
 
 
+def test_every_tutorial_of_commands_is_run() -> None:
+    """The others are made from examples, which tests/examples runs."""
+    pages = {path.stem for path in TUTORIALS.glob("*.md")}
+    assert {name for name in pages if "<!-- Made by" not in page(name)} == set(DATA)
+
+
 @pytest.mark.parametrize("name", DATA)
 def test_a_tutorial_is_short_and_its_pictures_are_small(name: str) -> None:
     text = page(name)
