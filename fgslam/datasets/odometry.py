@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TypeAlias
 
@@ -195,6 +196,7 @@ def recorded_motions(
     Raises:
         OdometryError: (when motions are asked for) it covers none of the frames.
     """
+    read = cache(read)  # motions are asked for again with the clock shifted
 
     def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
         log = read()
