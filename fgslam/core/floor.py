@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import congruence, pose, so3_exp
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import Sensor, vertical_of
 
 DegreesOfFreedom: TypeAlias = Literal[3, 5, 6]
 
@@ -39,8 +39,11 @@ class Floor:
 
     @staticmethod
     def under(rig: Sensor, dof: DegreesOfFreedom) -> Floor:
-        """The exact floor that is level with the robot's body in the first camera frame."""
-        return Floor(dof, -rig.bTc[2, :3])
+        """The exact floor that is level with the robot's body in the first camera frame.
+
+        Where nothing is known of how the camera is mounted, it is taken as level.
+        """
+        return Floor(dof, -vertical_of(rig.bTc))
 
     @property
     def rigid_dof(self) -> DegreesOfFreedom:

@@ -193,7 +193,7 @@ _NEARLY_ITSELF = 1.0 + 2.0 * np.cos(np.deg2rad(45.0))
 
 
 def vertical_of(bTc: FloatArray) -> FloatArray:
-    """(3,) the vertical in a sensor's frame: its body's z axis; to be looked at, not computed with.
+    """(3,) the vertical in a sensor's frame, upwards: its body's z axis.
 
     Where the body is the camera itself, raw or rectified, nothing is known of its tilt: then it is
     taken as level, and its -y axis as the vertical.
