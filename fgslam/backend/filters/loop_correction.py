@@ -1,10 +1,9 @@
 """Backward correction by submaps (Se, Lowe and Little's later work), and which loops are accepted.
 
 A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop asks for the least
-weighted changes to the chain under which it meets itself: the minimum of a pose graph. Its
-variables are the poses at which submaps begin; within a submap the change is spread over the
-frames as their steps' uncertainty has it, so that nothing tears. Derivation:
-docs/derivations/submaps.md.
+weighted changes to the chain under which it meets itself: the minimum of a pose graph of the poses
+at which submaps begin; within a submap the change is spread over the frames as their steps'
+uncertainty has it. Derivation: docs/derivations/submaps.md.
 """
 
 from __future__ import annotations
@@ -28,8 +27,7 @@ from fgslam.factors.noise import robust
 
 _DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
 SUBMAP_FRAMES = 10
-"""Frames to a submap: enough that the pose graph of a long drive stays small, few enough that what
-a submap's frames measured hardly bends within it."""
+"""Enough that the pose graph of a long drive stays small, few enough that a submap hardly bends."""
 CLOSURE_FACTOR = 3.0
 """By which deviations of a loop closure are multiplied: its own covariance takes the map around
 both frames as rigid, whose landmarks are as uncertain as the poses that saw them."""
@@ -86,6 +84,7 @@ class Constraint:
         motion: (4, 4) pose of ``after`` in ``before``.
         covariance: (6, 6) in the tangent space at it.
         doubted: it may be wrong: the farther off, the less it pulls (Cauchy's kernel).
+        matches: landmarks that agree on it; 0 where nobody counted.
     """
 
     before: int
@@ -93,6 +92,7 @@ class Constraint:
     motion: FloatArray
     covariance: FloatArray
     doubted: bool = False
+    matches: int = 0
 
 
 @dataclass(slots=True, eq=False)

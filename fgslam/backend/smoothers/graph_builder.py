@@ -266,7 +266,7 @@ class GraphBuilder:
     def kept_factors(self) -> Any:
         """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
         out = self._other_factors()
-        seen = self._kept_observed()
+        seen = self.kept_observed()
         for frame, variable, measurement, covariance in zip(*seen, strict=True):
             sighting = Sighting(int(frame), measurement, covariance)
             out.add(self._observation(int(variable), sighting))
@@ -287,7 +287,7 @@ class GraphBuilder:
         if not isinstance(self._sensor, CameraRig):
             return WholeGraph.of(self.kept_factors(), values, kernel)
         others = self._other_factors()
-        frames, variables, measured, covariances = self._kept_observed()
+        frames, variables, measured, covariances = self.kept_observed()
         return WholeGraph.of_rig(
             others,
             values,
@@ -297,7 +297,7 @@ class GraphBuilder:
             self._sensor,
         )
 
-    def _kept_observed(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    def kept_observed(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
         """Frames (k,), variables (k,), measurements and covariances of what was not taken out."""
         kept, seen = ~self.observed["gone"], self.observed
         return (

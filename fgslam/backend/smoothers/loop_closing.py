@@ -28,7 +28,7 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.measurements import LoopClosure
@@ -36,6 +36,8 @@ from fgslam.core.quantiles import chi_square_quantile
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 _AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
+_OBSERVED = float(chi_square_quantile(0.999, 3))  # of an observation that fits
+_LONG_UNSEEN = 60  # frames, as the front-end's LoopSettings.forgotten_after
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small
@@ -96,8 +98,13 @@ class GraphLoops:
         guess = first_guess(self._builder, graph.values(state), drive.chain, loops)
         closed = graph.plus(constraint_factor(known))
         solution = solved(closed, State.of(guess))
-        rise = 2.0 * (closed.cost(solution) - graph.cost(state))
-        refused = refusal(what, rise)
+        refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
+        rivals = self._rivals(closed.squared(solution))
+        if refused and 0 < rivals.sum() < known.matches:
+            graph, closed = graph.heeding(~rivals), closed.heeding(~rivals)
+            solution = solved(closed, solution)
+            rise = 2.0 * (closed.cost(solution) - graph.cost(solved(graph, state)))
+            refused = refusal(what, rise)
         if refused:
             return Acceptance(False, None, refused)
         self._accept(known)
@@ -106,6 +113,17 @@ class GraphLoops:
         shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
         remark = f"{what}: the camera moved by {shift:.2f} m, the graph with it"
         return Acceptance(True, found, remark)
+
+    def _rivals(self, squared: FloatArray) -> BoolArray:
+        """(k,) observations that claim another return than the loop's, by their residuals with it.
+
+        A landmark that was long out of view was found again by its looks and by where the drifted
+        camera expected it. That is a loop closure, too, of a few matches, and false where the
+        drift is large; so the larger number of matches says which of both is believed.
+        """
+        gate = _OBSERVED / self._builder.noise_factor**2
+        frames, variables, *_ = self._builder.kept_observed()
+        return found_again(frames, variables) & (squared > gate)
 
     def _accept(self, known: Constraint) -> None:
         """Believed now, it is doubted when later ones contradict it."""
@@ -116,6 +134,18 @@ class GraphLoops:
     def last_factor(self) -> Any:
         """The factor of the loop accepted last."""
         return constraint_factor(self._accepted[-1])
+
+
+def found_again(frames: IntArray, variables: IntArray) -> BoolArray:
+    """(k,) which observations, by frame and landmark, are of landmarks that were long unseen."""
+    order = np.lexsort((frames, variables))
+    same = np.diff(variables[order], prepend=-1) == 0
+    returns = np.cumsum(same & (np.diff(frames[order], prepend=0) >= _LONG_UNSEEN))
+    starts = np.flatnonzero(~same)
+    before = np.repeat(returns[starts], np.diff(np.append(starts, len(returns))))
+    out = np.zeros(len(frames), np.bool_)
+    out[order] = returns > before
+    return out
 
 
 def misfit(factor: Any, values: Any) -> float:
@@ -132,13 +162,14 @@ def carried_to(frame: int, loop: LoopClosure, trackings: list[EgoMotion], last: 
         trackings: of all frames.
         last: the present frame.
     """
+    matches = len(loop.observations)
     if frame == loop.frame:
-        return Constraint(frame, last, loop.oTc, loop.covariance)
+        return Constraint(frame, last, loop.oTc, loop.covariance, matches=matches)
     neighbour, earlier = trackings[frame], trackings[loop.frame]
     kTo = inverse(neighbour.wTc) @ earlier.wTc
     own = earlier.covariance + congruence(adjoint(inverse(kTo)), neighbour.covariance)
     covariance = loop.covariance + congruence(adjoint(inverse(loop.oTc)), own)
-    return Constraint(frame, last, kTo @ loop.oTc, covariance)
+    return Constraint(frame, last, kTo @ loop.oTc, covariance, matches=matches)
 
 
 def first_guess(builder: GraphBuilder, values: Any, chain: Chain, loops: list[Constraint]) -> Any:

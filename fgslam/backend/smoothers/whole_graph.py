@@ -149,6 +149,10 @@ class WholeGraph:
         new = np.asarray(weights, np.float64)
         return dataclasses.replace(self, weights=new, kernel=PLAIN)
 
+    def heeding(self, rows: BoolArray) -> WholeGraph:
+        """Without the other observations (k,), with its kernel."""
+        return dataclasses.replace(self, weights=self.weights * rows)
+
     def without(self, rows: IntArray, state: State) -> tuple[WholeGraph, State]:
         """Without landmarks, by row, and their factors, at the state (of all) without them."""
         kept = np.ones(len(self.landmark_keys), np.bool_)

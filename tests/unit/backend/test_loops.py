@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from loops import CLOSED, ROUND, Returned, Rounds, drive_rounds
-from simulated import Drive, assert_same_bits, play, play_directly, simulate
+from simulated import (
+    RIG,
+    Drive,
+    assert_same_bits,
+    play,
+    play_directly,
+    simulate,
+    visible,
+)
 from smoothing import FREE, PIXELS, build
 
 from fgslam.backend.filters import loop_correction
@@ -23,12 +32,14 @@ from fgslam.backend.settings import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
+from fgslam.backend.smoothers.loop_closing import _LONG_UNSEEN, found_again
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Estimate
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.evaluation.consistency import pose_nees
+from fgslam.factors.graphs import landmark_key, poses_of_frame
 
 CLOSING: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),
@@ -207,6 +218,46 @@ def test_refused_loop_leaves_the_answer_of_its_frame_alone() -> None:
     assert_same_bits(answers[0].trajectory, answers[1].trajectory)
     assert_same_bits(answers[0].covariances, answers[1].covariances)
     assert_same_bits(answers[0].landmarks, answers[1].landmarks)
+
+
+def found_again_where_expected(estimator: Any, count: int) -> None:
+    """Old landmarks, found again at the drifted pose where the drifted map has them: all wrong."""
+    builder, solver = estimator._builder, estimator._solver
+    frame = builder.frames[-1]
+    pose = poses_of_frame(solver._values, frame)
+    seen, when = builder.observed["variable"], builder.observed["frame"]
+    old = np.setdiff1d(seen, seen[when > frame - _LONG_UNSEEN])
+    points = {v: solver._values.atPoint3(landmark_key(v)) for v in old.tolist()}
+    local = g.transform_to_camera(pose, np.array(list(points.values())))
+    rows = np.flatnonzero(visible(RIG, local))[:count]
+    assert len(rows) == count
+    builder.observed.append(
+        {
+            "frame": np.full(count, frame),
+            "variable": np.array(list(points))[rows],
+            "measurement": g.project(RIG, local[rows]),
+            "covariance": np.tile(0.04 * np.eye(3), (count, 1, 1)),
+            "gone": np.zeros(count, np.bool_),
+        }
+    )
+    again = found_again(*builder.kept_observed()[:2])
+    assert again[-count:].all()
+    assert not again[:-count].any()
+
+
+@pytest.mark.parametrize("more", [False, True])
+def test_the_larger_number_of_matches_says_which_return_is_believed(more: bool) -> None:
+    """A few landmarks found again by chance do not keep a loop from closing; many do."""
+    before, closing = returned().increments[:CLOSED], returned().increments[CLOSED]
+    (loop,) = closing.loops
+    estimator = build(BatchSettings())
+    play(estimator, before, FREE)
+    found_again_where_expected(estimator, 9)
+    if more:
+        loop = dataclasses.replace(loop, observations=loop.observations.select(np.arange(5)))
+    play(estimator, [dataclasses.replace(closing, loops=(loop,))], FREE)
+    (remark,) = (each for each in estimator.estimate().remarks if "loop closure" in each)
+    assert ("refused" in remark) == more, remark
 
 
 @pytest.mark.slow
