@@ -99,9 +99,9 @@ class GraphLoops:
         closed = graph.plus(constraint_factor(known))
         solution = solved(closed, State.of(guess))
         refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
-        rivals = self._rivals(closed.squared(solution))
-        if refused and 0 < rivals.sum() < known.matches:
-            graph, closed = graph.heeding(~rivals), closed.heeding(~rivals)
+        competing = self._competing(closed.squared(solution))
+        if refused and 0 < competing.sum() < known.matches:
+            graph, closed = graph.heeding(~competing), closed.heeding(~competing)
             solution = solved(closed, solution)
             rise = 2.0 * (closed.cost(solution) - graph.cost(solved(graph, state)))
             refused = refusal(what, rise)
@@ -114,7 +114,7 @@ class GraphLoops:
         remark = f"{what}: the camera moved by {shift:.2f} m, the graph with it"
         return Acceptance(True, found, remark)
 
-    def _rivals(self, squared: FloatArray) -> BoolArray:
+    def _competing(self, squared: FloatArray) -> BoolArray:
         """(k,) observations that claim another return than the loop's, by their residuals with it.
 
         A landmark that was long out of view was found again by its looks and by where the drifted
