@@ -349,6 +349,8 @@ def _solved(expected: FloatArray, right: FloatArray) -> FloatArray:
     Raises:
         numpy.linalg.LinAlgError: it is singular.
     """
+    if not len(expected):
+        return right
     _, solved, info = lapack.dposv(expected, right, lower=1)
     return np.asarray(np.linalg.solve(expected, right) if info else solved)
 

@@ -282,7 +282,7 @@ class PlaceRecognition:
                     0 if confirmation is None else confirmation.count,
                 ]
             ),
-            "offset": np.eye(4) if confirmation is None else confirmation.offset,
+            **({} if confirmation is None else {"offset": confirmation.offset}),
             "merging": self._merging,
             "pose": self._pose,
         }
