@@ -13,7 +13,14 @@ SCRIPTS = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 EXAMPLES = [path for path in SCRIPTS if path.stem not in NEED_MORE]
 
 
-@pytest.mark.parametrize("script", EXAMPLES, ids=lambda path: path.stem)
+LONG = ("drive_home", "homing_vector")  # they render a house
+SCRIPTS = [
+    pytest.param(script, marks=pytest.mark.slow if script.stem in LONG else ())
+    for script in EXAMPLES
+]
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_example_runs_to_its_end(script: Path, tmp_path: Path) -> None:
     done = subprocess.run(  # noqa: S603 -- our own script
         [sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True, check=False

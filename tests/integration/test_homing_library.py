@@ -44,6 +44,7 @@ def world() -> OmniWorld:
     return open_house(HOUSE, SEED)
 
 
+@pytest.mark.slow
 def test_between_gives_the_numbers_of_the_task_homing_pairs(tmp_path: Path) -> None:
     settings = OmniHouseSettings(
         path=HousePathSettings(legs=2, spacing_m=1.0),

@@ -237,7 +237,10 @@ def long_bytes(
     return bytes_of(run_values(long_values, tmp_path_factory.mktemp("runs") / "long").folder)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+)
 def test_signals(
     number: signal.Signals,
     long_values: dict[str, Any],

@@ -345,7 +345,9 @@ def test_killed_at_ten_moments_a_run_resumes_to_the_same_bytes(
     killed_and_resumed(task, 10, straight, doing, tmp_path)
 
 
-@pytest.mark.parametrize("task", ["slam_compared", "localisation"])
+@pytest.mark.parametrize(
+    "task", [pytest.param("slam_compared", marks=pytest.mark.slow), "localisation"]
+)
 def test_killed_while_it_tidies_up_a_run_tracks_at_most_its_last_frame_again(
     task: str,
     straight: Straight,

@@ -140,14 +140,16 @@ def _array(path: Path, key: str, block: Mapping[str, Any]) -> FloatArray:
 # Numbers in them
 
 
-def flat_numbers(value: Any) -> FloatArray | None:
+def flat_numbers(value: Any, depth: int = 0) -> FloatArray | None:
     """All numbers of lists in lists, or of an array, in order; None where one is no number."""
     if isinstance(value, np.ndarray):
         return np.asarray(value, np.float64).ravel()
+    if depth > _DEEPEST:
+        return None
     found: list[float] = []
     for one in value if isinstance(value, list) else [value]:
         if isinstance(one, list | np.ndarray):
-            inner = flat_numbers(one)
+            inner = flat_numbers(one, depth + 1)
             if inner is None:
                 return None
             found.extend(inner.tolist())

@@ -76,6 +76,7 @@ def test_second_visit_moves_loose_things_only() -> None:
     assert all(name.startswith(("chair", "carton", "plotter")) for name in moved)
 
 
+@pytest.mark.slow
 def test_textures_repeat_exactly_from_their_seed() -> None:
     once, again = (build_library(np.random.default_rng(5)) for _ in range(2))
     assert list(once) == list(again)
