@@ -28,6 +28,7 @@ from benchmarks.evidence import (
     sizes,
     variants,
     visits,
+    wrong_mirror,
 )
 from benchmarks.measured import keep
 from benchmarks.pages import write_pages
@@ -51,6 +52,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "lasting": lambda data: lasting.tables(),
     "sizes": lambda data: sizes.tables(),
     "visits": lambda data: visits.tables(),
+    "wrong_mirror": lambda data: wrong_mirror.tables(),
     "unmapped": lambda data: relocalising.unmapped_tables(),
     "recognised": relocalising.recognised_tables,
 }

@@ -106,7 +106,6 @@ DRIVING = FrontEndSettings(
         confidence=0.999999,
         rival_angle_deg=40.0,
         rival_log_odds=8.0,
-        max_direction_sigma_deg=12.0,
     ),
 )
 """For driving: a start that is 10 degrees off does no harm, the estimator corrects it on the way.

@@ -7,6 +7,7 @@ the time alone.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -16,11 +17,13 @@ from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.mirrors import HyperbolicMirror
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image
+from fgslam.core.errors import CalibrationError
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import RADIUS_M, RangeSensor, Wheelchair
 from fgslam.worlds.house_settings import (
+    HouseCalibrationSettings,
     HouseCameraSettings,
     HousePanoramaSettings,
     HouseTiltSettings,
@@ -110,12 +113,37 @@ def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
     )
 
 
+def miscalibrated(
+    camera: OmniCamera, errors: HouseCalibrationSettings, rng: np.random.Generator
+) -> OmniCamera:
+    """The camera as the robot knows it: itself where there are no errors.
+
+    The ring that shows the surroundings keeps its radii: the wrong centre moves it.
+
+    Raises:
+        CalibrationError: the camera is no mirror.
+    """
+    if errors == HouseCalibrationSettings():
+        return camera
+    if not isinstance(camera, HyperbolicMirror):
+        raise CalibrationError(
+            "dataset.calibration: errors of a mirror, but dataset.camera.kind is equirectangular; "
+            "take mirror, or leave them out"
+        )
+    signs, side = rng.choice([-1.0, 1.0], 2), rng.uniform(0.0, 2.0 * np.pi)
+    xi, focal = (1.0 + errors.mirror * signs) * (camera.xi, camera.focal_px)
+    centre = camera.frame.centre + errors.centre_px * np.array([np.cos(side), np.sin(side)])
+    frame = replace(camera.frame, centre=(float(centre[0]), float(centre[1])))
+    return replace(camera, frame=frame, xi=float(xi), focal_px=float(focal))
+
+
 class OmniWorld:
     """A wheelchair with an omnidirectional camera in the house.
 
     Attributes:
         settings: as given.
         camera: the model that the images obey.
+        calibration: the model that the robot has of it.
         reference_poses: (legs + 1, 3) planar poses of the path; the first is the start.
         wheelchair: the vehicle, with its truth.
     """
@@ -124,12 +152,14 @@ class OmniWorld:
         """Opens the house, lays the reference path and puts the wheelchair at its start.
 
         Raises:
+            CalibrationError: the camera cannot have the calibration's errors.
             DatasetError: no reference path of that kind is found.
             MissingDependencyError: Open3D cannot be loaded.
         """
         self.settings, self._seed = settings, seed
         self.model = open_house(settings.house_seed)
         self.camera: OmniCamera = make_house_camera(settings.camera)
+        self.calibration = miscalibrated(self.camera, settings.calibration, self._rng(8))
         self._renderer = Renderer(omni_view(self.camera), self.model.bank, _EDGE_CONTRAST)
         self._planner = PathPlanner(self.model.space, _PATH_CLEARANCE_M)
         within = None if settings.path.rooms == "house" else settings.path.rooms

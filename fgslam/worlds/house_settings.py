@@ -67,6 +67,19 @@ class HouseTiltSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
+class HouseCalibrationSettings:
+    """Errors of the mirror's calibration that the robot has; its images obey the true mirror."""
+
+    mirror: Annotated[
+        float,
+        Field(ge=0.0, le=0.08, description="relative, of xi and of the focal length; signs drawn"),
+    ] = 0.0
+    centre_px: Annotated[
+        float, Field(ge=0.0, le=20.0, description="of the mirror's centre; its direction is drawn")
+    ] = 0.0
+
+
+@dataclass(frozen=True, config=STRICT)
 class HousePathSettings:
     """The reference path, laid by a planner from the seed."""
 
@@ -98,3 +111,4 @@ class OmniHouseSettings:
     exposure: HouseExposureSettings = HouseExposureSettings()
     light: HouseLightSettings = HouseLightSettings()
     tilt: HouseTiltSettings = HouseTiltSettings()
+    calibration: HouseCalibrationSettings = HouseCalibrationSettings()

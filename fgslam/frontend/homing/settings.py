@@ -54,7 +54,7 @@ class HomingVectorSettings:
     ] = 15.0
     max_direction_sigma_deg: Annotated[
         float, Field(gt=0.0, description="less certain directions are refused")
-    ] = 4.0
+    ] = 12.0
     second_look: Annotated[
         bool,
         Field(description="match unclear images again with all candidates, at a third of a second"),

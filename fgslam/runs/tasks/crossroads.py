@@ -49,7 +49,7 @@ def open_crossroads_drive(config: CrossroadsConfig, seed: int) -> Opened:
 def _taught(world: OmniWorld, number: int, poses: FloatArray) -> PathMemory:
     """What is kept of a route."""
     pictures = [world.picture(pose, number * _PICTURES + k) for k, pose in enumerate(poses)]
-    return teach(pictures, world.camera)
+    return teach(pictures, world.calibration)
 
 
 def _way(joined: RouteMap, image: Image, goal: str, seed: int) -> PathMemory:

@@ -160,10 +160,10 @@ def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
 
 
 def open_house_front_end(config: DrivingConfig, seed: int) -> tuple[OmniWorld, ImageFrontEnd]:
-    """The house of one seed, and the front-end for its camera. Raises as above."""
+    """The house of one seed, and the front-end for its camera as calibrated. Raises as above."""
     world = open_house(config.dataset, seed)
     settings = FrontEndSettings(config.features, config.homing_vector, config.wrong_matches)
-    return world, make_front_end(world.camera, settings, seed)
+    return world, make_front_end(world.calibration, settings, seed)
 
 
 def _run(config: DrivingConfig, opener: Opener, context: Context) -> RunResult:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from fgslam.cameras.omni.mirrors import HyperbolicMirror
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.planar import between, wrap
@@ -12,9 +13,17 @@ from fgslam.worlds.driving import wheelchair
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import RangeSensor, Wheelchair
-from fgslam.worlds.house import CameraTilt, camera_pose, exposed, make_house_camera
+from fgslam.worlds.house import (
+    CameraTilt,
+    camera_pose,
+    exposed,
+    make_house_camera,
+    miscalibrated,
+)
 from fgslam.worlds.house_settings import (
+    HouseCalibrationSettings,
     HouseMirrorSettings,
+    HousePanoramaSettings,
     HouseTiltSettings,
 )
 from fgslam.worlds.people import Walker
@@ -308,6 +317,27 @@ def test_tilt_is_bounded_and_leans_the_camera() -> None:
     np.testing.assert_allclose(pitched[:3, 3], [1.0, 2.0, 1.2])
     rolled: FloatArray = camera_pose(np.zeros(3), 1.2, np.array([0.1, 0.0]))
     np.testing.assert_allclose(rolled[2, 1], np.sin(0.1))
+
+
+def test_a_wrong_calibration_is_off_by_what_is_asked_for() -> None:
+    true = make_house_camera(HouseMirrorSettings())
+    assert isinstance(true, HyperbolicMirror)
+    assert miscalibrated(true, HouseCalibrationSettings(), rng()) is true
+    errors = HouseCalibrationSettings(mirror=0.05, centre_px=4.0)
+    for seed in range(8):
+        wrong = miscalibrated(true, errors, rng(seed))
+        assert isinstance(wrong, HyperbolicMirror)
+        assert abs(wrong.xi / true.xi - 1.0) == pytest.approx(0.05)
+        assert abs(wrong.focal_px / true.focal_px - 1.0) == pytest.approx(0.05)
+        moved = np.subtract(wrong.frame.centre, true.frame.centre)
+        assert np.hypot(*moved) == pytest.approx(4.0)
+        assert (wrong.inner_radius, wrong.outer_radius) == (true.inner_radius, true.outer_radius)
+
+
+def test_a_panorama_has_no_mirror_to_be_wrong_about() -> None:
+    camera = make_house_camera(HousePanoramaSettings())
+    with pytest.raises(CalibrationError, match=r"dataset\.calibration: .* take mirror"):
+        miscalibrated(camera, HouseCalibrationSettings(mirror=0.01), rng())
 
 
 def test_exposure_and_noise() -> None:
