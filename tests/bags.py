@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,9 +13,11 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.geometry import quaternion_from_rotation
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
@@ -105,13 +107,27 @@ def gyroscope(stamps_ns: Iterable[int], rate: FloatArray, topic: str = "/imu") -
     return [(topic, stamp, "sensor_msgs/msg/Imu", {"rate": rate}) for stamp in stamps_ns]
 
 
+def tf_static(transforms: Iterable[tuple[str, str, FloatArray]]) -> list[Written]:
+    """One tf_static of parents, children and their poses (4, 4) in them."""
+    return [("/tf_static", START_NS, "tf2_msgs/msg/TFMessage", {"transforms": list(transforms)})]
+
+
+def in_frames(messages: Iterable[Written], frames: Mapping[str, str]) -> list[Written]:
+    """The messages with the frames of those topics that begin with a key."""
+    out = []
+    for topic, stamp, kind, fields in messages:
+        frame = next((f for name, f in frames.items() if topic.startswith(name)), None)
+        out.append((topic, stamp, kind, fields if frame is None else {**fields, "frame": frame}))
+    return out
+
+
 def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> Path:
     """The bag; its ending says which kind. Of ROS 2 the file inside its folder.
 
     ``packed``: with compressed chunks, lz4 in ROS 1 and zstd in ROS 2.
     """
     ros1 = path.suffix == ".bag"
-    made = Maker(get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE), ros1)
+    made = Maker(_types(ros1), ros1)
     messages = sorted(written, key=lambda each: each[1])
     if ros1:
         bag = Writer1(path)
@@ -128,6 +144,15 @@ def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> P
     with bag2 as writer:
         made.write(writer, messages)
     return folder / path.name
+
+
+def _types(ros1: bool) -> Typestore:
+    if not ros1:
+        return get_typestore(Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    tf = get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage")
+    store.register(tf)
+    return store
 
 
 @dataclass
@@ -149,8 +174,13 @@ class Maker:
 
     def message(self, kind: str, stamp: int, fields: dict[str, Any]) -> Any:
         values = dict(fields)
+        frame = values.pop("frame", "camera")
+        if kind.endswith("TFMessage"):
+            made = [self._transform(stamp, *each) for each in fields["transforms"]]
+            return self.store.types[kind](transforms=made)
         if kind.endswith("CameraInfo"):
-            roi = self._make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+            x, y, width, height = values.pop("roi", (0, 0, 0, 0))
+            roi = self._make("sensor_msgs/msg/RegionOfInterest", x, y, height, width, False)
             values |= {"roi": roi}
             if self.ros1:
                 values = {k.upper() if len(k) == 1 else k: v for k, v in values.items()}
@@ -162,7 +192,7 @@ class Maker:
                 self._make("geometry_msgs/msg/Quaternion", qx, qy, qz, qw),
             )
             values = {
-                "child_frame_id": "base_link",
+                "child_frame_id": fields.get("child", "base_link"),
                 "pose": self._make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36)),
                 "twist": self._make(
                     "geometry_msgs/msg/TwistWithCovariance", self._twist(0.0, 0.0), np.zeros(36)
@@ -172,7 +202,17 @@ class Maker:
             values = {"twist": self._twist(*fields["twist"])}
         elif kind.endswith("Imu"):
             values = self._imu(fields["rate"])
-        return self.store.types[kind](header=self._header(stamp), **values)
+        return self.store.types[kind](header=self._header(stamp, frame), **values)
+
+    def _transform(self, stamp: int, parent: str, child: str, place: FloatArray) -> Any:
+        quaternion = quaternion_from_rotation(place[:3, :3]).tolist()
+        transform = self._make(
+            "geometry_msgs/msg/Transform",
+            self._make("geometry_msgs/msg/Vector3", *place[:3, 3].tolist()),
+            self._make("geometry_msgs/msg/Quaternion", *quaternion),
+        )
+        header = self._header(stamp, parent)
+        return self._make("geometry_msgs/msg/TransformStamped", header, child, transform)
 
     def _imu(self, rate: FloatArray) -> dict[str, Any]:
         vector, none = "geometry_msgs/msg/Vector3", np.zeros(9)
@@ -196,7 +236,7 @@ class Maker:
         )
         return self._make("geometry_msgs/msg/Twist", linear, angular)
 
-    def _header(self, stamp: int) -> Any:
+    def _header(self, stamp: int, frame: str) -> Any:
         time = self._make("builtin_interfaces/msg/Time", *divmod(stamp, 1_000_000_000))
-        values = {"stamp": time, "frame_id": "camera", **({"seq": 0} if self.ros1 else {})}
+        values = {"stamp": time, "frame_id": frame, **({"seq": 0} if self.ros1 else {})}
         return self.store.types["std_msgs/msg/Header"](**values)

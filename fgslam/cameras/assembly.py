@@ -96,12 +96,18 @@ def _usable(calibration: Calibration) -> tuple[RawCamera, ...]:
                 f"{calibration.source} does not state the images' size; give size=(width, "
                 "height), on the command line --size WxH"
             )
-        if camera.size != cameras[0].size:
+    _require_one_size(cameras)
+    return cameras
+
+
+def _require_one_size(cameras: Sequence[RawCamera]) -> None:
+    first = cameras[0]
+    for camera in cameras:
+        if camera.size != first.size:
             raise CalibrationError(
-                f"{cameras[0].name} is {cameras[0].width}x{cameras[0].height} but {camera.name} is "
+                f"{first.name} is {first.width}x{first.height} but {camera.name} is "
                 f"{camera.width}x{camera.height}; both must have one resolution"
             )
-    return cameras
 
 
 # --------------------------------------------------------------------------------------------
@@ -301,9 +307,11 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
         return calibration
     other = [c for c in calibration.cameras if c.size != size and c.width]
     if other and not scale:
+        _require_one_size(calibration.cameras)
         raise CalibrationError(
             f"{calibration.source} is for images of {other[0].width}x{other[0].height} pixels, the "
-            f"images have {size[0]}x{size[1]}; if they were resized, ask for it: scale=True"
+            f"images have {size[0]}x{size[1]}; if they were resized as a whole, say so: --set "
+            "dataset.resized=true, --scale of fgslam camera, scale=True of load_rig"
         )
     cameras = tuple(
         c.scaled(size) if c.width else replace(c, width=size[0], height=size[1])

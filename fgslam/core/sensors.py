@@ -192,11 +192,15 @@ _NEARLY_ITSELF = 1.0 + 2.0 * np.cos(np.deg2rad(45.0))
 """Trace of a turn by 45 degrees: rectification turns by less, a body's axes are further."""
 
 
+def body_is_camera(bTc: FloatArray) -> bool:
+    """Whether the body is the camera itself, raw or rectified: nothing says how it is mounted."""
+    return bool(np.trace(bTc[:3, :3]) > _NEARLY_ITSELF)
+
+
 def vertical_of(bTc: FloatArray) -> FloatArray:
     """(3,) the vertical in a sensor's frame, upwards: its body's z axis.
 
     Where the body is the camera itself, raw or rectified, nothing is known of its tilt: then it is
     taken as level, and its -y axis as the vertical.
     """
-    own = np.trace(bTc[:3, :3]) > _NEARLY_ITSELF
-    return -bTc[1, :3] if own else bTc[2, :3]
+    return -bTc[1, :3] if body_is_camera(bTc) else bTc[2, :3]

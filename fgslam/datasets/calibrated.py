@@ -25,9 +25,10 @@ def calibrated_rig(
         CalibrationError: there is no calibration, or it cannot be used.
     """
     if settings.camera_file is not None:
-        return mounted(load_rig(settings.camera_file, size=size), settings)
+        path = settings.camera_file
+        return mounted(load_rig(path, size=size, scale=settings.resized), settings)
     try:
-        return mounted(load_rig(own, size=size), settings)
+        return mounted(load_rig(own, size=size, scale=settings.resized), settings)
     except CalibrationError as fault:
         if not str(fault).startswith(f"{own}:"):  # of a file in it: that is there, and at fault
             raise

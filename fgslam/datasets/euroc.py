@@ -22,6 +22,7 @@ from fgslam.datasets.images import (
     RawImages,
     StereoFiles,
     check_sizes,
+    first_size,
     missing_notes,
     require_folder,
 )
@@ -69,6 +70,7 @@ def open_euroc(
     stamps, files, notes = _pairs(right_folder, left_folder, rig, settings)
     chosen = select_frames(len(stamps), settings)
     check_sizes(files, root)
+    files, held = files.with_bits()
     return Recording(
         name=root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig=rig.plain(),
@@ -76,7 +78,7 @@ def open_euroc(
         timestamps=stamps[chosen],
         identity=_identity(root, folders, files),
         ground_truth=_true_poses(root, rig, stamps[chosen]),
-        notes=rig.remarks + notes + missing_notes(files, stamps),
+        notes=rig.remarks + held + notes + missing_notes(files, stamps),
         indices=chosen,
         load_images=RawImages(files, rig).load,
         load_colour=RawImages(files, rig).load_colour,
@@ -98,14 +100,14 @@ def _gyroscope(root: Path, settings: RecordedOdometrySettings) -> OdometrySource
 
 def _rig(settings: EurocSettings, root: Path, folders: list[Path]) -> StereoRig:
     """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain beside mav0."""
-    own = [folder / "sensor.yaml" for folder in folders]
+    given: tuple[Path, ...] = tuple(folder / "sensor.yaml" for folder in folders)
     if settings.camera_file is not None:
-        return mounted(load_rig(settings.camera_file), settings)
-    if not any(path.is_file() for path in own):
-        for chain in (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml"):
-            if chain.is_file():
-                return mounted(load_rig(chain), settings)
-    return mounted(load_rig(*own), settings)
+        given = (Path(settings.camera_file),)
+    elif not any(path.is_file() for path in given):
+        chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
+        given = next(((chain,) for chain in chains if chain.is_file()), given)
+    size = first_size(read_camera_frames(folders[0]).paths)
+    return mounted(load_rig(*given, size=size, scale=settings.resized), settings)
 
 
 def _pairs(

@@ -62,6 +62,7 @@ def open_image_folder(
     chosen = select_frames(len(stamps), settings)
     files = _files(folders, listed, numbers, rig)
     check_sizes(files, root)
+    files, held = files.with_bits()
     images = RawImages(files, rig)
     truth = _read_truth(root, rig.baseline)
     odometry_file = find_odometry(root, settings.odometry_file)
@@ -79,6 +80,7 @@ def open_image_folder(
         ground_truth=None if truth is None else trajectory_at_frames(truth, stamps[chosen]),
         notes=(
             rig.remarks
+            + held
             + missing_notes(files, stamps)
             + _unlisted(folders, listed, numbers)
             + (_missing_top(root, settings.use_top) if settings.camera_file is None else ())
@@ -121,10 +123,9 @@ def _camera_file(root: Path, settings: ImageFolderSettings) -> Path:
 def _cameras(root: Path, settings: ImageFolderSettings, listed: list[dict[int, Path]]) -> StereoRig:
     """The rectified rig, with what rectifies the images where they are raw."""
     path, three = _camera_file(root, settings), len(listed) == 3
-    if settings.camera_file is None:
-        rig = load_rig(path, cameras=(0, 1, 2) if three else (0, 1))
-    else:
-        rig = load_rig(path, size=first_size(listed[0].values()))
+    chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
+    size = first_size(listed[0].values())
+    rig = load_rig(path, size=size, scale=settings.resized, cameras=chosen)
     if three and rig.vertical_baseline is None:
         raise CalibrationError(
             f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,20 +47,20 @@ def list_numbered_images(folder: Path) -> dict[int, Path]:
     return numbered
 
 
-def read_grey_image(path: Path) -> Image:
-    """The image (height, width) in grey, uint8.
+def read_grey_image(path: Path, bits: int = 16) -> Image:
+    """The image (height, width) in grey, uint8; ``bits`` are those that 16 of a pixel hold.
 
     A truncated or damaged file is refused, never returned half grey.
 
     Raises:
         FrameError: the file is absent, incomplete or no image.
     """
-    return decode_grey(_bytes_of(path), str(path))
+    return decode_grey(_bytes_of(path), str(path), bits)
 
 
-def read_sized_image(path: Path, width: int, height: int) -> Image:
+def read_sized_image(path: Path, width: int, height: int, bits: int = 16) -> Image:
     """The image in grey, as :func:`read_grey_image`. Raises FrameError if of another size, too."""
-    return sized(read_grey_image(path), f"image {path}", width, height)
+    return sized(read_grey_image(path, bits), f"image {path}", width, height)
 
 
 def sized(image: Image, name: str, width: int, height: int) -> Image:
@@ -73,10 +73,9 @@ def sized(image: Image, name: str, width: int, height: int) -> Image:
     return image
 
 
-def read_colour_image(path: Path) -> Image:
+def read_colour_image(path: Path, bits: int = 16) -> Image:
     """The image (height, width, 3) in red, green, blue, uint8; else as :func:`read_grey_image`."""
-    image = _decoded(_bytes_of(path), str(path), cv2.IMREAD_COLOR)
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return decode_colour(_bytes_of(path), str(path), bits)
 
 
 def encoded_png(image: Image) -> bytes:
@@ -100,21 +99,51 @@ def read_depth_image(path: Path) -> npt.NDArray[Any]:
     return image
 
 
-def decode_grey(data: bytes, name: str) -> Image:
+def decode_grey(data: bytes, name: str, bits: int = 16) -> Image:
     """The image (height, width) in grey, uint8, of an encoded image's bytes.
 
-    Of more than 8 bits the upper 8 are kept (:func:`grey_of_16_bits`).
+    Of more than 8 bits the upper 8 are kept (:func:`of_8_bits`).
 
     Args:
         data: PNG, JPEG or another known format.
         name: in messages.
+        bits: that 16 of a pixel hold.
 
     Raises:
         FrameError: incomplete, or no image.
     """
-    image = _decoded(data, name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    return of_8_bits(_decoded(data, name, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH), name, bits)
+
+
+def decode_colour(data: bytes, name: str, bits: int = 16) -> Image:
+    """The image (height, width, 3) in red, green, blue, uint8; else as :func:`decode_grey`."""
+    image = of_8_bits(_decoded(data, name, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), name, bits)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def decode_stored(data: bytes, name: str) -> npt.NDArray[Any]:
+    """An encoded image's pixels as they are stored. Raises FrameError as :func:`decode_grey`."""
+    return _decoded(data, name, cv2.IMREAD_UNCHANGED)
+
+
+# --------------------------------------------------------------------------------------------
+# More than eight bits
+
+
+_BITS = (8, 10, 12, 14, 16)
+"""Of the sensors whose pixels are stored in 16."""
+
+_LOOKED_AT = 9  # frames from first to last, by which it is decided how many bits are used
+
+
+def of_8_bits(image: npt.NDArray[Any], name: str, bits: int = 16) -> Image:
+    """The upper eight of ``bits`` bits of 16-bit pixels, what is brighter as 255; uint8 as it is.
+
+    One number of bits for a recording (:func:`bits_held`): stretching each image to its own
+    contrast would change its features from frame to frame. Raises FrameError for other types.
+    """
     if image.dtype == np.uint16:
-        return grey_of_16_bits(np.asarray(image, np.uint16))
+        return np.ascontiguousarray(np.minimum(image >> (bits - 8), 255), np.uint8)
     if image.dtype != np.uint8:
         raise FrameError(
             f"image {name} has pixels of type {image.dtype}; convert it to 8 or 16 bits a pixel"
@@ -122,12 +151,32 @@ def decode_grey(data: bytes, name: str) -> Image:
     return np.ascontiguousarray(image, np.uint8)
 
 
-def grey_of_16_bits(image: npt.NDArray[np.uint16]) -> Image:
-    """The upper eight bits, whatever the image holds.
+def bits_held(count: int, stored: Callable[[int], npt.NDArray[Any]]) -> tuple[int, tuple[str, ...]]:
+    """How many bits the 16-bit images of a recording hold, and a note where fewer than 16.
 
-    Stretching each image to its own contrast would change its features from frame to frame.
+    By the largest value of a few frames over the whole recording; 16 where images have 8 bits, or
+    nothing can be read.
+
+    Args:
+        count: of frames.
+        stored: the pixels of a frame as they are stored; raises FrameError.
     """
-    return np.ascontiguousarray(image >> 8, np.uint8)
+    largest = 0
+    for frame in np.unique(np.linspace(0, count - 1, _LOOKED_AT).astype(int)).tolist():
+        try:
+            pixels = stored(frame)
+        except FrameError:
+            continue
+        if pixels.dtype != np.uint16:
+            return 16, ()
+        largest = max(largest, int(pixels.max()))
+    bits = next(bits for bits in _BITS if largest < 1 << bits) if largest else 16
+    if bits == 16:
+        return bits, ()
+    return bits, (
+        f"pixels of 16 bits hold {bits}: none of {min(count, _LOOKED_AT)} frames looked at has one "
+        f"above {largest}; {(1 << bits) - 1} is taken as white",
+    )
 
 
 def _bytes_of(path: Path) -> bytes:
@@ -205,22 +254,35 @@ class StereoFiles:
     Attributes:
         paths: per frame the files of right, left[, top] camera; they need not exist.
         width, height: the calibrated size in pixels.
+        bits: that pixels of 16 bits hold.
     """
 
     paths: tuple[tuple[Path, ...], ...]
     width: int
     height: int
+    bits: int = 16
 
     def load(self, index: int) -> tuple[Image, ...]:
         """Images of a frame. Raises FrameError when one is missing, damaged or of another size."""
-        return tuple(read_sized_image(path, self.width, self.height) for path in self.paths[index])
+        return tuple(
+            read_sized_image(path, self.width, self.height, self.bits) for path in self.paths[index]
+        )
 
     def load_colour(self, index: int) -> tuple[Image, ...]:
         """The same in red, green, blue."""
         return tuple(
-            sized(read_colour_image(path), f"image {path}", self.width, self.height)
+            sized(read_colour_image(path, self.bits), f"image {path}", self.width, self.height)
             for path in self.paths[index]
         )
+
+    def with_bits(self) -> tuple[StereoFiles, tuple[str, ...]]:
+        """The same, with as many bits as the right images hold; a note where fewer than 16."""
+        bits, notes = bits_held(len(self.paths), self._stored)
+        return replace(self, bits=bits), notes
+
+    def _stored(self, index: int) -> npt.NDArray[Any]:
+        path = self.paths[index][0]
+        return decode_stored(_bytes_of(path), str(path))
 
     def first_images(self) -> tuple[Image, ...] | None:
         """Images of the first frame that can be read, whatever their size; None without any."""

@@ -48,6 +48,7 @@ def open_kitti(settings: KittiSettings) -> Recording:
     rig = _read_rig(folder / "calib.txt", files)
     files = StereoFiles(files.paths, rig.width, rig.height)
     check_sizes(files, folder)
+    files, held = files.with_bits()
     poses = _read_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
     truth = None if poses is None else right_from_left_camera(poses, rig.baseline)[chosen]
     return Recording(
@@ -59,7 +60,7 @@ def open_kitti(settings: KittiSettings) -> Recording:
             [path for images in cameras for path in images.values()],
         ),
         ground_truth=None if truth is None else Trajectory(stamps[chosen], truth),
-        notes=missing_notes(files, stamps),
+        notes=held + missing_notes(files, stamps),
         indices=chosen,
         load_images=files.load,
         load_colour=files.load_colour,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fgslam.cameras.assembly import at_size
 from fgslam.cameras.formats import kitti
 from fgslam.cameras.rig import StereoRig, load_rig, rig_of
 from fgslam.core.errors import CalibrationError, DatasetError
@@ -43,6 +44,7 @@ def open_kitti_raw(settings: KittiRawSettings) -> Recording:
     rig = _rig(settings, drive, names, first_size(right))
     files = StereoFiles(pairs, *rig.image_size)
     check_sizes(files, drive)
+    files, held = files.with_bits()
     images = RawImages(files, rig)
     chosen = select_frames(len(pairs), settings)
     return Recording(
@@ -52,7 +54,7 @@ def open_kitti_raw(settings: KittiRawSettings) -> Recording:
         timestamps=stamps[chosen],
         identity=recording_identity(lists, (path for pair in pairs for path in pair)),
         ground_truth=None,
-        notes=(*rig.remarks, *notes, *assumed),
+        notes=(*rig.remarks, *held, *notes, *assumed),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,
@@ -67,7 +69,7 @@ def _rig(
     settings: KittiRawSettings, drive: Path, names: tuple[str, str], size: tuple[int, int] | None
 ) -> StereoRig:
     if settings.camera_file is not None:
-        return mounted(load_rig(settings.camera_file, size=size), settings)
+        return mounted(load_rig(settings.camera_file, size=size, scale=settings.resized), settings)
     path = next((p for p in (drive / CALIBRATION, drive.parent / CALIBRATION) if p.is_file()), None)
     if path is None:
         raise CalibrationError(
@@ -75,4 +77,5 @@ def _rig(
             "or give one by --camera FILE"
         )
     keys = kitti.RAW if names == _PAIRS[0] else kitti.RAW_COLOUR
-    return mounted(rig_of(kitti.read_kitti(path, size, keys)), settings)
+    found = at_size(kitti.read_kitti(path, size, keys), size, settings.resized)
+    return mounted(rig_of(found), settings)

@@ -34,6 +34,7 @@ def open_loose_images(
     rig = calibrated_rig(settings, root, first_size(right for right, _ in pairs))
     files = StereoFiles(pairs, *rig.image_size)
     check_sizes(files, root)
+    files, held = files.with_bits()
     chosen = select_frames(len(pairs), settings)
     odometry_file = find_odometry(root, settings.odometry_file)
     images = RawImages(files, rig)
@@ -47,7 +48,7 @@ def open_loose_images(
             (p for pair in pairs for p in pair),
         ),
         ground_truth=None,
-        notes=(*rig.remarks, *unpaired, *assumed),
+        notes=(*rig.remarks, *held, *unpaired, *assumed),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,

@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from fgslam.cameras.assembly import at_size
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.raw_cameras import RawCamera
@@ -166,10 +167,10 @@ def _camera(
 ) -> tuple[RawCamera, tuple[str, ...]]:
     """The colour camera by the given file, the folder's own, or as TUM publishes it."""
     if settings.camera_file is not None:
-        return _of_file(Path(settings.camera_file), size), ()
+        return _of_file(Path(settings.camera_file), size, settings.resized), ()
     own = sorted(p for p in root.iterdir() if p.suffix in (".json", ".yaml", ".yml", ".xml"))
     if len(own) == 1:
-        return _of_file(own[0], size), ()
+        return _of_file(own[0], size, settings.resized), ()
     known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
     if known is None or size != (640, 480):
         raise CalibrationError(
@@ -182,15 +183,10 @@ def _camera(
     return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
 
 
-def _of_file(path: Path, size: tuple[int, int]) -> RawCamera:
-    camera = read_calibration_file(path, size=size).cameras[0]
-    stated = (camera.width, camera.height)
-    if stated != (0, 0) and stated != size:
-        raise CalibrationError(
-            f"{path} is for images of {stated[0]}x{stated[1]}, the colour images have "
-            f"{size[0]}x{size[1]}; give the calibration of these"
-        )
-    return replace(camera, width=size[0], height=size[1])
+def _of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:
+    found = read_calibration_file(path, size=size)
+    alone = replace(found, cameras=found.cameras[:1], view=None)
+    return at_size(alone, size, resized).cameras[0]
 
 
 def _rig(camera: RawCamera, settings: RgbdSettings) -> CameraRig:

@@ -40,6 +40,13 @@ class CalibratedSettings(RecordingSettings):
             description="calibration in place of the recording's own (docs/howto/your_camera.md)"
         ),
     ] = None
+    resized: Annotated[
+        bool,
+        Field(
+            description="the images were made smaller or larger as a whole after calibration: "
+            "scale it to them"
+        ),
+    ] = False
     camera_yaw_deg: Annotated[
         float | None,
         Field(

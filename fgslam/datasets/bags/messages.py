@@ -1,9 +1,9 @@
-"""What the messages of a bag mean: images in grey, calibrations, motions."""
+"""What the messages of a bag mean: images in grey and colour, calibrations, motions, frames."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError
-from fgslam.datasets.images import decode_grey, grey_of_16_bits
+from fgslam.datasets.images import decode_colour, decode_grey, decode_stored, of_8_bits
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -20,62 +20,102 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistStamped"
 TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU = "sensor_msgs/msg/Imu"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
-_GREY = {"mono8", "8UC1", "mono16", "16UC1"}
-_COLOURS: Mapping[str, tuple[int, int]] = {
-    "bgr8": (3, cv2.COLOR_BGR2GRAY),
-    "8UC3": (3, cv2.COLOR_BGR2GRAY),
-    "rgb8": (3, cv2.COLOR_RGB2GRAY),
-    "bgra8": (4, cv2.COLOR_BGRA2GRAY),
-    "8UC4": (4, cv2.COLOR_BGRA2GRAY),
-    "rgba8": (4, cv2.COLOR_RGBA2GRAY),
-    "bgr16": (3, cv2.COLOR_BGR2GRAY),
-    "rgb16": (3, cv2.COLOR_RGB2GRAY),
-    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUYV),
-    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUYV),
+_Code: TypeAlias = int | None  # of cv2.cvtColor; None: the pixels as they are
+
+
+_GREY = {"mono8", "8UC1", "mono16", "16UC1", "nv12", "nv21"}
+"""Encodings whose first channel, or first plane, is grey."""
+
+_COLOURS: Mapping[str, tuple[int, _Code, _Code]] = {
+    "bgr8": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
+    "8UC3": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
+    "rgb8": (3, cv2.COLOR_RGB2GRAY, None),
+    "bgra8": (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
+    "8UC4": (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
+    "bgr16": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
+    "rgb16": (3, cv2.COLOR_RGB2GRAY, None),
+    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV),
+    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV),
 }
-"""Encodings of colour: channels, and how they become grey."""
+"""Encodings of colour: channels, and how they become grey, and red, green, blue."""
 
 # ROS names the first pixels of the first two rows, OpenCV those of the second row from the second.
 _MOSAICS = {
-    "rggb": cv2.COLOR_BayerBG2GRAY,
-    "bggr": cv2.COLOR_BayerRG2GRAY,
-    "gbrg": cv2.COLOR_BayerGR2GRAY,
-    "grbg": cv2.COLOR_BayerGB2GRAY,
+    "rggb": (cv2.COLOR_BayerBG2GRAY, cv2.COLOR_BayerBG2RGB),
+    "bggr": (cv2.COLOR_BayerRG2GRAY, cv2.COLOR_BayerRG2RGB),
+    "gbrg": (cv2.COLOR_BayerGR2GRAY, cv2.COLOR_BayerGR2RGB),
+    "grbg": (cv2.COLOR_BayerGB2GRAY, cv2.COLOR_BayerGB2RGB),
 }
 
 
-def grey_of(message: Any, where: str) -> Image:
+def grey_of(message: Any, where: str, bits: int = 16) -> Image:
     """The image of an Image or CompressedImage message in grey, (height, width) uint8.
+
+    Args:
+        message: the message.
+        where: in messages to the user.
+        bits: that pixels of 16 bits hold.
 
     Raises:
         FrameError: its encoding is not known, or its data are incomplete.
     """
     if hasattr(message, "encoding"):
-        return _grey_of_raw(message, where)
-    data = bytes(memoryview(message.data))
-    mosaic = _mosaic_of(message.format.partition(";")[0])
-    image = decode_grey(data, where)
-    return image if mosaic is None else np.asarray(cv2.cvtColor(image, mosaic), np.uint8)
+        pixels, grey, _ = _raw(message, where)
+        return of_8_bits(_converted(pixels, grey), where, bits)
+    data, mosaic = _compressed(message)
+    if mosaic is not None and (stored := decode_stored(data, where)).ndim == 2:
+        return of_8_bits(_converted(stored, mosaic[0]), where, bits)
+    return decode_grey(data, where, bits)
 
 
-def _grey_of_raw(message: Any, where: str) -> Image:
+def colour_of(message: Any, where: str, bits: int = 16) -> Image:
+    """The same in red, green, blue, (height, width, 3); in grey where it has no colour."""
+    if hasattr(message, "encoding"):
+        pixels, _, colour = _raw(message, where)
+        return of_8_bits(_converted(pixels, colour), where, bits)
+    data, mosaic = _compressed(message)
+    stored = decode_stored(data, where)
+    if stored.ndim == 2:
+        return of_8_bits(stored if mosaic is None else _converted(stored, mosaic[1]), where, bits)
+    return decode_colour(data, where, bits)
+
+
+def stored_of(message: Any, where: str) -> npt.NDArray[Any]:
+    """The pixels as they are stored. Raises FrameError as :func:`grey_of`."""
+    if hasattr(message, "encoding"):
+        return _raw(message, where)[0]
+    return decode_stored(_compressed(message)[0], where)
+
+
+def _raw(message: Any, where: str) -> tuple[npt.NDArray[Any], _Code, _Code]:
+    """Pixels (height, width[, channels]), and how they become grey, and red, green, blue."""
     encoding, height, width = message.encoding, int(message.height), int(message.width)
     mosaic = _mosaic_of(encoding)
     if encoding not in _GREY and encoding not in _COLOURS and mosaic is None:
         known = ", ".join((*sorted(_GREY), *_COLOURS, "bayer_*"))
         raise FrameError(f"{where}: encoding {encoding!r} is not read; known: {known}")
-    channels, code = _COLOURS.get(encoding, (1, mosaic))
-    pixels = _pixels(message, encoding, channels, where).reshape(height, width, channels)
-    grey = pixels[:, :, 0] if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
-    if grey.dtype == np.uint16:
-        return grey_of_16_bits(np.asarray(grey, np.uint16))
-    return np.ascontiguousarray(grey, np.uint8)
+    channels, grey, colour = _COLOURS.get(encoding, (1, *(mosaic or (None, None))))
+    pixels = _pixels(message, encoding, channels, where)
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    return pixels.reshape(shape), grey, colour
 
 
-def _mosaic_of(encoding: str) -> int | None:
+def _compressed(message: Any) -> tuple[bytes, tuple[int, int] | None]:
+    """The encoded image, and how its mosaic becomes grey and colour, where it may be one."""
+    mosaic = _mosaic_of(message.format.partition(";")[0])
+    return bytes(memoryview(message.data)), mosaic
+
+
+def _converted(pixels: npt.NDArray[Any], code: _Code) -> npt.NDArray[Any]:
+    return pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
+
+
+def _mosaic_of(encoding: str) -> tuple[int, int] | None:
     return _MOSAICS.get(encoding[6:10]) if encoding.startswith("bayer_") else None
 
 
@@ -102,8 +142,12 @@ def _pixels(message: Any, encoding: str, channels: int, where: str) -> npt.NDArr
 
 
 def calibration_of(message: Any) -> dict[str, Any]:
-    """Keys and values of a CameraInfo message, as in the files of camera_calibration."""
+    """Keys and values of a CameraInfo message, as in the files of camera_calibration.
+
+    ``binning`` and ``roi`` (columns and rows) say which part of the calibrated image is sent.
+    """
     d, k, r, p = (_letters(message, letter) for letter in "dkrp")
+    roi = message.roi
     return {
         "image_width": int(message.width),
         "image_height": int(message.height),
@@ -112,6 +156,8 @@ def calibration_of(message: Any) -> dict[str, Any]:
         "distortion_coefficients": {"data": d},
         "rectification_matrix": {"data": r},
         "projection_matrix": {"data": p},
+        "binning": (max(int(message.binning_x), 1), max(int(message.binning_y), 1)),
+        "roi": tuple(int(v) for v in (roi.x_offset, roi.y_offset, roi.width, roi.height)),
     }
 
 
@@ -119,6 +165,22 @@ def _letters(message: Any, letter: str) -> list[float]:
     # Capital in ROS 1, small in ROS 2.
     values = getattr(message, letter, None)
     return [float(v) for v in (getattr(message, letter.upper()) if values is None else values)]
+
+
+def frame_of(message: Any) -> str:
+    """The frame in which a message is given; of an Odometry that whose motion it is."""
+    own = message.header.frame_id
+    return str(getattr(message, "child_frame_id", own)).strip("/")
+
+
+def transforms_of(message: Any) -> list[tuple[str, str, FloatArray]]:
+    """Of a TFMessage: parent, child, and (7,) position and quaternion x, y, z, w of the child."""
+    found = []
+    for each in message.transforms:
+        p, q = each.transform.translation, each.transform.rotation
+        numbers = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+        found.append((each.header.frame_id.strip("/"), each.child_frame_id.strip("/"), numbers))
+    return found
 
 
 # --------------------------------------------------------------------------------------------

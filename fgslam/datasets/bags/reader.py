@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from fgslam.cameras.formats.ros import read_camera_info_pair
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
+from fgslam.core.errors import DatasetError, FrameError
 from fgslam.datasets.bags import messages
+from fgslam.datasets.bags.calibration import Stated, rig_of_bag
 from fgslam.datasets.bags.cut import Message
 from fgslam.datasets.bags.files import BagFiles, MessagesByPlace, bag_files, paths_of
+from fgslam.datasets.bags.frames import FrameTree
 from fgslam.datasets.bags.motion import odometry_source
 from fgslam.datasets.bags.topics import Chosen, choose_topics
-from fgslam.datasets.calibrated import mounted
-from fgslam.datasets.images import sized
+from fgslam.datasets.images import bits_held, sized
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
+
+T = TypeVar("T")
 
 
 def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recording:
@@ -38,18 +41,17 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     chosen = choose_topics(files.topics, settings.topics, str(where))
     index = _indexed(files, chosen)
     source = _Images(files, index, chosen)
-    found, chosen, notes = _calibration(settings, index, chosen, source)
-    rig = mounted(found, settings)
+    height, width = source.first(chosen.right).shape
+    stated = Stated(index.infos, index.frames, FrameTree(index.transforms), (width, height))
+    rig, chosen, notes = rig_of_bag(settings, stated, chosen)
     (rows, partners), unpaired = _pairs(index, chosen, settings)
     stamps = NANOSECONDS * index.stamps[chosen.right][rows].astype(np.float64)
     used = select_frames(len(rows), settings)
     places = np.column_stack(
         [index.places[chosen.right][rows], index.places[chosen.left][partners]]
     )
-    motions = odometry_source(chosen.motion, index.motions, odometry)
-    if motions is not None and np.array_equal(rig.bTc, np.eye(4)):
-        rig = replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
-        notes += (_LOOKS_AHEAD,)
+    held = source.use_bits(places[:, 0])
+    images = _Pairs(source, places, rig)
     return Recording(
         name=where.resolve().stem,
         rig=rig.plain(),
@@ -57,17 +59,12 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         timestamps=stamps[used],
         identity=recording_identity([], [f for path in paths for f in bag_files(path)]),
         ground_truth=None,
-        notes=(*files.notes, *chosen.notes, *index.notes, *unpaired, *notes),
+        notes=(*files.notes, *chosen.notes, *index.notes, *unpaired, *held, *notes),
         indices=used,
-        load_images=_Pairs(source, places, rig).load,
-        odometry_source=motions,
+        load_images=images.load,
+        load_colour=images.load_colour,
+        odometry_source=odometry_source(chosen.motion, index.motions, odometry),
     )
-
-
-_LOOKS_AHEAD = (
-    "nothing says where the camera sits on the robot whose odometry is used: it is taken to look "
-    "straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say otherwise)"
-)
 
 
 # --------------------------------------------------------------------------------------------
@@ -83,7 +80,9 @@ class _Index:
         times: (n,) the bag's time of each of their messages, nanoseconds.
         places: (k,) of each image topic's messages among the n, by increasing stamp.
         stamps: (k,) their stamps, nanoseconds, increasing.
-        calibrations: the first camera_info of each camera, as in a file.
+        infos: the first camera_info of each camera, as in a file.
+        frames: of each topic the frame of its first message.
+        transforms: of tf_static: parent, child, position and quaternion.
         motions: stamps in seconds and values of the odometry.
         notes: which stamps could not be used.
     """
@@ -92,7 +91,9 @@ class _Index:
     times: IntArray
     places: dict[str, IntArray]
     stamps: dict[str, IntArray]
-    calibrations: dict[str, dict[str, Any]]
+    infos: dict[str, dict[str, Any]]
+    frames: dict[str, str]
+    transforms: list[tuple[str, str, FloatArray]]
     motions: tuple[FloatArray, FloatArray]
     notes: tuple[str, ...]
 
@@ -100,16 +101,24 @@ class _Index:
 def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
     images, infos = {chosen.left, chosen.right}, {chosen.left_info, chosen.right_info}
     motion = chosen.motion.name if chosen.motion else None
-    topics = frozenset(name for name in (*images, *infos, motion) if name)
-    calibrations: dict[str, dict[str, Any]] = {}
+    topics = frozenset(name for name in (*images, *infos, motion, *chosen.transforms) if name)
+    first: dict[str, dict[str, Any]] = {}
+    frames: dict[str, str] = {}
+    transforms: list[tuple[str, str, FloatArray]] = []
 
     def take(message: Message) -> tuple[str, int, int, Any]:
         connection, time, raw = message
         topic, value = connection.topic, None
-        if topic in infos and topic not in calibrations:
-            calibrations[topic] = messages.calibration_of(files.decoded(connection, raw))
-        if topic == motion:
-            value = messages.motion_of(files.decoded(connection, raw))
+        if topic in chosen.transforms:
+            transforms.extend(messages.transforms_of(files.decoded(connection, raw)))
+            return topic, time, time, None
+        if topic == motion or topic not in frames:
+            content = files.decoded(connection, raw)
+            frames.setdefault(topic, messages.frame_of(content))
+            if topic in infos:
+                first[topic] = messages.calibration_of(content)
+            if topic == motion:
+                value = messages.motion_of(content)
         return topic, time, files.stamp(raw), value
 
     rows = files.collect(topics, take)
@@ -122,7 +131,8 @@ def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
     moved = [(row[2], row[3]) for row in rows if row[0] == motion]
     values = np.array([value for _, value in moved])
     motions = (NANOSECONDS * np.array([stamp for stamp, _ in moved], np.float64), values)
-    return _Index(topics, times, places, by_stamp, calibrations, motions, tuple(notes))
+    parts = (places, by_stamp, first, frames, transforms, motions)
+    return _Index(topics, times, *parts, tuple(notes))
 
 
 def _in_order(
@@ -152,64 +162,6 @@ def _pairs(
 
 
 # --------------------------------------------------------------------------------------------
-# Calibration
-
-
-def _calibration(
-    settings: BagSettings, index: _Index, chosen: Chosen, source: _Images
-) -> tuple[StereoRig, Chosen, tuple[str, ...]]:
-    """The rig, the topics with sides as calibrated, and what was noticed."""
-    if settings.camera_file is not None:
-        height, width = source.first(chosen.right).shape
-        rig = load_rig(settings.camera_file, size=(width, height))
-        return rig, chosen, rig.remarks
-    left, right = (index.calibrations.get(t or "") for t in (chosen.left_info, chosen.right_info))
-    if left is None or right is None:
-        raise CalibrationError(_lacking(settings.path, chosen, left is None, right is None))
-    notes: tuple[str, ...] = ()
-    if left["projection_matrix"]["data"][3] < 0.0 <= right["projection_matrix"]["data"][3]:
-        notes = (f"by their camera_info {chosen.left} is the right camera, and is taken so",)
-        left, right = right, left
-        chosen = replace(
-            chosen,
-            left=chosen.right,
-            right=chosen.left,
-            left_info=chosen.right_info,
-            right_info=chosen.left_info,
-        )
-    rectified = [_is_rectified(topic) for topic in (chosen.left, chosen.right)]
-    if all(rectified):
-        left, right = (_without_distortion(values) for values in (left, right))
-    named = [Path(f"{settings.path}:{name}") for name in (chosen.left_info, chosen.right_info)]
-    rig = rig_of(read_camera_info_pair((named[0], named[1]), (left, right)))
-    return rig, chosen, (*notes, *rig.remarks)
-
-
-def _lacking(path: str, chosen: Chosen, no_left: bool, no_right: bool) -> str:
-    which = [t for t, absent in ((chosen.left, no_left), (chosen.right, no_right)) if absent]
-    return (
-        f"{path}: no camera_info belongs to {' and '.join(which)}, and one camera's says nothing "
-        "of the other; give the calibration of both by --camera FILE"
-    )
-
-
-def _is_rectified(topic: str) -> bool:
-    return "rect" in topic.removesuffix("/compressed").rpartition("/")[2].split("_")
-
-
-def _without_distortion(values: dict[str, Any]) -> dict[str, Any]:
-    """The camera_info of the image that image_proc has rectified by it."""
-    p = values["projection_matrix"]["data"]
-    return {
-        **values,
-        "distortion_model": "plumb_bob",
-        "camera_matrix": {"data": [*p[0:3], *p[4:7], *p[8:11]]},
-        "distortion_coefficients": {"data": [0.0] * 5},
-        "rectification_matrix": {"data": np.eye(3).ravel().tolist()},
-    }
-
-
-# --------------------------------------------------------------------------------------------
 # Images
 
 
@@ -220,14 +172,28 @@ class _Images:
         self._files, self._index = files, index
         views = (chosen.left, chosen.right)
         self._messages = MessagesByPlace(files, index.topics, index.times, views)
+        self._bits = 16
+
+    def use_bits(self, places: IntArray) -> tuple[str, ...]:
+        """Finds how many bits images of these places hold; a note where fewer than 16."""
+        stored = lambda k: self._made(int(places[k]), messages.stored_of)  # noqa: E731 - short
+        self._bits, notes = bits_held(len(places), stored)
+        return notes
 
     def load(self, place: int) -> Image:
         """A grey image. Raises FrameError."""
+        return self._made(place, partial(messages.grey_of, bits=self._bits))
+
+    def load_colour(self, place: int) -> Image:
+        """The same in red, green, blue, where it has colour. Raises FrameError."""
+        return self._made(place, partial(messages.colour_of, bits=self._bits))
+
+    def _made(self, place: int, make: Callable[[Any, str], T]) -> T:
         connection, raw = self._messages.read(place)
         where = f"{self._files.paths[0]}, {connection.topic}"
         message = self._files.decoded(connection, raw)
         try:
-            return messages.grey_of(message, where)
+            return make(message, where)
         except AttributeError as fault:  # the bag's own definition of the type is not ROS's
             raise FrameError(
                 f"{where}: message without a field of its type ({fault}); copy the bag again"
@@ -254,8 +220,13 @@ class _Pairs:
 
     def load(self, index: int) -> tuple[Image, ...]:
         """Rectified (right, left). Raises FrameError: damaged or of another size."""
-        found = []
-        for place in self.places[index]:
-            name = f"message {place}"
-            found.append(sized(self.images.load(int(place)), name, *self.rig.image_size))
-        return self.rig.rectified(tuple(found))
+        return self._rectified(index, self.images.load)
+
+    def load_colour(self, index: int) -> tuple[Image, ...]:
+        """The same in red, green, blue, or grey where the cameras are."""
+        return self._rectified(index, self.images.load_colour)
+
+    def _rectified(self, index: int, load: Callable[[int], Image]) -> tuple[Image, ...]:
+        size = self.rig.image_size
+        places = self.places[index].tolist()
+        return self.rig.rectified(tuple(sized(load(p), f"message {p}", *size) for p in places))

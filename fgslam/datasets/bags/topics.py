@@ -30,6 +30,7 @@ class Chosen:
         left, right: of images.
         left_info, right_info: of their camera_info; None where there is none.
         motion: of odometry, or None.
+        transforms: of tf_static.
         notes: what else could have been taken.
     """
 
@@ -38,6 +39,7 @@ class Chosen:
     left_info: str | None
     right_info: str | None
     motion: Topic | None
+    transforms: tuple[str, ...]
     notes: tuple[str, ...]
 
 
@@ -64,7 +66,10 @@ def choose_topics(topics: Sequence[Topic], wanted: Sequence[str], where: str) ->
     infos = _infos(used, left, right)
     notes = (f"also there: {', '.join(others)}; --topics chooses",) if others else ()
     motion = motions[0] if motions else _motion(used)
-    return Chosen(left, right, *infos, motion, notes)
+    transforms = tuple(
+        t.name for t in used if t.kind in kinds.TRANSFORMS and t.name.endswith("tf_static")
+    )
+    return Chosen(left, right, *infos, motion, transforms, notes)
 
 
 def _named(topics: Sequence[Topic], wanted: Sequence[str], where: str) -> list[Topic]:

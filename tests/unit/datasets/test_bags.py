@@ -110,8 +110,8 @@ def test_mosaics_are_read_in_the_right_order(tmp_path: Path, pattern: str) -> No
 def test_what_is_not_read_is_named(tmp_path: Path) -> None:
     encode = partial(raw_image, encoding="32FC7")
     recording_path = write_bag(tmp_path / "a.bag", stereo(1, encode))
-    with pytest.raises(FrameError, match=r"encoding '32FC7' is not read; known: .*bgr8.*bayer"):
-        opened(recording_path).frame(0)
+    with pytest.raises(DatasetError, match=r"encoding '32FC7' is not read; known: .*bgr8.*bayer"):
+        opened(recording_path)
 
 
 # --------------------------------------------------------------------------------------------

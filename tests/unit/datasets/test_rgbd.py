@@ -149,7 +149,7 @@ def test_the_colour_camera(tmp_path: Path) -> None:
         opened(root)
     assert opened(root, camera_file=str(tmp_path / "mine.json")).rig.fx == FOCAL
     camera(root, width=640, height=480)
-    with pytest.raises(CalibrationError, match="is for images of 640x480, the colour images have"):
+    with pytest.raises(CalibrationError, match="is for images of 640x480 pixels, the images have"):
         opened(root)
 
 

@@ -1,0 +1,233 @@
+"""The rig of a bag: by camera_info, tf_static or a file, and where it sits on the robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from fgslam.cameras.assembly import at_size
+from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
+from fgslam.cameras.raw_cameras import Calibration, RawCamera
+from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
+from fgslam.core.sensors import body_is_camera
+from fgslam.datasets.bags.frames import FrameTree, view_axes
+from fgslam.datasets.bags.topics import Chosen
+from fgslam.datasets.calibrated import mounted
+from fgslam.datasets.settings import BagSettings
+
+_BODIES = ("base_link", "base_footprint")
+"""The robot itself, where odometry does not name its frame (REP 105)."""
+
+Info: TypeAlias = dict[str, Any]
+"""A camera_info with the keys of camera_calibration's files."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stated:
+    """What a bag says of its cameras.
+
+    Attributes:
+        infos: by topic of camera_info its first message, as in a file.
+        frames: by topic the frame of its first message.
+        tree: of tf_static.
+        size: width and height of the images.
+    """
+
+    infos: dict[str, Info]
+    frames: dict[str, str]
+    tree: FrameTree
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A rig, its cameras left and right, the topics as calibrated, what was noticed."""
+
+    rig: StereoRig
+    cameras: tuple[RawCamera, ...]
+    chosen: Chosen
+    notes: tuple[str, ...] = ()
+
+
+def rig_of_bag(
+    settings: BagSettings, stated: Stated, chosen: Chosen
+) -> tuple[StereoRig, Chosen, tuple[str, ...]]:
+    """The rig on the robot, the topics with sides as calibrated, and what was noticed.
+
+    Raises:
+        CalibrationError: nothing says where the cameras are, or what does is malformed.
+    """
+    found = _of_file(settings, stated, chosen) or _of_topics(settings, stated, chosen)
+    notes = (*found.notes, *found.rig.remarks)
+    if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
+        return mounted(found.rig, settings), found.chosen, notes
+    rig, said = _on_robot(found, stated)
+    return rig, found.chosen, (*notes, *said)
+
+
+def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | None:
+    if settings.camera_file is None:
+        return None
+    rig = load_rig(settings.camera_file, size=stated.size, scale=settings.resized)
+    cameras = read_calibration_file(Path(settings.camera_file), size=stated.size).cameras
+    order = (0, 1) if rig.rectifier is None else rig.rectifier.order
+    right, left = (rig.sources[order.index(k)] for k in (0, 1))
+    return _Found(rig, (cameras[left], cameras[right]), chosen)
+
+
+# --------------------------------------------------------------------------------------------
+# By camera_info, and by tf_static where that has no baseline
+
+
+def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
+    topics = (chosen.left_info, chosen.right_info)
+    left, right = (stated.infos.get(topic or "") for topic in topics)
+    if left is None or right is None:
+        raise CalibrationError(_lacking(settings.path, chosen, left is None, right is None))
+    left, right = (_as_sent(values, stated.size) for values in (left, right))
+    if all(_is_rectified(topic) for topic in (chosen.left, chosen.right)):
+        left, right = (_without_distortion(values) for values in (left, right))
+    named = (Path(f"{settings.path}:{topics[0]}"), Path(f"{settings.path}:{topics[1]}"))
+    if not _shift(left) and not _shift(right):
+        return _by_tree(named, (left, right), stated, chosen, settings.resized)
+    notes: tuple[str, ...] = ()
+    if _shift(left) < 0.0 <= _shift(right):
+        notes = (f"by their camera_info {chosen.left} is the right camera, and is taken so",)
+        left, right, named = right, left, (named[1], named[0])
+        chosen = replace(
+            chosen,
+            left=chosen.right,
+            right=chosen.left,
+            left_info=chosen.right_info,
+            right_info=chosen.left_info,
+        )
+    found = at_size(read_camera_info_pair(named, (left, right)), stated.size, settings.resized)
+    return _Found(rig_of(found), found.cameras, chosen, notes)
+
+
+def _shift(info: Info) -> float:
+    """-fx times the baseline, of the right camera; 0 where none is stated."""
+    return float(info["projection_matrix"]["data"][3])
+
+
+def _by_tree(
+    named: tuple[Path, Path],
+    infos: tuple[Info, Info],
+    stated: Stated,
+    chosen: Chosen,
+    resized: bool,
+) -> _Found:
+    """Each camera by its own camera_info, their places by the transforms of their frames."""
+    left, right = (stated.frames[topic] for topic in (chosen.left, chosen.right))
+    try:
+        if left == right:
+            raise CalibrationError(f"both cameras have the frame {left or 'without a name'}")
+        fTc, said = view_axes(stated.tree, left, right, "")
+        apart = inverse(fTc) @ stated.tree.pose(left, right) @ fTc
+    except CalibrationError as fault:
+        raise CalibrationError(
+            f"{named[0]} and {named[1].name}: projection_matrix states no baseline, and {fault}; "
+            "give the calibration of both by --camera FILE"
+        ) from None
+    cameras = [read_camera_info(n, i).cameras[0] for n, i in zip(named, infos, strict=True)]
+    cameras[0] = replace(cameras[0], bTc=apart)
+    source, form = f"{named[0]} and {named[1].name}", "camera_info with tf_static"
+    pair = Calibration(source, form, tuple(cameras), sided=True)
+    found = at_size(pair, stated.size, resized)
+    rig = rig_of(found)
+    note = f"camera_info has no baseline: by tf_static {right} is {rig.baseline:.4g} m from {left}"
+    return _Found(rig, found.cameras, chosen, (note, *filter(None, [said])))
+
+
+def _as_sent(info: Info, size: tuple[int, int]) -> Info:
+    """The camera_info of images that were cropped and binned as it says; itself where not so."""
+    (across, down), (x, y, width, height) = info["binning"], info["roi"]
+    full = (width or info["image_width"], height or info["image_height"])
+    if size == (info["image_width"], info["image_height"]):
+        return info
+    if size != (full[0] // across, full[1] // down):
+        return info
+    sent = np.array(
+        [
+            [1.0 / across, 0.0, (0.5 - x) / across - 0.5],
+            [0.0, 1.0 / down, (0.5 - y) / down - 0.5],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    matrices = {
+        name: {"data": (sent @ np.reshape(info[name]["data"], (3, -1))).ravel().tolist()}
+        for name in ("camera_matrix", "projection_matrix")
+    }
+    return {**info, **matrices, "image_width": size[0], "image_height": size[1]}
+
+
+def _lacking(path: str, chosen: Chosen, no_left: bool, no_right: bool) -> str:
+    which = [t for t, absent in ((chosen.left, no_left), (chosen.right, no_right)) if absent]
+    return (
+        f"{path}: no camera_info belongs to {' and '.join(which)}, and one camera's says nothing "
+        "of the other; give the calibration of both by --camera FILE"
+    )
+
+
+def _is_rectified(topic: str) -> bool:
+    return "rect" in topic.removesuffix("/compressed").rpartition("/")[2].split("_")
+
+
+def _without_distortion(values: Info) -> Info:
+    """The camera_info of the image that image_proc has rectified by it."""
+    p = values["projection_matrix"]["data"]
+    return {
+        **values,
+        "distortion_model": "plumb_bob",
+        "camera_matrix": {"data": [*p[0:3], *p[4:7], *p[8:11]]},
+        "distortion_coefficients": {"data": [0.0] * 5},
+        "rectification_matrix": {"data": np.eye(3).ravel().tolist()},
+    }
+
+
+# --------------------------------------------------------------------------------------------
+# On the robot
+
+
+def _on_robot(found: _Found, stated: Stated) -> tuple[StereoRig, tuple[str, ...]]:
+    """The rig in the frame whose motion the odometry is, and how that was known."""
+    if found.chosen.motion is None:
+        return found.rig, ()
+    left, right = (stated.frames[topic] for topic in (found.chosen.left, found.chosen.right))
+    body = _body(stated.frames[found.chosen.motion.name], stated.tree)
+    # Where both have one frame it is the left camera's (CameraInfo.msg, P).
+    camera, frame = (0, left) if left == right else (1, right)
+    try:
+        bTf = stated.tree.pose(frame, body)
+    except CalibrationError as fault:
+        reason = f" ({fault})" if stated.tree else ""
+        if not body_is_camera(found.rig.bTc):
+            return found.rig, ()
+        ahead = replace(found.rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+        return ahead, (*stated.tree.notes, f"{_LOOKS_AHEAD[0]}{reason}: {_LOOKS_AHEAD[1]}")
+    fTc, said = view_axes(stated.tree, left, right, body)
+    bTc = bTf @ fTc @ inverse(found.cameras[camera].bTc) @ found.rig.bTc
+    x, y, z = (round(float(v), 3) + 0.0 for v in bTc[:3, 3])
+    note = (
+        f"by tf_static the right camera is {x:g}, {y:g}, {z:g} m (x, y, z) from {body}, whose "
+        f"motion {found.chosen.motion.name} is"
+    )
+    return replace(found.rig, bTc=bTc), (*stated.tree.notes, note, *filter(None, [said]))
+
+
+def _body(named: str, tree: FrameTree) -> str:
+    """The frame whose motion odometry is: the one it names, else the robot's."""
+    return named or next((body for body in _BODIES if body in tree), "")
+
+
+_LOOKS_AHEAD = (
+    "nothing says where the camera sits on the robot whose odometry is used",
+    "it is taken to look straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say "
+    "otherwise)",
+)

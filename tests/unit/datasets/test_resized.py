@@ -1,0 +1,140 @@
+"""Images of another size than the calibration's, and of fewer bits than their pixels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from dataset_builders import (
+    CALIBRATION,
+    EUROC_SIZE,
+    HEIGHT,
+    WIDTH,
+    euroc,
+    image_folder,
+    picture,
+    save,
+    write_calibration,
+)
+
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import pose
+from fgslam.datasets.recording import Recording
+from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.opening import open_sequence
+
+SIDE_BY_SIDE = (pose(np.eye(3), np.zeros(3)), pose(np.eye(3), np.array([0.1, 0.0, 0.0])))
+
+
+def own(root: Path) -> Path:
+    """Our layout; Kalibr would state the same numbers."""
+    image_folder(root, 3)
+    return root
+
+
+def three(root: Path) -> Path:
+    return image_folder(root, 3, top=True)
+
+
+def loose(root: Path) -> Path:
+    for k in range(3):
+        save(root / f"left_{k}.png", picture(60 + k))
+        save(root / f"right_{k}.png", picture(10 + k))
+    write_calibration(root)
+    return root
+
+
+def grow(root: Path, across: float = 2.0, down: float = 2.0) -> None:
+    """The calibration of the same cameras' images enlarged; pixel centres are whole numbers."""
+    path = root / "calib.json"
+    values = json.loads(path.read_text(encoding="utf-8"))
+    for focal, middle, length, factor in (
+        ("fx", "cx", "width", across),
+        ("fy", "cy", "height", down),
+    ):
+        values[focal] *= factor
+        values[middle] = factor * (values[middle] + 0.5) - 0.5
+        values[length] = round(factor * values[length])
+    path.write_text(json.dumps(values), encoding="utf-8")
+
+
+def opened(root: Path, *overrides: str) -> Recording:
+    config = bare_experiment(root, overrides=overrides).config
+    assert isinstance(config, ExperimentConfig)
+    found = open_sequence(config)
+    assert isinstance(found, Recording)
+    return found
+
+
+@pytest.mark.parametrize("make", [own, three, loose])
+def test_a_calibration_of_larger_images_is_scaled_only_when_asked(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    before = opened(root).rig
+    grow(root)
+    with pytest.raises(CalibrationError) as raised:
+        opened(root)
+    line = str(raised.value)
+    assert "\n" not in line
+    assert "is for images of 64x48 pixels, the images have 32x24" in line
+    assert "--set dataset.resized=true" in line
+    found = opened(root, "dataset.resized=true")
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline"):
+        expected = getattr(before, name)
+        assert getattr(found.rig, name) == (expected and pytest.approx(expected, abs=1e-9))
+    assert int(found.frame(1).images[0][0, 0]) == 11
+
+
+@pytest.mark.parametrize("make", [own, loose])
+def test_another_shape_is_refused_even_when_asked(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    grow(root, 2.0, 1.5)
+    with pytest.raises(CalibrationError, match=r"64x36 pixels cannot be scaled.*cropped"):
+        opened(root, "dataset.resized=true")
+
+
+def test_raw_cameras_are_scaled_as_well(tmp_path: Path) -> None:
+    root = euroc(tmp_path, SIDE_BY_SIDE)
+    focal = opened(root).rig.fx
+    for path in sorted((root / "mav0").glob("cam?/data/*.png")):
+        save(path, cv2.resize(cv2.imread(str(path), 0), None, fx=0.5, fy=0.5))
+    width, height = EUROC_SIZE
+    with pytest.raises(CalibrationError, match=f"{width}x{height} pixels, the images have 32x24"):
+        opened(root)
+    found = opened(root, "dataset.resized=true")
+    assert (found.rig.width, found.rig.height) == (WIDTH, HEIGHT)
+    assert found.rig.fx == pytest.approx(0.5 * focal, rel=0.03)
+    assert found.frame(0).images[0].shape == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize(("share", "bits"), [(1, 8), (4, 10), (16, 12), (64, 14)])
+def test_a_folder_of_16_bit_images_is_scaled_by_the_bits_they_hold(
+    tmp_path: Path, share: int, bits: int
+) -> None:
+    for k in range(3):
+        for name, code in (("left", 60 + k), ("right", 10 + k)):
+            image = np.clip(picture(code), 0, 254).astype(np.uint16) * share
+            save(tmp_path / f"{name}_{k}.png", image)
+    write_calibration(tmp_path)
+    found = opened(tmp_path)
+    np.testing.assert_array_equal(found.frame(2).images[1], np.clip(picture(62), 0, 254))
+    np.testing.assert_array_equal(found.colour(2)[1][:, :, 0], np.clip(picture(62), 0, 254))
+    assert sum(f"pixels of 16 bits hold {bits}:" in note for note in found.notes) == 1
+
+
+def test_sixteen_bits_that_are_used_are_no_note(tmp_path: Path) -> None:
+    for name, code in (("left", 60), ("right", 10)):
+        save(tmp_path / f"{name}_0.png", picture(code).astype(np.uint16) << 8 | 0x7F)
+    write_calibration(tmp_path)
+    found = opened(tmp_path)
+    np.testing.assert_array_equal(found.frame(0).images[0], picture(10))
+    assert not any("bits" in note for note in found.notes)
+    assert found.rig.fx == CALIBRATION["fx"]
