@@ -104,11 +104,15 @@ def as_overrides(given: Mapping[str, str | float | Path | None]) -> list[str]:
 
 
 def frames(
-    start: int | None, stop: int | None, stride: int | None, fps: float | None = None
+    start: int | None,
+    stop: int | None,
+    stride: int | None,
+    fps: float | None = None,
+    scale: float | None = None,
 ) -> dict[str, str | float | Path | None]:
-    """Which frames of a recording, and how fast they follow, by the keys that say it."""
-    names = ("start", "stop", "stride", "fps")
-    return {f"dataset.{k}": v for k, v in zip(names, (start, stop, stride, fps), strict=True)}
+    """Which frames of a recording, how fast they follow, how large, by the keys that say it."""
+    names, values = ("start", "stop", "stride", "fps", "scale"), (start, stop, stride, fps, scale)
+    return {f"dataset.{k}": v for k, v in zip(names, values, strict=True)}
 
 
 def topics_override(topics: str | None) -> list[str]:
@@ -163,6 +167,14 @@ Fps = Annotated[
     typer.Option(
         metavar="RATE",
         help="frames a second of images or a film that state no times; sets dataset.fps",
+    ),
+]
+Scale = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FACTOR",
+        help="make the images smaller, 0.5 by half, and the calibration with them; sets "
+        "dataset.scale",
     ),
 ]
 Topics = Annotated[

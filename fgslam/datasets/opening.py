@@ -49,7 +49,12 @@ def open_recording(
         CalibrationError: its calibration is missing or impossible.
     """
     found = _opened(settings, odometry or RecordedOdometrySettings())
-    return _judged(found) if found.unrectified else found
+    found = _judged(found) if found.unrectified else found
+    if settings.scale == 1.0:
+        return found
+    from fgslam.datasets.smaller import smaller
+
+    return smaller(found, settings.scale)
 
 
 def _judged(recording: Recording) -> Recording:

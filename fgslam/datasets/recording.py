@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
@@ -50,6 +51,7 @@ class Recording(Brief):
             needed, so that a bad odometry file hurts only who uses it.
         rectifier: what makes the images its own that the cameras gave; None where they are stored
             rectified.
+        margins: of frames, in place of the rectifier's.
     """
 
     name: str
@@ -63,6 +65,7 @@ class Recording(Brief):
     odometry_source: OdometrySource | None = None
     load_colour: ImageLoader | None = None
     rectifier: Rectifier | None = None
+    margins: tuple[npt.NDArray[np.float32], ...] = ()
     disparity_sigma_px: float | None = None
 
     @property
@@ -77,7 +80,9 @@ class Recording(Brief):
         """Images of frame ``i``, 0 <= i < len. Raises FrameError when missing or corrupt."""
         self._check_index(i, 0)
         index = int(self.indices[i])
-        margins = () if self.rectifier is None else self.rectifier.margins
+        margins = self.margins
+        if self.rectifier is not None:
+            margins = margins or self.rectifier.margins
         return Frame(index, float(self.timestamps[i]), self.load_images(index), margins)
 
     def colour(self, i: int) -> tuple[Image, ...]:

@@ -65,7 +65,7 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
     chosen = select_frames(len(pairs), settings)
     images = _Images(pairs, rig, _Undistorted.of(camera), scale)
     truth = root / "groundtruth.txt"
-    own = rig.fx * BASELINE_M * settings.depth_sigma_m
+    own = settings.scale * rig.fx * BASELINE_M * settings.depth_sigma_m
     return Recording(
         name=root.resolve().name,
         rig=rig,

@@ -28,6 +28,10 @@ class RecordingSettings(FrameSelection):
     """What every recording on disk has: where it lies and which of its frames are used."""
 
     path: Annotated[str, Field(min_length=1, description="folder of the recording")]
+    scale: Annotated[
+        float,
+        Field(gt=0.0, le=1.0, description="images are made smaller by this, the calibration too"),
+    ] = 1.0
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)

@@ -21,7 +21,7 @@ from dataset_builders import (
     write_calibration,
 )
 
-from fgslam.core.errors import CalibrationError
+from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose
 from fgslam.datasets.recording import Recording
 from fgslam.runs.bare_recording import bare_experiment
@@ -113,6 +113,46 @@ def test_raw_cameras_are_scaled_as_well(tmp_path: Path) -> None:
     assert (found.rig.width, found.rig.height) == (WIDTH, HEIGHT)
     assert found.rig.fx == pytest.approx(0.5 * focal, rel=0.03)
     assert found.frame(0).images[0].shape == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("make", [own, three])
+def test_images_are_made_smaller_with_their_calibration(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    before, found = opened(root), opened(root, "dataset.scale=0.5")
+    expected = (16, 12, 15.0, 15.5, 7.5, 5.5, before.rig.baseline, before.rig.vertical_baseline)
+    rig = found.rig
+    numbers = (rig.width, rig.height, rig.fx, rig.fy, rig.cx, rig.cy, rig.baseline)
+    assert (*numbers, rig.vertical_baseline) == expected
+    large, small = before.frame(1), found.frame(1)
+    for one, other in zip(large.images, small.images, strict=True):
+        mean = one.reshape(12, 2, 16, 2).astype(float).mean(axis=(1, 3))
+        assert np.abs(other - mean).max() <= 0.5
+    assert found.colour(1)[0].shape == (12, 16, 3)
+    assert found.notes[0] == "images of 32x24 are made 16x12"
+    assert np.array_equal(found.timestamps, before.timestamps)
+
+
+def test_black_borders_keep_their_distance_when_images_are_made_smaller(tmp_path: Path) -> None:
+    root = image_folder(tmp_path / "walk", 3)
+    hidden = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    hidden[:, :8] = 0
+    save(root / "mask_left.png", hidden)
+    large, small = opened(root).frame(0), opened(root, "dataset.scale=0.5").frame(0)
+    assert large.margins[1][12, 20] == pytest.approx(13.0, abs=0.5)
+    assert small.margins[1][6, 10] == pytest.approx(6.5, abs=0.3)
+    assert small.margins[1].shape == small.images[1].shape
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [("0.1", "images of 3x2 pixels of 32x24"), ("0", "greater than 0")]
+)
+def test_a_scale_that_leaves_nothing_is_refused(tmp_path: Path, scale: str, words: str) -> None:
+    root = image_folder(tmp_path / "walk", 3)
+    with pytest.raises(FgslamError, match=words) as raised:
+        opened(root, f"dataset.scale={scale}")
+    assert "dataset.scale" in str(raised.value)
 
 
 @pytest.mark.parametrize(("share", "bits"), [(1, 8), (4, 10), (16, 12), (64, 14)])
