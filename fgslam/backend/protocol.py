@@ -151,6 +151,20 @@ class MapUser(Protocol):
         ...
 
 
+@runtime_checkable
+class Recalibrated(Protocol):
+    """An estimator whose map follows the correction of a rig that calibrates itself; optional."""
+
+    def recalibrate(self, correction: FloatArray) -> object:
+        """Takes the correction (p,) that the next frame's measurements contain.
+
+        Called before that frame is predicted. Landmarks that were measured with another one, and
+        are contradicted, move to where this one would have put them; those of a saved map stay.
+        What is returned is not used.
+        """
+        ...
+
+
 class FullEstimator(Estimator, JointCovariances, Resumable, Protocol):
     """What the estimators of this package offer: everything but, in some, :class:`MapUser`."""
 
@@ -160,6 +174,12 @@ def predicted(estimator: Estimator, odometry: Odometry | None) -> Prediction:
     prediction = estimator.predict(odometry)
     _require_pose(estimator, "predict", prediction, Prediction)
     return prediction
+
+
+def recalibrated(estimator: Estimator, correction: FloatArray | None) -> None:
+    """Tells an estimator that follows it the correction of the next frame; None: there is none."""
+    if correction is not None and isinstance(estimator, Recalibrated):
+        estimator.recalibrate(correction)
 
 
 def updated(estimator: Estimator, increment: Increment, tracking: EgoMotion) -> UpdateStats:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator, predicted, updated
+from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.features import StereoFeatures
@@ -95,6 +95,8 @@ class SlamPipeline:
         watch = Stopwatch()
         found = self._watched(found)
         watch.lap("watch")
+        correction = self._correction()
+        recalibrated(self.estimator, None if correction is None else correction.values)
         odometry = self.motion.between(timestamp, body)
         prediction = predicted(self.estimator, odometry)
         watch.lap("predict")

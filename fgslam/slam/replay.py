@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.backend.protocol import Estimator, predicted, updated
+from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import ConfigError, MeasurementLogError
@@ -162,6 +162,7 @@ def replay_frame(
     if increment.odometry is None or increment.odometry.turned:
         stand_in = motion.between(increment.timestamp, increment.odometry)
         increment = dataclasses.replace(increment, odometry=stand_in)
+    recalibrated(estimator, increment.rig_correction)
     prediction = predicted(estimator, increment.odometry)
     watch.lap("predict")
     matched = increment.observations.select(~increment.observations.is_new)

@@ -27,6 +27,9 @@ from fgslam.backend.filters.loop_correction import (
     rotated,
     transported,
 )
+from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.filters.self_calibration import SETTLING
+from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
@@ -42,13 +45,16 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig, Sensor
 
+_CONTRADICTED = 2.0
+"""Sigmas of a measured disparity by which landmarks are off, rms, where a change of the rig's
+correction contradicts them: there the ego-motion's kernel bends."""
 _MISS_GROWTH_M = 0.0001  # added to a landmark's deviation on a miss (6.4, which gives no number)
 
 
 class LandmarkRows:
-    """Identities ascending, with position, covariance, number of sightings and home frame.
+    """Identities ascending, with position, covariance, sightings, home frame and last frame.
 
     An update costs what it touches: new landmarks are appended in place, and those that go are
     mostly young, so that only what lies behind the first of them moves.
@@ -64,6 +70,7 @@ class LandmarkRows:
             covariances=np.empty((0, 3, 3)),
             counts=number,
             homes=number,
+            lasts=number,
         )
 
     def __len__(self) -> int:
@@ -94,6 +101,11 @@ class LandmarkRows:
         """(n,) frame with which each moves when a loop is closed; -1 for one that stays."""
         return self._columns["homes"]
 
+    @property
+    def lasts(self) -> IntArray:
+        """(n,) frame that saw each last; -1 for one that none saw yet."""
+        return self._columns["lasts"]
+
     def map(self) -> LandmarkMap:
         """As a map; only until the next landmark comes or goes."""
         return LandmarkMap(self.ids, self.positions, self.covariances)
@@ -113,6 +125,7 @@ class LandmarkRows:
                 "covariances": covariances,
                 "counts": ones,
                 "homes": home * ones,
+                "lasts": home * ones,
             }
         )
         if not (np.diff(self.ids[max(before - 1, 0) :]) > 0).all():
@@ -126,11 +139,13 @@ class LandmarkRows:
         gone[self.rows(ids)] = True
         self._columns.drop(gone)
 
-    def load(self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray) -> None:
+    def load(
+        self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray, lasts: IntArray
+    ) -> None:
         """Replaces everything; the arrays are copied."""
         self._columns.take(0, np.empty(0, np.int64))
         self.add(landmarks.ids, landmarks.positions, landmarks.covariances, 0)
-        self.counts[:], self.homes[:] = counts, homes
+        self.counts[:], self.homes[:], self.lasts[:] = counts, homes, lasts
 
 
 class LandmarkKalman:
@@ -155,6 +170,8 @@ class LandmarkKalman:
         self._rows = LandmarkRows()
         self._drive = DriveRecord()
         self._fixed = False
+        self._applied = np.empty(0)  # correction of the rig in the last frame
+        self._disparity_sigma = np.inf  # of a measurement of the last frame that had any, pixels
 
     @property
     def keeps_maps(self) -> bool:
@@ -163,7 +180,8 @@ class LandmarkKalman:
 
     def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
         """Takes a saved map over; no loop of this drive moves its landmarks."""
-        self._rows.load(landmarks, hits, np.full(len(landmarks), -1))
+        unseen = np.full(len(landmarks), -1)
+        self._rows.load(landmarks, hits, unseen, unseen)
         self._fixed = fixed
 
     def predict(self, odometry: Odometry | None) -> Prediction:
@@ -181,6 +199,7 @@ class LandmarkKalman:
         closure, which is its uncertainty relative to the place returned to.
         """
         self._past.require_later(increment)
+        recalibrated(self, increment.rig_correction)
         before, self._current = self._current, Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)
         self._by_pose = tracking.covariance if shared else None
@@ -192,6 +211,9 @@ class LandmarkKalman:
         self._record(increment, tracking, before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
+        if len(increment.observations):
+            variances = increment.observations.covariance[:, 2, 2]
+            self._disparity_sigma = float(np.sqrt(np.median(variances)))
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         current = self._current
         return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof, closed)
@@ -221,6 +243,26 @@ class LandmarkKalman:
             self._rows.remove(observed.ids)
             self._add(observed)
 
+    def recalibrate(self, correction: FloatArray) -> RigChange | None:
+        """Moves the landmarks of this drive where the change of the correction contradicts them.
+
+        Returns:
+            By what they moved, None where they stay: a change within the noise of a measurement is
+            one more error among many, and after the first windows the rig itself may have moved.
+        """
+        before, self._applied = self._applied, correction
+        known = np.flatnonzero(self._rows.homes >= 0)
+        early = 0 < len(self._past) < SETTLING
+        if not (early and before.size and len(known) and isinstance(self._rig, CameraRig)):
+            return None
+        change = RigChange(self._rig, correction - before)
+        poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
+        moved, off_px = change.moved(poses, self._rows.positions[known])
+        if not off_px > _CONTRADICTED * self._disparity_sigma:
+            return None
+        self._rows.positions[known] = moved
+        return change
+
     def estimate(self) -> Estimate:
         """Trajectory as filtered, corrected by loops, and the map."""
         rows = self._rows
@@ -242,11 +284,13 @@ class LandmarkKalman:
 
     def state(self) -> StateArrays:
         """Everything needed to continue; a snapshot, which later updates leave alone."""
-        names = ("ids", "positions", "covariances", "counts", "homes")
+        names = ("ids", "positions", "covariances", "counts", "homes", "lasts")
         held = {name: a.copy() for name, a in zip(names, self._arrays(), strict=True)}
         current = {
             "current_pose": self._current.wTc,
             "current_covariance": self._current.covariance,
+            "rig_correction": self._applied,
+            "disparity_sigma": np.array(self._disparity_sigma),
         }
         return self._past.state() | current | held | self._drive.state()
 
@@ -255,14 +299,16 @@ class LandmarkKalman:
         self._past = FilteredTrajectory.restored(state)
         self._current = Prediction(state["current_pose"], state["current_covariance"])
         landmarks = LandmarkMap(state["ids"], state["positions"], state["covariances"])
-        self._rows.load(landmarks, state["counts"], state["homes"])
+        self._rows.load(landmarks, state["counts"], state["homes"], state["lasts"])
+        self._applied = state["rig_correction"]
+        self._disparity_sigma = float(state["disparity_sigma"])
         self._drive.restore(state)
 
     # ----------------------------------------------------------------------------------------
 
-    def _arrays(self) -> tuple[IntArray, FloatArray, FloatArray, IntArray, IntArray]:
+    def _arrays(self) -> tuple[IntArray | FloatArray, ...]:
         rows = self._rows
-        return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes
+        return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes, rows.lasts
 
     def _record(
         self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray
@@ -293,6 +339,7 @@ class LandmarkKalman:
         if not len(observed):
             return float("nan"), 0
         rows = self._rows.rows(observed.ids)
+        self._rows.lasts[rows] = len(self._past)
         before = self._rows.positions[rows], self._rows.covariances[rows]
         if self._settings.update == "pixel":
             nis = self._pixel_update(rows, observed)

@@ -31,6 +31,8 @@ Sandwich of an M-estimator (Huber 1981, ch. 6): E[w] E[w^2 s / d] / E[w - 2 w^2 
 Cauchy's weights w = 1 / (1 + s / c^2), s the squared residual of d = 2 * cameras coordinates.
 """
 _TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
+SETTLING = WINDOW * (int(_TRUSTED_WINDOWS) + 1)
+"""Frames before which no change of the correction can be a rig that was found to have moved."""
 _KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are a knock
 _DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
 

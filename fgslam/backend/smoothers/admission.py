@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.backend.filters.filtered import placed
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import GraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap
@@ -125,6 +126,17 @@ class LandmarkAdmission:
                 track.elsewhere.append((places[i], covariances[i]))
                 moved[i] = len(track.elsewhere) >= after and _agree(track.elsewhere[-after:])
         return rejected.select(moved)
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Corrects anew what sightings measured; what spoke against a landmark may not any more."""
+        sightings = {id(s): s for t in self.tracks.values() for s in (t.last, *t.waiting)}
+        if not sightings:
+            return
+        measured = change.measured(np.array([s.measurement for s in sightings.values()]))
+        for sighting, measurement in zip(sightings.values(), measured, strict=True):
+            sighting.measurement = measurement
+        for track in self.tracks.values():
+            track.elsewhere.clear()
 
     # -- coming and going ------------------------------------------------------------------------
 

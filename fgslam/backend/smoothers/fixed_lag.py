@@ -19,6 +19,7 @@ from fgslam.backend.filters.loop_correction import (
     nearest_positive,
     refusal,
 )
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.graph_builder import NewFactors
@@ -100,6 +101,10 @@ class FixedLagSolver:
         self._take(new)
         self._solve()
         self._move_window(landmarks)
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Corrects the window's observations anew; what has left it is what it was."""
+        self._window.remeasure(change.measured)
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """The window's solution, in every frame."""

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.persistence import MeasurementNoise, Persistence, StatedNoise
@@ -153,6 +154,11 @@ class GraphBuilder:
         """Takes note of what a frame's measurements were corrected by; None: they were not."""
         if correction is not None:
             self._applied = correction
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Corrects all observations so far anew."""
+        self.observed["measurement"][:] = change.measured(self.observed["measurement"])
+        self.admission.recalibrate(change)
 
     @property
     def doubted(self) -> RigCorrection | None:

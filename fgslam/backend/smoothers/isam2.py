@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.keyframes import Segments
@@ -78,6 +79,19 @@ class Isam2Solver(WholeGraphSolver):
         self._graph.push_back(self._builder.observation_factors(new.sightings))
         self._new_values.insert(new.values)
         self._answer = None
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Builds the tree anew, of the new measurements."""
+        super().recalibrate(change)
+        together = gtsam.Values(self._values)
+        together.insert(self._new_values)
+        if together.empty():
+            return
+        self._graph, self._new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        try:
+            self._rebuild(together)
+        except RuntimeError as error:
+            self._repair(together, error)
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Updates the tree where the last update lies `update_every` frames back."""

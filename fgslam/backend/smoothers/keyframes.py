@@ -15,11 +15,13 @@ of them their final place.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import gtsam
 import numpy as np
 
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.smoothers.graph_builder import TrackedFrame
 from fgslam.backend.smoothers.solver import Solution, allowed_parts
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -167,6 +169,11 @@ class Segments:
         fused = summarise(self._sensor, placed, middle, landmarks)
         return self._entering(middle, fused, last - middle.frame)
 
+    def recalibrate(self, change: RigChange) -> None:
+        """Corrects anew what frames between keyframes measured."""
+        self._block = [_corrected(frame, change) for frame in self._block]
+        self.between = [_corrected(frame, change) for frame in self.between]
+
     def forget(self, identities: list[int]) -> None:
         """Landmarks that start anew: what the open block saw of them is not the same landmark."""
         gone = np.array(identities, np.int64)
@@ -179,6 +186,12 @@ class Segments:
         since, self._motions = self._motions[:here], self._motions[here:]
         motion = compose_odometry(since) if since else None
         return TrackedFrame(frame.frame, frame.wTc, motion, accepted)
+
+
+def _corrected(frame: TrackedFrame, change: RigChange) -> TrackedFrame:
+    measured = change.measured(frame.accepted.measurement)
+    accepted = dataclasses.replace(frame.accepted, measurement=measured)
+    return dataclasses.replace(frame, accepted=accepted)
 
 
 def _is_placed(frame: TrackedFrame) -> bool:

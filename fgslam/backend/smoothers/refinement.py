@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops, Minimum
@@ -239,6 +240,10 @@ class WholeGraphSolver:
         self._values = gtsam.Values()
         self._answer: Refined | None = None
         self.remarks: list[str] = []
+
+    def recalibrate(self, change: RigChange) -> None:
+        """The next answer is that of the new measurements."""
+        self._answer = None
 
     @one_blas_thread()
     def solution(self) -> Solution:

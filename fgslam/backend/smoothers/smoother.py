@@ -26,6 +26,7 @@ from fgslam.backend.filters.loop_correction import (
     Constraint,
     founds_anew,
 )
+from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
@@ -140,6 +141,7 @@ class Smoother:
             step = self._unknown_step(increment, tracking)
             increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
+        recalibrated(self, increment.rig_correction)
         before = self._tracker.predict(None).wTc
         stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
         self._record(increment, tracking)
@@ -155,6 +157,17 @@ class Smoother:
         return dataclasses.replace(
             stats, wTc=current.wTc, covariance=current.covariance, closed=closed
         )
+
+    def recalibrate(self, correction: FloatArray) -> None:
+        """Where the tracker's map moves, corrects all that was measured so far anew."""
+        change = self._tracker.recalibrate(correction)
+        if change is None:
+            return
+        self._answer = None
+        self._builder.recalibrate(change)
+        if self._segments is not None:
+            self._segments.recalibrate(change)
+        self._solver.recalibrate(change)
 
     def estimate(self) -> Estimate:
         """All poses and landmarks as the graph has them now, with their marginals."""

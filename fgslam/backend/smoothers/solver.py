@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import Chain, Constraint
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
@@ -132,6 +133,10 @@ class GraphSolver(Protocol):
             landmarks: the tracker's map after that frame.
             timestamp: of the frame, seconds.
         """
+        ...
+
+    def recalibrate(self, change: RigChange) -> None:
+        """The builder has corrected its observations anew."""
         ...
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:

@@ -10,6 +10,7 @@ is linearised: judged where it has itself pulled the estimate to, a wrong match 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,6 +150,11 @@ class Window:
         """Observations (k,) of landmarks of the window from its frames; noise (k, 3, 3)."""
         new = Observed(frame, variable, measurement, whitening(noise))
         self.observed = self.observed.join(new)
+
+    def remeasure(self, measured: Callable[[FloatArray], FloatArray]) -> None:
+        """Replaces the numbers (k, 3) of all observations by a function of them."""
+        anew = measured(self.observed.measurement)
+        self.observed = dataclasses.replace(self.observed, measurement=anew)
 
     # -- the solution ------------------------------------------------------------------------
 

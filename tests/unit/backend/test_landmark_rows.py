@@ -64,7 +64,7 @@ def test_loading_copies(rng: np.random.Generator) -> None:
     before = given.positions.copy()
     rows = LandmarkRows()
     fill(rows, np.array([1, 2, 3]), rng, 0)
-    rows.load(given, np.array([4, 6]), np.array([-1, 9]))
+    rows.load(given, np.array([4, 6]), np.array([-1, 9]), np.array([3, 9]))
     rows.positions[:] = 0.0
     np.testing.assert_array_equal(given.positions, before)
     assert rows.ids.tolist() == [2, 5]

@@ -1,0 +1,62 @@
+"""What measurements and landmarks become where the correction of a rig changes between two frames.
+
+A map measured with one correction contradicts what is measured with the next: every landmark is as
+far off as its disparity was. So it moves to where the new correction would have put it, seen from
+the pose that saw it last: to first order, as corrections are fractions of a disparity. Derived in
+docs/derivations/self_calibration.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.geometry import in_front, project, triangulate
+from fgslam.core.rig_correction import displacements
+from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+
+_LEAST_SHARE = 0.5  # of a disparity that is left: below, it is no first-order change
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigChange:
+    """A change of the correction of a rig's pixels.
+
+    Attributes:
+        rig: the cameras.
+        values: (p,) the new correction less the old one
+            (:func:`fgslam.core.rig_correction.term_names`).
+    """
+
+    rig: CameraRig
+    values: FloatArray
+
+    def measured(self, measurement: FloatArray) -> FloatArray:
+        """Measurements (k, 3) (column, row, disparity) of all images, corrected anew."""
+        ratio, cameras = vertical_to_horizontal(self.rig), self.rig.cameras
+        pixels = measurement @ pixel_model(cameras, ratio).T
+        moved = displacements(self.rig, pixels.reshape(-1, cameras, 2)) @ self.values
+        return np.asarray(measurement - moved @ measurement_map("fused", cameras, ratio).T)
+
+    def moved(self, poses: FloatArray, positions: FloatArray) -> tuple[FloatArray, float]:
+        """Landmarks (k, 3) in the world, each measured anew from a pose (k, 4, 4) that saw it.
+
+        Returns:
+            Where they are then, one that its pose does not see where it was; and by how many
+            pixels of disparity they were off, root mean square.
+        """
+        turn, place = poses[:, :3, :3], poses[:, :3, 3]
+        local = np.einsum("kji,kj->ki", turn, positions - place)
+        ahead = in_front(self.rig, local)
+        before = project(self.rig, np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+        after = self.measured(before)
+        size = np.array([self.rig.width, self.rig.height])
+        seen = ahead & ((before[:, :2] >= 0.0) & (before[:, :2] < size)).all(axis=1)
+        seen &= after[:, 2] > _LEAST_SHARE * before[:, 2]
+        anew = triangulate(self.rig, np.where(seen[:, None], after, before))
+        anew = np.einsum("kij,kj->ki", turn, anew) + place
+        off = (after - before)[seen, 2]
+        rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
+        return np.where(seen[:, None], anew, positions), rms
