@@ -2,26 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from fgslam.cameras.assembly import at_size
 from fgslam.cameras.formats import kitti
 from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.geometry import pose
 from fgslam.datasets.calibrated import mounted
 from fgslam.datasets.images import RawImages, StereoFiles, check_sizes, first_size
 from fgslam.datasets.layouts import kitti_raw_drive
 from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
+from fgslam.datasets.oxts import Oxts, read_oxts
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
-from fgslam.datasets.settings import KittiRawSettings
+from fgslam.datasets.settings import KittiRawSettings, RecordedOdometrySettings
 from fgslam.datasets.stamps import stamps_of
+from fgslam.datasets.tables import trajectory_at_frames
 
 CALIBRATION = "calib_cam_to_cam.txt"
 _PAIRS = (("image_00", "image_01"), ("image_02", "image_03"))
 """Folders of the left and the right camera: grey, else colour."""
 
+_MAX_TRUTH_GAP_S = 0.25  # synchronised drives have a row a frame, every 0.1 s
 
-def open_kitti_raw(settings: KittiRawSettings) -> Recording:
+
+_DEFAULT_NOISE = RecordedOdometrySettings()
+
+
+def open_kitti_raw(
+    settings: KittiRawSettings, odometry: RecordedOdometrySettings = _DEFAULT_NOISE
+) -> Recording:
     """Open a drive; ``settings.path`` is its folder, or that of a date with one drive in it.
 
     Raises:
@@ -41,7 +56,8 @@ def open_kitti_raw(settings: KittiRawSettings) -> Recording:
     pairs, notes = pair_files(CameraFiles(left, right, drive, interleaved=False))
     folder = drive / names[1]
     stamps, assumed, lists = stamps_of([path for path, _ in pairs], (folder,), None)
-    rig = _rig(settings, drive, names, first_size(right))
+    rig, iTc = _rig(settings, drive, names, first_size(right))
+    oxts = read_oxts(drive)
     files = StereoFiles(pairs, *rig.image_size)
     check_sizes(files, drive)
     files, held = files.with_bits()
@@ -53,11 +69,29 @@ def open_kitti_raw(settings: KittiRawSettings) -> Recording:
         rectifier=rig.rectifier,
         timestamps=stamps[chosen],
         identity=recording_identity(lists, (path for pair in pairs for path in pair)),
-        ground_truth=None,
-        notes=(*rig.remarks, *held, *notes, *assumed),
+        ground_truth=_true_poses(oxts, iTc, stamps[chosen]),
+        notes=(*rig.remarks, *held, *notes, *assumed, *_untrue(oxts, iTc)),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,
+        odometry_source=None if oxts is None else oxts.odometry(odometry),
+    )
+
+
+def _true_poses(oxts: Oxts | None, iTc: FloatArray | None, frames: FloatArray) -> Trajectory | None:
+    """True poses of the reference camera at the frames' stamps (n,); None where unknown."""
+    if oxts is None or iTc is None:
+        return None
+    unit = trajectory_at_frames(oxts.poses(), frames, _MAX_TRUTH_GAP_S)
+    return Trajectory(unit.timestamps, unit.poses @ iTc)
+
+
+def _untrue(oxts: Oxts | None, iTc: FloatArray | None) -> tuple[str, ...]:
+    if oxts is None or iTc is not None:
+        return ()
+    return (
+        "oxts is used as odometry of a camera that looks ahead, and not as truth: beside "
+        f"{CALIBRATION} there are no calib_imu_to_velo.txt and calib_velo_to_cam.txt",
     )
 
 
@@ -67,15 +101,21 @@ def _has_images(camera: Path) -> bool:
 
 def _rig(
     settings: KittiRawSettings, drive: Path, names: tuple[str, str], size: tuple[int, int] | None
-) -> StereoRig:
-    if settings.camera_file is not None:
-        return mounted(load_rig(settings.camera_file, size=size, scale=settings.resized), settings)
+) -> tuple[StereoRig, FloatArray | None]:
+    """The rig, and the pose (4, 4) of the right camera on the inertial unit where it is known."""
     path = next((p for p in (drive / CALIBRATION, drive.parent / CALIBRATION) if p.is_file()), None)
-    if path is None:
+    keys = kitti.RAW if names == _PAIRS[0] else kitti.RAW_COLOUR
+    if settings.camera_file is not None:
+        rig = load_rig(settings.camera_file, size=size, scale=settings.resized)
+    elif path is None:
         raise CalibrationError(
             f"{drive}: no {CALIBRATION} in it or beside it; unpack the calibration of that date, "
             "or give one by --camera FILE"
         )
-    keys = kitti.RAW if names == _PAIRS[0] else kitti.RAW_COLOUR
-    found = at_size(kitti.read_kitti(path, size, keys), size, settings.resized)
-    return mounted(rig_of(found), settings)
+    else:
+        rig = rig_of(at_size(kitti.read_kitti(path, size, keys), size, settings.resized))
+    iTl = None if path is None else kitti.left_on_inertial_unit(path, keys)
+    if iTl is None:
+        return mounted(rig, settings), None
+    iTc = iTl @ pose(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
+    return mounted(replace(rig, bTc=iTc), settings), iTc

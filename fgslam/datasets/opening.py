@@ -75,10 +75,6 @@ def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings)
             from fgslam.datasets.kitti import open_kitti
 
             return open_kitti(settings)
-        case KittiRawSettings():
-            from fgslam.datasets.kitti_raw import open_kitti_raw
-
-            return open_kitti_raw(settings)
         case LightFieldSettings():
             from fgslam.datasets.light_field import open_light_field
 
@@ -98,7 +94,9 @@ def _open_film_or_depth(settings: _FilmOrDepth) -> Recording:
     return open_rgbd(settings)
 
 
-_WithOdometry: TypeAlias = ImageFolderSettings | LooseImagesSettings | EurocSettings | BagSettings
+_WithOdometry: TypeAlias = (
+    ImageFolderSettings | LooseImagesSettings | EurocSettings | KittiRawSettings | BagSettings
+)
 
 
 def _open_with_odometry(settings: _WithOdometry, odometry: RecordedOdometrySettings) -> Recording:
@@ -115,6 +113,10 @@ def _open_with_odometry(settings: _WithOdometry, odometry: RecordedOdometrySetti
             from fgslam.datasets.euroc import open_euroc
 
             return open_euroc(settings, odometry)
+        case KittiRawSettings():
+            from fgslam.datasets.kitti_raw import open_kitti_raw
+
+            return open_kitti_raw(settings, odometry)
         case BagSettings():
             from fgslam.datasets.bags.reader import open_bag
 

@@ -11,7 +11,12 @@ from fgslam.cameras.raw_cameras import Calibration, RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_lines
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    inverse,
+    pose,
+    reorthonormalise,
+)
 
 ODOMETRY = ("P0", "P1")
 RAW = ("P_rect_00", "P_rect_01")
@@ -60,6 +65,33 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
     return Calibration(str(path), "KITTI", cameras, sided=True)
 
 
+def left_on_inertial_unit(path: Path, keys: tuple[str, str]) -> FloatArray | None:
+    """Pose (4, 4) of a raw drive's rectified left camera on the inertial unit.
+
+    By calib_cam_to_cam.txt and the two files beside it that lead over the laser scanner; None
+    where those are absent.
+
+    Raises:
+        CalibrationError: a line is missing or malformed.
+    """
+    chain = [path.parent / f"calib_{name}.txt" for name in ("imu_to_velo", "velo_to_cam")]
+    if not all(file.is_file() for file in chain):
+        return None
+    to_scanner, to_camera = (_motion(file) for file in chain)
+    lines = _lines(path)
+    upright = pose(_numbers(path, lines, "R_rect_00", 9).reshape(3, 3), np.zeros(3))
+    left = _projection(path, lines, keys[0])
+    beside = pose(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
+    return np.asarray(inverse(reorthonormalise(upright @ to_camera @ to_scanner)) @ beside)
+
+
+def _motion(path: Path) -> FloatArray:
+    """(4, 4) of the lines R: and T:."""
+    lines = _lines(path)
+    rotation, place = (_numbers(path, lines, key, n) for key, n in (("R", 9), ("T", 3)))
+    return pose(rotation.reshape(3, 3), place)
+
+
 def _baseline(path: Path, left: FloatArray, right: FloatArray, keys: tuple[str, str]) -> float:
     fx, fy = float(right[0, 0]), float(right[1, 1])
     if fx <= 0.0 or fy <= 0.0:
@@ -84,17 +116,22 @@ def _lines(path: Path) -> Mapping[str, tuple[int, list[str]]]:
 
 def _projection(path: Path, lines: Mapping[str, tuple[int, list[str]]], key: str) -> FloatArray:
     """Projection matrix (3, 4) of a line such as ``P1: 12 numbers``."""
+    return _numbers(path, lines, key, 12).reshape(3, 4)
+
+
+def _numbers(
+    path: Path, lines: Mapping[str, tuple[int, list[str]]], key: str, count: int
+) -> FloatArray:
+    """(count,) of a line ``key: numbers``."""
     if key not in lines:
-        raise CalibrationError(
-            f"{path} has no line {key!r}; restore the file of the odometry data set"
-        )
+        raise CalibrationError(f"{path} has no line {key!r}; restore the file of the data set")
     number, words = lines[key]
     values = _floats(words)
-    if len(values) != 12 or not np.isfinite(values).all():
+    if len(values) != count or not np.isfinite(values).all():
         raise CalibrationError(
-            f"{path}, line {number}: {key} must be 12 finite numbers; restore the file"
+            f"{path}, line {number}: {key} must be {count} finite numbers; restore the file"
         )
-    return values.reshape(3, 4)
+    return values
 
 
 def _stated_size(
