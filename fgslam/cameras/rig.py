@@ -45,7 +45,8 @@ class StereoRig(CameraRig):
         vertical_baseline: distance of top and right camera, metres; None without a top camera.
         bTc: (4, 4) pose of the right camera in the robot's body, where its odometry is measured.
             The identity where odometry is the camera's own motion, or there is none.
-
+        exact: the calibration has no error, as that of a rendered rig; else covariances contain
+            what one leaves.
         rectifier: how raw images become rectified ones; None where they are rectified already.
         sources: which of a calibration file's cameras are right, left[, top].
         remarks: what the calibration gives rise to say, a line each.

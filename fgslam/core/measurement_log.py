@@ -71,6 +71,7 @@ _PER_LOOP: Items = {
 }
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
+_EXACT = "exact"  # of a rig: written where it is
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -111,6 +112,8 @@ class MeasurementLog(Brief):
         """The log as the arrays of its file."""
         kind = "stereo" if isinstance(self.rig, CameraRig) else "range_bearing"
         sensor = {"kind": kind} | {name: getattr(self.rig, name) for name in _SENSOR_KEYS[kind]}
+        if isinstance(self.rig, CameraRig) and self.rig.exact:
+            sensor[_EXACT] = True
         version = self._version()
         header = LOG.header(version, sensor=sensor, motion=self.motion_model)
         out = header | {
@@ -203,7 +206,8 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
         header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
     sensor = header.get("sensor")
     keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
-    if keys is None or set(sensor or ()) != {"kind", *keys}:
+    given = set(sensor or ()) - ({_EXACT} if keys is _RIG else set())
+    if keys is None or given != {"kind", *keys}:
         raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
     if not isinstance(header.get("motion"), dict):
         raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")

@@ -36,6 +36,12 @@ def rig_fault(rig: CameraRig) -> str:
                 f"{name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
                 "give the principal point (column, row) in pixels of these images"
             )
+    return _mounting_fault(rig)
+
+
+def _mounting_fault(rig: CameraRig) -> str:
+    if not isinstance(rig.exact, bool | np.bool_):
+        return f"exact is {rig.exact!r}; give True for a rig known without error, as a rendered one"
     if not is_rigid(np.asarray(rig.bTc, np.float64)):
         return (
             "bTc must be a rigid motion (4, 4), the pose of the right camera in the body; "

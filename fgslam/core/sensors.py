@@ -30,6 +30,8 @@ class CameraRig(Brief):
         baseline: horizontal baseline in metres.
         vertical_baseline: vertical baseline in metres, or None for a two-camera rig.
         bTc: (4, 4) pose of the reference camera in the robot's body frame (the lever arm).
+        exact: the calibration has no error, as that of a rendered rig; else covariances contain
+            what one leaves (:data:`fgslam.core.rig_correction.SHARED`).
     """
 
     width: int
@@ -41,6 +43,7 @@ class CameraRig(Brief):
     baseline: float
     vertical_baseline: float | None
     bTc: FloatArray
+    exact: bool = False
 
     @property
     def cameras(self) -> int:

@@ -216,6 +216,7 @@ def make_rig(settings: LabRigSettings) -> CameraRig:
         baseline=settings.baseline_m,
         vertical_baseline=settings.vertical_baseline_m,
         bTc=bTc,
+        exact=True,
     )
 
 

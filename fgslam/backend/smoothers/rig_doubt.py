@@ -6,7 +6,8 @@ together: no average over landmarks and frames takes it out. The graph holds the
 first order into poses and landmarks. It is that of the correction given the prior of any
 calibration and the graph's own measurements, so the sum is the marginal of a graph that had the
 correction as a variable. What all cameras share (focal length, lens, baseline) is considered too,
-with a prior alone: each image is as far off as the images are found to be off against each other.
+with a prior alone: each image is as far off as any calibration is taken to leave it, or as the
+images are found to be off against each other, if that is more. A rendered rig is exact.
 docs/derivations/measurement_noise.md.
 """
 
@@ -27,6 +28,7 @@ from fgslam.backend.smoothers.marginals import (
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.rig_correction import (
+    EXPECTED_PX,
     RigCorrection,
     displacements,
     prior_information,
@@ -98,11 +100,12 @@ def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
 
 
 def _shared(correction: RigCorrection) -> FloatArray:
-    """(q, q) covariance of what nothing estimates; (0, 0) where the rig was not found to be off."""
-    against = correction.rms_px()
-    if not against:
+    """(q, q) covariance of what nothing estimates; (0, 0) of an exact rig."""
+    if correction.rig.exact:
         return np.empty((0, 0))
-    return np.asarray(np.linalg.inv(shared_information(correction.rig, against / np.sqrt(2.0))))
+    # EXPECTED_PX is of one coordinate between two images: as much of a pixel in each of them.
+    off_px = max(EXPECTED_PX, correction.rms_px() / np.sqrt(2.0))
+    return np.asarray(np.linalg.inv(shared_information(correction.rig, off_px)))
 
 
 def _step(

@@ -26,9 +26,8 @@ from fgslam.core.rig_correction import (
 )
 from fgslam.evaluation.consistency import pose_nees
 
-EXACT = RigCorrection.none(RIG)
-OFF = dataclasses.replace(EXACT, values=0.3 / RIG.fx * np.eye(len(EXACT.values))[0])
-"""The left image 0.3 pixels to the right."""
+EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
+CALIBRATED = RigCorrection.none(dataclasses.replace(RIG, exact=False))
 
 ALL = (*term_names(RIG), *SHARED)
 
@@ -80,7 +79,7 @@ def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     """By some tenth of a pixel; to first order."""
     by = 0.1 / RIG.fx * (np.array(ALL) == term)
     refined, moved = solved(), solved(3, tuple(by))
-    found = DoubtedMarginals.of(refined.graph, refined.state, OFF)
+    found = DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
     before, after = refined.state.poses, moved.state.poses
     steps = np.array([g.se3_log(step) for step in g.inverse(before) @ after])
     gain = (found.gain[found.held.system.columns :] @ by).reshape(-1, 6)
@@ -89,7 +88,22 @@ def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     np.testing.assert_allclose(gain, steps, rtol=0.0, atol=0.05 * size)
 
 
-def test_an_image_is_taken_to_be_off_as_the_images_are_against_each_other() -> None:
+def test_images_far_off_against_each_other_are_taken_to_be_off_as_far() -> None:
+    refined, shared = solved(), slice(len(EXACT.values), None)
+    column = np.eye(len(EXACT.values))[0]
+
+    def of(left_px: float) -> FloatArray:
+        """Covariance of what is shared, the left image so far to the right."""
+        moved = dataclasses.replace(CALIBRATED, values=left_px / RIG.fx * column)
+        found = DoubtedMarginals.of(refined.graph, refined.state, moved)
+        return found.correction[shared, shared]
+
+    np.testing.assert_allclose(of(0.3), of(0.0))
+    # 2 pixels in each of three images
+    np.testing.assert_allclose(of(4.0), 4.0 * of(0.0), rtol=1e-6)
+
+
+def test_what_is_shared_is_as_large_as_stated() -> None:
     information = shared_information(RIG, 0.2)
     rng = np.random.default_rng(4)
     drawn_terms = rng.multivariate_normal(np.zeros(len(SHARED)), np.linalg.inv(information), 4000)
@@ -110,15 +124,14 @@ def per_dof(poses: FloatArray, covariances: FloatArray, truth: FloatArray) -> fl
 
 def test_rigs_that_are_off_as_assumed_leave_consistent_poses() -> None:
     """Calibrations drawn as off as they are taken to be; NEES of 12 drives."""
-    worse = dataclasses.replace(OFF, values=8.0 * OFF.values)
     rng = np.random.default_rng(5)
     found, held = [], []
     for seed in range(12):
         exact, truth = solved(seed), drawn(seed, frames=12).poses[1:]
-        assumed = DoubtedMarginals.of(exact.graph, exact.state, worse).correction
+        assumed = DoubtedMarginals.of(exact.graph, exact.state, CALIBRATED).correction
         refined = solved(seed, tuple(rng.multivariate_normal(np.zeros(len(ALL)), assumed)))
         poses = refined.poses()[1:]
-        doubted = DoubtedMarginals.of(refined.graph, refined.state, worse)
+        doubted = DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
         found.append(per_dof(poses, doubted.poses()[1:], truth))
         held.append(per_dof(poses, doubted.held.poses()[1:], truth))
     assert np.mean(held) > 2.0

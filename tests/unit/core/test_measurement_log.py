@@ -100,6 +100,14 @@ def test_a_two_camera_rig_and_an_empty_log(tmp_path: Path) -> None:
     assert loaded.rig.cameras == 2
 
 
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_log_says_whether_its_rig_is_exact(exact: bool, tmp_path: Path) -> None:
+    MeasurementLog(replace(RIG, exact=exact), {}).save(tmp_path / "measurements.npz")
+    loaded = MeasurementLog.load(tmp_path / "measurements.npz").rig
+    assert isinstance(loaded, CameraRig)
+    assert loaded.exact is exact
+
+
 def test_time_may_not_run_backwards(log: MeasurementLog, rng: np.random.Generator) -> None:
     late = increment(5, rng, 2, with_odometry=True)
     with pytest.raises(MeasurementLogError, match=r"does not come after .*; sort"):
