@@ -85,8 +85,10 @@ def _camera(part: Values) -> tuple[RawCamera, FloatArray, FloatArray]:
         raise part.refuse(f"distortion_model {model} is not known; known: {known}")
     matrix = part.matrix("camera_matrix", 3, 3)
     given = part.tree.get("distortion_coefficients")
-    empty = isinstance(given, np.ndarray) and not given.size
-    coefficients = np.zeros(5) if empty else part.numbers("distortion_coefficients")
+    given = given.get("data") if isinstance(given, dict) else given
+    empty = isinstance(given, np.ndarray | list) and not len(given)  # CameraInfo.msg: none
+    none = np.zeros(5 if lens == "radtan" else 4)
+    coefficients = none if empty else part.numbers("distortion_coefficients")
     width, height = part.size("image_width", "image_height")
     name = part.path.name
     raw = RawCamera(width, height, matrix, coefficients, np.eye(4), name, lens)

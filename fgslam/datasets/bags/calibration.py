@@ -90,6 +90,12 @@ def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
     left, right = (stated.infos.get(topic or "") for topic in topics)
     if left is None or right is None:
         raise CalibrationError(_lacking(settings.path, chosen, left is None, right is None))
+    for topic, values in zip(topics, (left, right), strict=True):
+        if not values["camera_matrix"]["data"][0]:
+            raise CalibrationError(
+                f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are "
+                "0); calibrate it, and give the calibration of both by --camera FILE"
+            )
     left, right = (_as_sent(values, stated.size) for values in (left, right))
     if all(_is_rectified(topic) for topic in (chosen.left, chosen.right)):
         left, right = (_without_distortion(values) for values in (left, right))
@@ -135,8 +141,12 @@ def _by_tree(
             f"{named[0]} and {named[1].name}: projection_matrix states no baseline, and {fault}; "
             "give the calibration of both by --camera FILE"
         ) from None
-    cameras = [read_camera_info(n, i).cameras[0] for n, i in zip(named, infos, strict=True)]
-    cameras[0] = replace(cameras[0], bTc=apart)
+    cameras = [
+        replace(read_camera_info(file, info).cameras[0], name=str(topic), bTc=place)
+        for file, info, topic, place in zip(
+            named, infos, (chosen.left, chosen.right), (apart, np.eye(4)), strict=True
+        )
+    ]
     source, form = f"{named[0]} and {named[1].name}", "camera_info with tf_static"
     pair = Calibration(source, form, tuple(cameras), sided=True)
     found = at_size(pair, stated.size, resized)

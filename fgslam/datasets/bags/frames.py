@@ -17,29 +17,43 @@ from fgslam.core.geometry import (
 )
 
 _NAMED = 8  # frames that a message lists
+_STILL = 1e-5  # metres, and of a quaternion; less is rounding
 _UPWARD = 0.7071  # cosine of 45 degrees
 
 
 class FrameTree:
-    """Transforms between frames that do not move against each other.
-
-    Attributes:
-        notes: what is not as it should be, a line each.
-    """
+    """Transforms between frames that do not move against each other."""
 
     def __init__(self, transforms: Iterable[tuple[str, str, FloatArray]]) -> None:
+        """Takes what :meth:`add` takes."""
+        self._parents: dict[str, tuple[str, FloatArray]] = {}
+        self._moving: set[str] = set()
+        self._other: dict[str, str] = {}
+        self.add(transforms, static=True)
+
+    def add(self, transforms: Iterable[tuple[str, str, FloatArray]], static: bool) -> None:
         """Takes parent, child, and (7,) position and quaternion x, y, z, w of the child in it.
 
-        Of several transforms of one child the last counts, as in tf.
+        Of several transforms of one child the last counts, as in tf. Those that are not from
+        tf_static count as long as they stay the same.
         """
-        self._parents: dict[str, tuple[str, FloatArray]] = {}
-        other = {}
         for parent, child, numbers in transforms:
+            if child in self._moving:
+                continue
             before = self._parents.get(child)
             if before is not None and before[0] != parent:
-                other[child] = f"tf_static: {child} has two parents, {before[0]} and {parent}; "
+                text = f"{child} has two parents, {before[0]} and {parent}; the latter counts"
+                self._other[child] = f"tf_static: {text}"
+            elif before is not None and not static and np.abs(before[1] - numbers).max() > _STILL:
+                self._moving.add(child)
+                del self._parents[child]
+                continue
             self._parents[child] = parent, numbers
-        self.notes = tuple(f"{text}the latter counts" for text in other.values())
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is not as it should be, a line each."""
+        return tuple(self._other.values())
 
     def __bool__(self) -> bool:
         return bool(self._parents)

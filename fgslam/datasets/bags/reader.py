@@ -42,7 +42,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     index = _indexed(files, chosen)
     source = _Images(files, index, chosen)
     height, width = source.first(chosen.right).shape
-    stated = Stated(index.infos, index.frames, FrameTree(index.transforms), (width, height))
+    stated = Stated(index.infos, index.frames, index.tree, (width, height))
     rig, chosen, notes = rig_of_bag(settings, stated, chosen)
     (rows, partners), unpaired = _pairs(index, chosen, settings)
     stamps = NANOSECONDS * index.stamps[chosen.right][rows].astype(np.float64)
@@ -82,7 +82,7 @@ class _Index:
         stamps: (k,) their stamps, nanoseconds, increasing.
         infos: the first camera_info of each camera, as in a file.
         frames: of each topic the frame of its first message.
-        transforms: of tf_static: parent, child, position and quaternion.
+        tree: of tf_static.
         motions: stamps in seconds and values of the odometry.
         notes: which stamps could not be used.
     """
@@ -93,7 +93,7 @@ class _Index:
     stamps: dict[str, IntArray]
     infos: dict[str, dict[str, Any]]
     frames: dict[str, str]
-    transforms: list[tuple[str, str, FloatArray]]
+    tree: FrameTree
     motions: tuple[FloatArray, FloatArray]
     notes: tuple[str, ...]
 
@@ -104,13 +104,14 @@ def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
     topics = frozenset(name for name in (*images, *infos, motion, *chosen.transforms) if name)
     first: dict[str, dict[str, Any]] = {}
     frames: dict[str, str] = {}
-    transforms: list[tuple[str, str, FloatArray]] = []
+    tree = FrameTree(())
 
     def take(message: Message) -> tuple[str, int, int, Any]:
         connection, time, raw = message
         topic, value = connection.topic, None
         if topic in chosen.transforms:
-            transforms.extend(messages.transforms_of(files.decoded(connection, raw)))
+            found = messages.transforms_of(files.decoded(connection, raw))
+            tree.add(found, static=topic.endswith("tf_static"))
             return topic, time, time, None
         if topic == motion or topic not in frames:
             content = files.decoded(connection, raw)
@@ -131,7 +132,7 @@ def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
     moved = [(row[2], row[3]) for row in rows if row[0] == motion]
     values = np.array([value for _, value in moved])
     motions = (NANOSECONDS * np.array([stamp for stamp, _ in moved], np.float64), values)
-    parts = (places, by_stamp, first, frames, transforms, motions)
+    parts = (places, by_stamp, first, frames, tree, motions)
     return _Index(topics, times, *parts, tuple(notes))
 
 

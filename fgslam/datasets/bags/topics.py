@@ -30,7 +30,7 @@ class Chosen:
         left, right: of images.
         left_info, right_info: of their camera_info; None where there is none.
         motion: of odometry, or None.
-        transforms: of tf_static.
+        transforms: of tf_static; where the bag has none, of tf, which says again what stays.
         notes: what else could have been taken.
     """
 
@@ -66,9 +66,8 @@ def choose_topics(topics: Sequence[Topic], wanted: Sequence[str], where: str) ->
     infos = _infos(used, left, right)
     notes = (f"also there: {', '.join(others)}; --topics chooses",) if others else ()
     motion = motions[0] if motions else _motion(used)
-    transforms = tuple(
-        t.name for t in used if t.kind in kinds.TRANSFORMS and t.name.endswith("tf_static")
-    )
+    of_frames = tuple(topic.name for topic in used if topic.kind in kinds.TRANSFORMS)
+    transforms = tuple(name for name in of_frames if name.endswith("tf_static")) or of_frames
     return Chosen(left, right, *infos, motion, transforms, notes)
 
 

@@ -136,6 +136,26 @@ def test_what_the_frames_do_not_connect_is_said_and_the_camera_looks_ahead(tmp_p
     assert "tf_static has no frame base_link; it has left_optical, mast, ri" in recording.notes[-1]
 
 
+def test_without_tf_static_what_stays_in_tf_counts(tmp_path: Path) -> None:
+    """As ROS 1 publishes it, again and again; the wheels turn, the robot moves in odom."""
+    turning = []
+    for k in range(4):
+        wheel = ("base_link", "wheel", pose(so3_exp(np.array([0.0, 0.1 * k, 0.0])), np.zeros(3)))
+        on_floor = ("odom", "base_link", shifted(0.1 * k))
+        stamp = START_NS + k * PERIOD_NS
+        fields = {"transforms": [*robot(), wheel, on_floor]}
+        turning.append(("/tf", stamp, "tf2_msgs/msg/TFMessage", fields))
+    messages = in_frames(stereo(4), FRAMES) + moving() + turning
+    recording = opened(write_bag(tmp_path / "a.bag", messages))
+    expected = ON_MAST @ AHEAD @ shifted(BASELINE)
+    np.testing.assert_allclose(recording.rig.bTc, expected, rtol=0.0, atol=1e-9)
+    tree = FrameTree(())
+    for k in range(2):
+        tree.add([("a", "b", np.array([float(k), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))], static=False)
+    with pytest.raises(CalibrationError, match="has no frame b"):
+        tree.pose("b", "a")
+
+
 # --------------------------------------------------------------------------------------------
 # Between the cameras
 
@@ -250,6 +270,18 @@ def test_a_calibration_of_larger_images_is_scaled_only_when_asked(tmp_path: Path
     ):
         opened(path)
     require_as_calibrated(opened(path, resized=True))
+
+
+def test_camera_info_without_numbers_is_no_calibration_but_without_lens_it_is(
+    tmp_path: Path,
+) -> None:
+    def changed(**values: Any) -> list[Written]:
+        return [(t, s, k, {**f, **values} if k.endswith("Info") else f) for t, s, k, f in stereo(2)]
+
+    require_as_calibrated(opened(write_bag(tmp_path / "a.bag", changed(d=np.zeros(0)))))
+    zeros = {"k": np.zeros(9), "p": np.zeros(12), "r": np.zeros(9), "d": np.zeros(0)}
+    with pytest.raises(CalibrationError, match="/cam/left/camera_info is of a camera that is not"):
+        opened(write_bag(tmp_path / "b.bag", changed(**zeros)))
 
 
 # --------------------------------------------------------------------------------------------
