@@ -242,7 +242,7 @@ def _cut_off(camera: RawCamera, view: View) -> tuple[str, ...]:
         return ()
     return (
         f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-        f"{kept[1]:.0f}; what lies beyond is cut off",
+        f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
     )
 
 

@@ -146,7 +146,7 @@ def load_rig(
     """
     require_options(size, unit_m, fov_deg)
     own = _own_rectified(Path(path), cameras) if path2 is None else None
-    if own is not None and (size is None or size == (own.width, own.height)):
+    if own is not None and fov_deg is None and size in (None, (own.width, own.height)):
         return with_masks(own, Path(path))
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)

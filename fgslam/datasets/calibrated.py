@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from fgslam.cameras.assembly import at_size
 from fgslam.cameras.calibration import level_mounting
-from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.cameras.raw_cameras import Calibration
+from fgslam.cameras.rig import StereoRig, load_rig, rig_of
 from fgslam.core.errors import CalibrationError
 from fgslam.datasets.settings import CalibratedSettings
 
@@ -25,16 +28,34 @@ def calibrated_rig(
         CalibrationError: there is no calibration, or it cannot be used.
     """
     if settings.camera_file is not None:
-        path = settings.camera_file
-        return mounted(load_rig(path, size=size, scale=settings.resized), settings)
+        return mounted(loaded_rig(settings, Path(settings.camera_file), size=size), settings)
     try:
-        return mounted(load_rig(own, size=size, scale=settings.resized), settings)
+        return mounted(loaded_rig(settings, own, size=size), settings)
     except CalibrationError as fault:
         if not str(fault).startswith(f"{own}:"):  # of a file in it: that is there, and at fault
             raise
         raise CalibrationError(
             f"{fault}; give a calibration: {own / 'calib.json'}, or another one by --camera FILE"
         ) from None
+
+
+def loaded_rig(
+    settings: CalibratedSettings,
+    *files: Path,
+    size: tuple[int, int] | None,
+    cameras: Sequence[int] | None = None,
+) -> StereoRig:
+    """:func:`fgslam.load_rig` of one file or two, scaled and as wide as the settings ask for."""
+    return load_rig(
+        *files, size=size, scale=settings.resized, fov_deg=settings.fov_deg, cameras=cameras
+    )
+
+
+def read_rig(
+    settings: CalibratedSettings, calibration: Calibration, size: tuple[int, int] | None
+) -> StereoRig:
+    """The same of a calibration that is read."""
+    return rig_of(at_size(calibration, size, settings.resized), settings.fov_deg)
 
 
 def mounted(rig: StereoRig, settings: CalibratedSettings) -> StereoRig:

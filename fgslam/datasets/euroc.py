@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.formats.kalibr import read_asl_mounting
-from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.calibrated import mounted
+from fgslam.datasets.calibrated import loaded_rig, mounted
 from fgslam.datasets.gyroscope import recorded_gyroscope
 from fgslam.datasets.images import (
     RawImages,
@@ -107,7 +107,7 @@ def _rig(settings: EurocSettings, root: Path, folders: list[Path]) -> StereoRig:
         chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
         given = next(((chain,) for chain in chains if chain.is_file()), given)
     size = first_size(read_camera_frames(folders[0]).paths)
-    return mounted(load_rig(*given, size=size, scale=settings.resized), settings)
+    return mounted(loaded_rig(settings, *given, size=size), settings)
 
 
 def _pairs(

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.calibration import read_json_object
-from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
-from fgslam.datasets.calibrated import mounted
+from fgslam.datasets.calibrated import loaded_rig, mounted
 from fgslam.datasets.images import (
     RawImages,
     StereoFiles,
@@ -125,7 +125,7 @@ def _cameras(root: Path, settings: ImageFolderSettings, listed: list[dict[int, P
     path, three = _camera_file(root, settings), len(listed) == 3
     chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
     size = first_size(listed[0].values())
-    rig = load_rig(path, size=size, scale=settings.resized, cameras=chosen)
+    rig = loaded_rig(settings, path, size=size, cameras=chosen)
     if three and rig.vertical_baseline is None:
         raise CalibrationError(
             f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size
 from fgslam.cameras.formats import kitti
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose
-from fgslam.datasets.calibrated import mounted
+from fgslam.datasets.calibrated import loaded_rig, mounted, read_rig
 from fgslam.datasets.images import RawImages, StereoFiles, check_sizes, first_size
 from fgslam.datasets.layouts import kitti_raw_drive
 from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
@@ -106,14 +105,14 @@ def _rig(
     path = next((p for p in (drive / CALIBRATION, drive.parent / CALIBRATION) if p.is_file()), None)
     keys = kitti.RAW if names == _PAIRS[0] else kitti.RAW_COLOUR
     if settings.camera_file is not None:
-        rig = load_rig(settings.camera_file, size=size, scale=settings.resized)
+        rig = loaded_rig(settings, Path(settings.camera_file), size=size)
     elif path is None:
         raise CalibrationError(
             f"{drive}: no {CALIBRATION} in it or beside it; unpack the calibration of that date, "
             "or give one by --camera FILE"
         )
     else:
-        rig = rig_of(at_size(kitti.read_kitti(path, size, keys), size, settings.resized))
+        rig = read_rig(settings, kitti.read_kitti(path, size, keys), size)
     iTl = None if path is None else kitti.left_on_inertial_unit(path, keys)
     if iTl is None:
         return mounted(rig, settings), None

@@ -51,6 +51,15 @@ class CalibratedSettings(RecordingSettings):
             "scale it to them"
         ),
     ] = False
+    fov_deg: Annotated[
+        float | None,
+        Field(
+            gt=0.0,
+            lt=170.0,
+            description="horizontal angle of the rectified, perspective view; null: as wide as "
+            "all cameras fill, at most 120",
+        ),
+    ] = None
     camera_yaw_deg: Annotated[
         float | None,
         Field(

@@ -8,17 +8,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.cameras.rig import StereoRig
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera
 from fgslam.datasets.bags.frames import FrameTree, view_axes
 from fgslam.datasets.bags.topics import Chosen
-from fgslam.datasets.calibrated import mounted
+from fgslam.datasets.calibrated import loaded_rig, mounted, read_rig
 from fgslam.datasets.settings import BagSettings
 
 _BODIES = ("base_link", "base_footprint")
@@ -74,7 +73,7 @@ def rig_of_bag(
 def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | None:
     if settings.camera_file is None:
         return None
-    rig = load_rig(settings.camera_file, size=stated.size, scale=settings.resized)
+    rig = loaded_rig(settings, Path(settings.camera_file), size=stated.size)
     cameras = read_calibration_file(Path(settings.camera_file), size=stated.size).cameras
     order = (0, 1) if rig.rectifier is None else rig.rectifier.order
     right, left = (rig.sources[order.index(k)] for k in (0, 1))
@@ -101,7 +100,7 @@ def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
         left, right = (_without_distortion(values) for values in (left, right))
     named = (Path(f"{settings.path}:{topics[0]}"), Path(f"{settings.path}:{topics[1]}"))
     if not _shift(left) and not _shift(right):
-        return _by_tree(named, (left, right), stated, chosen, settings.resized)
+        return _by_tree(settings, named, (left, right), stated, chosen)
     notes: tuple[str, ...] = ()
     if _shift(left) < 0.0 <= _shift(right):
         notes = (f"by their camera_info {chosen.left} is the right camera, and is taken so",)
@@ -113,8 +112,8 @@ def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
             left_info=chosen.right_info,
             right_info=chosen.left_info,
         )
-    found = at_size(read_camera_info_pair(named, (left, right)), stated.size, settings.resized)
-    return _Found(rig_of(found), found.cameras, chosen, notes)
+    found = read_camera_info_pair(named, (left, right))
+    return _Found(read_rig(settings, found, stated.size), found.cameras, chosen, notes)
 
 
 def _shift(info: Info) -> float:
@@ -123,11 +122,11 @@ def _shift(info: Info) -> float:
 
 
 def _by_tree(
+    settings: BagSettings,
     named: tuple[Path, Path],
     infos: tuple[Info, Info],
     stated: Stated,
     chosen: Chosen,
-    resized: bool,
 ) -> _Found:
     """Each camera by its own camera_info, their places by the transforms of their frames."""
     left, right = (stated.frames[topic] for topic in (chosen.left, chosen.right))
@@ -149,10 +148,9 @@ def _by_tree(
     ]
     source, form = f"{named[0]} and {named[1].name}", "camera_info with tf_static"
     pair = Calibration(source, form, tuple(cameras), sided=True)
-    found = at_size(pair, stated.size, resized)
-    rig = rig_of(found)
+    rig = read_rig(settings, pair, stated.size)
     note = f"camera_info has no baseline: by tf_static {right} is {rig.baseline:.4g} m from {left}"
-    return _Found(rig, found.cameras, chosen, (note, *filter(None, [said])))
+    return _Found(rig, pair.cameras, chosen, (note, *filter(None, [said])))
 
 
 def _as_sent(info: Info, size: tuple[int, int]) -> Info:

@@ -155,6 +155,16 @@ def test_a_scale_that_leaves_nothing_is_refused(tmp_path: Path, scale: str, word
     assert "dataset.scale" in str(raised.value)
 
 
+def test_the_angle_of_the_rectified_view_may_be_chosen(tmp_path: Path) -> None:
+    for root in (own(tmp_path / "own"), euroc(tmp_path, SIDE_BY_SIDE)):
+        wide = opened(root, "dataset.fov_deg=100")
+        rig = wide.rig
+        assert rig.width / rig.fx == pytest.approx(2.0 * np.tan(np.radians(50.0)), abs=1e-6)
+        assert wide.frame(0).images[0].shape == (rig.height, rig.width)
+    with pytest.raises(FgslamError, match=r"fov_deg.*less than 170"):
+        opened(root, "dataset.fov_deg=175")
+
+
 @pytest.mark.parametrize(("share", "bits"), [(1, 8), (4, 10), (16, 12), (64, 14)])
 def test_a_folder_of_16_bit_images_is_scaled_by_the_bits_they_hold(
     tmp_path: Path, share: int, bits: int
