@@ -88,6 +88,22 @@ def nees(errors: FloatArray, covariances: FloatArray) -> Nees:
     return Nees(terms.sum(axis=1), supported.sum(axis=1))
 
 
+def within(errors: FloatArray, covariances: FloatArray, sigmas: float = 2.0) -> FloatArray:
+    """Shares (d,) of errors (n, d) within so many reported standard deviations, axis by axis.
+
+    Of two, 95 % lie within where the errors are normal and the covariances right. Items with a
+    value that is not finite are left out; NaN along an axis that was never uncertain.
+    """
+    variances = np.diagonal(covariances, axis1=1, axis2=2)
+    largest = variances.max(axis=1, initial=0.0, keepdims=True)
+    known = np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+    counted = np.asarray(known)[:, None] & (variances > _RELATIVE_RANK_TOLERANCE * largest)
+    held = counted & (errors**2 <= sigmas**2 * np.where(counted, variances, 0.0))
+    number = counted.sum(axis=0)
+    shares = np.full(len(number), np.nan)
+    return np.asarray(np.divide(held.sum(axis=0), number, out=shares, where=number > 0))
+
+
 def pose_errors(estimate: FloatArray, truth: FloatArray) -> FloatArray:
     """Tangent vectors (n, 6) ``Log(estimate^-1 truth)``, [rotation, translation], radians, metres.
 

@@ -14,7 +14,15 @@ from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajec
 from fgslam.core.geometry import transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.evaluation.consistency import Consistency, Nees, judge, landmark_nees, pose_nees
+from fgslam.evaluation.consistency import (
+    Consistency,
+    Nees,
+    judge,
+    landmark_nees,
+    pose_errors,
+    within,
+)
+from fgslam.evaluation.consistency import nees as normalised
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime, time_growth
 from fgslam.evaluation.trajectory import (
     Alignment,
@@ -156,9 +164,11 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     aligned = evaluate_trajectory(final, truth.trajectory, Alignment.SE3)
     first = evaluate_trajectory(final, truth.trajectory, Alignment.FIRST_POSE)
     errors = _landmark_errors(answer.estimate, truth)
+    final_errors = _pose_errors(final, answer.estimate.covariances, truth)
+    online_errors = _pose_errors(answer.online, answer.online_covariances, truth)
     nees = {
-        "pose": _pose_nees(final, answer.estimate.covariances, truth),
-        "online_pose": _pose_nees(answer.online, answer.online_covariances, truth),
+        "pose": normalised(*final_errors),
+        "online_pose": normalised(*online_errors),
         "landmark": _no_nees() if errors is None else errors.nees,
     }
     judged = {name: judge([values]) for name, values in nees.items()}
@@ -180,7 +190,9 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             **_alignment_notes(aligned, first),
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
-            "online": _online(answer.online, truth, judged["online_pose"]),
+            "coverage": _coverage(*final_errors),
+            "online": _online(answer.online, truth, judged["online_pose"])
+            | {"coverage": _coverage(*online_errors)},
             **_landmark_numbers(errors, truth),
             **_innovations(answer),
             "update_growth": _growth(answer.update_ms),
@@ -251,14 +263,28 @@ def _as_json(found: Consistency | None) -> JsonValue:
     return None if found is None else asdict(found)
 
 
-def _pose_nees(trajectory: Trajectory, covariances: FloatArray, truth: Truth) -> Nees:
-    """Of all poses but the first matched one: the gauge has neither error nor covariance."""
+def _pose_errors(
+    trajectory: Trajectory, covariances: FloatArray, truth: Truth
+) -> tuple[FloatArray, FloatArray]:
+    """Errors (k, 6) and covariances (k, 6, 6) of all poses with a truth, but the first of them.
+
+    It is aligned, and the gauge has neither error nor covariance.
+    """
     known = truth.trajectory
     found = None if known is None else to_estimate_world(trajectory, known)
     if found is None:
-        return _no_nees()
+        return np.empty((0, 6)), np.empty((0, 6, 6))
     rows, poses = found[0][1:], found[1][1:]
-    return pose_nees(trajectory.poses[rows], covariances[rows], poses)
+    return pose_errors(trajectory.poses[rows], poses), covariances[rows]
+
+
+def _coverage(errors: FloatArray, covariances: FloatArray) -> JsonValue:
+    """Shares of pose errors within two reported sigmas, by axis of the camera and of all axes."""
+    axes = within(errors, covariances)
+    if not np.isfinite(axes).any():
+        return None
+    shares = [None if np.isnan(share) else float(share) for share in axes]
+    return {"rotation": shares[:3], "position": shares[3:], "all": float(np.nanmean(axes))}
 
 
 def _landmark_errors(estimate: Estimate, truth: Truth) -> LandmarkErrors | None:
@@ -278,7 +304,7 @@ def _alignment_notes(aligned: TrajectoryError, first: TrajectoryError) -> dict[s
     }
 
 
-def _online(online: Trajectory, truth: Truth, nees: Consistency | None) -> JsonValue:
+def _online(online: Trajectory, truth: Truth, nees: Consistency | None) -> dict[str, JsonValue]:
     """The same errors of the poses as they were first estimated."""
     aligned = evaluate_trajectory(online, truth.trajectory, Alignment.SE3)
     first = evaluate_trajectory(online, truth.trajectory, Alignment.FIRST_POSE)

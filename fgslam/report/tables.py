@@ -108,6 +108,8 @@ RESULT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("nees_pose_final_verdict", "nees_pose.verdict"),
     ("nees_pose_online_per_dof", "online.nees_pose_per_dof"),
     ("nees_pose_online_verdict", "online.nees_pose.verdict"),
+    ("coverage_final", "coverage.all"),
+    ("coverage_online", "online.coverage.all"),
     ("nees_landmark_per_dof", "nees_landmark_per_dof"),
     ("nees_landmark_verdict", "nees_landmark.verdict"),
     ("nis_per_dof", "nis_per_dof"),

@@ -270,6 +270,8 @@ _CONSISTENCY = (
         _judged,
         _NO_TRUTH,
     ),
+    MetricColumn("in 2 sigma\nfinal", ("coverage.all",), _number(".0%"), _NO_TRUTH),
+    MetricColumn("in 2 sigma\nonline", ("online.coverage.all",), _number(".0%"), _NO_TRUTH),
     MetricColumn(
         "NEES\nlandmarks",
         ("nees_landmark_per_dof", "nees_landmark.verdict"),
@@ -387,6 +389,7 @@ _PAGE = (
         "whether the pose NEES lies in its 95 % chi-square band; one run counts as one sample",
         optional=False,
     ),
+    MetricColumn("in 2 sigma", ("coverage.all",), _number(".0%"), "pose errors within two sigma"),
     MetricColumn(
         "NEES online",
         ("online.nees_pose_per_dof",),

@@ -15,6 +15,7 @@ from fgslam.evaluation.consistency import (
     nees,
     pose_errors,
     pose_nees,
+    within,
 )
 
 
@@ -112,3 +113,17 @@ def test_without_degrees_of_freedom_consistency_is_not_known() -> None:
     assert judge([]) is None
     assert judge([empty]) is None
     assert judge([nees(np.ones((3, 6)), np.zeros((3, 6, 6)))]) is None
+
+
+def test_two_sigmas_hold_95_percent_of_errors_that_are_as_large_as_stated() -> None:
+    rng = np.random.default_rng(8)
+    covariances = random_covariances(rng, 4000, 6)
+    errors = drawn(rng, covariances)
+    np.testing.assert_allclose(within(errors, covariances), chi2.cdf(4.0, 1), atol=0.02)
+    np.testing.assert_allclose(within(errors, covariances / 16.0), chi2.cdf(0.25, 1), atol=0.03)
+
+
+def test_an_axis_that_is_held_has_no_share() -> None:
+    covariances = np.tile(np.diag([1e-4, 0.0, 1e-4]), (3, 1, 1))
+    errors = np.array([[0.0, 0.0, 0.03], [0.01, 0.0, 0.0], [np.nan, 0.0, 0.0]])
+    np.testing.assert_equal(within(errors, covariances), [1.0, np.nan, 0.5])

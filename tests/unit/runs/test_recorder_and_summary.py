@@ -24,6 +24,7 @@ from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.judging import Truth
+from fgslam.evaluation.metrics import value_at
 from fgslam.runs.tasks.slam_metrics import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
@@ -207,6 +208,7 @@ def test_a_perfect_path_has_no_error_in_any_world() -> None:
     assert metrics.end_error_m == pytest.approx(0.0, abs=1e-12)
     assert metrics.rpe_rot_deg == pytest.approx(0.0, abs=1e-5)
     assert metrics.nees_pose_per_dof == pytest.approx(0.0, abs=1e-9)
+    assert value_at(metrics.more, "coverage.all") == 1.0
     assert metrics.landmarks == 7
     assert metrics.update_ms.median == 8.5  # predict 1 and update 4 to 11
     assert metrics.peak_memory_mb is not None
