@@ -2,8 +2,9 @@
 
 From the last path image on, later images are compared with it. As long as enough features are
 common and the direction between both places is known well, the way may be left to one leg; where
-that ends, the last image for which it held becomes the next path image. An image with too little
-parallax adds nothing and is passed over. So the spacing follows the place: far apart in a hall,
+that ends, the last image for which it held becomes the next path image. A leg is driven straight:
+it ends, too, where the way that was driven bends away from it. An image with too little parallax
+adds nothing and is passed over. So the spacing follows the place: far apart in a hall,
 near each other at a corner. Images are taken in once, in their order; of a film that moves slowly
 only some are looked at.
 """
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import Image
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.planar import circular_median, wrap
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.homing.view_pairs import pair_generator
 from fgslam.homing.active_homing import parallax
@@ -37,11 +39,16 @@ PARALLAX_DEG = 2.0
 """Median of the common features between two path images; below, one of both is superfluous: the
 direction between them would hang on noise."""
 
+_BEND = 0.2
+"""Of the straight line between two path images, in its length, that the way between them may keep
+away: 0.4 m on a leg of 2 m, half the corridor that a wheelchair needs."""
+_BEND_SIGMAS = 2.0  # by which it must be farther
+
 _MISSES = 3  # images one after another without enough in common end a leg: one may be blurred
 _SKIPPED = 0.15  # of the images since the last path image: so many are passed over unseen
 _WEIGHT_BEFORE = 1.0  # vote of the path image before, against all votes of the images after it
 
-START, FULL, GAP, END = "start", "common features", "gap", "end"
+START, FULL, BEND, GAP, END = "start", "common features", "bend", "gap", "end"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +59,8 @@ class TaughtImage:
         number: of the image in the recording.
         name: its name.
         reason: ``start`` and ``end`` of the recording; ``common features``: the last one with
-            enough of them in common with the path image before; ``gap``: it has not, and there is
-            none in between.
+            enough of them in common with the path image before; ``bend``: the last one to which
+            the way was straight; ``gap``: it has too little in common, and there is none between.
         common: inliers of the homing vector from the path image before; 0 where it is refused.
         parallax_deg: their median parallax.
         direction_deg: of this image from the one before; NaN where it is not known.
@@ -103,10 +110,16 @@ class _Compared:
     row: TaughtImage
     inliers: BearingMatches | None
     near: bool
+    bent: bool = False
 
     @property
     def enough(self) -> bool:
         """Whether both could be neighbours on the path."""
+        return self.common and not self.bent
+
+    @property
+    def common(self) -> bool:
+        """Whether one can be seen well from the other."""
         if self.row.common < COMMON:
             return self.near
         return self.row.parallax_deg < PARALLAX_DEG or self.row.sigma_deg <= DIRECTION_DEG
@@ -123,6 +136,7 @@ class _Leg:
 
     begin: _View
     votes: Votes
+    way: list[TaughtImage] = field(default_factory=list)
     best: _Compared | None = None
     misses: list[_Compared] = field(default_factory=list)
 
@@ -195,6 +209,8 @@ class Teacher:
         found = self._compared(leg.begin, view)
         if found.inliers is not None:
             leg.votes = leg.votes.plus(found.inliers, 1.0, second=False)
+            found = replace(found, bent=found.apart and _bends(leg.way, found.row))
+            leg.way.append(found.row)
         if not found.enough:
             leg.misses.append(found)
             return
@@ -209,10 +225,11 @@ class Teacher:
             Later images, to be compared with it.
         """
         misses = [miss.view for miss in leg.misses]
+        first = leg.misses[0]
         if leg.best is not None:
-            self._begin(leg.best, FULL)
+            self._begin(leg.best, BEND if first.common else FULL)
             return [view for view in misses if view.number > leg.best.view.number]
-        self._begin(leg.misses[0], GAP)
+        self._begin(first, BEND if first.common else GAP)
         return misses[1:]
 
     def _go_to_the_end(self, leg: _Leg) -> None:
@@ -246,9 +263,17 @@ class Teacher:
         vector, matches = compare_views(first.features, view.features, self._settings, rng)
         if isinstance(vector, Refusal):
             row = TaughtImage(view.number, view.name, "", refusal=vector.details)
-            return _Compared(view, row, None, vector.reason is RefusalReason.AT_TARGET)
+            return _Compared(view, row, None, _is_near(vector, matches))
         inliers = matches.select(vector.inliers)
         return _Compared(view, _row_of(view, vector, inliers), inliers, False)
+
+
+def _is_near(refusal: Refusal, matches: BearingMatches) -> bool:
+    """Whether there is no homing vector because there is no way to speak of, only a turn."""
+    if refusal.reason in (RefusalReason.AMBIGUOUS, RefusalReason.UNCERTAIN):
+        turn = circular_median(wrap(matches.bearing_a - matches.bearing_b))
+        return parallax(matches, turn) < np.deg2rad(PARALLAX_DEG)
+    return refusal.reason is RefusalReason.AT_TARGET
 
 
 def _row_of(view: _View, vector: TwoViewVector, inliers: BearingMatches) -> TaughtImage:
@@ -261,6 +286,23 @@ def _row_of(view: _View, vector: TwoViewVector, inliers: BearingMatches) -> Taug
         direction_deg=float(np.rad2deg(vector.direction)),
         sigma_deg=float(np.rad2deg(np.sqrt(vector.covariance[0, 0]))),
     )
+
+
+def _bends(way: Sequence[TaughtImage], end: TaughtImage) -> bool:
+    """Whether images on the way lie clearly off the straight line to the image at its end.
+
+    Their distances are those of their parallax, in parts of the line: about, but that is enough.
+    """
+    if not way:
+        return False
+    seen = np.array([[one.parallax_deg, one.direction_deg, one.sigma_deg] for one in way])
+    far = seen[:, 0] / end.parallax_deg
+    turned = np.deg2rad(seen[:, 1] - end.direction_deg)
+    along, across = far * np.cos(turned), far * np.sin(turned)
+    off = np.hypot(along - np.clip(along, 0.0, 1.0), across)
+    sigma = far * np.deg2rad(np.hypot(seen[:, 2], end.sigma_deg))
+    least = max(_BEND, PARALLAX_DEG / end.parallax_deg)  # nearer the line is noise
+    return bool(np.any(off - _BEND_SIGMAS * sigma > least))
 
 
 def with_neighbours_votes(

@@ -22,6 +22,7 @@ from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import between
 from fgslam.datasets.simulated_homing import OmniWorld, open_house
 from fgslam.homing.active_homing import ActiveHoming
+from fgslam.homing.api import teach
 from fgslam.homing.closed_loop import Driver, World, follow
 from fgslam.homing.command import Command
 from fgslam.homing.drive_record import (
@@ -155,7 +156,7 @@ def drives_task(config: DrivingConfig, opener: Opener) -> Task[RunResult]:
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
     world, front_end = open_house_front_end(config, seed)
-    memory = PathMemory.of([front_end.describe(image) for image in world.targets])
+    memory = teach(world.targets, world.camera, features=config.features)
     return Opened(world, front_end, memory, world.target_poses)
 
 

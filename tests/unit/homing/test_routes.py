@@ -20,7 +20,17 @@ from fgslam.homing.command import HomingState
 from fgslam.homing.compact import MOST_COLUMNS, MOST_SIFT, Votes, best_all_around, compacted
 from fgslam.homing.feature_files import pack_features
 from fgslam.homing.settings import DRIVING
-from fgslam.homing.teaching import COMMON, END, FULL, GAP, PARALLAX_DEG, START, Taught, Teacher
+from fgslam.homing.teaching import (
+    BEND,
+    COMMON,
+    END,
+    FULL,
+    GAP,
+    PARALLAX_DEG,
+    START,
+    Taught,
+    Teacher,
+)
 from tests import textured_room
 
 FINE = textured_room.CAMERA
@@ -139,6 +149,17 @@ def test_few_images_are_chosen_and_each_shares_enough_with_the_last(taught: Taug
         assert abs(row.direction_deg) < 3.0  # straight on
     assert rows[-1].number == 12
     assert taught.seen <= 13
+
+
+def test_a_leg_ends_where_the_way_bends() -> None:
+    """Straight from begin to end of an L it would be 0.6 m off the way at the corner."""
+    corner = np.array([-0.8, -1.0])
+    there = [np.array([corner[0] - 0.3 * k, corner[1], 0.0]) for k in range(4, 0, -1)]
+    on = [np.array([corner[0], corner[1] + 0.3 * k, 1.5]) for k in range(5)]
+    rows = taught_from([picture(pose) for pose in (*there, *on)]).rows
+    assert [row.reason for row in rows] == [START, BEND, END]
+    place = np.array([*there, *on])[rows[1].number]
+    assert np.hypot(*(place[:2] - corner)) <= 0.3
 
 
 def test_images_of_one_place_are_one_path_image(film: list[Image]) -> None:
