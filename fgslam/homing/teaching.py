@@ -272,7 +272,7 @@ def _is_near(refusal: Refusal, matches: BearingMatches) -> bool:
     """Whether there is no homing vector because there is no way to speak of, only a turn."""
     if refusal.reason in (RefusalReason.AMBIGUOUS, RefusalReason.UNCERTAIN):
         turn = circular_median(wrap(matches.bearing_a - matches.bearing_b))
-        return parallax(matches, turn) < np.deg2rad(PARALLAX_DEG)
+        return bool(parallax(matches, turn) < np.deg2rad(PARALLAX_DEG))
     return refusal.reason is RefusalReason.AT_TARGET
 
 
