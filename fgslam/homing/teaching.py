@@ -301,7 +301,8 @@ def _bends(way: Sequence[TaughtImage], end: TaughtImage) -> bool:
     along, across = far * np.cos(turned), far * np.sin(turned)
     off = np.hypot(along - np.clip(along, 0.0, 1.0), across)
     sigma = far * np.deg2rad(np.hypot(seen[:, 2], end.sigma_deg))
-    least = max(_BEND, PARALLAX_DEG / end.parallax_deg)  # nearer the line is noise
+    # Nearer the line is noise: the legs on both sides of a bend must have their parallax.
+    least = max(_BEND, 2.0 * PARALLAX_DEG / end.parallax_deg)
     return bool(np.any(off - _BEND_SIGMAS * sigma > least))
 
 

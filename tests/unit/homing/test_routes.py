@@ -159,7 +159,7 @@ def test_a_leg_ends_where_the_way_bends() -> None:
     rows = taught_from([picture(pose) for pose in (*there, *on)]).rows
     assert [row.reason for row in rows] == [START, BEND, END]
     place = np.array([*there, *on])[rows[1].number]
-    assert np.hypot(*(place[:2] - corner)) <= 0.3
+    assert np.hypot(*(place[:2] - corner)) < 0.31  # one step of the robot
 
 
 def test_images_of_one_place_are_one_path_image(film: list[Image]) -> None:
