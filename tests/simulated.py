@@ -16,7 +16,6 @@ from fgslam.backend.protocol import Estimator
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
-from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.datasets.settings import ConstantVelocitySettings
@@ -26,6 +25,8 @@ from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
 from fgslam.worlds.driving import paths
 from fgslam.worlds.lab_settings import LabDriveSettings
+from fgslam.worlds.simulated import features
+from fgslam.worlds.simulated.features import visible
 from fgslam.worlds.simulated.landmarks import IdentityBook
 
 RIG = CameraRig(
@@ -41,8 +42,8 @@ RIG = CameraRig(
 )
 """The paper's rig: 320x240, 60 degrees, 10 cm baselines."""
 
-TURN_AND_GO = (0.0, 0.03, 0.0, 0.01, 0.0, 0.08)
 BORDER_PX = 5.0
+TURN_AND_GO = (0.0, 0.03, 0.0, 0.01, 0.0, 0.08)
 
 
 @dataclass(frozen=True)
@@ -102,16 +103,6 @@ def points_in_view(
     return np.column_stack(
         [(column - rig.cx) * depth / rig.fx, (row - rig.cy) * depth / rig.fy, depth]
     )
-
-
-def visible(rig: CameraRig, points: FloatArray) -> BoolArray:
-    """Which points (n, 3) in the camera's frame are in front and inside the reference image."""
-    front = points[:, 2] > 0.2
-    measured = g.project(rig, np.where(front[:, None], points, 1.0))
-    low = BORDER_PX
-    high = np.array([rig.width, rig.height]) - 1 - BORDER_PX
-    inside = ((measured[:, :2] > low) & (measured[:, :2] < high)).all(axis=1)
-    return np.asarray(front & inside)
 
 
 class _Identities:
@@ -244,47 +235,11 @@ def assert_same_bits(first: object, second: object) -> None:
         np.testing.assert_array_equal(x, y)
 
 
-class FeatureWorld:
-    """Points with an appearance, as ideal SIFT features of the rig's images.
-
-    Each point has its own descriptor, orientation and physical size; coordinates carry
-    independent normal noise.
-    """
+class FeatureWorld(features.FeatureWorld):
+    """As the project's own; by default of the paper's rig."""
 
     def __init__(self, points: FloatArray, rng: np.random.Generator, rig: CameraRig = RIG) -> None:
-        count = len(points)
-        self.points = points
-        self._rig = rig
-        self._rng = rng
-        self._descriptors = rng.integers(0, 120, (count, 128)).astype(np.uint8)
-        self._orientation = rng.uniform(0.0, 2.0 * np.pi, count)
-        self._size = rng.uniform(4.0, 12.0, count)
-
-    def features(
-        self, wTc: FloatArray, sigma_px: float = 0.0, hidden: IntArray | None = None
-    ) -> tuple[Features, ...]:
-        """Features of right, left[, top] image; the ``hidden`` points are not there."""
-        local = g.transform_to_camera(wTc, self.points)
-        shown = visible(self._rig, local)
-        if hidden is not None:
-            shown[hidden] = False
-        which = np.flatnonzero(shown)
-        column, row, disparity = g.project(self._rig, local[which]).T
-        places = [(column, row), (column + disparity, row)]
-        if self._rig.vertical_baseline is not None:
-            ratio = self._rig.vertical_baseline / self._rig.baseline
-            places.append((column, row + ratio * disparity))
-        return tuple(self._image(np.column_stack(at), which, local, sigma_px) for at in places)
-
-    def _image(
-        self, xy: FloatArray, which: IntArray, local: FloatArray, sigma_px: float
-    ) -> Features:
-        return Features(
-            xy=xy + sigma_px * self._rng.standard_normal(xy.shape),
-            scale=self._size[which] / local[which, 2],
-            orientation=self._orientation[which],
-            descriptors=self._descriptors[which],
-        )
+        super().__init__(points, rng, rig)
 
 
 def plan_drive(settings: LabDriveSettings) -> paths.Drive:

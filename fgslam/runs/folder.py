@@ -35,6 +35,7 @@ METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"
 LOG_FILE = "measurements.npz"
 STATE_FILE = "checkpoint.npz"
+SUBMAPS_FOLDER = "submaps"
 COMPARISON_FILE = "comparison.csv"
 CALIBRATION_FILE = "calibration.csv"
 CAMERA_FILE = "camera.json"
@@ -79,6 +80,7 @@ _RESULT_FILES = (
     "follow.csv",
     "logs/*.npz",
     "units/*.npz",
+    f"{SUBMAPS_FOLDER}/*.fgmap",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )

@@ -134,19 +134,19 @@ def saved_map(
         session: what its run needs to go on; None for nothing.
         evidence: the frames that are in it (:func:`evidence_of`); None where that is not known.
     """
-    database, places = pipeline.tracker.database, pipeline.places
+    book, places = pipeline.book, pipeline.places
     landmarks = estimate.landmarks
     if places is not None:  # no later frame of this run ends them
         landmarks = landmarks.without(places.ending)
-    rows = database.rows(landmarks.ids)
+    rows = book.rows(landmarks.ids)
     return SavedMap(
         rig=rig,
         landmarks=landmarks,
-        appearances=database.appearances(landmarks.ids),
-        hits=database.hits[rows],
-        misses=database.misses[rows],
-        permanent=database.lasting[rows],
-        colour=database.colour[rows],
+        appearances=book.appearances(landmarks.ids),
+        hits=book.hits[rows],
+        misses=book.misses[rows],
+        permanent=book.lasting[rows],
+        colour=book.colour[rows],
         trajectory=estimate.trajectory,
         about=about,
         session=session or {},

@@ -74,6 +74,10 @@ class MapSettings:
         Field(description="save also what `start: continue` needs"),
     ] = True
     begin: MapStartSettings = MapStartSettings()
+    active_radius_m: Annotated[
+        float | None,
+        Field(gt=0.0, description="landmarks farther away go to disk until needed; null: none"),
+    ] = None
 
     @property
     def given(self) -> bool:

@@ -12,7 +12,14 @@ import numpy as np
 
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.core.arrays import IntArray
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.estimates import (
+    EgoMotion,
+    EgoMotionStatus,
+    Estimate,
+    LandmarkMap,
+    Prediction,
+    UpdateStats,
+)
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.rig_correction import RigCorrection
@@ -23,10 +30,12 @@ from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
+from fgslam.slam.submaps.whole import LandmarkBook
 
 if TYPE_CHECKING:
     from fgslam.backend.filters.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
+    from fgslam.slam.submaps.memory import SubMaps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +74,7 @@ class SlamPipeline:
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
         key_frames: tracking between key frames; None where every frame is one.
         watch: says which frames' images cannot be used; None uses all.
+        submaps: landmarks far from the robot, on disk; None where all are in memory.
         describe: finds the features of a key frame that came without.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
@@ -80,6 +90,7 @@ class SlamPipeline:
     watch: CameraWatch | None = None
     located: Prediction | None = None
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
+    submaps: SubMaps | None = None
 
     def process(
         self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
@@ -100,11 +111,14 @@ class SlamPipeline:
         odometry = self.motion.between(timestamp, body)
         prediction = predicted(self.estimator, odometry)
         watch.lap("predict")
+        if self.submaps is not None:
+            self.submaps.before(prediction.wTc)
+            watch.lap("places")
         landmarks, ended = self._fused()
         carried = self._carried(prediction, found, landmarks)
         watch.lap("track")
         if self.key_frames is not None and carried is not None and self._goes_on(carried):
-            stereo = carried.carried.features
+            stereo, described = carried.carried.features, None
             seen = _Seen(carried.tracked.ego_motion, self.key_frames.book(carried))
         else:
             found = self._described(found)
@@ -113,7 +127,7 @@ class SlamPipeline:
             watch.lap("stereo")
             guessed = odometry is not None and not odometry.measured
             every, seen = self._track(prediction, found, every, landmarks, carried, guessed)
-            stereo = every.whole
+            stereo = described = every.whole
             watch.lap("track")
             seen = self._recognise(seen, stereo, landmarks)
         watch.lap("places")
@@ -126,7 +140,27 @@ class SlamPipeline:
         if self.calibration is not None:
             self.calibration.observe(increment, stats.wTc)
         watch.lap("calibrate")
+        if self.submaps is not None:
+            self.submaps.after(stats.wTc, described, any(stats.closed))
+            watch.lap("places")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
+
+    def estimate(self) -> Estimate:
+        """The estimator's, with the landmarks that are on disk."""
+        found = self.estimator.estimate()
+        if self.submaps is None:
+            return found
+        return dataclasses.replace(found, landmarks=self.submaps.whole().landmarks)
+
+    @property
+    def book(self) -> LandmarkBook:
+        """What is known of all landmarks beside their places."""
+        return self.tracker.database if self.submaps is None else self.submaps.whole()
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be said of landmarks on disk."""
+        return () if self.submaps is None else self.submaps.remarks
 
     def _watched(self, found: FeatureFrame) -> FeatureFrame:
         """The frame, without its images where these are not of one moment and this one."""

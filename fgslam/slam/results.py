@@ -281,7 +281,7 @@ def result_of(
         unknown = np.setdiff1d(estimate.landmarks.ids, pipeline.tracker.database.ids)
         estimate = replace(estimate, landmarks=estimate.landmarks.without(unknown))
     else:
-        estimate = pipeline.estimator.estimate()
+        estimate = pipeline.estimate()
     return SessionResult(
         kind=pipeline.estimator.kind,
         estimate=estimate,

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Self
 
 import numpy as np
@@ -46,6 +49,8 @@ from fgslam.slam.motion import MotionModel, description_of
 from fgslam.slam.part_remarks import part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
+from fgslam.slam.submaps.making import make_submaps
+from fgslam.slam.submaps.memory import ActiveArea, require_sets_aside
 
 
 @dataclass(frozen=True)
@@ -122,6 +127,9 @@ class Session:
         self.numbering = (0, 1)
         chosen = chosen_estimator(estimator)
         self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed)
+        self._seed = seed
+        self._area: ActiveArea | None = None
+        self._scratch: TemporaryDirectory[str] | None = None
         self._start: MapStart | None = None
         if isinstance(beginning, MapStart):
             beginning = self._begun(beginning, chosen, seed)
@@ -139,6 +147,7 @@ class Session:
         pipeline = self._make(beginning)
         describer, every = self._describer, self.frontend.tracking == "sift"
         pipeline.describe = describer.complete if every else describer.of_reference
+        self._near(pipeline)
         return pipeline
 
     def _begun(
@@ -157,6 +166,37 @@ class Session:
         self._start, self._map = start, start.name
         self._locate = make_locator(self.rig, self.frontend, start.saved, seed)
         return start.at(np.eye(4), relocalised=True)
+
+    def keep_near(self, radius_m: float, folder: Path | None = None) -> None:
+        """Keeps in memory only landmarks near the robot; the others wait on disk until needed.
+
+        What is tracked, and every result, is of the whole map. Called before the first frame.
+
+        Args:
+            radius_m: landmarks farther from the robot may leave; at least twice the distance over
+                which landmarks are matched.
+            folder: for the sub-maps; made when there is one. None: a temporary one.
+
+        Raises:
+            ConfigError: the radius is not positive, or the estimator keeps all landmarks.
+            SessionError: frames have been tracked already.
+        """
+        if len(self) or self._left_out.count:
+            raise SessionError("keep_near comes before the first frame; make a new session")
+        if not 0.0 < radius_m < math.inf:
+            raise ConfigError(f"active radius {radius_m} m: give a positive number of metres")
+        require_sets_aside(self.pipeline.estimator)
+        resumable = folder is not None
+        if folder is None:
+            self._scratch = TemporaryDirectory(prefix="fgslam-submaps-")
+            folder = Path(self._scratch.name) / "submaps"
+        self._area = ActiveArea(radius_m, folder, resumable)
+        self._near(self.pipeline)
+
+    def _near(self, pipeline: SlamPipeline) -> None:
+        area, rig = self._area, self.rig
+        if area is not None:
+            pipeline.submaps = make_submaps(area, rig, self.frontend, pipeline, self._seed)
 
     # -- frames ------------------------------------------------------------------------------
 
@@ -285,6 +325,7 @@ class Session:
         notes = stereo_remarks(self.recorder, self._seen)
         notes = (*camera_remarks(self.recorder, self.pipeline.watch), *notes)
         notes = (*part_remarks(self.recorder, self.pipeline.tracker.parts), *notes)
+        notes = (*notes, *self.pipeline.remarks)
         if left_out.count:
             notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
         with one_blas_thread():

@@ -29,6 +29,7 @@ from fgslam.backend.filters.loop_correction import (
 )
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.filters.self_calibration import SETTLING
+from fgslam.backend.filters.set_aside import SetAside
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray, StateArrays
@@ -116,16 +117,22 @@ class LandmarkRows:
 
     def add(self, ids: IntArray, positions: FloatArray, covariances: FloatArray, home: int) -> None:
         """Adds landmarks (k,), seen once; they must be new."""
-        before = len(self)
         ones = np.ones(len(ids), np.int64)
+        self.bring(LandmarkMap(ids, positions, covariances), ones, home * ones, home * ones)
+
+    def bring(
+        self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray, lasts: IntArray
+    ) -> None:
+        """Adds landmarks (k,) that are known already; none of them may be there."""
+        before = len(self)
         self._columns.append(
             {
-                "ids": ids,
-                "positions": positions,
-                "covariances": covariances,
-                "counts": ones,
-                "homes": home * ones,
-                "lasts": home * ones,
+                "ids": landmarks.ids,
+                "positions": landmarks.positions,
+                "covariances": landmarks.covariances,
+                "counts": counts,
+                "homes": homes,
+                "lasts": lasts,
             }
         )
         if not (np.diff(self.ids[max(before - 1, 0) :]) > 0).all():
@@ -144,8 +151,7 @@ class LandmarkRows:
     ) -> None:
         """Replaces everything; the arrays are copied."""
         self._columns.take(0, np.empty(0, np.int64))
-        self.add(landmarks.ids, landmarks.positions, landmarks.covariances, 0)
-        self.counts[:], self.homes[:], self.lasts[:] = counts, homes, lasts
+        self.bring(landmarks, counts, homes, lasts)
 
 
 class LandmarkKalman:
@@ -227,6 +233,34 @@ class LandmarkKalman:
     def chain(self) -> Chain:
         """The drive as tracked, with the uncertainty of its steps."""
         return self._drive.chain
+
+    def poses_of(self, frames: IntArray) -> FloatArray:
+        """Poses (k, 4, 4) of earlier frames as known now."""
+        return np.array([self._past.poses[frame] for frame in frames.tolist()]).reshape(-1, 4, 4)
+
+    def held_aside(self, ids: IntArray) -> SetAside:
+        """Copies of landmarks, with what it takes to give them back; nothing changes."""
+        rows = self._rows.rows(ids)
+        homes = self._rows.homes[rows]
+        frames = np.unique(homes[homes >= 0])
+        return SetAside(
+            landmarks=self._rows.map().select(rows),
+            counts=self._rows.counts[rows],
+            homes=homes,
+            lasts=self._rows.lasts[rows],
+            frames=frames,
+            timestamps=np.array(self._past.timestamps)[frames],
+            poses=self.poses_of(frames),
+        )
+
+    def give_up(self, ids: IntArray) -> None:
+        """Forgets landmarks that somebody else holds now."""
+        self._rows.remove(ids)
+
+    def take_back(self, aside: SetAside) -> None:
+        """Landmarks come back, moved by what closures have corrected their homes since."""
+        now = aside.moved(self.poses_of(aside.frames))
+        self._rows.bring(now, aside.counts, aside.homes, aside.lasts)
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
         """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.

@@ -102,6 +102,11 @@ class PlaceRecognition:
         return lost is None or not 0 < self._lost < lost.give_up_after
 
     @property
+    def lost(self) -> bool:
+        """Whether the last frame was located by nothing in the map."""
+        return self._lost > 0
+
+    @property
     def taken(self) -> tuple[bool, ...]:
         """Whether the estimator took the closures so far, in the log's order."""
         return tuple(self._memory.taken)

@@ -48,14 +48,22 @@ class LandmarkDatabase(LandmarkTable):
     @property
     def valid(self) -> BoolArray:
         """(n,) landmarks seen often enough to be trusted (6.1)."""
-        return np.asarray(self.hits >= self._settings.valid_hits)
+        return self.are_valid(self.hits)
+
+    def are_valid(self, hits: IntArray) -> BoolArray:
+        """(k,) which landmarks of so many hits are to be trusted (6.1)."""
+        return np.asarray(hits >= self._settings.valid_hits)
 
     @property
     def lasting(self) -> BoolArray:
         """(n,) landmarks that a map saved now should hold as permanent ones."""
+        return self.would_last(self.permanent, self.hits, self.misses)
+
+    def would_last(self, permanent: BoolArray, hits: IntArray, misses: IntArray) -> BoolArray:
+        """(k,) as :attr:`lasting`, of landmarks of these flags and counts."""
         if self._settings.permanence is None:
-            return self.permanent.copy()
-        return self.permanent | self._reliable(np.arange(len(self)), self._settings.permanence)
+            return permanent.copy()
+        return permanent | self._reliable(hits, misses, self._settings.permanence)
 
     def expected(self, landmarks: LandmarkMap, wTc: FloatArray) -> ExpectedLandmarks:
         """Landmarks of the map that should or may be in view from ``wTc`` (4.4)."""
@@ -101,7 +109,8 @@ class LandmarkDatabase(LandmarkTable):
         self._refresh(rows, Views.of(features, which, directions, self._frame))
         permanence = self._settings.permanence
         if permanence is not None and permanence.when == "running":
-            self.permanent[rows] |= self._reliable(rows, permanence)
+            counts = self.hits[rows], self.misses[rows]
+            self.permanent[rows] |= self._reliable(*counts, permanence)
 
     def record_carried(self, ids: IntArray) -> None:
         """A whole frame between key frames: landmarks hit whose looks nobody has described anew."""
@@ -201,9 +210,10 @@ class LandmarkDatabase(LandmarkTable):
 
         return wanted
 
-    def _reliable(self, rows: IntArray, permanence: PermanenceSettings) -> BoolArray:
-        trusted = self.hits[rows] >= self._settings.valid_hits
-        return trusted & reliable(self.hits[rows], self.misses[rows], permanence)
+    def _reliable(
+        self, hits: IntArray, misses: IntArray, permanence: PermanenceSettings
+    ) -> BoolArray:
+        return self.are_valid(hits) & reliable(hits, misses, permanence)
 
 
 _NEAR_PX = 40.0  # what is seen past a place is this near to it in the image

@@ -186,6 +186,37 @@ class LandmarkTable:
         self._next_id = int(ids[-1]) + 1 if len(ids) else 0
         self._frame = 0
 
+    def unseen_for(self, frames: int) -> BoolArray:
+        """(n,) landmarks that none of the last ``frames`` frames matched."""
+        return np.asarray(self._columns["seen"] + frames <= self._frame)
+
+    def held_aside(self, ids: IntArray) -> StateArrays:
+        """All entries of landmarks (ascending) and their views, as arrays; nothing changes."""
+        rows = self.rows(ids)
+        names = ("ids", "colour", "permanent", *_COUNTS)
+        out: StateArrays = {name: self._columns[name][rows] for name in names}
+        owner, places = self._places_of(rows)
+        views = self._pool.at(places)
+        out |= {name: getattr(views, name) for name in _VIEWS}
+        out["view_counts"] = np.bincount(owner, minlength=len(rows))
+        return out
+
+    def give_up(self, ids: IntArray) -> None:
+        """Forgets landmarks that somebody else holds now."""
+        gone = np.zeros(len(self), np.bool_)
+        gone[self.rows(ids)] = True
+        self._remove(gone)
+
+    def take_back(self, held: StateArrays) -> None:
+        """What :meth:`held_aside` gave comes back."""
+        before = len(self)
+        views = Views(**{name: held[name] for name in _VIEWS})
+        places = self._pool.load(held["view_counts"], views)
+        names = ("ids", "colour", "permanent", *_COUNTS)
+        self._columns.append({name: held[name] for name in names} | {_PLACES: places})
+        if before and len(self) > before and self.ids[before] < self.ids[before - 1]:
+            self._columns.take(0, np.argsort(self.ids, kind="stable"))
+
     def state(self) -> StateArrays:
         """All entries, as arrays; a snapshot."""
         out = self._columns.state()

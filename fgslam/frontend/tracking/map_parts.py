@@ -25,7 +25,9 @@ class MapParts:
 
     def __init__(self) -> None:
         """Nothing is there yet."""
-        self._landmarks = np.empty(0, np.int64)
+        self._of = np.empty(0, np.int64)  # with room for more: identities only grow
+        self._known = 0
+        self._several = False
         self._frames: list[int] = []
         self._newest = _FIRST
 
@@ -36,7 +38,11 @@ class MapParts:
     @property
     def several(self) -> bool:
         """Whether landmarks were ever begun at a guess that nothing has confirmed since."""
-        return bool((self._landmarks != _FIRST).any())
+        return self._several
+
+    @property
+    def _landmarks(self) -> IntArray:
+        return self._of[: self._known]
 
     def of(self, ids: IntArray) -> IntArray:
         """The part of each landmark (k,)."""
@@ -75,14 +81,16 @@ class MapParts:
     def state(self) -> StateArrays:
         """All of it."""
         return {
-            "landmarks": self._landmarks,
+            "landmarks": self._landmarks.copy(),
             "frames": np.array(self._frames, np.int64),
             "newest": np.array(self._newest),
         }
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
-        self._landmarks, self._newest = state["landmarks"], int(state["newest"])
+        self._of, self._newest = state["landmarks"].copy(), int(state["newest"])
+        self._known = len(self._of)
+        self._several = bool((self._of != _FIRST).any())
         self._frames = state["frames"].tolist()
 
     # ----------------------------------------------------------------------------------------
@@ -100,11 +108,15 @@ class MapParts:
         """Makes these parts one."""
         if len(held) > 1:
             self._landmarks[np.isin(self._landmarks, list(held))] = part
+            self._several = bool((self._landmarks != _FIRST).any())
             self._frames = [part if one in held else one for one in self._frames]
 
     def _begin(self, ids: IntArray, part: int) -> None:
-        if len(ids):
-            grown = np.full(max(int(ids.max()) + 1, len(self._landmarks)), _FIRST)
-            grown[: len(self._landmarks)] = self._landmarks
-            grown[ids] = part
-            self._landmarks = grown
+        if not len(ids):
+            return
+        known = max(int(ids.max()) + 1, self._known)
+        if known > len(self._of):
+            self._of = np.concatenate([self._of, np.full(known, _FIRST)])
+        self._known = known
+        self._of[ids] = part
+        self._several |= part != _FIRST

@@ -20,7 +20,13 @@ from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, provenance_of, run_task
-from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder, write_config
+from fgslam.runs.folder import (
+    COMPARISON_FILE,
+    SUBMAPS_FOLDER,
+    ExistingFolder,
+    is_run_folder,
+    write_config,
+)
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.owner import give_back
@@ -138,6 +144,8 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         seed=config.seed,
         beginning=arrival,
     )
+    if config.map.active_radius_m is not None:
+        session.keep_near(config.map.active_radius_m, run.folder / SUBMAPS_FOLDER)
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
     if run.resumed:

@@ -98,7 +98,7 @@ class RunOutputs:
 
     def write_results(self, status: str) -> EstimatorMetrics:
         """Log, trajectories, covariances, map, metrics and timing of the frames so far."""
-        estimate = self.pipeline.estimator.estimate()
+        estimate = self.pipeline.estimate()
         self.recorder.log.save(self.folder / LOG_FILE)
         truth = self._write_truth(with_landmarks=status == "finished")
         self._write_estimate(estimate)
@@ -156,7 +156,7 @@ class RunOutputs:
         online = Trajectory(
             estimate.trajectory.timestamps, np.array(self.recorder.online_poses).reshape(-1, 4, 4)
         )
-        points = map_points(estimate.landmarks, self.pipeline.tracker.database)
+        points = map_points(estimate.landmarks, self.pipeline.book)
         write_estimate(folder, online, estimate, points, self.remark)
 
     def _write_timing(self, trajectory: Trajectory) -> None:
@@ -182,7 +182,7 @@ class RunOutputs:
         of_images = stereo_remarks(self.recorder)
         of_parts = part_remarks(self.recorder, self.pipeline.tracker.parts)
         of_run = (*self.sequence.notes, *self.notes, *self._unlocated(), *of_parts)
-        return (*of_run, *of_cameras, *of_images)
+        return (*of_run, *of_cameras, *of_images, *self.pipeline.remarks)
 
     def _unlocated(self) -> tuple[str, ...]:
         found = located(self.recorder)
@@ -197,7 +197,7 @@ class RunOutputs:
             "frames_in_recording": len(self.sequence),
             "odometry": self.config.odometry.kind,
             "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
-            "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
+            "landmarks_permanent": int(self.pipeline.book.permanent.sum()),
             "remark": self.remark or None,
             "notes": list(self.remarks()),
         }
@@ -367,14 +367,14 @@ class RunFigures:
 def figures_of(outputs: RunOutputs) -> RunFigures:
     """A live run's figures."""
     # Once for all pictures: a smoother's estimate may take long.
-    estimate = outputs.pipeline.estimator.estimate()
-    database, recorder = outputs.pipeline.tracker.database, outputs.recorder
+    estimate = outputs.pipeline.estimate()
+    book, recorder = outputs.pipeline.book, outputs.recorder
     return RunFigures(
         name=outputs.config.name,
         synthetic=bool(outputs.remark),
         estimate=estimate,
         truth=outputs.sequence.ground_truth,
-        valid=database.valid[database.rows(estimate.landmarks.ids)],
+        valid=book.valid[book.rows(estimate.landmarks.ids)],
         frames=np.array([increment.index for increment in recorder.log], np.int64),
         matched=recorder.column("matched"),
         inliers=recorder.column("inliers"),

@@ -32,6 +32,8 @@ from fgslam.slam.results import RunRecorder
 def save_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     """Writes the state. The log must have been written before: it may not lack a frame of it."""
     write_arrays(folder / STATE_FILE, state_of(pipeline, recorder))
+    if pipeline.submaps is not None:
+        pipeline.submaps.tidy()
 
 
 def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
@@ -51,6 +53,8 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         parts["key_frames"] = pipeline.key_frames.state()
     if pipeline.watch is not None:
         parts["watch"] = pipeline.watch.state()
+    if pipeline.submaps is not None:
+        parts["submaps"] = pipeline.submaps.state()
     return {
         f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
     }
@@ -78,6 +82,8 @@ def restore(
         pipeline.key_frames.restore(_part(state, "key_frames"))
     if pipeline.watch is not None:
         pipeline.watch.restore(_part(state, "watch"))
+    if pipeline.submaps is not None:
+        pipeline.submaps.restore(_part(state, "submaps"))
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -294,7 +300,7 @@ def leave_map(outputs: RunOutputs) -> str:
 
 def _saved_map(outputs: RunOutputs) -> SavedMap:
     """The session's map with what is known of its drives."""
-    estimate = outputs.pipeline.estimator.estimate()
+    estimate = outputs.pipeline.estimate()
     about = {"drives": [*_drives_before(outputs), _drive(outputs, estimate)]}
     session = _session(outputs) if outputs.config.map.session else None
     before = None if outputs.given is None else outputs.given.saved

@@ -1,0 +1,76 @@
+"""Landmarks out of a filter's hands: what it takes to have them back as if they had never left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from fgslam.backend.filters.loop_correction import changes, home_changes, rotated, transported
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SetAside:
+    """Landmarks as they were, anchored to the frames that first saw them.
+
+    Attributes:
+        landmarks: n of them, in the world as it was then.
+        counts: (n,) frames in which each was seen.
+        homes: (n,) frame with which each moves when a loop is closed; -1 for one that stays.
+        frames: (k,) the homes, ascending, each once.
+        timestamps: (k,) theirs, seconds.
+        poses: (k, 4, 4) theirs, as they were then.
+    """
+
+    landmarks: LandmarkMap
+    counts: IntArray
+    homes: IntArray
+    frames: IntArray
+    timestamps: FloatArray
+    poses: FloatArray
+
+    def moved(self, poses: FloatArray) -> LandmarkMap:
+        """The landmarks beside their homes' poses (k, 4, 4) as known now; to the bit if unmoved."""
+        if np.array_equal(poses, self.poses):
+            return self.landmarks
+        place = np.where(self.homes < 0, -1, np.searchsorted(self.frames, self.homes))
+        by_landmark = home_changes(place, changes(self.poses, poses))
+        landmarks = self.landmarks
+        return LandmarkMap(
+            landmarks.ids,
+            transported(by_landmark, landmarks.positions),
+            rotated(by_landmark, landmarks.covariances),
+        )
+
+
+@runtime_checkable
+class SetsAside(Protocol):
+    """An estimator whose landmarks may leave its memory and come back; optional.
+
+    It keeps no correlations between landmarks: those that are away cannot be updated by what those
+    that are there see.
+    """
+
+    @property
+    def homes(self) -> IntArray:
+        """(n,) frame with which each landmark of the map moves; -1 for one that stays."""
+        ...
+
+    def poses_of(self, frames: IntArray) -> FloatArray:
+        """Poses (k, 4, 4) of earlier frames as known now."""
+        ...
+
+    def held_aside(self, ids: IntArray) -> SetAside:
+        """Copies of landmarks (ascending), with what it takes to give them back."""
+        ...
+
+    def give_up(self, ids: IntArray) -> None:
+        """Forgets landmarks that somebody else holds now."""
+        ...
+
+    def take_back(self, aside: SetAside) -> None:
+        """Landmarks come back, moved by what closures have corrected their homes since."""
+        ...

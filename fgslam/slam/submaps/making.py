@@ -1,0 +1,30 @@
+"""Joins sub-maps with the parts of a session."""
+
+from __future__ import annotations
+
+from fgslam.core.sensors import CameraRig
+from fgslam.frontend.settings import FrontendSettings, LoopSettings
+from fgslam.slam.factory import make_relocaliser
+from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.submaps.memory import ActiveArea, SubMapParts, SubMaps, require_sets_aside
+
+
+def make_submaps(
+    area: ActiveArea, rig: CameraRig, settings: FrontendSettings, pipeline: SlamPipeline, seed: int
+) -> SubMaps:
+    """Sub-maps of a pipeline that is at its first frame.
+
+    Raises:
+        ConfigError: its estimator keeps every landmark in memory.
+    """
+    loops = settings.loops or LoopSettings()
+    parts = SubMapParts(
+        rig=rig,
+        database=pipeline.tracker.database,
+        estimator=require_sets_aside(pipeline.estimator),
+        places=pipeline.places,
+        relocaliser=make_relocaliser(rig, settings),
+        max_drift_share=loops.max_drift_share,
+        seed=seed,
+    )
+    return SubMaps(area, parts)
