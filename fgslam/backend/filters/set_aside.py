@@ -20,6 +20,7 @@ class SetAside:
         landmarks: n of them, in the world as it was then.
         counts: (n,) frames in which each was seen.
         homes: (n,) frame with which each moves when a loop is closed; -1 for one that stays.
+        lasts: (n,) frame that saw each last.
         frames: (k,) the homes, ascending, each once.
         timestamps: (k,) theirs, seconds.
         poses: (k, 4, 4) theirs, as they were then.
@@ -28,6 +29,7 @@ class SetAside:
     landmarks: LandmarkMap
     counts: IntArray
     homes: IntArray
+    lasts: IntArray
     frames: IntArray
     timestamps: FloatArray
     poses: FloatArray

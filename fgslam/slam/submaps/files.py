@@ -19,7 +19,7 @@ from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
 
-_OF_ESTIMATOR = ("counts", "homes", "frames")
+_OF_ESTIMATOR = ("counts", "homes", "lasts", "frames")
 _OF_DATABASE = ("missed", "seen", "contradicted", "view_counts", "used")
 FILES = "[0-9]" * 6 + ".fgmap"
 
@@ -101,6 +101,7 @@ def _geometry(saved: SavedMap) -> SetAside:
         landmarks=saved.landmarks,
         counts=session["counts"],
         homes=session["homes"],
+        lasts=session["lasts"],
         frames=session["frames"],
         timestamps=saved.trajectory.timestamps,
         poses=saved.trajectory.poses,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import FrontendSettings, LoopSettings
 from fgslam.slam.factory import make_relocaliser
@@ -26,5 +27,6 @@ def make_submaps(
         relocaliser=make_relocaliser(rig, settings),
         max_drift_share=loops.max_drift_share,
         seed=seed,
+        settling=0 if pipeline.calibration is None else SETTLING,
     )
     return SubMaps(area, parts)

@@ -86,7 +86,10 @@ class _Stored:
 
 @dataclass(frozen=True)
 class SubMapParts:
-    """The parts of a session that sub-maps are cut from and come back to."""
+    """The parts of a session that sub-maps are cut from and come back to.
+
+    ``settling``: frames in which all stays in memory, as a new calibration may move the map.
+    """
 
     rig: CameraRig
     database: LandmarkDatabase
@@ -95,6 +98,7 @@ class SubMapParts:
     relocaliser: Locator
     max_drift_share: float
     seed: int
+    settling: int = 0
 
 
 class SubMaps:
@@ -173,7 +177,8 @@ class SubMaps:
         self._frame += 1
         if corrected:
             self._refresh()
-        if not np.linalg.norm(here - self._looked) < _STEP * self._area.radius_m:
+        settled = self._frame > self._parts.settling
+        if settled and not np.linalg.norm(here - self._looked) < _STEP * self._area.radius_m:
             self._looked = here
             self._put_away()
         if features is not None and len(features):

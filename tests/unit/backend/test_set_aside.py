@@ -44,6 +44,7 @@ def test_landmarks_move_with_the_frame_that_first_saw_them() -> None:
         landmarks=LandmarkMap(np.array([3, 5, 9]), points, covariances),
         counts=np.ones(3, np.int64),
         homes=np.array([4, 7, -1]),
+        lasts=np.array([4, 7, 7]),
         frames=np.array([4, 7]),
         timestamps=np.array([4.0, 7.0]),
         poses=poses,
