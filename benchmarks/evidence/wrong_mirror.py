@@ -28,6 +28,7 @@ ERRORS = (
     (0.0, 2.0),
     (0.0, 4.0),
     (0.05, 4.0),
+    (0.08, 10.0),
 )
 """Of the mirror's parameters, relative, and of its centre in pixels."""
 

@@ -45,3 +45,20 @@ def test_a_path_in_the_rendered_house(tmp_path: Path) -> None:
     values = metrics_of("path_following", tmp_path / "run", "trials=2")
     assert values["arrived"] == 2
     assert values["pass_distance_max_m"] <= 0.2
+
+
+def test_a_robot_whose_mirror_is_calibrated_wrongly_comes_home(tmp_path: Path) -> None:
+    wrong = ("dataset.calibration.mirror=0.05", "dataset.calibration.centre_px=4")
+    exact = metrics_of("homing_lab", tmp_path / "exact", "trials=2")
+    values = metrics_of("homing_lab", tmp_path / "wrong", "trials=2", *wrong)
+    assert values["arrived"] == 2
+    assert values["pass_distance_max_m"] <= 0.3
+    assert values["pass_distance_max_m"] != exact["pass_distance_max_m"]
+
+
+def test_a_robot_beside_its_path_is_on_it_after_a_leg(tmp_path: Path) -> None:
+    aside = ("trials=2", "dataset.path.legs=2", "start_offset_m=1.5")
+    values = metrics_of("path_following", tmp_path / "run", *aside)
+    assert values["arrived"] == 2
+    # The second target is the last: the robot stops where 7 % of the leg of 2 m are left.
+    assert values["pass_distance_median_m"] <= 0.12
