@@ -61,7 +61,7 @@ class DoubtedMarginals:
             EstimatorError: the measurements do not determine all variables.
         """
         system = graph.linear(state)
-        held, prior, shared = reduced(system), prior_information(rig.rig), _shared(rig)
+        held, prior, shared = reduced(system), prior_information(rig.rig), shared_covariance(rig)
         p, terms = len(prior), slice(len(prior) + len(shared))
         pull, own = graph.pulled(state, lambda measured: shifts(rig.rig, measured)[..., terms])
         gain = np.column_stack([_step(held, system, one) for one in pull.T])
@@ -99,7 +99,7 @@ def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
     return np.asarray(fuse @ np.concatenate(of_pixels, axis=2))
 
 
-def _shared(correction: RigCorrection) -> FloatArray:
+def shared_covariance(correction: RigCorrection) -> FloatArray:
     """(q, q) covariance of what nothing estimates; (0, 0) of an exact rig."""
     if correction.rig.exact:
         return np.empty((0, 0))

@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated import RIG
-from smoothing import drawn, run
+from simulated import RIG, play
+from smoothing import FREE, drawn, run
 
-from fgslam.backend.settings import BatchSettings, KernelSettings
+from fgslam.backend.settings import BatchSettings, Isam2Settings, KernelSettings
+from fgslam.backend.smoothers.online_doubt import OnlineDoubt
 from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals, shifts
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import (
     SHARED,
     RigCorrection,
@@ -24,7 +26,9 @@ from fgslam.core.rig_correction import (
     shared_information,
     term_names,
 )
+from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.consistency import pose_nees
+from fgslam.slam.factory import make_estimator
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
 CALIBRATED = RigCorrection.none(dataclasses.replace(RIG, exact=False))
@@ -136,3 +140,50 @@ def test_rigs_that_are_off_as_assumed_leave_consistent_poses() -> None:
         held.append(per_dof(poses, doubted.held.poses()[1:], truth))
     assert np.mean(held) > 2.0
     assert 0.75 < np.mean(found) < 1.25
+
+
+def driven(frames: int) -> OnlineDoubt:
+    """After the first frames of a drive, at its true poses."""
+    drive = drawn(3, frames=12)
+    online = OnlineDoubt(CALIBRATED.rig)
+    for increment, wTc in zip(drive.increments[:frames], drive.poses, strict=False):
+        online.observe(increment, wTc)
+    return online
+
+
+@pytest.mark.parametrize("term", ["column", "focal", "radial", "baseline"])
+def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
+    by = 1e-3 / RIG.fx * (np.array(ALL) == term)
+    first = drawn(3, frames=12).increments[0].observations
+    moved = first.measurement + shifts(RIG, first.measurement) @ by
+    before, after = g.triangulate(RIG, first.measurement), g.triangulate(RIG, moved)
+    turned = (after - before) @ drawn(3, frames=12).poses[0][:3, :3].T
+    gain = driven(1)._map["gain"] @ by[-len(SHARED) :]
+    np.testing.assert_allclose(gain, turned, rtol=1e-3, atol=1e-4 * np.abs(turned).max())
+
+
+def test_the_newest_pose_is_as_uncertain_as_the_whole_graph_has_it() -> None:
+    """Within a factor of two: a filter does not go back to earlier poses."""
+    refined, shared = solved(), slice(len(EXACT.values), None)
+    whole = DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
+    gain = whole.gain[-6:, shared]
+    known = np.diagonal(gain @ whole.correction[shared, shared] @ gain.T)
+    ratio = np.sqrt(np.diagonal(driven(12).added(CALIBRATED)) / known)
+    assert (ratio > 0.5).all()
+    assert (ratio < 2.0).all(), ratio
+
+
+def test_online_covariances_of_a_calibrated_rig_hold_its_error_and_of_an_exact_one_none() -> None:
+    settings, zero = Isam2Settings(noise_factor=1.0), np.zeros(len(EXACT.values))
+    increments = drawn(3, frames=12).increments
+    applied = [dataclasses.replace(each, rig_correction=zero) for each in increments]
+
+    def last(rig: CameraRig, of: list[Increment]) -> FloatArray:
+        return np.asarray(play(make_estimator(rig, settings, FREE), of, FREE)[-1].covariance)
+
+    exact, calibrated = last(EXACT.rig, applied), last(CALIBRATED.rig, applied)
+    np.testing.assert_array_equal(exact, last(CALIBRATED.rig, increments))
+    np.testing.assert_allclose(
+        calibrated - exact, driven(12).added(CALIBRATED), rtol=0.5, atol=1e-4
+    )
+    assert np.trace(calibrated) > 1.2 * np.trace(exact)
