@@ -191,7 +191,9 @@ class LandmarkKalman:
         if not (early and before.size and len(known) and isinstance(self._rig, CameraRig)):
             return None
         change = RigChange(self._rig, correction - before)
-        poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
+        # One that a smoother started anew was seen in the last frame, which was over by then.
+        lasts = np.minimum(self._rows.lasts[known], len(self._past) - 1)
+        poses = np.array([*self._past.poses[:-1], self._current.wTc])[lasts]
         moved, off_px = change.moved(poses, self._rows.positions[known])
         if not off_px > _CONTRADICTED * self._disparity_sigma:
             return None

@@ -96,6 +96,16 @@ def test_a_landmark_moves_along_its_ray_to_where_it_is() -> None:
     assert off_px == pytest.approx(1.0, abs=0.02)
 
 
+def test_a_landmark_started_anew_moves_with_the_others(drive: Simulation) -> None:
+    increments = known_from(WINDOW, 2.0, drive)[:WINDOW]
+    estimator = make_estimator(RIG, LandmarkKalmanSettings())
+    play(estimator, increments)
+    estimator.restart(increments[-1].observations.select(np.arange(3)))
+    before = estimator.landmarks().positions.copy()
+    estimator.recalibrate(yaw(2.0))
+    assert (estimator.landmarks().positions != before).any(axis=1).mean() > 0.5
+
+
 @pytest.mark.parametrize("kind", SETTINGS)
 def test_a_correction_found_after_the_first_window_leaves_no_contradiction(
     kind: str, drive: Simulation
