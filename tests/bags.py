@@ -170,11 +170,13 @@ class Maker:
                 self.connections[topic] = made
             message = self.message(kind, stamp, fields)
             serialize = self.store.serialize_ros1 if self.ros1 else self.store.serialize_cdr
-            writer.write(self.connections[topic], stamp + LATE_NS, serialize(message, kind))
+            raw = bytes(serialize(message, kind))[: fields.get("kept_bytes")]
+            writer.write(self.connections[topic], stamp + LATE_NS, raw)
 
     def message(self, kind: str, stamp: int, fields: dict[str, Any]) -> Any:
         values = dict(fields)
         frame = values.pop("frame", "camera")
+        values.pop("kept_bytes", None)
         if kind.endswith("TFMessage"):
             made = [self._transform(stamp, *each) for each in fields["transforms"]]
             return self.store.types[kind](transforms=made)

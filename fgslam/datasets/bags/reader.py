@@ -114,7 +114,12 @@ def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
             tree.add(found, static=topic.endswith("tf_static"))
             return topic, time, time, None
         if topic == motion or topic not in frames:
-            content = files.decoded(connection, raw)
+            try:
+                content = files.decoded(connection, raw)
+            except FrameError:
+                if topic not in images:
+                    raise
+                return topic, time, files.stamp(raw), None  # one lost frame
             frames.setdefault(topic, messages.frame_of(content))
             if topic in infos:
                 first[topic] = messages.calibration_of(content)
@@ -132,7 +137,7 @@ def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
     moved = [(row[2], row[3]) for row in rows if row[0] == motion]
     values = np.array([value for _, value in moved])
     motions = (NANOSECONDS * np.array([stamp for stamp, _ in moved], np.float64), values)
-    parts = (places, by_stamp, first, frames, tree, motions)
+    parts = (places, by_stamp, first, dict.fromkeys(topics, "") | frames, tree, motions)
     return _Index(topics, times, *parts, tuple(notes))
 
 

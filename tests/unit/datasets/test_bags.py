@@ -204,6 +204,16 @@ def test_an_image_of_another_size_is_one_lost_frame(tmp_path: Path) -> None:
     assert codes(recording, 2) == (12, 62)
 
 
+def test_a_first_message_that_is_cut_is_one_lost_frame(tmp_path: Path, ending: str) -> None:
+    messages = stereo(3)
+    k = next(i for i, m in enumerate(messages) if m[0] == "/cam/left/image_raw")
+    messages[k] = (*messages[k][:3], {**messages[k][3], "kept_bytes": 40})
+    recording = opened(write_bag(tmp_path / f"a{ending}", messages))
+    with pytest.raises(FrameError, match=r"of /cam/left/image_raw .* cannot be decoded"):
+        recording.frame(0)
+    assert codes(recording, 2) == (12, 62)
+
+
 # --------------------------------------------------------------------------------------------
 # Odometry
 
