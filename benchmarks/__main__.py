@@ -33,7 +33,7 @@ from benchmarks.evidence import (
 from benchmarks.measured import keep
 from benchmarks.pages import write_pages
 from benchmarks.runs import DATA, say
-from benchmarks.speed import long_drive, parts
+from benchmarks.speed import long_drive, parts, submaps
 from benchmarks.tables import Table
 from fgslam.core.errors import ConfigError, FgslamError
 
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = ("pages", "keep", "speed", "long_drive", *sorted(EVIDENCE))
+    names = ("pages", "keep", "speed", "long_drive", "submaps", *sorted(EVIDENCE))
     parser.add_argument("what", choices=names, metavar="NAME", help=", ".join(names))
     parser.add_argument("path", type=Path, nargs="?", help="keep: run folder or file of --out")
     parser.add_argument("--out", type=Path, help="write the numbers as JSON to this file")
@@ -92,6 +92,8 @@ def _do(given: argparse.Namespace) -> None:
         say(f"kept {keep(given.path)}; now `python -m benchmarks pages`")
     elif given.what == "speed":
         _write_ratios(parts.measure(given.part, given.frames), given.out or Path("bench.json"))
+    elif given.what == "submaps":
+        _write_ratios(submaps.numbers(), given.out or Path("bench_submaps.json"))
     elif given.what == "long_drive":
         _write_ratios(long_drive.ratios_beside_batch(), given.out or Path("bench_long.json"))
     else:
