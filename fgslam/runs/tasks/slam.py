@@ -53,6 +53,7 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.session import Session
+from fgslam.slam.submaps.memory import require_sets_aside
 
 Watch: TypeAlias = Callable[[RunOutputs, FrameReport], None]
 """Called after each frame, with all that the run has computed; changes nothing of it."""
@@ -107,6 +108,10 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
         opened = state.window(config, given)
     sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
+    if config.map.active_radius_m is not None:
+        require_sets_aside(
+            make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
+        )
     if config.map.given and config.map.start != "continue":
         estimator = make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
         user = require_map_user(estimator, config.map.extend)
