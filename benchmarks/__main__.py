@@ -1,8 +1,9 @@
 """Measures speed or accuracy, stores what was measured, writes the pages of results.
 
-`python -m benchmarks NAME` prints one set of tables as Markdown; `speed` and `long_drive` write
-`bench.json` and `bench_long.json`; `keep PATH` stores such a file, or the numbers of a run folder,
-in benchmarks/measured; `pages` writes docs/results from benchmarks/results and benchmarks/measured.
+`python -m benchmarks NAME` prints one set of tables as Markdown; `speed`, `long_drive` and `soak`
+write `bench.json`, `bench_long.json` and `bench_soak.json`; `keep PATH` stores such a file, or the
+numbers of a run folder, in benchmarks/measured; `pages` writes docs/results from benchmarks/results
+and benchmarks/measured.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from benchmarks.evidence import (
 from benchmarks.measured import keep
 from benchmarks.pages import write_pages
 from benchmarks.runs import DATA, say
-from benchmarks.speed import long_drive, parts, submaps
+from benchmarks.speed import long_drive, parts, soak, submaps
 from benchmarks.tables import Table
 from fgslam.core.errors import ConfigError, FgslamError
 
@@ -72,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = ("pages", "keep", "speed", "long_drive", "submaps", *sorted(EVIDENCE))
+    names = ("pages", "keep", "speed", "long_drive", "soak", "submaps", *sorted(EVIDENCE))
     parser.add_argument("what", choices=names, metavar="NAME", help=", ".join(names))
     parser.add_argument("path", type=Path, nargs="?", help="keep: run folder or file of --out")
     parser.add_argument("--out", type=Path, help="write the numbers as JSON to this file")
@@ -96,6 +97,8 @@ def _do(given: argparse.Namespace) -> None:
         _write_ratios(submaps.numbers(), given.out or Path("bench_submaps.json"))
     elif given.what == "long_drive":
         _write_ratios(long_drive.ratios_beside_batch(), given.out or Path("bench_long.json"))
+    elif given.what == "soak":
+        _write_ratios(soak.traces(), given.out or Path("bench_soak.json"))
     else:
         _print_tables(given.what, given.data, given.out)
 

@@ -15,6 +15,7 @@ from benchmarks.speed import (
     maps,
     relocalising,
     smoothers,
+    soak,
     starting,
 )
 from benchmarks.speed.drives import open_drive
@@ -28,6 +29,7 @@ LIMITS: dict[str, float] = (
     | maps.LIMITS
     | relocalising.LIMITS
     | smoothers.LIMITS
+    | soak.LIMITS
     | starting.LIMITS
 )
 """Largest allowed value of each bounded ratio, by its name in `bench.json`."""
