@@ -240,7 +240,7 @@ class FixedLagSolver:
             many = EstimatorError("too many landmarks left it indeterminate")
             raise solver_failed(self.kind, many, self._builder.frames[-1])
         for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
-            self._poses[frame] = pose
+            self._poses[frame] = pose.copy()  # a view would keep the whole window's array
 
     def _take_out(self, error: LandmarkUndeterminedError) -> None:
         self._window.take_out(error.variable)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from array import array
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -119,15 +120,13 @@ class GraphBuilder:
         self._settings = settings
         self._floor = floor
         self._prior = prior
-        factor = settings.noise_factor
-        self.noise: MeasurementNoise = (
-            Persistence(sensor) if factor is None else StatedNoise(factor)
-        )
+        given = settings.noise_factor
+        self.noise: MeasurementNoise = Persistence(sensor) if given is None else StatedNoise(given)
         self._applied: FloatArray | None = None
         self._variance_of: dict[int, float] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
-        self._id_of: list[int] = []
+        self._id_of = array("q")  # eight bytes a variable, which is all a bounded lag keeps of it
         self.observed = GrowingColumns(
             frame=np.empty(0, np.int64),
             variable=np.empty(0, np.int64),

@@ -23,9 +23,11 @@ from smoothing import (
 )
 
 from fgslam.backend.settings import FixedLagSettings
+from fgslam.backend.smoothers.fixed_lag import FixedLagSolver
 from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.backend.smoothers.window import LandmarkUndeterminedError
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
 
@@ -119,6 +121,20 @@ def test_factors_and_variables_do_not_grow_with_the_run() -> None:
     assert (late[:, 3] == 6).all()
     assert (late[:, 4] == 0).all()
     assert late[:, 5].mean() <= 1.3 * per_frame * early[:, 5].mean()
+
+
+def test_a_frame_that_left_keeps_no_array_of_its_window() -> None:
+    """A view of one row would keep the poses of the whole lag for each frame of the run."""
+    estimator = smoother()
+    play(estimator, drawn(1, frames=10).increments, FREE)
+    solver = estimator._solver
+    assert isinstance(solver, FixedLagSolver)
+    assert max(_held_by(pose) for pose in solver._poses[:-1]) == 4 * 4 * 8
+
+
+def _held_by(array: FloatArray) -> int:
+    """Bytes that an array keeps alive, itself or as a view of another."""
+    return array.nbytes if array.base is None else _held_by(array.base)
 
 
 def test_landmark_that_left_keeps_its_place_until_it_is_seen_again() -> None:

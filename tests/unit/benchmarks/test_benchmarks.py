@@ -20,7 +20,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import images, parts
+from benchmarks.speed import images, parts, soak
 from benchmarks.tables import Table
 
 
@@ -220,3 +220,13 @@ def test_too_few_frames_over_images_are_refused_in_one_line(
     asked = ["speed", "--part", "images", "--frames", str(images.LEAST - 1)]
     assert runner.main(asked) == 2
     assert f"give {images.LEAST} or more" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_soak_gives_time_and_memory_of_every_block() -> None:
+    found = soak._trace(("landmark_kalman", 200, 50))
+    blocks = [found[f"soak_landmark_kalman_{stop}_ms"] for stop in (50, 100, 150, 200)]
+    assert min(blocks) > 0.0
+    assert found["soak_landmark_kalman_ms_last_over_second_block"] == blocks[-1] / blocks[1]
+    grown = found["soak_landmark_kalman_200_mb"] - found["soak_landmark_kalman_100_mb"]
+    assert found["soak_landmark_kalman_kb_a_frame_second_half"] == pytest.approx(1e3 * grown / 100)
