@@ -44,7 +44,9 @@ def _trace(given: tuple[str, int, int]) -> dict[str, float]:
     drive = open_drive("lab_trials", _endless(frames))
     player = Player(drive, ESTIMATORS[name])
     player.on_to(1)
-    out, before, mb = {}, resident_mb(), []
+    out: dict[str, float] = {}
+    before = resident_mb()
+    mb: list[float] = []
     for stop in range(block, frames + 1, block):
         player.on_to(stop)
         mb.append(resident_mb() - before)
