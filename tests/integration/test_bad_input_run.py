@@ -240,7 +240,7 @@ def test_a_depth_image_that_cannot_be_read_ends_the_run_which_goes_on_later(
         ({"baseline_m": -0.1}, "left and right are swapped, swap the folders"),
         ({"fy": None}, "has no 'fy'; add it"),
         ({"fy": "big"}, "fy is 'big', not a finite number"),
-        ({"width": 640, "height": 480}, "images are 160x120 but the calibration says 640x480"),
+        ({"width": 640, "height": 480}, "is for images of 640x480 pixels"),
     ],
 )
 def test_bad_calibration(

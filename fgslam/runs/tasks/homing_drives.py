@@ -156,7 +156,8 @@ def drives_task(config: DrivingConfig, opener: Opener) -> Task[RunResult]:
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
     world, front_end = open_house_front_end(config, seed)
-    memory = teach(world.targets, world.calibration, features=config.features)
+    taught = teach(world.targets, world.calibration, features=config.features)
+    memory = PathMemory.of(taught.images)  # the front-end has the camera
     return Opened(world, front_end, memory, world.target_poses)
 
 

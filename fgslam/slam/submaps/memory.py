@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
@@ -26,11 +26,13 @@ from fgslam.core.features import StereoFeatures
 from fgslam.core.files import make_subfolder
 from fgslam.core.geometry import inverse
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.places.recognition import Locator, PlaceRecognition
 from fgslam.frontend.places.word_index import WordIndex, pair_words
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.slam.submaps.files import FILES, SubMap, file_of, read_submap, write_submap
 from fgslam.slam.submaps.whole import WholeMap
+
+if TYPE_CHECKING:  # loads what only recognition needs
+    from fgslam.frontend.places.recognition import Locator, PlaceRecognition
 
 _CUBE = 0.5  # side, of the radius
 _FAR = 1.6  # distance of a cube's middle, of the radius: 0.17 beyond where it would come back
