@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -49,8 +49,9 @@ from fgslam.slam.motion import MotionModel, description_of
 from fgslam.slam.part_remarks import part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
-from fgslam.slam.submaps.making import make_submaps
-from fgslam.slam.submaps.memory import ActiveArea, require_sets_aside
+
+if TYPE_CHECKING:
+    from fgslam.slam.submaps.memory import ActiveArea
 
 
 @dataclass(frozen=True)
@@ -185,6 +186,8 @@ class Session:
             raise SessionError("keep_near comes before the first frame; make a new session")
         if not 0.0 < radius_m < math.inf:
             raise ConfigError(f"active radius {radius_m} m: give a positive number of metres")
+        from fgslam.slam.submaps.memory import ActiveArea, require_sets_aside
+
         require_sets_aside(self.pipeline.estimator)
         resumable = folder is not None
         if folder is None:
@@ -196,6 +199,8 @@ class Session:
     def _near(self, pipeline: SlamPipeline) -> None:
         area, rig = self._area, self.rig
         if area is not None:
+            from fgslam.slam.submaps.making import make_submaps
+
             pipeline.submaps = make_submaps(area, rig, self.frontend, pipeline, self._seed)
 
     # -- frames ------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ import yaml
 import fgslam as fg
 from fgslam.cli.main import app
 from fgslam.datasets.simulated_homing import open_house
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.homing.settings import DRIVING, AvoidanceSettings, HomingBehaviourSettings
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.house_settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
@@ -83,10 +82,7 @@ def test_a_follower_commands_what_the_closed_loop_does(tmp_path: Path, world: Om
     assert len(written) == STEPS
     world.put(world.reference_poses[0])
     behaviour = HomingBehaviourSettings(avoidance=AvoidanceSettings(method="none"))
-    # The closed loop remembers all features of its targets, not those that fg.teach keeps.
-    extractor = OmniFeatureExtractor(world.camera, DRIVING.features)
-    whole = [extractor.extract(np.asarray(image)) for image in world.targets]
-    path = fg.PathMemory.of(whole, None, world.camera)
+    path = fg.teach(world.targets, world.camera)
     follower = fg.PathFollower(world.camera, path, behaviour=behaviour, seed=SEED)
     for k, row in enumerate(written):
         command = follower.step(world.image(k * DT), k * DT)

@@ -53,7 +53,6 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.session import Session
-from fgslam.slam.submaps.memory import require_sets_aside
 
 Watch: TypeAlias = Callable[[RunOutputs, FrameReport], None]
 """Called after each frame, with all that the run has computed; changes nothing of it."""
@@ -109,6 +108,8 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
     sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
     if config.map.active_radius_m is not None:
+        from fgslam.slam.submaps.memory import require_sets_aside
+
         require_sets_aside(
             make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
         )

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances
 from fgslam.core.files import clear_output_errors
 from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.slam.submaps.files import SubMap
+
+if TYPE_CHECKING:
+    from fgslam.slam.submaps.files import SubMap
 
 _VIEWS = ("descriptors", "size", "orientation", "direction")
 _COLUMNS = ("hits", "misses", "permanent", "colour")
@@ -74,7 +76,7 @@ class LandmarkBook(Protocol):
         ...
 
 
-Pieces = Callable[[], Iterator[tuple[LandmarkMap, SubMap]]]
+Pieces = Callable[[], Iterator[tuple[LandmarkMap, "SubMap"]]]
 """All parts of the map, one after the other: landmarks where they are now, and what they are."""
 
 
