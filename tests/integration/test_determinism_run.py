@@ -52,6 +52,7 @@ def test_another_seed_matters_where_it_should(recording: Path, tmp_path: Path) -
     assert bytes_of(one.folder) != bytes_of(two.folder)
 
 
+@pytest.mark.slow
 def test_pictures(recording: Path, tmp_path: Path) -> None:
     """Drawn twice, the second time by a run that was interrupted and resumed."""
     values = experiment(

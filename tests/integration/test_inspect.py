@@ -338,6 +338,7 @@ def test_experiment_file_opens_its_recording(tmp_path: Path) -> None:
         inspect_recording(experiment, ["dataset.strid=2"])
 
 
+@pytest.mark.slow
 def test_rendered_lab_is_found_sound(
     tmp_path: Path, open3d: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:

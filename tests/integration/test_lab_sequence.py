@@ -329,6 +329,7 @@ def test_blocked_view_is_dark_and_has_no_truth() -> None:
     assert np.isfinite(sequence.depth(0)).all()
 
 
+@pytest.mark.slow
 def test_second_visit_finds_some_furniture_moved_and_the_rest_as_it_was() -> None:
     now = RenderedLabSequence(QUICK, 0, stride=31)
     then = RenderedLabSequence(replace(QUICK, visit=2), 0, stride=31)

@@ -52,6 +52,7 @@ def right(matches: BearingMatches, a: FloatArray, b: FloatArray) -> BoolArray:
     return np.abs(np.ravel(residual)) < np.deg2rad(1.5)
 
 
+@pytest.mark.slow
 def test_more_right_matches_and_no_more_wrong_ones(shared_data: Path) -> None:
     (pose_a, image_a), (pose_b, image_b) = (pose_and_image(shared_data, k) for k in (7, 10))
     camera = Equirectangular(image_a.shape[1], image_a.shape[0])

@@ -47,6 +47,7 @@ def test_a_hundred_points_through_the_mirror_video(shared_data: Path) -> None:
     assert np.median(list(lives.values())) >= 10
 
 
+@pytest.mark.slow
 def test_the_wide_baseline_pair_is_matched_with_both_kinds(shared_data: Path) -> None:
     """Not calibrated: centre from the rim's circle, 25 degrees above the horizon assumed."""
     paths = [present(shared_data, f"omni_mirror/kit_pair_{side}.png") for side in ("left", "right")]

@@ -56,6 +56,7 @@ def assert_same_files(live: Path, runs: list[Path], estimator: str) -> None:
         assert (live / log).read_bytes() == (run / log).read_bytes(), run
 
 
+@pytest.mark.slow
 def test_rendered_frames_give_the_same_bytes_on_every_way_in(tmp_path: Path) -> None:
     overrides = QUIET | {"dataset.stop": 8, "estimator.kind": "isam2", "compare": []}
     live = pushed("lab_loop", overrides, tmp_path / "live")

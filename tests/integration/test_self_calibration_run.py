@@ -36,6 +36,7 @@ def turned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_the_turn_is_found_told_and_written(
     turned: Path,
     tmp_path: Path,

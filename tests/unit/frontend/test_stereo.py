@@ -195,6 +195,7 @@ def test_what_two_of_three_images_show_follows_what_all_show() -> None:
     assert_same_bits(found.whole, whole)
 
 
+@pytest.mark.slow
 def test_the_covariance_of_two_images_is_that_of_their_noise() -> None:
     """Monte Carlo: 4,000 draws give each entry within 5 % of the largest."""
     rig = dataclasses.replace(RIG, vertical_baseline=0.2)
