@@ -13,7 +13,13 @@ SCRIPTS = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 EXAMPLES = [path for path in SCRIPTS if path.stem not in NEED_MORE]
 
 
-LONG = ("drive_home", "homing_vector")  # they render a house
+# They render a house, or compare estimators.
+LONG = (
+    "drive_home",
+    "filter_or_smoother",
+    "homing_vector",
+    "own_features",
+)
 SCRIPTS = [
     pytest.param(script, marks=pytest.mark.slow if script.stem in LONG else ())
     for script in EXAMPLES

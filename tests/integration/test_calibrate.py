@@ -49,6 +49,7 @@ def test_real_boards_give_the_baseline_that_others_found(
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_a_few_real_images_calibrate_and_are_called_few(
     shared_data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

@@ -306,6 +306,7 @@ def test_a_damaged_truth_is_reported_before_anything_is_written(
 # Trials
 
 
+@pytest.mark.slow
 def test_trials_repeat_to_the_byte_and_need_noise_to_vary(
     plain: Path,
     finished: Any,

@@ -217,6 +217,7 @@ def test_cached_frames_are_the_same_bytes_and_need_no_open3d(
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.slow
 def test_rendering_is_deterministic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     once = opened(QUICK, (30, 33))
     monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path))

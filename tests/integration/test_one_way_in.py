@@ -67,7 +67,7 @@ def test_rendered_frames_give_the_same_bytes_on_every_way_in(tmp_path: Path) -> 
     assert_same_files(live, [run.folder, command], "isam2")
 
 
-@pytest.mark.parametrize("extend", [True, False])
+@pytest.mark.parametrize("extend", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_session_in_a_saved_map_gives_the_bytes_of_the_configured_run(
     tmp_path: Path, extend: bool
 ) -> None:

@@ -174,6 +174,7 @@ DRAWN_EYE, KEPT_EYE = f"{SCENE}._scene.getCamera().eye", f"{SCENE}.camera.eye"
 AT_REST = f"['x', 'y', 'z'].every(k => Math.abs({DRAWN_EYE}[k] - {KEPT_EYE}[k]) < 1e-6)"
 
 
+@pytest.mark.slow
 def test_the_map_turns_by_mouse_and_stays_turned(browser: Browser, page: Path) -> None:
     browser.open(page)
     before = browser.js(KEPT_EYE)
@@ -311,6 +312,7 @@ def one_estimator() -> ReportData:
         ("no estimator", ReportData("x", "", ()), "No estimator gave a result."),
     ],
 )
+@pytest.mark.slow
 def test_incomplete_runs_have_a_page(
     offline: Browser, tmp_path: Path, name: str, data: ReportData, said: str
 ) -> None:

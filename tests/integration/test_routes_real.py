@@ -85,6 +85,7 @@ def bloggie(root: Path) -> tuple[Path, str]:
     return film, str(camera)
 
 
+@pytest.mark.slow
 def test_two_seconds_of_a_walk_are_taught_and_followed(shared_data: Path, tmp_path: Path) -> None:
     film, camera = bloggie(shared_data)
     part = ["dataset.start=200", "dataset.stop=260", "output.report=false", "output.pictures=0"]

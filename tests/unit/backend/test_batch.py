@@ -35,7 +35,9 @@ from fgslam.evaluation.consistency import judge
 METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
 
 
-@pytest.mark.parametrize("name", ["batch", "gnc", "isam2", "fixed_lag"])
+@pytest.mark.parametrize(
+    "name", ["batch", pytest.param("gnc", marks=pytest.mark.slow), "isam2", "fixed_lag"]
+)
 def test_pose_and_landmarks_are_consistent_over_20_drives(name: str) -> None:
     assert_consistent(SMOOTHERS[name])
 

@@ -71,6 +71,7 @@ def joint_error(estimator: DeadReckoning, simulation: Simulation, ids: FloatArra
     return np.concatenate([pose, offsets.ravel()])
 
 
+@pytest.mark.slow
 def test_the_joint_covariance_is_that_of_many_drawn_drives() -> None:
     """Pose and landmarks of several frames at once: their shared past must be in it."""
     drive = dataclasses.replace(DRIVE, points=12, miss_rate=0.0, sigma_px=(0.05, 0.05, 0.02))

@@ -31,6 +31,7 @@ def driven(recording: fg.Recording, frontend: dict[str, object]) -> fg.Slam:
     return slam
 
 
+@pytest.mark.slow
 def test_frames_of_a_late_camera_are_not_used_and_the_covariance_says_so(
     recording: fg.Recording,
 ) -> None:

@@ -75,6 +75,7 @@ def test_return_is_recognised_and_the_drift_corrected() -> None:
     assert max(error_m(reports[k], RING[k]) for k in range(first, len(RING))) < 0.15
 
 
+@pytest.mark.slow
 def test_frame_with_two_hypotheses_is_placed_by_recent_landmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
