@@ -8,6 +8,7 @@ rows are stored flat with offsets: the rows of part ``k`` are ``start[k]:start[k
 from __future__ import annotations
 
 import json
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -32,6 +33,8 @@ _UNREADABLE = (
     TypeError,
     NotImplementedError,
     MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
     zipfile.BadZipFile,
     zlib.error,
 )

@@ -49,6 +49,17 @@ def test_what_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> None:
         load_arrays(path)
 
 
+@pytest.mark.parametrize("header", ["{'descr': '<f8', 'shape': (3,", "{'a': 1}\n  b\n c"])
+def test_an_array_s_header_that_breaks_off_is_one_line(header: str, tmp_path: Path) -> None:
+    path = tmp_path / "log.npz"
+    text = header.encode() + b"\n"
+    with zipfile.ZipFile(path, "w") as file:
+        length = len(text).to_bytes(2, "little")
+        file.writestr("a.npy", b"\x93NUMPY\x01\x00" + length + text)
+    with pytest.raises(MeasurementLogError, match=r"log\.npz"):
+        load_arrays(path)
+
+
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     path = tmp_path / "pipe"
     os.mkfifo(path)
