@@ -153,6 +153,11 @@ class GrowingColumns:
             buffer[start:stop] = buffer[rows]
         self._length = stop
 
+    def keep_ascending(self, name: str, since: int) -> None:
+        """Orders the rows by a column; those before row ``since`` are in order already."""
+        if not (np.diff(self[name][max(since - 1, 0) :]) > 0).all():
+            self.take(0, np.argsort(self[name], kind="stable"))
+
     def state(self) -> StateArrays:
         """A snapshot of all columns."""
         return {name: self[name].copy() for name in self._buffers}

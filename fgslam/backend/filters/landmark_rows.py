@@ -89,8 +89,7 @@ class LandmarkRows:
                 "lasts": lasts,
             }
         )
-        if not (np.diff(self.ids[max(before - 1, 0) :]) > 0).all():
-            self._columns.take(0, np.argsort(self.ids, kind="stable"))
+        self._columns.keep_ascending("ids", before)
 
     def remove(self, ids: IntArray) -> None:
         """Drops landmarks. Raises KeyError when one is absent."""

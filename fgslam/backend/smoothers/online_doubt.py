@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.backend.smoothers.rig_doubt import shared_covariance, shifts
+from fgslam.backend.smoothers.rig_doubt import shared_covariance, shared_shifts
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.geometry import (
     adjoint,
@@ -88,10 +88,9 @@ class OnlineDoubt:
             return
         gain = np.linalg.solve(look.by_point, look.off(self._gain))
         new = {"ids": look.ids, "gain": gain, "information": look.landmarks()[1]}
+        before = len(self._map)
         self._map.append(new)
-        ids = self._map["ids"]
-        if not (np.diff(ids) > 0).all():
-            self._map.take(0, np.argsort(ids, kind="stable"))
+        self._map.keep_ascending("ids", before)
 
 
 class _Look:
@@ -101,7 +100,7 @@ class _Look:
         points = triangulate(rig, seen.measurement)
         projection = projection_jacobian(rig, points)
         self.ids = seen.ids
-        self.shift = shifts(rig, seen.measurement)[..., -len(SHARED) :]
+        self.shift = shared_shifts(rig, seen.measurement)
         self.by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
         self.by_point = projection @ wTc[:3, :3].T
         self.covariance = seen.covariance

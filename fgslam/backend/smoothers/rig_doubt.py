@@ -92,11 +92,27 @@ class DoubtedMarginals:
 
 def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
     """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED."""
-    ratio = vertical_to_horizontal(rig)
-    pixels = (measured @ pixel_model(rig.cameras, ratio).T).reshape(-1, rig.cameras, 2)
-    fuse = measurement_map("fused", rig.cameras, ratio)
-    of_pixels = (displacements(rig, pixels), shared_displacements(rig, pixels))
-    return np.asarray(fuse @ np.concatenate(of_pixels, axis=2))
+    pixels = _pixels(rig, measured)
+    return _fused(
+        rig, np.concatenate([displacements(rig, pixels), shared_displacements(rig, pixels)], axis=2)
+    )
+
+
+def shared_shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
+    """(k, 3, q) the same by a unit of each term of SHARED alone."""
+    return _fused(rig, shared_displacements(rig, _pixels(rig, measured)))
+
+
+def _pixels(rig: CameraRig, measured: FloatArray) -> FloatArray:
+    """(k, cameras, 2) where a point of these measurements (k, 3) is seen."""
+    model = pixel_model(rig.cameras, vertical_to_horizontal(rig))
+    return np.asarray((measured @ model.T).reshape(-1, rig.cameras, 2))
+
+
+def _fused(rig: CameraRig, of_pixels: FloatArray) -> FloatArray:
+    """(k, 3, n) of measurements, by displacements of their pixels (k, 2 * cameras, n)."""
+    fuse = measurement_map("fused", rig.cameras, vertical_to_horizontal(rig))
+    return np.asarray(fuse @ of_pixels)
 
 
 def shared_covariance(correction: RigCorrection) -> FloatArray:

@@ -214,8 +214,7 @@ class LandmarkTable:
         places = self._pool.load(held["view_counts"], views)
         names = ("ids", "colour", "permanent", *_COUNTS)
         self._columns.append({name: held[name] for name in names} | {_PLACES: places})
-        if before and len(self) > before and self.ids[before] < self.ids[before - 1]:
-            self._columns.take(0, np.argsort(self.ids, kind="stable"))
+        self._columns.keep_ascending("ids", before)
 
     def state(self) -> StateArrays:
         """All entries, as arrays; a snapshot."""
