@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -179,6 +179,11 @@ def bits_held(count: int, stored: Callable[[int], npt.NDArray[Any]]) -> tuple[in
     )
 
 
+def bits_of(paths: Sequence[Path]) -> tuple[int, tuple[str, ...]]:
+    """:func:`bits_held` of image files, one a frame."""
+    return bits_held(len(paths), lambda k: decode_stored(_bytes_of(paths[k]), str(paths[k])))
+
+
 def _bytes_of(path: Path) -> bytes:
     remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
     if path.exists() and not path.is_file():
@@ -277,12 +282,8 @@ class StereoFiles:
 
     def with_bits(self) -> tuple[StereoFiles, tuple[str, ...]]:
         """The same, with as many bits as the right images hold; a note where fewer than 16."""
-        bits, notes = bits_held(len(self.paths), self._stored)
+        bits, notes = bits_of([paths[0] for paths in self.paths])
         return replace(self, bits=bits), notes
-
-    def _stored(self, index: int) -> npt.NDArray[Any]:
-        path = self.paths[index][0]
-        return decode_stored(_bytes_of(path), str(path))
 
     def first_images(self) -> tuple[Image, ...] | None:
         """Images of the first frame that can be read, whatever their size; None without any."""

@@ -21,7 +21,7 @@ from fgslam.cameras.raw_cameras import Calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.files import write_text
-from fgslam.datasets.images import read_grey_image
+from fgslam.datasets.images import bits_of, read_grey_image
 from fgslam.datasets.loose_files import find_cameras, images_in, pair_files
 from fgslam.report.pictures.board import draw_corners
 
@@ -67,7 +67,8 @@ def calibrate_cameras(
     if model not in MODELS:
         raise ConfigError(f"lens {model!r} is not known; use {' or '.join(MODELS)}")
     files, notes = _files(folders)
-    views, size = _views(files, board, progress)
+    bits, held = bits_of([moment[0] for moment in files])
+    views, size = _views(files, bits, board, progress)
     found = calibrate(board, views, size, model)
     checked = [held_out(board, views, size, model, k) for k in range(1, len(found.cameras))]
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
@@ -75,7 +76,13 @@ def calibrate_cameras(
     write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
     picture = out.with_suffix(".png")
     draw_corners(picture, size, _shown(views, found), NAMES)
-    lines = (*notes, *_told(files, views, found), *_judged(board, views, found, checked), *remarks)
+    lines = (
+        *notes,
+        *held,
+        *_told(files, views, found),
+        *_judged(board, views, found, checked),
+        *remarks,
+    )
     return Calibrated(out, picture, lines)
 
 
@@ -105,13 +112,13 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
 
 
 def _views(
-    files: Sequence[tuple[Path, ...]], board: Board, progress: Progress
+    files: Sequence[tuple[Path, ...]], bits: int, board: Board, progress: Progress
 ) -> tuple[list[View], tuple[int, int]]:
     """What the cameras see of the board at each moment, and the size of all images."""
     views, sizes = [], set()
     for done, moment in enumerate(files):
         progress("board", done, len(files))
-        images = [read_grey_image(path) for path in moment]
+        images = [read_grey_image(path, bits) for path in moment]
         sizes |= {(image.shape[1], image.shape[0]) for image in images}
         if len(sizes) > 1:
             raise DatasetError(
@@ -121,13 +128,13 @@ def _views(
         views.append(tuple(find_corners(board, image) for image in images))
     progress("board", len(files), len(files))
     if not any(corners for view in views for corners in view):
-        raise CalibrationError(_no_board(files, board))
+        raise CalibrationError(_no_board(files, bits, board))
     return views, sizes.pop()
 
 
-def _no_board(files: Sequence[tuple[Path, ...]], board: Board) -> str:
+def _no_board(files: Sequence[tuple[Path, ...]], bits: int, board: Board) -> str:
     size = f"{board.columns}x{board.rows}"
-    others = sizes_that_fit(board, read_grey_image(files[0][0]))
+    others = sizes_that_fit(board, read_grey_image(files[0][0], bits))
     meant = f"; {files[0][0].name} shows {', '.join(others)}" if others else ""
     counted = {
         "chessboard": "inner corners are counted, not squares",
@@ -239,7 +246,7 @@ def calibrate_mirror(
     """
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a mirror's calibration is written as .yaml; give such a name")
-    picture = read_grey_image(image)
+    picture = read_grey_image(image, bits_of([image])[0])
     circle = find_mirror_circle(picture, np.random.default_rng(_SEED))
     frame = MirrorFrame(picture.shape[1], picture.shape[0], circle.centre)
     radii = (inner_px, _WITHIN_RIM * circle.radius)

@@ -96,6 +96,21 @@ def test_mistakes_of_calibrate(tmp_path: Path, monkeypatch: Patch, capfd: Captur
     assert "different numbers of images" in reported("trinocular", *three, *sizes)
 
 
+def test_a_board_in_ten_bits_is_seen_as_a_run_sees_it(
+    tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    """A dim board and a lamp: the upper eight of sixteen bits are black but for the lamp."""
+    squares = np.indices((6, 8)).sum(axis=0) % 2
+    board = np.pad(np.kron(squares, np.ones((24, 24))), 40, constant_values=1.0)
+    image = (100.0 + 150.0 * board).astype(np.uint16)
+    image[:8, :8] = 900
+    for name in ("left1.png", "right1.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    sizes = ("--board", "7x5", "--square", "0.025")
+    assert main(monkeypatch, "calibrate", "stereo", tmp_path, *sizes) == 2
+    assert "shows the board in 1 images" in capfd.readouterr().err
+
+
 def test_a_mirror_is_calibrated_from_an_image_of_rings(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

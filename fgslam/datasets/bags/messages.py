@@ -25,8 +25,10 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _Code: TypeAlias = int | None  # of cv2.cvtColor; None: the pixels as they are
 
 
-_GREY = {"mono8", "8UC1", "mono16", "16UC1", "nv12", "nv21"}
-"""Encodings whose first channel, or first plane, is grey."""
+_GREY = {"mono8", "8UC1", "mono16", "16UC1"}
+
+_PLANES: Mapping[str, int] = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}
+"""Encodings of a plane of grey, and one of two colours and half its height below it."""
 
 _COLOURS: Mapping[str, tuple[int, _Code, _Code]] = {
     "bgr8": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
@@ -76,6 +78,8 @@ def grey_of(message: Any, where: str, bits: int = 16) -> Image:
 def colour_of(message: Any, where: str, bits: int = 16) -> Image:
     """The same in red, green, blue, (height, width, 3); in grey where it has no colour."""
     if hasattr(message, "encoding"):
+        if message.encoding in _PLANES:
+            return _colour_of_planes(message, where)
         pixels, _, colour = _raw(message, where)
         return of_8_bits(_converted(pixels, colour), where, bits)
     data, mosaic = _compressed(message)
@@ -96,13 +100,25 @@ def _raw(message: Any, where: str) -> tuple[npt.NDArray[Any], _Code, _Code]:
     """Pixels (height, width[, channels]), and how they become grey, and red, green, blue."""
     encoding, height, width = message.encoding, int(message.height), int(message.width)
     mosaic = _mosaic_of(encoding)
-    if encoding not in _GREY and encoding not in _COLOURS and mosaic is None:
-        known = ", ".join((*sorted(_GREY), *_COLOURS, "bayer_*"))
+    if encoding not in (*_GREY, *_PLANES, *_COLOURS) and mosaic is None:
+        known = ", ".join((*sorted(_GREY), *_PLANES, *_COLOURS, "bayer_*"))
         raise FrameError(f"{where}: encoding {encoding!r} is not read; known: {known}")
     channels, grey, colour = _COLOURS.get(encoding, (1, *(mosaic or (None, None))))
     pixels = _pixels(message, encoding, channels, where)
     shape = (height, width) if channels == 1 else (height, width, channels)
     return pixels.reshape(shape), grey, colour
+
+
+def _colour_of_planes(message: Any, where: str) -> Image:
+    """Red, green, blue (height, width, 3) of grey above colours of half the resolution."""
+    height, width = int(message.height), int(message.width)
+    if height % 2 or width % 2:
+        raise FrameError(
+            f"{where}: {width}x{height} is no size of {message.encoding}, whose colours belong to "
+            "two by two pixels; record it in another encoding"
+        )
+    pixels = _pixels(message, message.encoding, 1, where, planes=1.5)
+    return np.asarray(cv2.cvtColor(pixels, _PLANES[message.encoding]), np.uint8)
 
 
 def _compressed(message: Any) -> tuple[bytes, tuple[int, int] | None]:
@@ -119,18 +135,22 @@ def _mosaic_of(encoding: str) -> tuple[int, int] | None:
     return _MOSAICS.get(encoding[6:10]) if encoding.startswith("bayer_") else None
 
 
-def _pixels(message: Any, encoding: str, channels: int, where: str) -> npt.NDArray[Any]:
-    """The rows of the image without their padding."""
+def _pixels(
+    message: Any, encoding: str, channels: int, where: str, planes: float = 1.0
+) -> npt.NDArray[Any]:
+    """The rows of the image, ``planes`` times its height, without their padding."""
     wide = encoding.endswith("16") or encoding.startswith("16")
     kind = np.dtype(np.uint16 if wide else np.uint8)
     if wide and message.is_bigendian:
         kind = kind.newbyteorder(">")
     data = np.frombuffer(memoryview(message.data), np.uint8)
-    height, used = int(message.height), int(message.width) * channels * kind.itemsize
+    height = int(planes * int(message.height))
+    used = int(message.width) * channels * kind.itemsize
     step = int(message.step) or used
     if height < 1 or used < 1 or step < used or len(data) < height * step:
         raise FrameError(
-            f"{where}: {len(data)} bytes are no image of {message.width}x{height} {encoding}; "
+            f"{where}: {len(data)} bytes are no image of {message.width}x{message.height} "
+            f"{encoding}; "
             "record it again"
         )
     rows = data[: height * step].reshape(height, step)[:, :used]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from bags import (
@@ -24,10 +26,11 @@ from bags import (
 from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibration
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import CalibrationError
+from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA as AHEAD
 from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.datasets.bags.frames import FrameTree
+from fgslam.datasets.bags.messages import colour_of
 from fgslam.datasets.bags.reader import open_bag
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
@@ -335,6 +338,47 @@ def test_colour_stays_colour(tmp_path: Path, name: str) -> None:
         assert np.abs(inner - RED[4:-4, 4:-4]).max() <= 3
     grey = 0.299 * 200 + 0.587 * 40 + 0.114 * 10
     assert np.abs(recording.frame(0).images[0][4:-4, 4:-4] - grey).max() <= 1.5
+
+
+def of_planes(swapped: bool) -> Image:
+    """The colour as one plane of luma and one of both chromas, by OpenCV (BT.601)."""
+    planar = cv2.cvtColor(RED, cv2.COLOR_RGB2YUV_I420)
+    chroma = planar[HEIGHT:].reshape(2, -1)[:: -1 if swapped else 1]
+    return np.vstack([planar[:HEIGHT], chroma.T.reshape(HEIGHT // 2, WIDTH)])
+
+
+def of_pairs(code: int) -> Image:
+    return np.asarray(cv2.cvtColor(RED, code))
+
+
+VIDEO: dict[str, dict[str, Any]] = {
+    "nv12": raw_image(of_planes(False), "nv12", padding=5) | {"height": HEIGHT},
+    "nv21": raw_image(of_planes(True), "nv21") | {"height": HEIGHT},
+    "uyvy": raw_image(of_pairs(cv2.COLOR_RGB2YUV_UYVY), "uyvy"),
+    "yuv422": raw_image(of_pairs(cv2.COLOR_RGB2YUV_UYVY), "yuv422"),
+    "yuyv": raw_image(of_pairs(cv2.COLOR_RGB2YUV_YUYV), "yuyv"),
+    "yuv422_yuy2": raw_image(of_pairs(cv2.COLOR_RGB2YUV_YUYV), "yuv422_yuy2"),
+}
+
+
+@pytest.mark.parametrize("name", VIDEO)
+def test_the_encodings_of_video_have_colour(tmp_path: Path, name: str) -> None:
+    recording = opened(write_bag(tmp_path / "a.mcap", stereo(1, lambda _: VIDEO[name])))
+    assert np.abs(recording.colour(0)[1].astype(int) - RED).max() <= 3
+    luma = cv2.cvtColor(RED, cv2.COLOR_RGB2YUV_I420)[0, 0]
+    assert np.abs(recording.frame(0).images[1].astype(int) - luma).max() <= 1
+
+
+def test_planes_that_are_cut_or_odd_are_refused(tmp_path: Path) -> None:
+    """Grey is whole in its own plane: only colour is missing."""
+    cut = raw_image(of_planes(False)[:HEIGHT], "nv12")
+    recording = opened(write_bag(tmp_path / "a.mcap", stereo(1, lambda _: cut)))
+    assert recording.frame(0).images[0].shape == (HEIGHT, WIDTH)
+    with pytest.raises(FrameError, match="768 bytes are no image of 32x24 nv12; record it again"):
+        recording.colour(0)
+    odd = SimpleNamespace(encoding="nv21", height=23, width=32, step=32, data=bytes(1200))
+    with pytest.raises(FrameError, match="32x23 is no size of nv21"):
+        colour_of(odd, "a.bag, /cam")
 
 
 def test_grey_images_have_no_colour(tmp_path: Path) -> None:
