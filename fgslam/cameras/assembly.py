@@ -72,7 +72,7 @@ def assembled(calibration: Calibration, fov_deg: float | None = None) -> Assembl
         found = replace(found, order=(1 - sources[0], 1 - sources[1]))
         if sources == (0, 1):
             remarks = (*remarks, _swapped(chosen, found.rig))
-    remarks = (*remarks, *_plausible(calibration, found.rig))
+    remarks = (*remarks, *implausible(calibration.source, found.rig))
     straight = found.order[:2] == (0, 1) and fov_deg is None and _is_rectified(chosen)
     kept = None if straight else found
     return Assembly(found.rig, kept, sources, remarks)
@@ -187,7 +187,12 @@ def _require_side_by_side(chosen: Sequence[RawCamera], turn: FloatArray) -> None
     """Raises CalibrationError unless the cameras form a stereo rig."""
     right, left = chosen[:2]
     offset = turn @ _offset(right, left)
-    if np.abs(offset[0]) < max(2.0 * np.hypot(offset[1], offset[2]), _LEAST_BASELINE_M):
+    if np.linalg.norm(offset) < _LEAST_BASELINE_M:
+        raise CalibrationError(
+            f"{left.name} and {right.name} are {1e3 * np.linalg.norm(offset):.3g} mm apart, as one "
+            "camera; check T_BS (or T) in the calibration, and the unit of its lengths (--unit)"
+        )
+    if np.abs(offset[0]) < 2.0 * np.hypot(offset[1], offset[2]):
         x, y, z = offset
         raise CalibrationError(
             f"{left.name} and {right.name} are not side by side (offset {x:.3f}, {y:.3f}, {z:.3f} "
@@ -274,12 +279,13 @@ def _swapped(chosen: Sequence[RawCamera], rig: CameraRig) -> str:
     )
 
 
-def _plausible(calibration: Calibration, rig: CameraRig) -> tuple[str, ...]:
+def implausible(source: str, rig: CameraRig) -> tuple[str, ...]:
+    """A remark where no vehicle carries cameras so far apart."""
     if rig.baseline <= _LONGEST_BASELINE_M:
         return ()
     return (
-        f"{calibration.source}: the baseline is {rig.baseline:.4g} m; if its unit is not the "
-        "metre, give it: unit_m=0.001 for millimetres, or the size of a square in metres",
+        f"{source}: the baseline is {rig.baseline:.4g} m; if its unit is not the metre, give it: "
+        "--unit 0.001 for millimetres, or the side of a square in metres (unit_m of load_rig)",
     )
 
 

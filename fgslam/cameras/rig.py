@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.assembly import assembled, at_size, in_metres
+from fgslam.cameras.assembly import assembled, at_size, implausible, in_metres
 from fgslam.cameras.calibration import read_json_object
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.corrected import read_own_format
@@ -145,7 +145,8 @@ def load_rig(
             impossible, the size is another one, or the cameras are no stereo rig.
     """
     require_options(size, unit_m, fov_deg)
-    own = _own_rectified(Path(path), cameras) if path2 is None else None
+    metres = path2 is None and unit_m == 1.0
+    own = _own_rectified(Path(path), cameras) if metres else None
     if own is not None and fov_deg is None and size in (None, (own.width, own.height)):
         return with_masks(own, Path(path))
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
@@ -219,7 +220,7 @@ def _own_rectified(path: Path, cameras: Sequence[int] | None) -> StereoRig | Non
     three = "vertical_baseline_m" in values if cameras is None else len(cameras) == 3
     found = read_own_format(path, three)
     rig, raw = (found.rig, found) if isinstance(found, Rectifier) else (found, None)
-    return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], ())
+    return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
 
 
 def _stereo_rig(

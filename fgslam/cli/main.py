@@ -65,6 +65,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     stride: options.Stride = None,
     fps: options.Fps = None,
     scale: options.Scale = None,
+    unit: options.Unit = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -88,7 +89,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import experiment_of
 
     existing = existing_folder(overwrite, resume)
-    given = {**options.frames(start, stop, stride, fps, scale), "estimator.kind": estimator}
+    given = {**options.frames(start, stop, stride, fps, scale, unit), "estimator.kind": estimator}
     given |= {"map.load": map_in, "map.save": map_out}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
@@ -120,6 +121,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     stride: options.Stride = None,
     fps: options.Fps = None,
     scale: options.Scale = None,
+    unit: options.Unit = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -127,7 +129,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
     from fgslam.runs.bare_recording import short_config
 
-    given = {**options.frames(start, stop, stride, fps, scale), "estimator.kind": estimator}
+    given = {**options.frames(start, stop, stride, fps, scale, unit), "estimator.kind": estimator}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
 

@@ -109,9 +109,11 @@ def frames(
     stride: int | None,
     fps: float | None = None,
     scale: float | None = None,
+    unit: float | None = None,
 ) -> dict[str, str | float | Path | None]:
-    """Which frames of a recording, how fast they follow, how large, by the keys that say it."""
-    names, values = ("start", "stop", "stride", "fps", "scale"), (start, stop, stride, fps, scale)
+    """Which frames of a recording, how fast, how large, in which unit, by the keys that say it."""
+    names = ("start", "stop", "stride", "fps", "scale", "unit_m")
+    values = (start, stop, stride, fps, scale, unit)
     return {f"dataset.{k}": v for k, v in zip(names, values, strict=True)}
 
 
@@ -175,6 +177,13 @@ Scale = Annotated[
         metavar="FACTOR",
         help="make the images smaller, 0.5 by half, and the calibration with them; sets "
         "dataset.scale",
+    ),
+]
+Unit = Annotated[
+    float | None,
+    typer.Option(
+        metavar="METRES",
+        help="one unit of the calibration's lengths, 0.001: millimetres; sets dataset.unit_m",
     ),
 ]
 Topics = Annotated[

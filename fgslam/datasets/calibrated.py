@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from fgslam.cameras.assembly import at_size
+from fgslam.cameras.assembly import at_size, in_metres
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rig import StereoRig, load_rig, rig_of
@@ -45,9 +45,14 @@ def loaded_rig(
     size: tuple[int, int] | None,
     cameras: Sequence[int] | None = None,
 ) -> StereoRig:
-    """:func:`fgslam.load_rig` of one file or two, scaled and as wide as the settings ask for."""
+    """:func:`fgslam.load_rig` of one file or two, in the unit, scaled, as wide as is asked for."""
     return load_rig(
-        *files, size=size, scale=settings.resized, fov_deg=settings.fov_deg, cameras=cameras
+        *files,
+        size=size,
+        scale=settings.resized,
+        unit_m=settings.unit_m,
+        fov_deg=settings.fov_deg,
+        cameras=cameras,
     )
 
 
@@ -55,7 +60,8 @@ def read_rig(
     settings: CalibratedSettings, calibration: Calibration, size: tuple[int, int] | None
 ) -> StereoRig:
     """The same of a calibration that is read."""
-    return rig_of(at_size(calibration, size, settings.resized), settings.fov_deg)
+    found = in_metres(calibration, settings.unit_m)
+    return rig_of(at_size(found, size, settings.resized), settings.fov_deg)
 
 
 def mounted(rig: StereoRig, settings: CalibratedSettings) -> StereoRig:

@@ -59,8 +59,9 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
     size = first_size(colour for colour, _ in pairs)
     if size is None:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
-    if settings.fov_deg is not None:
-        raise DatasetError(f"{root}: dataset.fov_deg is for two cameras; leave it out")
+    for name, asked in (("fov_deg", settings.fov_deg), ("unit_m", settings.unit_m != 1.0)):
+        if asked:
+            raise DatasetError(f"{root}: dataset.{name} is for two cameras; leave it out")
     camera, known = _camera(root, settings, size)
     rig = _rig(camera, settings)
     scale, said = _scale(root, pairs, settings)

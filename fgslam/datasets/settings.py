@@ -60,6 +60,14 @@ class CalibratedSettings(RecordingSettings):
             "all cameras fill, at most 120",
         ),
     ] = None
+    unit_m: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            description="metres of one unit of the calibration's lengths: 0.001 for millimetres, "
+            "the side of a square for one in squares",
+        ),
+    ] = 1.0
     camera_yaw_deg: Annotated[
         float | None,
         Field(

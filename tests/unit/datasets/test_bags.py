@@ -179,6 +179,17 @@ def test_a_camera_info_without_baseline(tmp_path: Path) -> None:
         opened(write_bag(tmp_path / "a.bag", messages))
 
 
+def test_a_camera_info_in_millimetres(tmp_path: Path) -> None:
+    """The last column of P is -fx times the baseline."""
+    far = [
+        (t, s, k, f | {"p": f["p"] * ([1, 1, 1, 1000] * 3)} if k.endswith("Info") else f)
+        for t, s, k, f in stereo()
+    ]
+    path = write_bag(tmp_path / "a.bag", far)
+    assert any("the baseline is 200 m; if its unit" in note for note in opened(path).notes)
+    assert opened(path, unit_m=0.001).rig.baseline == pytest.approx(0.2, abs=1e-9)
+
+
 def test_rectified_topics_are_not_rectified_again(tmp_path: Path) -> None:
     info = {"d": np.array([-0.3, 0.1, 0.0, 0.0, 0.0])}
     messages = [

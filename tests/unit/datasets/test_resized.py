@@ -63,6 +63,15 @@ def grow(root: Path, across: float = 2.0, down: float = 2.0) -> None:
     path.write_text(json.dumps(values), encoding="utf-8")
 
 
+def in_unit(root: Path, metres: float) -> None:
+    """The calibration of the same cameras with its lengths in a unit of so many metres."""
+    path = root / "calib.json"
+    values = json.loads(path.read_text(encoding="utf-8"))
+    for name in {"baseline_m", "vertical_baseline_m"} & set(values):
+        values[name] /= metres
+    path.write_text(json.dumps(values), encoding="utf-8")
+
+
 def opened(root: Path, *overrides: str) -> Recording:
     config = bare_experiment(root, overrides=overrides).config
     assert isinstance(config, ExperimentConfig)
@@ -99,6 +108,30 @@ def test_another_shape_is_refused_even_when_asked(
     grow(root, 2.0, 1.5)
     with pytest.raises(CalibrationError, match=r"64x36 pixels cannot be scaled.*cropped"):
         opened(root, "dataset.resized=true")
+
+
+@pytest.mark.parametrize("make", [own, three, loose])
+@pytest.mark.parametrize("metres", [0.001, 0.025])
+def test_lengths_in_another_unit_are_noticed_and_mended(
+    tmp_path: Path, make: Callable[[Path], Path], metres: float
+) -> None:
+    """0.2 m are 200 m where millimetres are taken as metres, and 8 squares of 25 mm."""
+    root = make(tmp_path / "walk")
+    before = opened(root).rig
+    in_unit(root, metres)
+    (noticed,) = (note for note in opened(root).notes if "its unit is not the metre" in note)
+    assert f"the baseline is {before.baseline / metres:.4g} m" in noticed
+    assert "--unit 0.001 for millimetres, or the side of a square" in noticed
+    found = opened(root, f"dataset.unit_m={metres}")
+    assert not any("unit" in note for note in found.notes)
+    for name in ("baseline", "vertical_baseline"):
+        expected = getattr(before, name)
+        assert getattr(found.rig, name) == (expected and pytest.approx(expected, abs=1e-9))
+
+
+def test_a_unit_that_makes_one_camera_of_two_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"are 0\.2 mm apart, as one camera; .*\(--unit\)"):
+        opened(own(tmp_path / "walk"), "dataset.unit_m=0.001")
 
 
 def test_raw_cameras_are_scaled_as_well(tmp_path: Path) -> None:
