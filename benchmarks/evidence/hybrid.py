@@ -110,16 +110,21 @@ def _row(
     start = time.process_time()
     for frame in found.frames:
         t = float(found.sequence.timestamps[frame.i])
-        seen = frame if kind == "sift" else replace(frame, features=frame.features[:1])
-        pipeline.describe = lambda _, seen=seen: seen
+        pipeline.describe = lambda _, seen=frame: seen
+        pipeline.describe_reference = lambda _, seen=frame: replace(
+            seen, features=seen.features[:1]
+        )
         images_only = frame if kind == "sift" else replace(frame, features=())
         body = body_motion(found.sequence, frame.i, pipeline.motion)
         reports.append(pipeline.process(images_only, frame.i, t, body))
     loop = time.process_time() - start
     estimate = pipeline.estimator.estimate().trajectory
     final = time.process_time() - start - loop
-    keys = np.array([len(r.found.features) > 0 for r in reports])
-    spent = loop + float(found.seconds[keys, : None if kind == "sift" else 1].sum())
+    described = [len(r.found.features) for r in reports]
+    keys = np.array(described) > 0
+    spent = loop + sum(
+        float(own[:images].sum()) for own, images in zip(found.seconds, described, strict=True)
+    )
     located = np.mean([r.tracking.status in _LOCATED for r in reports])
     error = evaluate_trajectory(estimate, found.sequence.ground_truth, Alignment.SE3)
     ate_cm = 100.0 * (error.ate_rmse_m or np.nan)

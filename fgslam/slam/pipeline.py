@@ -75,7 +75,9 @@ class SlamPipeline:
         key_frames: tracking between key frames; None where every frame is one.
         watch: says which frames' images cannot be used; None uses all.
         submaps: landmarks far from the robot, on disk; None where all are in memory.
-        describe: finds the features of a key frame that came without.
+        describe: finds the features of all images of a frame that came without.
+        describe_reference: of a frame that carried landmarks have placed, those of its reference
+            image alone: patches tell the rest.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
     """
@@ -90,6 +92,7 @@ class SlamPipeline:
     watch: CameraWatch | None = None
     located: Prediction | None = None
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
+    describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
     submaps: SubMaps | None = None
 
     def process(
@@ -121,7 +124,7 @@ class SlamPipeline:
             stereo, described = carried.carried.features, None
             seen = _Seen(carried.tracked.ego_motion, self.key_frames.book(carried))
         else:
-            found = self._described(found)
+            found = self._described(found, carried)
             watch.lap("sift")
             every = self._match_stereo(found)
             watch.lap("stereo")
@@ -183,8 +186,11 @@ class SlamPipeline:
         """Whether the frame needs no features: enough is carried, and no place is looked for."""
         return carried.suffices and (self.places is None or not self.places.wants_features)
 
-    def _described(self, found: FeatureFrame) -> FeatureFrame:
-        return found if self.describe is None else self.describe(found)
+    def _described(self, found: FeatureFrame, carried: CarriedFrame | None) -> FeatureFrame:
+        """The frame with features; of all images where no landmark could be carried into it."""
+        patches = carried is not None and carried.placed
+        find = self.describe_reference if patches else self.describe
+        return found if find is None else find(found)
 
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         if found.frame is None:

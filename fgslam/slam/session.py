@@ -146,8 +146,8 @@ class Session:
 
     def _made(self, beginning: Arrival | None) -> SlamPipeline:
         pipeline = self._make(beginning)
-        describer, every = self._describer, self.frontend.tracking == "sift"
-        pipeline.describe = describer.complete if every else describer.of_reference
+        pipeline.describe = self._describer.complete
+        pipeline.describe_reference = self._describer.of_reference
         self._near(pipeline)
         return pipeline
 

@@ -54,6 +54,19 @@ def test_it_is_as_accurate_as_features_on_every_frame(
     assert errors[0] < 1.3 * errors[1] + 0.001
 
 
+def test_frames_too_far_apart_to_carry_anything_are_tracked_as_by_features_alone(
+    recording: Path, tmp_path: Path
+) -> None:
+    """Every sixth: a step moves the image by more than its sixteenth."""
+    logs = []
+    for tracking in ("hybrid", "sift"):
+        values = values_of(recording, frontend={"tracking": tracking})
+        values["dataset"] |= {"stride": 6}
+        run_values(values, tmp_path / tracking)
+        logs.append((tmp_path / tracking / "measurements.npz").read_bytes())
+    assert logs[0] == logs[1]
+
+
 @pytest.mark.parametrize("frames", [1, 5, 9])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(
     frames: int, recording: Path, hybrid: Finished, tmp_path: Path

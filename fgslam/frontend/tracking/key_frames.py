@@ -1,9 +1,10 @@
 """Frames tracked by carried landmarks, and when it takes a key frame instead.
 
 On a key frame SIFT finds features in the reference image, whose patches are measured in the others
-(:mod:`fgslam.frontend.patch_stereo`). It describes the landmarks that are carried, finds again
-those that were lost, and starts new ones. Between key frames the carried landmarks alone place the
-camera, and nothing is missed, pruned or started.
+(:mod:`fgslam.frontend.patch_stereo`); in all images where carried landmarks do not place the
+camera. It describes the landmarks that are carried, finds again those that were lost, and starts
+new ones. Between key frames the carried landmarks alone place the camera, and nothing is missed,
+pruned or started.
 """
 
 from __future__ import annotations
@@ -35,12 +36,27 @@ class CarriedFrame:
     Attributes:
         carried: the landmarks found again.
         tracked: the pose that follows; its matches are rows of ``carried``.
-        suffices: it needs no key frame.
+        lasting: enough of the last key frame's landmarks are left, over enough of the image.
     """
 
     carried: Carried
     tracked: Tracked
-    suffices: bool
+    lasting: bool
+
+    @property
+    def placed(self) -> bool:
+        """Whether the pose can be relied on: enough landmarks agree on it, and most of them do.
+
+        Patches that went astray together agree on a wrong pose, too.
+        """
+        pose = self.tracked.ego_motion
+        enough = pose.inliers.sum() >= _LEAST_LANDMARKS
+        return bool(pose.status.measured and pose.coherent and enough)
+
+    @property
+    def suffices(self) -> bool:
+        """It needs no key frame."""
+        return self.placed and self.lasting
 
 
 class KeyFrameTracker:
@@ -71,7 +87,7 @@ class KeyFrameTracker:
         every = np.arange(len(carried))
         matches = MapMatches(carried.rows, every, np.ones(len(carried), np.bool_))
         tracked = self._tracker.solved(prediction, landmarks, (expected, matches, carried.features))
-        return CarriedFrame(carried, tracked, self._suffices(carried, tracked, images[0]))
+        return CarriedFrame(carried, tracked, self._lasting(carried, tracked, images[0]))
 
     def book(self, frame: CarriedFrame) -> Association:
         """Records a frame between key frames; outliers are carried no further."""
@@ -88,11 +104,13 @@ class KeyFrameTracker:
     ) -> tuple[Tracked, StereoFeatures]:
         """A key frame: what is carried, and of the others what SIFT finds; all features of both.
 
+        A frame that carried landmarks do not place is tracked as if SIFT were all there is.
+
         Landmarks that are carried and found by SIFT are measured by their patch, whose place in
         the image has not changed, and described by SIFT.
         """
-        if frame is None or not frame.tracked.ego_motion.status.measured:
-            return _spread(self._tracker.track(prediction, landmarks, sift), sift), sift
+        if frame is None or not frame.placed:
+            return self._tracker.track(prediction, landmarks, sift), sift
         pose = frame.tracked.ego_motion
         around = Prediction(pose.wTc, pose.covariance)
         expected, matches = self._tracker.matched_around(around, landmarks, sift)
@@ -130,12 +148,9 @@ class KeyFrameTracker:
         self._count, self._cells = state["key_frame"].tolist()
         self._carrier.restore(state)
 
-    def _suffices(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
+    def _lasting(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
         pose = tracked.ego_motion
-        if not (pose.status.measured and pose.coherent):
-            return False
-        left = int(pose.inliers.sum())
-        if left < max(_LEAST_LANDMARKS, _LEAST_SHARE * self._count):
+        if pose.inliers.sum() < _LEAST_SHARE * self._count:
             return False
         cells = _cells(carried.features.pixels[pose.inliers, 0], image)
         return len(cells) >= _LEAST_COVERAGE * self._cells
