@@ -138,7 +138,8 @@ def make_estimator(
         case LandmarkKalmanSettings():
             from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 
-            estimator = LandmarkKalman(rig, settings, prior)
+            floor = Floor.under(rig, ego_motion.dof)
+            estimator = LandmarkKalman(rig, settings, prior, floor)
         case LandmarkKalmanGraphSettings():
             from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 

@@ -23,6 +23,7 @@ from fgslam.backend.filters.ekf_update import (
 from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, require_finite
 from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
 from fgslam.backend.filters.loop_correction import within_gate
+from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.settings import EkfSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
@@ -68,6 +69,7 @@ class FullEkf:
         self._ids: IntArray = np.empty(0, np.int64)
         self._positions: FloatArray = np.empty((0, 3))
         self._past = FilteredTrajectory()
+        self._doubt = OnlineDoubt(sensor, floor)
         self._matched = self._gated = self._skipped = 0
         self._remarks: list[str] = []
         self._map: LandmarkMap | None = None
@@ -132,7 +134,8 @@ class FullEkf:
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         self._drop(increment)
         self._add(first)
-        current = Prediction(self._wTc, self._covariance.front()[:FRONT])
+        self._doubt.observe(increment, self._wTc)
+        current = self._doubt.pose(Prediction(self._wTc, self._covariance.front()[:FRONT]))
         self._past.append(increment.timestamp, current)
         return UpdateStats(
             current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof, closed
@@ -153,30 +156,35 @@ class FullEkf:
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
-            self.landmarks(),
+            self._doubt.landmarks(self.landmarks()),
             (*remarks, *self._remarks),
             noise_factor=1.0,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Marginal covariances (k, 3, 3) of the named landmarks."""
-        return self._covariance.diagonal_blocks(self._blocks(ids))
+        held = self.landmarks()
+        return self._doubt.landmarks(held.select(held.rows(ids))).covariances
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance of the last pose and the named landmarks, as the filter holds it."""
+        """Joint covariance of the last pose and the named landmarks, and the rig's doubt."""
         rows = rows_of(self._blocks(ids)).ravel()
-        return self._covariance.square(np.concatenate([np.arange(FRONT), rows]))
+        return self._doubt.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
 
     def state(self) -> StateArrays:
         """Everything needed to continue; the covariance as its lower triangle."""
-        return self._past.state() | {
-            "pose": self._wTc,
-            "covariance": self._covariance.packed(),
-            "ids": self._ids,
-            "positions": self._positions,
-            "counts": np.array([self._matched, self._gated, self._skipped]),
-            "remarks": np.array(self._remarks, np.str_),
-        }
+        return (
+            self._past.state()
+            | {
+                "pose": self._wTc,
+                "covariance": self._covariance.packed(),
+                "ids": self._ids,
+                "positions": self._positions,
+                "counts": np.array([self._matched, self._gated, self._skipped]),
+                "remarks": np.array(self._remarks, np.str_),
+            }
+            | self._doubt.state()
+        )
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
@@ -186,6 +194,7 @@ class FullEkf:
         self._ids, self._positions = state["ids"], state["positions"]
         self._matched, self._gated, self._skipped = state["counts"].tolist()
         self._remarks = [str(words) for words in state["remarks"]]
+        self._doubt.restore(state)
         self._map = None
 
     # -- what may fail, before anything is changed ---------------------------------------------

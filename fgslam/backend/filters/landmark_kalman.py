@@ -28,6 +28,7 @@ from fgslam.backend.filters.loop_correction import (
     rotated,
     transported,
 )
+from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.backend.filters.set_aside import SetAside
@@ -35,6 +36,7 @@ from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     block_diagonal,
     congruence,
@@ -61,13 +63,20 @@ class LandmarkKalman:
     kind: ClassVar[str] = "landmark_kalman"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
 
-    def __init__(self, rig: Sensor, settings: LandmarkKalmanSettings, prior: Prediction) -> None:
+    def __init__(
+        self,
+        rig: Sensor,
+        settings: LandmarkKalmanSettings,
+        prior: Prediction,
+        floor: Floor | None = None,
+    ) -> None:
         """Starts at the prior pose with an empty map.
 
         Args:
             rig: the cameras, or the range-bearing sensor.
             settings: which update, and its noise.
             prior: pose of the first frame and its covariance.
+            floor: to which the ego-motion keeps; None: to none.
         """
         self._rig = rig
         self._settings = settings
@@ -76,6 +85,7 @@ class LandmarkKalman:
         self._past = FilteredTrajectory()
         self._rows = LandmarkRows()
         self._drive = DriveRecord()
+        self._doubt = OnlineDoubt(rig, floor or Floor.under(rig, 6))
         self._fixed = False
         self._applied = np.empty(0)  # correction of the rig in the last frame
         self._disparity_sigma = np.inf  # of a measurement of the last frame that had any, pixels
@@ -122,7 +132,9 @@ class LandmarkKalman:
             variances = increment.observations.covariance[:, 2, 2]
             self._disparity_sigma = float(np.sqrt(np.median(variances)))
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
-        current = self._current
+        self._doubt.observe(increment, self._current.wTc)
+        current = self._doubt.pose(self._current)
+        self._past.covariances[-1] = current.covariance
         return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof, closed)
 
     @property
@@ -157,6 +169,7 @@ class LandmarkKalman:
     def give_up(self, ids: IntArray) -> None:
         """Forgets landmarks that somebody else holds now."""
         self._rows.remove(ids)
+        self._doubt.forget(ids)
 
     def take_back(self, aside: SetAside) -> None:
         """Landmarks come back, moved by what closures have corrected their homes since."""
@@ -203,21 +216,23 @@ class LandmarkKalman:
     def estimate(self) -> Estimate:
         """Trajectory as filtered, corrected by loops, and the map."""
         rows = self._rows
+        held = LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy())
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
-            LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy()),
+            self._doubt.landmarks(held),
             tuple(self._drive.remarks),
             noise_factor=1.0,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of the named landmarks."""
-        return self._rows.covariances[self._rows.rows(ids)]
+        return self._doubt.landmarks(self._rows.map().select(self._rows.rows(ids))).covariances
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Pose and landmarks as the filter sees them: independent (6.4)."""
-        return block_diagonal(self._current.covariance, self.landmark_covariances(ids))
+        """Pose and landmarks as the filter sees them: independent (6.4) but for the rig's doubt."""
+        own = self._rows.covariances[self._rows.rows(ids)]
+        return self._doubt.joint(ids, block_diagonal(self._current.covariance, own))
 
     def state(self) -> StateArrays:
         """Everything needed to continue; a snapshot, which later updates leave alone."""
@@ -229,7 +244,7 @@ class LandmarkKalman:
             "rig_correction": self._applied,
             "disparity_sigma": np.array(self._disparity_sigma),
         }
-        return self._past.state() | current | held | self._drive.state()
+        return self._past.state() | current | held | self._drive.state() | self._doubt.state()
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
@@ -240,6 +255,7 @@ class LandmarkKalman:
         self._applied = state["rig_correction"]
         self._disparity_sigma = float(state["disparity_sigma"])
         self._drive.restore(state)
+        self._doubt.restore(state)
 
     # ----------------------------------------------------------------------------------------
 

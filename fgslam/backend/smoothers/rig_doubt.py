@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
+from fgslam.backend.filters.online_doubt import fused, pixels_of, shared_covariance
 from fgslam.backend.smoothers.marginals import (
     ChainMarginals,
     GraphMarginals,
@@ -28,14 +29,12 @@ from fgslam.backend.smoothers.marginals import (
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.rig_correction import (
-    EXPECTED_PX,
     RigCorrection,
     displacements,
     prior_information,
     shared_displacements,
-    shared_information,
 )
-from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,36 +91,10 @@ class DoubtedMarginals:
 
 def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
     """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED."""
-    pixels = _pixels(rig, measured)
-    return _fused(
+    pixels = pixels_of(rig, measured)
+    return fused(
         rig, np.concatenate([displacements(rig, pixels), shared_displacements(rig, pixels)], axis=2)
     )
-
-
-def shared_shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
-    """(k, 3, q) the same by a unit of each term of SHARED alone."""
-    return _fused(rig, shared_displacements(rig, _pixels(rig, measured)))
-
-
-def _pixels(rig: CameraRig, measured: FloatArray) -> FloatArray:
-    """(k, cameras, 2) where a point of these measurements (k, 3) is seen."""
-    model = pixel_model(rig.cameras, vertical_to_horizontal(rig))
-    return np.asarray((measured @ model.T).reshape(-1, rig.cameras, 2))
-
-
-def _fused(rig: CameraRig, of_pixels: FloatArray) -> FloatArray:
-    """(k, 3, n) of measurements, by displacements of their pixels (k, 2 * cameras, n)."""
-    fuse = measurement_map("fused", rig.cameras, vertical_to_horizontal(rig))
-    return np.asarray(fuse @ of_pixels)
-
-
-def shared_covariance(correction: RigCorrection) -> FloatArray:
-    """(q, q) covariance of what nothing estimates; (0, 0) of an exact rig."""
-    if correction.rig.exact:
-        return np.empty((0, 0))
-    # EXPECTED_PX is of one coordinate between two images: as much of a pixel in each of them.
-    off_px = max(EXPECTED_PX, correction.rms_px() / np.sqrt(2.0))
-    return np.asarray(np.linalg.inv(shared_information(correction.rig, off_px)))
 
 
 def _step(

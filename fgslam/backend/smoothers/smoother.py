@@ -26,12 +26,12 @@ from fgslam.backend.filters.loop_correction import (
     Constraint,
     founds_anew,
 )
+from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
 from fgslam.backend.smoothers.loop_closing import carried_to
-from fgslam.backend.smoothers.online_doubt import OnlineDoubt
 from fgslam.backend.smoothers.recorded_inputs import RecordedInputs
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
@@ -114,7 +114,7 @@ class Smoother:
         self._answer: Solution | None = None
         self._takeovers = 0
         self._eras: list[int] = []
-        self._doubt: OnlineDoubt | None = None
+        self._doubt = OnlineDoubt(problem.sensor, problem.floor)
 
     # -- the method ----------------------------------------------------------------------------
 
@@ -145,7 +145,9 @@ class Smoother:
         require_finite(increment, tracking)
         recalibrated(self, increment.rig_correction)
         before = self._tracker.predict(None).wTc
-        stats = self._tracker.update(dataclasses.replace(increment, loops=()), tracking)
+        # The tracker's covariances are given the graph's, and so are not in doubt themselves.
+        plain = dataclasses.replace(increment, loops=(), rig_correction=None)
+        stats = self._tracker.update(plain, tracking)
         self._record(increment, tracking)
         self._learn_noise(increment, tracking, before)
         tracked = self._admitted(increment, tracking)
@@ -156,7 +158,8 @@ class Smoother:
             self._solve(entering[-1], tracked, bool(increment.loops))
         closed = tuple(self._close(loop, increment.index) for loop in increment.loops)
         current = self._current(tracking)
-        covariance = current.covariance + self._doubted(increment, current.wTc)
+        self._doubt.observe(increment, current.wTc)
+        covariance = self._doubt.pose(current).covariance
         return dataclasses.replace(stats, wTc=current.wTc, covariance=covariance, closed=closed)
 
     def recalibrate(self, correction: FloatArray) -> None:
@@ -330,16 +333,6 @@ class Smoother:
         moved = adjoint(inverse(now.wTc) @ self._smoothed.wTc)
         drift = congruence(moved, self._smoothed.covariance)
         return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + tracking.covariance))
-
-    def _doubted(self, increment: Increment, wTc: FloatArray) -> FloatArray:
-        """(6, 6) what the calibration's error adds to the newest pose's covariance."""
-        doubted = self._builder.doubted
-        if doubted is None or doubted.rig.exact:
-            return np.zeros((6, 6))
-        if self._doubt is None:
-            self._doubt = OnlineDoubt(doubted.rig)
-        self._doubt.observe(increment, wTc)
-        return self._floor.allowed_part(wTc, self._doubt.added(doubted))
 
     def _solved(self) -> Solution:
         """The graph's answer, with the poses of frames between keyframes."""

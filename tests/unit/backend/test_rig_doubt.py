@@ -8,15 +8,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated import RIG, play
+from simulated import RIG, assert_same_bits, play
 from smoothing import FREE, drawn, run
 
-from fgslam.backend.settings import BatchSettings, Isam2Settings, KernelSettings
-from fgslam.backend.smoothers.online_doubt import OnlineDoubt
+from fgslam.backend.filters import online_doubt
+from fgslam.backend.filters.online_doubt import OnlineDoubt, shared_covariance
+from fgslam.backend.protocol import FullEstimator
+from fgslam.backend.settings import (
+    BatchSettings,
+    EkfSettings,
+    EstimatorSettings,
+    Isam2Settings,
+    KernelSettings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals, shifts
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction, UpdateStats
+from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import (
     SHARED,
@@ -32,6 +44,14 @@ from fgslam.slam.factory import make_estimator
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
 CALIBRATED = RigCorrection.none(dataclasses.replace(RIG, exact=False))
+
+ONLINE: dict[str, EstimatorSettings] = {
+    "landmark_kalman": LandmarkKalmanSettings(),
+    "landmark_kalman_graph": LandmarkKalmanGraphSettings(),
+    "ekf": EkfSettings(),
+    "isam2": Isam2Settings(noise_factor=1.0),
+}
+NO_FLOOR = Floor.under(RIG, 6)
 
 ALL = (*term_names(RIG), *SHARED)
 
@@ -142,13 +162,26 @@ def test_rigs_that_are_off_as_assumed_leave_consistent_poses() -> None:
     assert 0.75 < np.mean(found) < 1.25
 
 
-def driven(frames: int) -> OnlineDoubt:
+UNCORRECTED = np.zeros(len(EXACT.values))
+"""What a rig that calibrates itself applies before it has found anything."""
+
+
+def increments_of(frames: int, applied: FloatArray | None = UNCORRECTED) -> list[Increment]:
+    """The first frames of a drive, measured with a correction."""
+    increments = drawn(3, frames=12).increments[:frames]
+    return [dataclasses.replace(each, rig_correction=applied) for each in increments]
+
+
+def driven(frames: int, floor: Floor = NO_FLOOR) -> OnlineDoubt:
     """After the first frames of a drive, at its true poses."""
-    drive = drawn(3, frames=12)
-    online = OnlineDoubt(CALIBRATED.rig)
-    for increment, wTc in zip(drive.increments[:frames], drive.poses, strict=False):
+    online = OnlineDoubt(CALIBRATED.rig, floor)
+    for increment, wTc in zip(increments_of(frames), drawn(3, frames=12).poses, strict=False):
         online.observe(increment, wTc)
     return online
+
+
+def added_to_pose(online: OnlineDoubt) -> FloatArray:
+    return np.asarray(online.pose(Prediction(np.eye(4), np.zeros((6, 6)))).covariance)
 
 
 @pytest.mark.parametrize("term", ["column", "focal", "radial", "baseline"])
@@ -162,28 +195,92 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
     np.testing.assert_allclose(gain, turned, rtol=1e-3, atol=1e-4 * np.abs(turned).max())
 
 
+def whole() -> DoubtedMarginals:
+    refined = solved()
+    return DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
+
+
 def test_the_newest_pose_is_as_uncertain_as_the_whole_graph_has_it() -> None:
     """Within a factor of two: a filter does not go back to earlier poses."""
-    refined, shared = solved(), slice(len(EXACT.values), None)
-    whole = DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
-    gain = whole.gain[-6:, shared]
-    known = np.diagonal(gain @ whole.correction[shared, shared] @ gain.T)
-    ratio = np.sqrt(np.diagonal(driven(12).added(CALIBRATED)) / known)
+    shared = slice(len(EXACT.values), None)
+    gain = whole().gain[-6:, shared]
+    known = np.diagonal(gain @ whole().correction[shared, shared] @ gain.T)
+    ratio = np.sqrt(np.diagonal(added_to_pose(driven(12))) / known)
     assert (ratio > 0.5).all()
     assert (ratio < 2.0).all(), ratio
 
 
-def test_online_covariances_of_a_calibrated_rig_hold_its_error_and_of_an_exact_one_none() -> None:
-    settings, zero = Isam2Settings(noise_factor=1.0), np.zeros(len(EXACT.values))
-    increments = drawn(3, frames=12).increments
-    applied = [dataclasses.replace(each, rig_correction=zero) for each in increments]
+def test_a_hard_floor_keeps_the_doubt_within_what_it_allows() -> None:
+    floor = Floor.under(RIG, 3)
+    last, added = drawn(3, frames=12).poses[-1], added_to_pose(driven(12, floor))
+    assert np.linalg.matrix_rank(added, tol=1e-9 * np.trace(added)) == 3
+    np.testing.assert_allclose(floor.allowed_part(last, added), added, atol=1e-12)
 
-    def last(rig: CameraRig, of: list[Increment]) -> FloatArray:
-        return np.asarray(play(make_estimator(rig, settings, FREE), of, FREE)[-1].covariance)
 
-    exact, calibrated = last(EXACT.rig, applied), last(CALIBRATED.rig, applied)
-    np.testing.assert_array_equal(exact, last(CALIBRATED.rig, increments))
+@pytest.mark.parametrize("kind", ["landmark_kalman", "landmark_kalman_graph", "ekf", "isam2"])
+def test_online_covariances_of_a_calibrated_rig_hold_its_error_and_of_an_exact_one_none(
+    kind: str,
+) -> None:
+    settings = ONLINE[kind]
+
+    def last(rig: CameraRig, applied: FloatArray | None) -> UpdateStats:
+        estimator = make_estimator(rig, settings, FREE)
+        return play(estimator, increments_of(12, applied), FREE, rig)[-1]
+
+    exact, calibrated = last(EXACT.rig, UNCORRECTED), last(CALIBRATED.rig, UNCORRECTED)
+    as_stated = last(CALIBRATED.rig, None)
+    np.testing.assert_array_equal(exact.covariance, as_stated.covariance)
+    np.testing.assert_array_equal(exact.wTc, calibrated.wTc)
     np.testing.assert_allclose(
-        calibrated - exact, driven(12).added(CALIBRATED), rtol=0.5, atol=1e-4
+        calibrated.covariance - exact.covariance, added_to_pose(driven(12)), rtol=0.5, atol=1e-4
     )
-    assert np.trace(calibrated) > 1.2 * np.trace(exact)
+    assert np.trace(calibrated.covariance) > 1.2 * np.trace(exact.covariance)
+
+
+@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf"])
+def test_filters_report_landmarks_as_uncertain_as_their_rig_leaves_them(kind: str) -> None:
+    def after(rig: CameraRig) -> FullEstimator:
+        estimator = make_estimator(rig, ONLINE[kind], FREE)
+        play(estimator, increments_of(12), FREE, rig)
+        return estimator
+
+    exact, calibrated = after(EXACT.rig), after(CALIBRATED.rig)
+    matched, reported = exact.estimate().landmarks, calibrated.estimate().landmarks
+    more = reported.covariances - matched.covariances
+    assert np.linalg.eigvalsh(more).min() > -1e-12
+    assert np.median(np.trace(more, axis1=1, axis2=2)) > 1e-6
+    # Matching needs what a landmark's place is beside the camera, which shares the rig's error.
+    np.testing.assert_array_equal(calibrated.landmarks().covariances, exact.landmarks().covariances)
+    ids = reported.ids[[5, 2]]
+    joint = calibrated.joint_covariance(ids)
+    np.testing.assert_allclose(joint[6:9, 6:9], reported.covariances[5], rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(calibrated.landmark_covariances(ids)[1], reported.covariances[2])
+    assert np.linalg.eigvalsh(joint).min() > 0.0
+
+
+def test_a_correction_is_weighed_once_for_as_long_as_it_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weighed: list[FloatArray] = []
+
+    def counted(correction: RigCorrection) -> FloatArray:
+        weighed.append(correction.values)
+        return shared_covariance(correction)
+
+    monkeypatch.setattr(online_doubt, "shared_covariance", counted)
+    online = OnlineDoubt(CALIBRATED.rig, NO_FLOOR)
+    for frame, increment in enumerate(increments_of(12)):
+        applied = UNCORRECTED if frame < 8 else UNCORRECTED + 1e-3
+        online.observe(dataclasses.replace(increment, rig_correction=applied), np.eye(4))
+    assert len(weighed) == 2
+
+
+@pytest.mark.parametrize("kind", ["landmark_kalman", "landmark_kalman_graph", "ekf"])
+def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: str) -> None:
+    increments = increments_of(12)
+    through, first, second = (make_estimator(CALIBRATED.rig, ONLINE[kind], FREE) for _ in range(3))
+    play(through, increments, FREE)
+    play(first, increments[:7], FREE)
+    second.restore(first.state())
+    play(second, increments[7:], FREE)
+    assert_same_bits(second.estimate(), through.estimate())

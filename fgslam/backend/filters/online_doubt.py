@@ -1,0 +1,245 @@
+"""What the doubt about a rig's calibration adds to poses and landmarks, frame by frame.
+
+The Schmidt-Kalman filter's cross terms (Schmidt 1966), as derivatives: how the newest pose and each
+landmark of the map follow the terms that all cameras share, which no estimator here estimates. A
+frame costs what it sees. Estimates stay as they are. Final covariances of a whole graph have the
+same from the graph (:mod:`fgslam.backend.smoothers.rig_doubt`).
+docs/derivations/measurement_noise.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, StateArrays
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import (
+    adjoint,
+    inverse,
+    projection_jacobian,
+    skew,
+    triangulate,
+)
+from fgslam.core.measurements import Increment, Observations
+from fgslam.core.rig_correction import (
+    EXPECTED_PX,
+    SHARED,
+    RigCorrection,
+    shared_displacements,
+    shared_information,
+)
+from fgslam.core.sensors import (
+    CameraRig,
+    Sensor,
+    measurement_map,
+    pixel_model,
+    vertical_to_horizontal,
+)
+
+_LEAST_MATCHES = 6  # of a frame; with fewer, its pose follows the one before
+_LEAST_DISPARITY_PX = 0.5  # farther points are known no better than their noise
+_LEAST_INFORMATION = 1e-9  # of the mean, in directions that the matches leave open
+
+
+class OnlineDoubt:
+    """Derivatives of the newest pose and of the landmarks by the terms in SHARED.
+
+    Of a rig that is exact, or that is taken as stated, there is no doubt: nothing is added.
+    """
+
+    def __init__(self, sensor: Sensor, floor: Floor) -> None:
+        """The first pose is known, the map empty.
+
+        Args:
+            sensor: that measures; only a rig of cameras is ever in doubt.
+            floor: a hard one leaves the pose these directions alone.
+        """
+        self._rig = sensor if isinstance(sensor, CameraRig) and not sensor.exact else None
+        self._floor = floor
+        self._applied: FloatArray = np.empty(0)  # correction of the rig, as last heard
+        self._covariance: FloatArray | None = None  # (q, q) of the terms; None: no doubt
+        self._wTc: FloatArray | None = None
+        self._gain = np.zeros((6, len(SHARED)))
+        # By landmark: identity, derivative in world axes, information given the poses.
+        self._map = GrowingColumns(
+            ids=np.empty(0, np.int64),
+            gain=np.empty((0, 3, len(SHARED))),
+            information=np.empty((0, 3, 3)),
+        )
+
+    def observe(self, increment: Increment, wTc: FloatArray) -> None:
+        """Takes in a frame: its accepted measurements and its pose as estimated."""
+        self._hear(increment.rig_correction)
+        if self._rig is None or self._covariance is None:
+            return
+        if self._wTc is not None:
+            self._gain = adjoint(inverse(inverse(self._wTc) @ wTc)) @ self._gain
+        seen = increment.observations.select(~increment.rejected)
+        near = seen.measurement[:, 2] > _LEAST_DISPARITY_PX
+        look = _Look(self._rig, seen.select(near), wTc)
+        rows, known = self._rows(look.ids)
+        if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
+            basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
+            self._gain = look.select(known).pose_gain(*self._at(rows[known]), basis)
+        self._update(look.select(known), rows[known])
+        self._add(look.select(~known))
+        self.forget(increment.pruned_ids)
+        self._wTc = wTc
+
+    def forget(self, ids: IntArray) -> None:
+        """Landmarks that somebody else holds now, or nobody."""
+        self._map.drop(np.isin(self._map["ids"], ids))
+
+    def pose(self, newest: Prediction) -> Prediction:
+        """The newest pose with what the doubt adds to its covariance."""
+        if self._covariance is None:
+            return newest
+        added = self._gain @ self._covariance @ self._gain.T
+        return Prediction(newest.wTc, newest.covariance + added)
+
+    def landmarks(self, known: LandmarkMap) -> LandmarkMap:
+        """Landmarks with what the doubt adds to their covariances."""
+        if self._covariance is None:
+            return known
+        gain = self._gains(known.ids)
+        added = gain @ self._covariance @ np.swapaxes(gain, 1, 2)
+        return dataclasses.replace(known, covariances=known.covariances + added)
+
+    def joint(self, ids: IntArray, covariance: FloatArray) -> FloatArray:
+        """A joint covariance (6 + 3k, 6 + 3k) of newest pose and landmarks with what it adds."""
+        if self._covariance is None:
+            return covariance
+        gain = np.concatenate([self._gain, self._gains(ids).reshape(-1, len(SHARED))])
+        return np.asarray(covariance + gain @ self._covariance @ gain.T)
+
+    def state(self) -> StateArrays:
+        """Everything needed to continue."""
+        pose = np.empty((0, 4, 4)) if self._wTc is None else self._wTc[None]
+        own = {"applied": self._applied, "pose": pose, "pose_gain": self._gain}
+        return {f"doubt_{name}": array for name, array in (own | self._map.state()).items()}
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        of = {name.removeprefix("doubt_"): array for name, array in state.items()}
+        self._hear(of["applied"] if of["applied"].size else None)
+        self._wTc = next(iter(of["pose"]), None)
+        self._gain = of["pose_gain"]
+        self._map.restore({name: state[f"doubt_{name}"] for name in ("ids", "gain", "information")})
+
+    # ----------------------------------------------------------------------------------------
+
+    def _hear(self, correction: FloatArray | None) -> None:
+        """Of the correction that a frame's measurements contain; it changes seldom."""
+        if self._rig is None or correction is None or np.array_equal(correction, self._applied):
+            return
+        self._applied = correction
+        none = RigCorrection.none(self._rig)
+        self._covariance = shared_covariance(dataclasses.replace(none, values=correction))
+
+    def _gains(self, ids: IntArray) -> FloatArray:
+        """(k, 3, q) of landmarks; zero of those too far away to be known."""
+        rows, known = self._rows(ids)
+        gain = np.zeros((len(ids), 3, len(SHARED)))
+        gain[known] = self._map["gain"][rows[known]]
+        return gain
+
+    def _rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
+        """(k,) rows of landmarks in the map, and which of them are there."""
+        have = self._map["ids"]
+        if not len(have):
+            return np.zeros(len(ids), np.int64), np.zeros(len(ids), np.bool_)
+        rows = np.minimum(np.searchsorted(have, ids), len(have) - 1)
+        return rows, np.asarray(have[rows] == ids)
+
+    def _at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        return self._map["gain"][rows], self._map["information"][rows]
+
+    def _update(self, look: _Look, rows: IntArray) -> None:
+        gain, information = self._at(rows)
+        pull, told = look.landmarks()
+        information = information + told
+        off = look.off(self._gain) - look.by_point @ gain
+        self._map["gain"][rows] = gain + np.linalg.solve(information, pull @ off)
+        self._map["information"][rows] = information
+
+    def _add(self, look: _Look) -> None:
+        """Landmarks where their first measurement has them; identities ascend."""
+        if not len(look.ids):
+            return
+        gain = np.linalg.solve(look.by_point, look.off(self._gain))
+        new = {"ids": look.ids, "gain": gain, "information": look.landmarks()[1]}
+        before = len(self._map)
+        self._map.append(new)
+        self._map.keep_ascending("ids", before)
+
+
+class _Look:
+    """Measurements (k) of a frame, linearised where they have their points."""
+
+    def __init__(self, rig: CameraRig, seen: Observations, wTc: FloatArray) -> None:
+        points = triangulate(rig, seen.measurement)
+        projection = projection_jacobian(rig, points)
+        self.ids = seen.ids
+        self.shift = shared_shifts(rig, seen.measurement)
+        self.by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
+        self.by_point = projection @ wTc[:3, :3].T
+        self.covariance = seen.covariance
+
+    def select(self, rows: BoolArray) -> _Look:
+        """Some of them."""
+        out = object.__new__(_Look)
+        for name, values in vars(self).items():
+            setattr(out, name, values[rows])
+        return out
+
+    def off(self, pose_gain: FloatArray) -> FloatArray:
+        """(k, 3, q) what of the measurements' shifts the pose does not follow."""
+        return np.asarray(self.shift - self.by_pose @ pose_gain)
+
+    def landmarks(self) -> tuple[FloatArray, FloatArray]:
+        """What residuals pull landmarks by (k, 3, 3), and tell of them (k, 3, 3)."""
+        pull = np.swapaxes(self.by_point, 1, 2) @ np.linalg.inv(self.covariance)
+        return pull, pull @ self.by_point
+
+    def pose_gain(self, gain: FloatArray, information: FloatArray, basis: FloatArray) -> FloatArray:
+        """(6, q) derivative of the pose that fits landmarks of these derivatives best.
+
+        ``basis`` (6, d) spans the directions that the pose has.
+        """
+        turned = np.swapaxes(self.by_point, 1, 2)
+        expected = self.covariance + self.by_point @ np.linalg.solve(information, turned)
+        by_pose = self.by_pose @ basis
+        pull = np.swapaxes(by_pose, 1, 2) @ np.linalg.inv(expected)
+        normal, freedom = (pull @ by_pose).sum(axis=0), basis.shape[1]
+        normal += _LEAST_INFORMATION * np.trace(normal) / freedom * np.eye(freedom)
+        off = self.shift - self.by_point @ gain
+        return np.asarray(basis @ np.linalg.solve(normal, (pull @ off).sum(axis=0)))
+
+
+def shared_shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
+    """(k, 3, q) by which a unit of each term of SHARED displaces measurements (k, 3)."""
+    return fused(rig, shared_displacements(rig, pixels_of(rig, measured)))
+
+
+def pixels_of(rig: CameraRig, measured: FloatArray) -> FloatArray:
+    """(k, cameras, 2) where a point of these measurements (k, 3) is seen."""
+    model = pixel_model(rig.cameras, vertical_to_horizontal(rig))
+    return np.asarray((measured @ model.T).reshape(-1, rig.cameras, 2))
+
+
+def fused(rig: CameraRig, of_pixels: FloatArray) -> FloatArray:
+    """(k, 3, n) of measurements, by displacements of their pixels (k, 2 * cameras, n)."""
+    fuse = measurement_map("fused", rig.cameras, vertical_to_horizontal(rig))
+    return np.asarray(fuse @ of_pixels)
+
+
+def shared_covariance(correction: RigCorrection) -> FloatArray:
+    """(q, q) covariance of what nothing estimates; (0, 0) of an exact rig."""
+    if correction.rig.exact:
+        return np.empty((0, 0))
+    # EXPECTED_PX is of one coordinate between two images: as much of a pixel in each of them.
+    off_px = max(EXPECTED_PX, correction.rms_px() / np.sqrt(2.0))
+    return np.asarray(np.linalg.inv(shared_information(correction.rig, off_px)))
