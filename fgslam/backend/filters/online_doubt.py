@@ -70,6 +70,11 @@ class OnlineDoubt:
             information=np.empty((0, 3, 3)),
         )
 
+    @property
+    def present(self) -> bool:
+        """Whether there is any doubt."""
+        return self._covariance is not None
+
     def observe(self, increment: Increment, wTc: FloatArray) -> None:
         """Takes in a frame: its accepted measurements and its pose as estimated."""
         self._hear(increment.rig_correction)
@@ -93,12 +98,17 @@ class OnlineDoubt:
         """Landmarks that somebody else holds now, or nobody."""
         self._map.drop(np.isin(self._map["ids"], ids))
 
+    def of_pose(self) -> FloatArray:
+        """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
+        if self._covariance is None:
+            return np.zeros((6, 6))
+        return self._gain @ self._covariance @ self._gain.T
+
     def pose(self, newest: Prediction) -> Prediction:
         """The newest pose with what the doubt adds to its covariance."""
         if self._covariance is None:
             return newest
-        added = self._gain @ self._covariance @ self._gain.T
-        return Prediction(newest.wTc, newest.covariance + added)
+        return Prediction(newest.wTc, newest.covariance + self.of_pose())
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with what the doubt adds to their covariances."""

@@ -256,7 +256,7 @@ def fill_between(
         carried = _carried(poses, covariances, frame, in_graph[max(after - 1, 0) : after + 1])
         own = np.array(marginals.marginalCovariance(key)) + carried
         covariances[frame] = allowed_parts(floor, poses[frame][None], own[None])[0]
-    return Solution(poses, covariances, solved.points, solved.point_covariances, solved.remarks)
+    return dataclasses.replace(solved, poses=poses, pose_covariances=covariances)
 
 
 def _carried(

@@ -313,7 +313,7 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
         return Solution(poses, kept, points, missing, (*refined.remarks, str(error)))
-    return Solution(poses, kept, points, covariances, refined.remarks)
+    return Solution(poses, kept, points, covariances, refined.remarks, considers_rig=True)
 
 
 def _lost(builder: GraphBuilder, found: Refined) -> dict[int, str]:

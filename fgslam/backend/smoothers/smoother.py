@@ -115,6 +115,7 @@ class Smoother:
         self._takeovers = 0
         self._eras: list[int] = []
         self._doubt = OnlineDoubt(problem.sensor, problem.floor)
+        self._doubts: list[FloatArray] = []  # (6, 6) a frame: added to its pose when it came
 
     # -- the method ----------------------------------------------------------------------------
 
@@ -159,7 +160,8 @@ class Smoother:
         closed = tuple(self._close(loop, increment.index) for loop in increment.loops)
         current = self._current(tracking)
         self._doubt.observe(increment, current.wTc)
-        covariance = self._doubt.pose(current).covariance
+        self._doubts.append(self._doubt.of_pose())
+        covariance = current.covariance + self._doubts[-1]
         return dataclasses.replace(stats, wTc=current.wTc, covariance=covariance, closed=closed)
 
     def recalibrate(self, correction: FloatArray) -> None:
@@ -178,10 +180,14 @@ class Smoother:
         if not self._inputs.increments:
             return self._tracker.estimate()
         answer = self._solved()
+        covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
+        if self._doubt.present and not answer.considers_rig:
+            covariances = covariances + np.array(self._doubts)
+            landmarks = self._doubt.landmarks(landmarks)
         return Estimate(
             Trajectory(self._inputs.timestamps(), answer.poses),
-            answer.pose_covariances,
-            self._map.reported(answer),
+            covariances,
+            landmarks,
             (*self._solver.remarks, *self._builder.admission.remarks, *answer.remarks),
             noise_factor=float(np.sqrt(self._builder.noise.power)),
         )
@@ -203,7 +209,10 @@ class Smoother:
                 f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
                 "its marginal instead"
             )
-        return self._at_last_frame(self._solver.joint(variables))
+        joint = self._at_last_frame(self._solver.joint(variables))
+        if self._doubt.present and not self._solved().considers_rig:
+            joint = self._doubt.joint(ids, joint)
+        return joint
 
     def state(self) -> StateArrays:
         """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""

@@ -32,6 +32,8 @@ class Solution:
         points: positions (3,) of landmark variables.
         point_covariances: (3, 3) of the same.
         remarks: what was left out, why covariances are missing; in words.
+        considers_rig: covariances contain what is open of the rig's calibration; else what was
+            open when each frame came is added.
     """
 
     poses: FloatArray
@@ -39,6 +41,7 @@ class Solution:
     points: dict[int, FloatArray]
     point_covariances: dict[int, FloatArray]
     remarks: tuple[str, ...] = ()
+    considers_rig: bool = False
 
 
 def poses_of(values: Any, frames: list[int]) -> FloatArray:

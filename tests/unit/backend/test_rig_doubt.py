@@ -18,6 +18,7 @@ from fgslam.backend.settings import (
     BatchSettings,
     EkfSettings,
     EstimatorSettings,
+    FixedLagSettings,
     Isam2Settings,
     KernelSettings,
     LandmarkKalmanGraphSettings,
@@ -27,7 +28,7 @@ from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals, shifts
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction, UpdateStats
+from fgslam.core.estimates import UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import (
@@ -50,6 +51,7 @@ ONLINE: dict[str, EstimatorSettings] = {
     "landmark_kalman_graph": LandmarkKalmanGraphSettings(),
     "ekf": EkfSettings(),
     "isam2": Isam2Settings(noise_factor=1.0),
+    "fixed_lag": FixedLagSettings(lag_frames=5, noise_factor=1.0),
 }
 NO_FLOOR = Floor.under(RIG, 6)
 
@@ -180,10 +182,6 @@ def driven(frames: int, floor: Floor = NO_FLOOR) -> OnlineDoubt:
     return online
 
 
-def added_to_pose(online: OnlineDoubt) -> FloatArray:
-    return np.asarray(online.pose(Prediction(np.eye(4), np.zeros((6, 6)))).covariance)
-
-
 @pytest.mark.parametrize("term", ["column", "focal", "radial", "baseline"])
 def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
     by = 1e-3 / RIG.fx * (np.array(ALL) == term)
@@ -205,14 +203,14 @@ def test_the_newest_pose_is_as_uncertain_as_the_whole_graph_has_it() -> None:
     shared = slice(len(EXACT.values), None)
     gain = whole().gain[-6:, shared]
     known = np.diagonal(gain @ whole().correction[shared, shared] @ gain.T)
-    ratio = np.sqrt(np.diagonal(added_to_pose(driven(12))) / known)
+    ratio = np.sqrt(np.diagonal(driven(12).of_pose()) / known)
     assert (ratio > 0.5).all()
     assert (ratio < 2.0).all(), ratio
 
 
 def test_a_hard_floor_keeps_the_doubt_within_what_it_allows() -> None:
     floor = Floor.under(RIG, 3)
-    last, added = drawn(3, frames=12).poses[-1], added_to_pose(driven(12, floor))
+    last, added = drawn(3, frames=12).poses[-1], driven(12, floor).of_pose()
     assert np.linalg.matrix_rank(added, tol=1e-9 * np.trace(added)) == 3
     np.testing.assert_allclose(floor.allowed_part(last, added), added, atol=1e-12)
 
@@ -232,12 +230,12 @@ def test_online_covariances_of_a_calibrated_rig_hold_its_error_and_of_an_exact_o
     np.testing.assert_array_equal(exact.covariance, as_stated.covariance)
     np.testing.assert_array_equal(exact.wTc, calibrated.wTc)
     np.testing.assert_allclose(
-        calibrated.covariance - exact.covariance, added_to_pose(driven(12)), rtol=0.5, atol=1e-4
+        calibrated.covariance - exact.covariance, driven(12).of_pose(), rtol=0.5, atol=1e-4
     )
     assert np.trace(calibrated.covariance) > 1.2 * np.trace(exact.covariance)
 
 
-@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf"])
+@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf", "fixed_lag"])
 def test_filters_report_landmarks_as_uncertain_as_their_rig_leaves_them(kind: str) -> None:
     def after(rig: CameraRig) -> FullEstimator:
         estimator = make_estimator(rig, ONLINE[kind], FREE)
@@ -251,6 +249,8 @@ def test_filters_report_landmarks_as_uncertain_as_their_rig_leaves_them(kind: st
     assert np.median(np.trace(more, axis1=1, axis2=2)) > 1e-6
     # Matching needs what a landmark's place is beside the camera, which shares the rig's error.
     np.testing.assert_array_equal(calibrated.landmarks().covariances, exact.landmarks().covariances)
+    added = calibrated.estimate().covariances - exact.estimate().covariances
+    assert np.trace(added[-1]) > 0.2 * np.trace(exact.estimate().covariances[-1])
     ids = reported.ids[[5, 2]]
     joint = calibrated.joint_covariance(ids)
     np.testing.assert_allclose(joint[6:9, 6:9], reported.covariances[5], rtol=0.0, atol=1e-12)
