@@ -11,7 +11,7 @@ import json
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -73,8 +73,12 @@ class ArrayFile:
         text = json.dumps({"format": self.name, "version": chosen, **values}, sort_keys=True)
         return {"header": np.array(text)}
 
-    def load(self, path: Path) -> StateArrays:
-        """All arrays of a file, never unpickled. Raises :attr:`error` for what cannot be read."""
+    def load(self, path: Path, names: Sequence[str] | None = None) -> StateArrays:
+        """The arrays of a file of these names, or all; never unpickled.
+
+        Raises:
+            FgslamError: :attr:`error`, for what cannot be read.
+        """
         if path.exists() and not path.is_file() and not path.is_dir():
             require_file(path, self.error, self.give)  # who opens a pipe waits for its other end
         try:
@@ -88,7 +92,7 @@ class ArrayFile:
         try:
             with np.load(path, allow_pickle=False) as file:
                 _require_plain(file)
-                return {name: file[name] for name in file.files}
+                return {name: file[name] for name in (file.files if names is None else names)}
         except _UNREADABLE as error:
             cause = " ".join(str(error).split()) or type(error).__name__
             if "pickle" in cause:  # NumPy advises to unpickle, which would run what the file says
@@ -176,6 +180,45 @@ def write_arrays(path: Path, arrays: StateArrays, compressed: bool = False) -> i
         return file.tell()
 
 
+@dataclass(frozen=True)
+class Pieces:
+    """An array that is written without ever being whole in memory.
+
+    Attributes:
+        dtype: of its elements.
+        shape: of the whole.
+        parts: gives its rows, one contiguous part after the other.
+    """
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    parts: Callable[[], Iterable[np.ndarray[Any, Any]]]
+
+    @staticmethod
+    def of(array: np.ndarray[Any, Any]) -> Pieces:
+        """One that is in memory."""
+        return Pieces(array.dtype, array.shape, lambda: (array,))
+
+
+def write_pieces(path: Path, arrays: Mapping[str, Pieces]) -> None:
+    """Writes what :func:`write_arrays` would write of the whole arrays, to the same bytes.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w", allowZip64=True) as file:
+        for name, array in arrays.items():
+            described = {
+                "descr": np.lib.format.dtype_to_descr(array.dtype),
+                "fortran_order": False,
+                "shape": array.shape,
+            }
+            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array_header_1_0(member, described)
+                for part in array.parts():
+                    member.write(np.ascontiguousarray(part).tobytes())
+
+
 def load_arrays(path: Path) -> StateArrays:
     """Arrays of a file of a run folder. Raises MeasurementLogError for what cannot be read."""
     return _OF_RUNS.load(path)
@@ -204,6 +247,14 @@ def rows_of(arrays: Mapping[str, Any], name: str) -> int:
 def offsets(sizes: Sequence[int]) -> IntArray:
     """Offsets (n + 1,) of parts of these sizes."""
     return np.cumsum(np.array([0, *sizes], np.int64))
+
+
+OFFSETS = "_start"  # ends the names of arrays of offsets
+
+
+def continued(parts: Sequence[IntArray]) -> IntArray:
+    """Offsets of parts one after the other, of the offsets of each."""
+    return offsets(joined([np.diff(part) for part in parts], (), np.int64).tolist())
 
 
 def joined(

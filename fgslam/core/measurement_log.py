@@ -1,77 +1,32 @@
 """The measurement log: everything that estimators consume, replayable without images.
 
-One uncompressed ``.npz`` (:mod:`fgslam.core.array_files`).
-
-A log without loop closures and relocalised frames is written as version 2, to the same bytes as
-before there were any; one that has them is version 3, one of a rig that calibrated itself version
-4. All four versions are read.
+One uncompressed ``.npz`` (:mod:`fgslam.core.log_arrays`).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fgslam.core.array_files import (
-    ArrayFile,
-    Items,
-    from_upper,
-    joined,
-    of_rows,
-    offsets,
-    rows_of,
-    split,
-    write_arrays,
-)
-from fgslam.core.array_values import require_covariances, require_finite, require_single
-from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, StateArrays
+from fgslam.core.array_files import write_arrays
+from fgslam.core.arrays import Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
-from fgslam.core.rig_checks import rig_fault
-from fgslam.core.rig_correction import term_names
-from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
-
-LOG = ArrayFile(
-    name="fgslam measurement log",
-    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope.
-    versions=(1, 2, 3, 4, 5),
-    error=MeasurementLogError,
-    give="give a run folder's measurements.npz",
-    again="run again",
+from fgslam.core.log_arrays import (
+    LOG,
+    SENSOR_ARRAYS,
+    arrays_of,
+    frames_of,
+    sensor_of,
+    version_of,
 )
-_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, _WITH_TURNS = 2, 3, 4, 5
-_UPPER = np.triu_indices(3)
-
-# Arrays by the count that their first axis has, with type and the shape of an item.
-_PER_FRAME: Items = {
-    "frame_index": ("i", ()),
-    "timestamp": ("f", ()),
-    "odometry_motion": ("f", (4, 4)),
-    "odometry_covariance": ("f", (6, 6)),
-}
-_PER_OBSERVATION: Items = {
-    "observation_id": ("i", ()),
-    "measurement": ("f", (3,)),
-    "measurement_covariance": ("f", (6,)),
-    "pixels": ("f", (3, 2)),
-    "is_new": ("b", ()),
-    "rejected": ("b", ()),
-}
-_LOOPS = "loop_"  # before the names of the arrays of the loops' own observations
-_PER_LOOP: Items = {
-    "loop_frame": ("i", ()),
-    "loop_oTc": ("f", (4, 4)),
-    "loop_covariance": ("f", (6, 6)),
-}
-_RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
-_SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
-_EXACT = "exact"  # of a rig: written where it is
+from fgslam.core.log_blocks import LogBlocks
+from fgslam.core.measurements import Increment, LoopClosure, Odometry
+from fgslam.core.sensors import Sensor
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -87,7 +42,7 @@ class MeasurementLog(Brief):
 
     rig: Sensor
     motion_model: dict[str, Any]
-    increments: list[Increment] = field(default_factory=list)
+    increments: list[Increment] | LogBlocks = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.increments)
@@ -108,205 +63,88 @@ class MeasurementLog(Brief):
         increment = dataclasses.replace(increment, odometry=_without_stand_in(increment.odometry))
         self.increments.append(increment)
 
+    def keep_in(self, folder: Path) -> None:
+        """From now on only the last few hundred frames are in memory, the others in the folder.
+
+        What is read of the log is the same. The folder is the log's own; it is made when needed.
+
+        Raises:
+            OutputError: it holds blocks of an earlier log that cannot be removed.
+        """
+        before, self.increments = self.increments, LogBlocks(self.rig, self.motion_model, folder)
+        for increment in before:
+            self.increments.append(increment)
+
+    def rest_in(self, path: Path) -> None:
+        """Of a log on disk: frames are read from now on from its file, which holds all of them."""
+        if isinstance(self.increments, LogBlocks):
+            self.increments.rest_in(path)
+
+    def continue_with(self, frames: Sequence[Increment]) -> None:
+        """Makes these the frames so far: a loaded log's."""
+        on_disk = self.increments if isinstance(self.increments, LogBlocks) else None
+        self.increments = list(frames)
+        if on_disk is not None:
+            self.keep_in(on_disk.folder)
+
+    @property
+    def timestamps(self) -> FloatArray:
+        """(n,) seconds."""
+        if isinstance(self.increments, LogBlocks):
+            return self.increments.timestamps
+        return np.array([s.timestamp for s in self], np.float64)
+
+    @property
+    def numbers(self) -> IntArray:
+        """(n,) the frames' numbers in their recording."""
+        if isinstance(self.increments, LogBlocks):
+            return self.increments.numbers
+        return np.array([s.index for s in self], np.int64)
+
+    @property
+    def relocalised(self) -> int:
+        """How many frames were placed without a prior."""
+        if isinstance(self.increments, LogBlocks):
+            return self.increments.relocalised
+        return sum(s.relocalised for s in self)
+
+    @property
+    def closures(self) -> list[tuple[int, LoopClosure]]:
+        """All loop closures, with the position of the frame that offered each."""
+        if isinstance(self.increments, LogBlocks):
+            return self.increments.closures
+        return [(k, loop) for k, step in enumerate(self) for loop in step.loops]
+
     def to_arrays(self) -> StateArrays:
         """The log as the arrays of its file."""
-        kind = "stereo" if isinstance(self.rig, CameraRig) else "range_bearing"
-        sensor = {"kind": kind} | {name: getattr(self.rig, name) for name in _SENSOR_KEYS[kind]}
-        if isinstance(self.rig, CameraRig) and self.rig.exact:
-            sensor[_EXACT] = True
-        version = self._version()
-        header = LOG.header(version, sensor=sensor, motion=self.motion_model)
-        out = header | {
-            "rig_bTc": self.rig.bTc,
-            "frame_index": np.array([s.index for s in self], np.int64),
-            "timestamp": np.array([s.timestamp for s in self], np.float64),
-            "odometry_motion": _stack([_motion(s) for s in self], (4, 4)),
-            "odometry_covariance": _stack([_motion_covariance(s) for s in self], (6, 6)),
-        }
-        out |= _ragged("missed", [s.missed_ids for s in self])
-        out |= _ragged("pruned", [s.pruned_ids for s in self])
-        out |= _observation_arrays([s.observations for s in self], "")
-        out["rejected"] = joined([s.rejected for s in self], (), np.bool_)
-        if version >= _WITH_LOOPS:
-            out |= self._loop_arrays()
-        if version >= _WITH_CORRECTIONS and isinstance(self.rig, CameraRig):
-            terms = len(term_names(self.rig))
-            known = any(s.rig_correction is not None for s in self)
-            none = np.full(terms, 0.0 if known else np.nan)
-            corrections = [s.rig_correction for s in self]
-            rows = [none if c is None else c for c in corrections]
-            out["rig_correction"] = _stack(rows, (terms,))
-        return out
-
-    def _version(self) -> int:
-        """The first that has a place for all that is there."""
-        if any(s.odometry is not None and s.odometry.turned for s in self):
-            return _WITH_TURNS
-        if any(s.rig_correction is not None for s in self):
-            return _WITH_CORRECTIONS
-        return _WITH_LOOPS if any(s.loops or s.relocalised for s in self) else _BEFORE_LOOPS
-
-    def _loop_arrays(self) -> StateArrays:
-        loops = [loop for s in self for loop in s.loops]
-        return {
-            "relocalised": np.array([s.relocalised for s in self], np.bool_),
-            "loop_start": offsets([len(s.loops) for s in self]),
-            "loop_frame": np.array([loop.frame for loop in loops], np.int64),
-            "loop_oTc": _stack([loop.oTc for loop in loops], (4, 4)),
-            "loop_covariance": _stack([loop.covariance for loop in loops], (6, 6)),
-            "loop_merged_start": offsets([len(loop.merged) for loop in loops]),
-            "loop_merged": joined([loop.merged for loop in loops], (2,), np.int64),
-        } | _observation_arrays([loop.observations for loop in loops], _LOOPS)
+        frames = list(self)
+        return arrays_of(self.rig, self.motion_model, frames, version_of(frames))
 
     @staticmethod
     def from_arrays(arrays: StateArrays, where: str) -> MeasurementLog:
         """The log back from its arrays; ``where`` names the source in messages."""
-        header = _read_header(arrays, where)
-        _require_consistent(arrays, where)
-        _require_sound(arrays, where)
-        loops, relocalised = _loops(arrays, header["version"], where)
-        sensor = _sensor(header["sensor"], arrays["rig_bTc"], where)
-        log = MeasurementLog(sensor, header["motion"])
-        corrections = _corrections(arrays, header["version"], log.rig, where)
-        observed = _split_observations(arrays, "")
-        missed = _split(arrays, "missed")
-        pruned = _split(arrays, "pruned")
-        start = arrays["observation_start"]
-        for k, index in enumerate(arrays["frame_index"]):
-            log.append(
-                Increment(
-                    index=int(index),
-                    timestamp=float(arrays["timestamp"][k]),
-                    odometry=_odometry(arrays, k),
-                    observations=observed[k],
-                    rejected=arrays["rejected"][start[k] : start[k + 1]],
-                    missed_ids=missed[k],
-                    pruned_ids=pruned[k],
-                    loops=loops[k],
-                    relocalised=bool(relocalised[k]),
-                    rig_correction=corrections[k],
-                )
-            )
+        sensor, motion_model, frames = frames_of(arrays, where)
+        log = MeasurementLog(sensor, motion_model)
+        for frame in frames:
+            log.append(frame)
         return log
 
     def save(self, path: str | Path) -> None:
         """Writes the log, whole or not at all. Raises OutputError when it cannot be written."""
-        write_arrays(Path(path), self.to_arrays())
+        if isinstance(self.increments, LogBlocks):
+            self.increments.save(Path(path))
+        else:
+            write_arrays(Path(path), self.to_arrays())
+
+    @staticmethod
+    def load_sensor(path: Path) -> Sensor:
+        """What a log's file was measured with. Raises MeasurementLogError as :meth:`load` does."""
+        return sensor_of(LOG.load(path, SENSOR_ARRAYS), str(path))
 
     @staticmethod
     def load(path: str | Path) -> MeasurementLog:
         """Reads a log. Raises MeasurementLogError for a missing, truncated or foreign file."""
         return MeasurementLog.from_arrays(LOG.load(Path(path)), str(path))
-
-
-def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
-    header = LOG.read_header(arrays, where)
-    if header["version"] == 1:
-        rig = header.get("rig")
-        header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
-    sensor = header.get("sensor")
-    keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
-    given = set(sensor or ()) - ({_EXACT} if keys is _RIG else set())
-    if keys is None or given != {"kind", *keys}:
-        raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
-    if not isinstance(header.get("motion"), dict):
-        raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")
-    return header
-
-
-def _sensor(values: dict[str, Any], bTc: FloatArray, where: str) -> Sensor:
-    numbers = {name: value for name, value in values.items() if name != "kind"}
-    if values["kind"] != "stereo":
-        return RangeBearingSensor(**numbers, bTc=bTc)
-    rig = CameraRig(**numbers, bTc=bTc)
-    if fault := rig_fault(rig):
-        raise MeasurementLogError(f"{where}: the log's rig cannot be one: {fault}; run again")
-    return rig
-
-
-def _require_sound(arrays: StateArrays, where: str) -> None:
-    """Raises MeasurementLogError for values that no run measures."""
-    require_finite(LOG, arrays, ("timestamp", "rig_bTc", "measurement"), where)
-    covariances = from_upper(arrays["measurement_covariance"], 3)
-    require_covariances(LOG, "measurement_covariance", covariances, where)
-    known = ~np.isnan(arrays["odometry_motion"][:, 0, 0])
-    motions = {"odometry_motion": _with_translation(arrays["odometry_motion"][known])}
-    require_finite(LOG, motions, ("odometry_motion",), where)
-    moved = arrays["odometry_covariance"][known]
-    require_covariances(LOG, "odometry_covariance", moved, where, definite=False)
-    ids, start = arrays["observation_id"], arrays["observation_start"]
-    require_single(LOG, "observation_id", ids, start, where)
-
-
-def _require_consistent(arrays: StateArrays, where: str) -> None:
-    """Raises MeasurementLogError unless all arrays are there, of the right type and size."""
-    frames = rows_of(arrays, "frame_index")
-    expected = {"rig_bTc": ("f", (4, 4))} | of_rows(frames, _PER_FRAME)
-    for name in ("observation", "missed", "pruned"):
-        rows = LOG.require_offsets(arrays, f"{name}_start", frames, where)
-        expected |= of_rows(
-            rows, _PER_OBSERVATION if name == "observation" else {f"{name}_id": ("i", ())}
-        )
-    LOG.require(arrays, expected, where)
-
-
-def _loops(
-    arrays: StateArrays, version: int, where: str
-) -> tuple[list[tuple[LoopClosure, ...]], BoolArray]:
-    """Loop closures of each frame, and which frames (n,) were relocalised; none before version 3.
-
-    Raises MeasurementLogError where their arrays do not fit together, or a loop leads nowhere.
-    """
-    frames = len(arrays["frame_index"])
-    if version < _WITH_LOOPS:
-        return [()] * frames, np.zeros(frames, np.bool_)
-    _require_consistent_loops(arrays, where)
-    observed = _split_observations(arrays, _LOOPS)
-    merged = split(arrays["loop_merged"], arrays["loop_merged_start"])
-    of_all = [
-        LoopClosure(int(frame), arrays["loop_oTc"][i], arrays["loop_covariance"][i], seen, pairs)
-        for i, (frame, seen, pairs) in enumerate(
-            zip(arrays["loop_frame"], observed, merged, strict=True)
-        )
-    ]
-    out = [tuple(of_all[a:b]) for a, b in itertools.pairwise(arrays["loop_start"])]
-    for k, loops in enumerate(out):
-        astray = [loop.frame for loop in loops if not 0 <= loop.frame < k]
-        if astray:
-            raise MeasurementLogError(
-                f"{where}: a loop closure of frame {k} leads to frame {astray[0]}, which does not "
-                "come before it; run again"
-            )
-    return out, arrays["relocalised"]
-
-
-def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
-    """Raises MeasurementLogError unless the loops' arrays are there, of the right type and size."""
-    frames = rows_of(arrays, "frame_index")
-    count = LOG.require_offsets(arrays, "loop_start", frames, where)
-    seen = LOG.require_offsets(arrays, "loop_observation_start", count, where)
-    merged = LOG.require_offsets(arrays, "loop_merged_start", count, where)
-    of_loops = {
-        _LOOPS + name: item for name, item in _PER_OBSERVATION.items() if name != "rejected"
-    }
-    expected = {"relocalised": ("b", (frames,)), "loop_merged": ("i", (merged, 2))}
-    LOG.require(arrays, expected | of_rows(count, _PER_LOOP) | of_rows(seen, of_loops), where)
-
-
-def _corrections(
-    arrays: StateArrays, version: int, rig: Sensor, where: str
-) -> list[FloatArray | None]:
-    """The rig's correction in each frame; None before version 4, and in a log of NaN.
-
-    Raises MeasurementLogError where they are not there, or of another rig.
-    """
-    frames = len(arrays["frame_index"])
-    if version < _WITH_CORRECTIONS or not isinstance(rig, CameraRig):
-        return [None] * frames
-    terms = len(term_names(rig))
-    LOG.require(arrays, {"rig_correction": ("f", (frames, terms))}, where)
-    rows = arrays["rig_correction"]
-    return [None] * frames if np.isnan(rows).all() else list(rows)
 
 
 def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
@@ -316,76 +154,3 @@ def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
     if odometry.turned:
         return Odometry.turn(odometry.motion[:3, :3], odometry.covariance[:3, :3])
     return None
-
-
-def _motion(increment: Increment) -> FloatArray:
-    """(4, 4); NaN where nothing was measured, and as translation of a mere turn."""
-    odometry = increment.odometry
-    if odometry is None:
-        return np.full((4, 4), np.nan)
-    return odometry.motion + (_NO_TRANSLATION if odometry.turned else 0.0)
-
-
-_NO_TRANSLATION = np.zeros((4, 4))
-_NO_TRANSLATION[:3, 3] = np.nan
-
-
-def _with_translation(motions: FloatArray) -> FloatArray:
-    """Motions (n, 4, 4), mere turns without translation."""
-    out = np.array(motions)
-    out[np.isnan(motions[:, :3, 3]).all(axis=1), :3, 3] = 0.0
-    return out
-
-
-def _motion_covariance(increment: Increment) -> FloatArray:
-    if increment.odometry is None:
-        return np.full((6, 6), np.nan)
-    return increment.odometry.covariance
-
-
-def _odometry(arrays: StateArrays, k: int) -> Odometry | None:
-    motion, covariance = arrays["odometry_motion"][k], arrays["odometry_covariance"][k]
-    if np.isnan(motion[0, 0]):
-        return None
-    if np.isnan(motion[0, 3]):
-        return Odometry.turn(motion[:3, :3], covariance[:3, :3])
-    return Odometry(motion, covariance)
-
-
-def _stack(parts: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    return np.array(parts, np.float64).reshape(len(parts), *shape)
-
-
-def _ragged(name: str, parts: list[IntArray]) -> StateArrays:
-    return {
-        f"{name}_start": offsets([len(p) for p in parts]),
-        f"{name}_id": joined(parts, (), np.int64),
-    }
-
-
-def _observation_arrays(seen: list[Observations], prefix: str) -> StateArrays:
-    return {
-        **_ragged(f"{prefix}observation", [o.ids for o in seen]),
-        f"{prefix}measurement": joined([o.measurement for o in seen], (3,)),
-        f"{prefix}measurement_covariance": joined(
-            [o.covariance[:, _UPPER[0], _UPPER[1]] for o in seen], (6,)
-        ),
-        f"{prefix}pixels": joined([o.pixels for o in seen], (3, 2)),
-        f"{prefix}is_new": joined([o.is_new for o in seen], (), np.bool_),
-    }
-
-
-def _split(arrays: StateArrays, name: str) -> list[IntArray]:
-    return split(arrays[f"{name}_id"], arrays[f"{name}_start"])
-
-
-def _split_observations(arrays: StateArrays, prefix: str) -> list[Observations]:
-    everything = Observations(
-        arrays[f"{prefix}observation_id"],
-        arrays[f"{prefix}measurement"],
-        from_upper(arrays[f"{prefix}measurement_covariance"], 3),
-        arrays[f"{prefix}pixels"],
-        arrays[f"{prefix}is_new"],
-    )
-    start = arrays[f"{prefix}observation_start"]
-    return [everything.select(np.arange(a, b)) for a, b in itertools.pairwise(start)]

@@ -36,6 +36,7 @@ REPORT_FILE = "report.html"
 LOG_FILE = "measurements.npz"
 STATE_FILE = "checkpoint.npz"
 SUBMAPS_FOLDER = "submaps"
+BLOCKS_FOLDER = "measurements"
 COMPARISON_FILE = "comparison.csv"
 CALIBRATION_FILE = "calibration.csv"
 CAMERA_FILE = "camera.json"
@@ -81,6 +82,7 @@ _RESULT_FILES = (
     "logs/*.npz",
     "units/*.npz",
     f"{SUBMAPS_FOLDER}/*.fgmap",
+    f"{BLOCKS_FOLDER}/*.npz",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )

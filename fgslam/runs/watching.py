@@ -158,7 +158,7 @@ class Watcher:
         if truth is None:
             return
         recorder = outputs.recorder
-        stamps = np.array([increment.timestamp for increment in recorder.log])
+        stamps = recorder.log.timestamps
         placed = to_estimate_world(Trajectory(stamps, np.array(recorder.online_poses)), truth)
         if placed is None:
             return

@@ -10,9 +10,9 @@ from fgslam.slam.results import RunRecorder
 def camera_remarks(recorder: RunRecorder, watch: CameraWatch | None) -> tuple[str, ...]:
     """A line for each fault with its frames; none where the cameras are sound or not watched."""
     frames: dict[str, list[int]] = {}
-    for increment, row in zip(recorder.log, recorder.rows, strict=True):
+    for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
         if row.status == EgoMotionStatus.CAMERA_FAULT.value:
-            frames.setdefault(row.problem, []).append(increment.index)
+            frames.setdefault(row.problem, []).append(number)
     lines = [
         f"{fault}: {len(which)} of {len(recorder)} frames, {_between(which)}, are not used; their "
         "poses are predicted (mend the camera; frontend.watch_cameras: false uses them all)"

@@ -31,7 +31,7 @@ def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     adrift = located_frames(recorder) & ~connected_frames(recorder, parts)
     if not adrift.any():
         return ()
-    numbers = np.array([increment.index for increment in recorder.log])[adrift]
+    numbers = recorder.log.numbers[adrift]
     known, n = in_first_map(recorder, parts), len(recorder)
     return (
         f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]} are located beside each other "

@@ -71,11 +71,11 @@ class RunRecorder:
         stages = dict.fromkeys(STAGES, 0.0) | report.stage_ms
         times = stages | beside
         row = _row(report, stereo_precision)
+        self.log.append(report.increment)  # may write to disk, and fail
         self.stage_ms.append(np.array([times[stage] for stage in STAGES]))
         self.tracked_poses.append(report.tracking.wTc)
         self.online_poses.append(report.stats.wTc)
         self.online_covariances.append(report.stats.covariance)
-        self.log.append(report.increment)
         frame = report.found.frame
         self.frame_digests.append(0 if frame is None else frame.digest())
         self.rows.append(row)
@@ -108,7 +108,7 @@ class RunRecorder:
         self.online_covariances = list(state["online_covariances"])
         self.stage_ms = list(state["stage_ms"])
         self.frame_digests = state["frame_digests"].tolist()
-        self.log.increments = log.increments[: len(self.rows)]
+        self.log.continue_with(log.increments[: len(self.rows)])
 
 
 def _row(report: FrameReport, stereo_precision: float) -> FrameRow:
@@ -273,8 +273,7 @@ def result_of(
     Where the estimator ``failed`` in the frame after them, it may have taken in a part of that
     frame, and may have no answer any more.
     """
-    stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
-    online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    online = Trajectory(recorder.log.timestamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
     covariances = np.array(recorder.online_covariances).reshape(-1, 6, 6)
     if failed:
         estimate, _ = estimate_of_failed(pipeline.estimator, online, covariances)

@@ -137,6 +137,7 @@ class Session:
         self._describer = FrameDescriber(features or make_extractor(frontend))
         self.pipeline = self._made(beginning)
         self.recorder = RunRecorder(MeasurementLog(rig, description_of(self.pipeline.motion)))
+        self._join_log()
         self._left_out = _LeftOut()
         self._seen = FirstImages()
         self._margins = rig.margins if isinstance(rig, StereoRig) else ()
@@ -195,6 +196,24 @@ class Session:
             folder = Path(self._scratch.name) / "submaps"
         self._area = ActiveArea(radius_m, folder, resumable)
         self._near(self.pipeline)
+
+    def keep_log(self, folder: Path) -> None:
+        """Keeps all but the last frames of the log in a folder of its own, for a long drive.
+
+        It is read from there where it is needed: replays and :meth:`MeasurementLog.save` give the
+        same. Blocks of an earlier log go. Called before the first frame.
+
+        Raises:
+            OutputError: blocks of an earlier log cannot be removed.
+            SessionError: frames have been tracked already.
+        """
+        if len(self):
+            raise SessionError("keep_log comes before the first frame; make a new session")
+        self.log.keep_in(folder)
+
+    def _join_log(self) -> None:
+        if self.pipeline.places is not None:
+            self.pipeline.places.read_from(self.recorder.log)
 
     def _near(self, pipeline: SlamPipeline) -> None:
         area, rig = self._area, self.rig
@@ -262,6 +281,7 @@ class Session:
             why = located.why
             if located.found:
                 self.pipeline = self._made(start.at(located.wTc, relocalised=True))
+                self._join_log()
                 first, stride = self.numbering
                 self.numbering = (first + stride * left_out.count, stride)
                 self._start = None

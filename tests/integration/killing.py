@@ -27,6 +27,7 @@ from fgslam.runs.trials import Seeds, run_trials
 
 REFUSED = 2
 _STEPS = {
+    "fgslam.core.log_blocks.BLOCK": 3,
     "fgslam.runs.tasks.homing_views._VIEWS_A_BLOCK": 2,
     "fgslam.runs.tasks.homing_trials._BLOCK": 1,
     "fgslam.runs.tasks.homing_video._SAVE_EVERY_S": 0.0,

@@ -275,6 +275,10 @@ class PlaceRecognition:
         if len(self._memory) % _WORDS_EVERY == 0:
             self._find_words()
 
+    def read_from(self, log: MeasurementLog) -> None:
+        """Measurements of earlier frames are read from the log of the run."""
+        self._memory.read_from(log)
+
     def state(self) -> StateArrays:
         """All but what the log tells."""
         confirmation = self._confirmation

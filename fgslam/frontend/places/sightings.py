@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import lil_array
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, StateArrays
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
@@ -23,8 +23,9 @@ _LEAST_M = 1e-6  # of an edge: none at all is no edge
 class SightingMemory:
     """Observations of all frames so far, and when each landmark was last seen.
 
-    The observations are those of the log; nothing is copied. A closure that the estimator refused
-    is none: neither a return nor a sighting of the landmarks that it names.
+    Which landmarks a frame saw is kept; how it measured them is read from the log, once there is
+    one. A closure that the estimator refused is none: neither a return nor a sighting of the
+    landmarks that it names.
 
     A run may begin in a map. That map is one place, whatever of it the run has seen: frames tied to
     it do not drift apart, and what the run has yet to see of it was "seen" where the run entered.
@@ -36,7 +37,10 @@ class SightingMemory:
     def __init__(self, given: int = -1) -> None:
         """Nothing was seen yet; ``given`` is the last identity of the map it all begins in."""
         self._given = given
-        self._seen: list[Observations] = []
+        self._log: MeasurementLog | None = None
+        self._own: list[Increment] = []  # while there is no log
+        self._seen = GrowingColumns(ids=np.empty(0, np.int32))
+        self._starts: list[int] = []
         self._way: list[float] = []
         self._newest: list[int] = []
         self._returns: list[tuple[int, int]] = []
@@ -46,7 +50,11 @@ class SightingMemory:
         self.taken: list[bool] = []
 
     def __len__(self) -> int:
-        return len(self._seen)
+        return len(self._starts)
+
+    def read_from(self, log: MeasurementLog) -> None:
+        """Measurements are read from the log of the run, which has all frames so far."""
+        self._log, self._own = log, []
 
     def add(self, increment: Increment, step: FloatArray, closed: tuple[bool, ...] = ()) -> None:
         """Books a frame.
@@ -124,7 +132,7 @@ class SightingMemory:
         """
         wanted = np.zeros(len(self._last_seen), np.bool_)
         wanted[ids] = True
-        counts = np.array([int(wanted[seen.ids].sum()) for seen in self._seen], np.int64)
+        counts = self._counts(wanted)
         unseen = self._never_seen(ids)
         if unseen and (entry := self._entry(landmarks)) >= 0:
             counts[entry] += unseen
@@ -141,7 +149,8 @@ class SightingMemory:
                 frame saw them, only that map places the frame beside them.
             landmarks: the map.
         """
-        seen = self._seen[frame]
+        frames = self._own if self._log is None else self._log.increments
+        seen = frames[frame].kept
         keep = np.isin(seen.ids, landmarks.ids)
         if self._never_seen(ids) > int(np.isin(seen.ids, ids).sum()):
             keep &= self.of_given(seen.ids)
@@ -157,7 +166,9 @@ class SightingMemory:
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
-        self._seen, self._newest, self._returns, self._ties = [], [], [], []
+        self._seen = GrowingColumns(ids=np.empty(0, np.int32))
+        self._starts, self._newest, self._returns, self._ties = [], [], [], []
+        self._own = []
         self._given, self._on_map = int(state["given"]), False
         self._last_seen = np.full(self._given + 1, -1)
         accepted, self.taken = iter(state["taken"].tolist()), []
@@ -171,7 +182,7 @@ class SightingMemory:
         ids = np.concatenate([seen.ids, *(loop.observations.ids for loop in loops)])
         self.taken += closed
         self._grow(int(ids.max(initial=-1)) + 1)
-        here = len(self._seen)
+        here = len(self)
         before = np.sort(self._last_seen[seen.ids])
         old = before[(before >= 0) & (before < here - _RETURN_FRAMES)]
         if len(old) >= _RETURN_MATCHES:
@@ -181,7 +192,10 @@ class SightingMemory:
         if by_map >= _RETURN_MATCHES:
             self._tie(here)
         self._last_seen[ids] = here
-        self._seen.append(seen)
+        if self._log is None:
+            self._own.append(increment)
+        self._starts.append(len(self._seen))
+        self._seen.append({"ids": seen.ids.astype(np.int32)})
         self._returns += [(here, loop.frame) for loop in loops]
         newest = self._newest[-1] if self._newest else self._given
         self._newest.append(int(increment.observations.ids.max(initial=newest)))
@@ -204,8 +218,13 @@ class SightingMemory:
         still = np.zeros(len(self._last_seen), np.bool_)
         given = landmarks.ids[self.of_given(landmarks.ids)]
         still[given] = True
-        counts = ((frame, int(still[self._seen[frame].ids].sum())) for frame in self._ties)
-        return next((frame for frame, count in counts if count >= _RETURN_MATCHES), -1)
+        enough = self._counts(still)[self._ties] >= _RETURN_MATCHES
+        return self._ties[int(np.argmax(enough))] if enough.any() else -1
+
+    def _counts(self, wanted: BoolArray) -> IntArray:
+        """(n,) how many of the landmarks that are marked each frame saw."""
+        found = np.cumsum(np.r_[0, wanted[self._seen["ids"]]])
+        return np.diff(found[[*self._starts, len(self._seen)]])
 
     def _grow(self, count: int) -> None:
         lacking = count - len(self._last_seen)

@@ -21,7 +21,9 @@ from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, provenance_of, run_task
 from fgslam.runs.folder import (
+    BLOCKS_FOLDER,
     COMPARISON_FILE,
+    LOG_FILE,
     SUBMAPS_FOLDER,
     ExistingFolder,
     is_run_folder,
@@ -152,6 +154,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     )
     if config.map.active_radius_m is not None:
         session.keep_near(config.map.active_radius_m, run.folder / SUBMAPS_FOLDER)
+    session.keep_log(run.folder / BLOCKS_FOLDER)
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
     if run.resumed:
@@ -225,6 +228,7 @@ def _run(opened: OpenedRun, context: Context, watch: Watch | None) -> SlamResult
     outputs = begin(opened, context.progress)
     saved = _loop(outputs, context.progress, context.stopped, watch)
     if saved is not None:
+        outputs.recorder.log.rest_in(outputs.folder / LOG_FILE)
         return _result(outputs, "interrupted", saved)
     return _finish(outputs, context)
 
@@ -320,6 +324,7 @@ def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameR
 def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
     pictures: tuple[Path, ...] = ()
     live = outputs.write_results("finished")
+    outputs.recorder.log.rest_in(outputs.folder / LOG_FILE)
     about_map = state.leave_map(outputs)
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))

@@ -32,8 +32,7 @@ _LOOP_STAGES = ("watch", "predict", "stereo", "track", "places", "update", "cali
 def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -> EstimatorMetrics:
     """Accuracy, consistency, time and memory of the live estimator, as of a replayed one."""
     times = recorder.known_times()
-    stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
-    online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    online = Trajectory(recorder.log.timestamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
     answer = Answer(
         estimate=estimate,
         online=online,
@@ -75,15 +74,15 @@ def located(recorder: RunRecorder) -> LocatedShare:
 def frame_problems(recorder: RunRecorder) -> list[str]:
     """A line for each frame that the landmarks did not locate: which and why."""
     lines = []
-    for increment, row in zip(recorder.log, recorder.rows, strict=True):
+    for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
         status = EgoMotionStatus(row.status)
         if status is EgoMotionStatus.CAMERA_FAULT:  # said of all of them together
             continue
         if row.problem:
-            lines.append(f"frame {increment.index}: {row.problem}")
+            lines.append(f"frame {number}: {row.problem}")
         elif not status.measured and status is not EgoMotionStatus.FIRST:
             lines.append(
-                f"frame {increment.index}: pose predicted only ({status.value}; {row.features} "
+                f"frame {number}: pose predicted only ({status.value}; {row.features} "
                 f"features, {row.stereo} stereo matches, {row.matched} landmarks matched)"
             )
     return lines
@@ -150,12 +149,10 @@ def closures_of(
         taken: of each closure of the log, in its order, whether the run's estimator took it.
         truth: true poses.
     """
-    offered = [(k, loop) for k, step in enumerate(recorder.log) for loop in step.loops]
-    closures = [(*which, so) for which, so in zip(offered, taken, strict=True)]
+    closures = [(*which, so) for which, so in zip(recorder.log.closures, taken, strict=True)]
     if not closures:
         return []
-    stamps = np.array([increment.timestamp for increment in recorder.log], np.float64)
-    online = Trajectory(stamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
+    online = Trajectory(recorder.log.timestamps, np.array(recorder.online_poses).reshape(-1, 4, 4))
     tracked = np.array(recorder.tracked_poses).reshape(-1, 4, 4)
     return judge_closures(closures, tracked, online, truth)
 
@@ -168,7 +165,7 @@ def place_numbers(recorder: RunRecorder, closures: list[JudgedClosure]) -> dict[
         "closures": len(closed),
         "false_closures": sum(known) if len(known) == len(closed) else None,
         "refused_closures": len(closures) - len(closed),
-        "relocalised": sum(increment.relocalised for increment in recorder.log),
+        "relocalised": recorder.log.relocalised,
     }
 
 
@@ -177,7 +174,7 @@ def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClo
     if not closures:
         (folder / LOOPS_FILE).unlink(missing_ok=True)
         return
-    numbers = [increment.index for increment in recorder.log]
+    numbers = recorder.log.numbers.tolist()
     rows: list[tuple[Cell, ...]] = [
         (numbers[one.at], numbers[one.to], *astuple(one), one.false) for one in closures
     ]

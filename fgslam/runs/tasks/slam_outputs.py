@@ -160,7 +160,7 @@ class RunOutputs:
         write_estimate(folder, online, estimate, points, self.remark)
 
     def _write_timing(self, trajectory: Trajectory) -> None:
-        indices = [increment.index for increment in self.recorder.log]
+        indices = self.recorder.log.numbers.tolist()
         write_timing(
             self.folder / "timing.csv",
             [
@@ -375,7 +375,7 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
         estimate=estimate,
         truth=outputs.sequence.ground_truth,
         valid=book.valid[book.rows(estimate.landmarks.ids)],
-        frames=np.array([increment.index for increment in recorder.log], np.int64),
+        frames=recorder.log.numbers,
         matched=recorder.column("matched"),
         inliers=recorder.column("inliers"),
         landmarks=recorder.column("landmarks"),

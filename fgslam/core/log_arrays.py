@@ -1,0 +1,356 @@
+"""Frames of a measurement log as plain arrays, and back: the layout of its file.
+
+A log without loop closures and relocalised frames is written as version 2, to the same bytes as
+before there were any; one that has them is version 3, one of a rig that calibrated itself version
+4, one with turns of a gyroscope version 5. All are read.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from fgslam.core.array_files import (
+    ArrayFile,
+    Items,
+    from_upper,
+    joined,
+    of_rows,
+    offsets,
+    rows_of,
+    split,
+)
+from fgslam.core.array_values import require_covariances, require_finite, require_single
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.errors import MeasurementLogError
+from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.rig_checks import rig_fault
+from fgslam.core.rig_correction import term_names
+from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
+
+LOG = ArrayFile(
+    name="fgslam measurement log",
+    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope.
+    versions=(1, 2, 3, 4, 5),
+    error=MeasurementLogError,
+    give="give a run folder's measurements.npz",
+    again="run again",
+)
+_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, WITH_EVERYTHING = 2, 3, 4, 5
+CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
+_UPPER = np.triu_indices(3)
+
+# Arrays by the count that their first axis has, with type and the shape of an item.
+_PER_FRAME: Items = {
+    "frame_index": ("i", ()),
+    "timestamp": ("f", ()),
+    "odometry_motion": ("f", (4, 4)),
+    "odometry_covariance": ("f", (6, 6)),
+}
+_PER_OBSERVATION: Items = {
+    "observation_id": ("i", ()),
+    "measurement": ("f", (3,)),
+    "measurement_covariance": ("f", (6,)),
+    "pixels": ("f", (3, 2)),
+    "is_new": ("b", ()),
+    "rejected": ("b", ()),
+}
+_LOOPS = "loop_"  # before the names of the arrays of the loops' own observations
+_PER_LOOP: Items = {
+    "loop_frame": ("i", ()),
+    "loop_oTc": ("f", (4, 4)),
+    "loop_covariance": ("f", (6, 6)),
+}
+_RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
+_SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
+_EXACT = "exact"  # of a rig: written where it is
+
+
+def arrays_of(
+    sensor: Sensor, motion_model: dict[str, Any], frames: Sequence[Increment], version: int
+) -> StateArrays:
+    """Frames as the arrays of a log's file of one version (:func:`version_of`)."""
+    kind = "stereo" if isinstance(sensor, CameraRig) else "range_bearing"
+    about = {"kind": kind} | {name: getattr(sensor, name) for name in _SENSOR_KEYS[kind]}
+    if isinstance(sensor, CameraRig) and sensor.exact:
+        about[_EXACT] = True
+    out = LOG.header(version, sensor=about, motion=motion_model) | {
+        SENSOR_POSE: sensor.bTc,
+        "frame_index": np.array([s.index for s in frames], np.int64),
+        "timestamp": np.array([s.timestamp for s in frames], np.float64),
+        "odometry_motion": _stack([_motion(s) for s in frames], (4, 4)),
+        "odometry_covariance": _stack([_motion_covariance(s) for s in frames], (6, 6)),
+    }
+    out |= _ragged("missed", [s.missed_ids for s in frames])
+    out |= _ragged("pruned", [s.pruned_ids for s in frames])
+    out |= _observation_arrays([s.observations for s in frames], "")
+    out["rejected"] = joined([s.rejected for s in frames], (), np.bool_)
+    if version >= _WITH_LOOPS:
+        out |= _loop_arrays(frames)
+    if version >= _WITH_CORRECTIONS and isinstance(sensor, CameraRig):
+        terms = len(term_names(sensor))
+        known = any(s.rig_correction is not None for s in frames)
+        none = np.full(terms, 0.0 if known else np.nan)
+        corrections = [s.rig_correction for s in frames]
+        rows = [none if c is None else c for c in corrections]
+        out[CORRECTIONS] = _stack(rows, (terms,))
+    return out
+
+
+def version_of(frames: Sequence[Increment]) -> int:
+    """The first version that has a place for all that is there."""
+    if any(s.odometry is not None and s.odometry.turned for s in frames):
+        return WITH_EVERYTHING
+    if any(s.rig_correction is not None for s in frames):
+        return _WITH_CORRECTIONS
+    return _WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else _BEFORE_LOOPS
+
+
+def frames_of(
+    arrays: StateArrays, where: str, first: int = 0
+) -> tuple[Sensor, dict[str, Any], list[Increment]]:
+    """Sensor, motion model and frames from their arrays.
+
+    Args:
+        arrays: of a log's file.
+        where: names the source in messages.
+        first: position in the whole log of the first frame.
+
+    Raises:
+        MeasurementLogError: they are damaged, foreign, or hold what no run measures.
+    """
+    header = _read_header(arrays, where)
+    _require_consistent(arrays, where)
+    _require_sound(arrays, where)
+    loops, relocalised = _loops(arrays, header["version"], where, first)
+    sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
+    corrections = _corrections(arrays, header["version"], sensor, where)
+    observed = _split_observations(arrays, "")
+    missed, pruned = _split(arrays, "missed"), _split(arrays, "pruned")
+    start = arrays["observation_start"]
+    frames = [
+        Increment(
+            index=int(index),
+            timestamp=float(arrays["timestamp"][k]),
+            odometry=_odometry(arrays, k),
+            observations=observed[k],
+            rejected=arrays["rejected"][start[k] : start[k + 1]],
+            missed_ids=missed[k],
+            pruned_ids=pruned[k],
+            loops=loops[k],
+            relocalised=bool(relocalised[k]),
+            rig_correction=corrections[k],
+        )
+        for k, index in enumerate(arrays["frame_index"])
+    ]
+    return sensor, header["motion"], frames
+
+
+def _loop_arrays(frames: Sequence[Increment]) -> StateArrays:
+    loops = [loop for s in frames for loop in s.loops]
+    return {
+        "relocalised": np.array([s.relocalised for s in frames], np.bool_),
+        "loop_start": offsets([len(s.loops) for s in frames]),
+        "loop_frame": np.array([loop.frame for loop in loops], np.int64),
+        "loop_oTc": _stack([loop.oTc for loop in loops], (4, 4)),
+        "loop_covariance": _stack([loop.covariance for loop in loops], (6, 6)),
+        "loop_merged_start": offsets([len(loop.merged) for loop in loops]),
+        "loop_merged": joined([loop.merged for loop in loops], (2,), np.int64),
+    } | _observation_arrays([loop.observations for loop in loops], _LOOPS)
+
+
+def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
+    header = LOG.read_header(arrays, where)
+    if header["version"] == 1:
+        rig = header.get("rig")
+        header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
+    sensor = header.get("sensor")
+    keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
+    given = set(sensor or ()) - ({_EXACT} if keys is _RIG else set())
+    if keys is None or given != {"kind", *keys}:
+        raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
+    if not isinstance(header.get("motion"), dict):
+        raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")
+    return header
+
+
+SENSOR_ARRAYS = ("header", SENSOR_POSE)
+
+
+def sensor_of(arrays: StateArrays, where: str) -> Sensor:
+    """The sensor that :data:`SENSOR_ARRAYS` tell of. Raises MeasurementLogError."""
+    header = _read_header(arrays, where)
+    LOG.require(arrays, {SENSOR_POSE: ("f", (4, 4))}, where)
+    require_finite(LOG, arrays, (SENSOR_POSE,), where)
+    return _sensor(header["sensor"], arrays[SENSOR_POSE], where)
+
+
+def _sensor(values: dict[str, Any], bTc: FloatArray, where: str) -> Sensor:
+    numbers = {name: value for name, value in values.items() if name != "kind"}
+    if values["kind"] != "stereo":
+        return RangeBearingSensor(**numbers, bTc=bTc)
+    rig = CameraRig(**numbers, bTc=bTc)
+    if fault := rig_fault(rig):
+        raise MeasurementLogError(f"{where}: the log's rig cannot be one: {fault}; run again")
+    return rig
+
+
+def _require_sound(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError for values that no run measures."""
+    require_finite(LOG, arrays, ("timestamp", SENSOR_POSE, "measurement"), where)
+    covariances = from_upper(arrays["measurement_covariance"], 3)
+    require_covariances(LOG, "measurement_covariance", covariances, where)
+    known = ~np.isnan(arrays["odometry_motion"][:, 0, 0])
+    motions = {"odometry_motion": _with_translation(arrays["odometry_motion"][known])}
+    require_finite(LOG, motions, ("odometry_motion",), where)
+    moved = arrays["odometry_covariance"][known]
+    require_covariances(LOG, "odometry_covariance", moved, where, definite=False)
+    ids, start = arrays["observation_id"], arrays["observation_start"]
+    require_single(LOG, "observation_id", ids, start, where)
+
+
+def _require_consistent(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError unless all arrays are there, of the right type and size."""
+    frames = rows_of(arrays, "frame_index")
+    expected = {SENSOR_POSE: ("f", (4, 4))} | of_rows(frames, _PER_FRAME)
+    for name in ("observation", "missed", "pruned"):
+        rows = LOG.require_offsets(arrays, f"{name}_start", frames, where)
+        expected |= of_rows(
+            rows, _PER_OBSERVATION if name == "observation" else {f"{name}_id": ("i", ())}
+        )
+    LOG.require(arrays, expected, where)
+
+
+def _loops(
+    arrays: StateArrays, version: int, where: str, first: int
+) -> tuple[list[tuple[LoopClosure, ...]], BoolArray]:
+    """Loop closures of each frame, and which frames (n,) were relocalised; none before version 3.
+
+    Raises MeasurementLogError where their arrays do not fit together, or a loop leads nowhere.
+    """
+    frames = len(arrays["frame_index"])
+    if version < _WITH_LOOPS:
+        return [()] * frames, np.zeros(frames, np.bool_)
+    _require_consistent_loops(arrays, where)
+    observed = _split_observations(arrays, _LOOPS)
+    merged = split(arrays["loop_merged"], arrays["loop_merged_start"])
+    of_all = [
+        LoopClosure(int(frame), arrays["loop_oTc"][i], arrays["loop_covariance"][i], seen, pairs)
+        for i, (frame, seen, pairs) in enumerate(
+            zip(arrays["loop_frame"], observed, merged, strict=True)
+        )
+    ]
+    out = [tuple(of_all[a:b]) for a, b in itertools.pairwise(arrays["loop_start"])]
+    for k, loops in enumerate(out, first):
+        astray = [loop.frame for loop in loops if not 0 <= loop.frame < k]
+        if astray:
+            raise MeasurementLogError(
+                f"{where}: a loop closure of frame {k} leads to frame {astray[0]}, which does not "
+                "come before it; run again"
+            )
+    return out, arrays["relocalised"]
+
+
+def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError unless the loops' arrays are there, of the right type and size."""
+    frames = rows_of(arrays, "frame_index")
+    count = LOG.require_offsets(arrays, "loop_start", frames, where)
+    seen = LOG.require_offsets(arrays, "loop_observation_start", count, where)
+    merged = LOG.require_offsets(arrays, "loop_merged_start", count, where)
+    of_loops = {
+        _LOOPS + name: item for name, item in _PER_OBSERVATION.items() if name != "rejected"
+    }
+    expected = {"relocalised": ("b", (frames,)), "loop_merged": ("i", (merged, 2))}
+    LOG.require(arrays, expected | of_rows(count, _PER_LOOP) | of_rows(seen, of_loops), where)
+
+
+def _corrections(
+    arrays: StateArrays, version: int, rig: Sensor, where: str
+) -> list[FloatArray | None]:
+    """The rig's correction in each frame; None before version 4, and in a log of NaN.
+
+    Raises MeasurementLogError where they are not there, or of another rig.
+    """
+    frames = len(arrays["frame_index"])
+    if version < _WITH_CORRECTIONS or not isinstance(rig, CameraRig):
+        return [None] * frames
+    terms = len(term_names(rig))
+    LOG.require(arrays, {CORRECTIONS: ("f", (frames, terms))}, where)
+    rows = arrays[CORRECTIONS]
+    return [None] * frames if np.isnan(rows).all() else list(rows)
+
+
+def _motion(increment: Increment) -> FloatArray:
+    """(4, 4); NaN where nothing was measured, and as translation of a mere turn."""
+    odometry = increment.odometry
+    if odometry is None:
+        return np.full((4, 4), np.nan)
+    return odometry.motion + (_NO_TRANSLATION if odometry.turned else 0.0)
+
+
+_NO_TRANSLATION = np.zeros((4, 4))
+_NO_TRANSLATION[:3, 3] = np.nan
+
+
+def _with_translation(motions: FloatArray) -> FloatArray:
+    """Motions (n, 4, 4), mere turns without translation."""
+    out = np.array(motions)
+    out[np.isnan(motions[:, :3, 3]).all(axis=1), :3, 3] = 0.0
+    return out
+
+
+def _motion_covariance(increment: Increment) -> FloatArray:
+    if increment.odometry is None:
+        return np.full((6, 6), np.nan)
+    return increment.odometry.covariance
+
+
+def _odometry(arrays: StateArrays, k: int) -> Odometry | None:
+    motion, covariance = arrays["odometry_motion"][k], arrays["odometry_covariance"][k]
+    if np.isnan(motion[0, 0]):
+        return None
+    if np.isnan(motion[0, 3]):
+        return Odometry.turn(motion[:3, :3], covariance[:3, :3])
+    return Odometry(motion, covariance)
+
+
+def _stack(parts: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    return np.array(parts, np.float64).reshape(len(parts), *shape)
+
+
+def _ragged(name: str, parts: list[IntArray]) -> StateArrays:
+    return {
+        f"{name}_start": offsets([len(p) for p in parts]),
+        f"{name}_id": joined(parts, (), np.int64),
+    }
+
+
+def _observation_arrays(seen: list[Observations], prefix: str) -> StateArrays:
+    return {
+        **_ragged(f"{prefix}observation", [o.ids for o in seen]),
+        f"{prefix}measurement": joined([o.measurement for o in seen], (3,)),
+        f"{prefix}measurement_covariance": joined(
+            [o.covariance[:, _UPPER[0], _UPPER[1]] for o in seen], (6,)
+        ),
+        f"{prefix}pixels": joined([o.pixels for o in seen], (3, 2)),
+        f"{prefix}is_new": joined([o.is_new for o in seen], (), np.bool_),
+    }
+
+
+def _split(arrays: StateArrays, name: str) -> list[IntArray]:
+    return split(arrays[f"{name}_id"], arrays[f"{name}_start"])
+
+
+def _split_observations(arrays: StateArrays, prefix: str) -> list[Observations]:
+    everything = Observations(
+        arrays[f"{prefix}observation_id"],
+        arrays[f"{prefix}measurement"],
+        from_upper(arrays[f"{prefix}measurement_covariance"], 3),
+        arrays[f"{prefix}pixels"],
+        arrays[f"{prefix}is_new"],
+    )
+    start = arrays[f"{prefix}observation_start"]
+    return [everything.select(np.arange(a, b)) for a, b in itertools.pairwise(start)]
