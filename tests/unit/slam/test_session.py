@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -487,3 +488,24 @@ def test_features_of_another_form_are_refused_and_the_session_goes_on(
     broken = False
     push(slam, views, range(3, FRAMES))
     assert_same_result(slam, driven(views))
+
+
+def test_a_log_kept_in_a_folder_is_the_log(
+    views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fgslam.core.log_blocks.BLOCK", 2)
+    memory, disk = session(views), session(views)
+    disk.keep_log(tmp_path / "log")
+    for name, one in (("memory", memory), ("disk", disk)):
+        for k in range(FRAMES):
+            one.track(float(k), views.images(k), views.odometry(k) if k else None)
+        one.log.save(tmp_path / name)
+    assert (tmp_path / "memory").read_bytes() == (tmp_path / "disk").read_bytes()
+    assert len(list((tmp_path / "log").iterdir())) == 2
+    assert_same_bits(disk.result().trajectory, memory.result().trajectory)
+    assert_same_bits(
+        replay(disk.log, LandmarkKalmanSettings(), EgoMotionSettings()).estimate,
+        replay(memory.log, LandmarkKalmanSettings(), EgoMotionSettings()).estimate,
+    )
+    with pytest.raises(SessionError, match="before the first frame"):
+        disk.keep_log(tmp_path / "other")
