@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp
 
@@ -53,6 +55,41 @@ def write_recording(root: Path, frames: int = 12, top: bool = True, seed: int = 
     write_tum(root / "gt_right_cam.txt", stamps, poses)
     write_tum(root / "odometry.txt", stamps, _drifting_body_poses(poses, rng))
     return root
+
+
+def views(
+    cameras: Sequence[RawCamera], frames: int = 12, seed: int = 0
+) -> Iterator[tuple[Image, ...]]:
+    """What cameras with lenses see of the same boards, frame by frame.
+
+    The first one's body moves as :func:`camera_path`; ``bTc`` of each is its place in it.
+    """
+    rng = np.random.default_rng(seed)
+    textures = [_texture(rng, width, height) for *_, width, height in _BOARDS]
+    maps = [_map_of(camera) for camera in cameras]
+    for wTb in camera_path(frames):
+        seen = []
+        for camera, (columns, rows) in zip(cameras, maps, strict=True):
+            wTc = wTb @ camera.bTc
+            wide = _render(textures, wTc[:3, :3], wTc[:3, 3], rng, _WIDE)
+            seen.append(cv2.remap(wide, columns, rows, cv2.INTER_LINEAR))
+        yield tuple(seen)
+
+
+_WIDE = (180.0, 600, 480)
+"""Focal length and size of the plane that lenses look at: 118 x 106 degrees."""
+
+
+def _map_of(camera: RawCamera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Columns and rows of the wide plane at which each pixel of a camera looks."""
+    focal, width, height = _WIDE
+    grid = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    rays = camera.unproject(np.column_stack([axis.ravel() for axis in grid]))
+    plane = np.where(rays[:, 2:] > 0.1, rays[:, :2] / rays[:, 2:], np.nan)
+    pixels = focal * plane + 0.5 * np.array([width - 1, height - 1])
+    found = np.nan_to_num(pixels, nan=-1e4).reshape(camera.height, camera.width, 2)
+    columns, rows = np.moveaxis(found.astype(np.float32), -1, 0).copy()
+    return columns, rows
 
 
 def write_calibration(root: Path, **changes: object) -> None:
@@ -123,16 +160,17 @@ def _render(
     wRc: FloatArray,
     centre: FloatArray,
     rng: np.random.Generator,
+    plane: tuple[float, int, int] = (FOCAL, WIDTH, HEIGHT),
 ) -> Image:
     """Boards painted from far to near; camera noise of one grey level."""
-    camera = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1.0]])
-    canvas = np.zeros((HEIGHT, WIDTH), np.float32)
+    focal, *size = plane
+    camera = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
+    canvas = np.zeros(size[::-1], np.float32)
     for texture, (x, y, depth, width, height) in zip(textures, _BOARDS, strict=True):
         corner = np.array([x - width / 2, y - height / 2, depth]) - centre
         axes = np.diag([_CELL_M, _CELL_M, 0.0])
         axes[:, 2] = corner
         homography = camera @ wRc.T @ axes
-        size = (WIDTH, HEIGHT)
         painted = cv2.warpPerspective(texture, homography, size, flags=cv2.INTER_LINEAR)
         cover = cv2.warpPerspective(np.ones_like(texture), homography, size)
         canvas = np.asarray(canvas * (1.0 - cover) + painted, canvas.dtype)

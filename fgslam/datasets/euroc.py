@@ -11,11 +11,11 @@ import numpy as np
 from fgslam.cameras.formats.kalibr import read_asl_mounting
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.errors import DatasetError
+from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, body_is_camera
 from fgslam.datasets.calibrated import loaded_rig, mounted
 from fgslam.datasets.gyroscope import recorded_gyroscope
 from fgslam.datasets.images import (
@@ -101,11 +101,16 @@ def _gyroscope(root: Path, settings: RecordedOdometrySettings) -> OdometrySource
 def _rig(settings: EurocSettings, root: Path, folders: list[Path]) -> StereoRig:
     """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain beside mav0."""
     given: tuple[Path, ...] = tuple(folder / "sensor.yaml" for folder in folders)
+    chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
     if settings.camera_file is not None:
         given = (Path(settings.camera_file),)
     elif not any(path.is_file() for path in given):
-        chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
-        given = next(((chain,) for chain in chains if chain.is_file()), given)
+        given = next(((chain,) for chain in chains if chain.is_file()), ())
+    if not given:
+        raise CalibrationError(
+            f"{root}: neither {folders[0].name}/sensor.yaml nor, as in TUM-VI, {chains[0]} is "
+            "there; restore one, or give a calibration by --camera FILE"
+        )
     size = first_size(read_camera_frames(folders[0]).paths)
     return mounted(loaded_rig(settings, *given, size=size), settings)
 
@@ -135,6 +140,8 @@ def _identity(root: Path, folders: list[Path], files: StereoFiles) -> str:
 def _true_poses(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
     """True poses of the rectified right camera, interpolated at the frames' stamps (n,)."""
     body = read_body_truth(root / "state_groundtruth_estimate0")
+    if body is None and not body_is_camera(rig.bTc):  # TUM-VI tracks the gyroscope
+        body = read_body_truth(root / "mocap0")
     if body is None:
         return None
     at_frames = trajectory_at_frames(body, frames, _MAX_TRUTH_GAP_S)
@@ -185,7 +192,7 @@ def read_camera_frames(folder: Path) -> CameraFrames:
 
 
 def read_body_truth(folder: Path) -> Trajectory | None:
-    """Body poses of ``state_groundtruth_estimate0``, stamps in seconds; None where it is absent.
+    """Body poses of ``state_groundtruth_estimate0`` or ``mocap0``, stamps in seconds; or None.
 
     The file gives the pose of its own sensor; sensor.yaml says where that sits on the body.
 
