@@ -20,7 +20,7 @@ Reader: TypeAlias = Callable[[Path, Tree, Size | None], Calibration]
 KNOWN = (
     "known: calib.json of fgslam, Kalibr's camchain, OpenCV's stereo files (M1, D1, M2, D2, R, T), "
     "left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, EuRoC's sensor.yaml, settings "
-    "of ORB-SLAM, stella_vslam, VINS and SVO, files of Basalt, OAK, ZED and OCamCalib"
+    "of ORB-SLAM, stella_vslam, VINS and SVO, files of Basalt, OAK, ZED, RealSense and OCamCalib"
 )
 
 
@@ -34,6 +34,7 @@ def _rectified(path: Path, tree: Tree, _: Size | None) -> Calibration:
 
 
 _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
+    (makers.is_realsense, _without_size(makers.read_realsense)),
     (own.is_rectified, _rectified),
     (own.is_raw, _without_size(own.read_raw)),
     (makers.is_basalt, _without_size(makers.read_basalt)),
@@ -163,7 +164,15 @@ def _of_folder(folder: Path, size: Size | None) -> Calibration:
     if found:
         names = ", ".join(Path(one.source).name for one in found)
         raise CalibrationError(f"{folder}: holds several calibrations ({names}); name one")
+    own = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES[:4]]
+    if len(own) == 1 and own[0].is_file():
+        _require_readable(own[0], size)
     raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {KNOWN}")
+
+
+def _require_readable(path: Path, size: Size | None) -> None:
+    """Raises CalibrationError where the only file that may be meant is at fault."""
+    read_calibration_file(path, size=size)
 
 
 def _rigs(files: Iterable[Path], size: Size | None) -> Iterable[Calibration]:

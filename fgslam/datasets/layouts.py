@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
-from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural
+from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural, one_camera
 from fgslam.datasets.sides import camera_pairs
 
 _DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
@@ -175,6 +175,12 @@ def _unknown(folder: Path) -> str:
         )
     if not any(folder.iterdir()):
         return f"{folder} is empty; give the folder of a recording, docs/datasets/ has the layouts"
+    if (alone := one_camera(folder)) is not None:
+        return (
+            f"{alone} holds images of one camera only; a stereo pair is the least, beside a "
+            "gyroscope, too: images of a left and a right camera by the names of folders or files "
+            "(of a mirror or panoramas: fgslam teach)"
+        )
     missing = "; ".join(_with_lacking(folder, layout) for layout in LAYOUTS.values())
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
 

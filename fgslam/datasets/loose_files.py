@@ -45,6 +45,14 @@ def images_in(folder: Path) -> list[Path]:
     return sorted(found, key=natural)
 
 
+def one_camera(root: Path) -> Path | None:
+    """The only folder with images, this one or one in it; None where there are none or more."""
+    inside = sorted(path for path in root.iterdir() if path.is_dir())
+    places = [root, *inside, *(path / _INSIDE for path in inside)]
+    found = [path for path in places if path.is_dir() and images_in(path)]
+    return found[0] if len(found) == 1 else None
+
+
 def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles | None:
     """The files of a left and a right camera; None where there is no such pair.
 

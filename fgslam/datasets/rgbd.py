@@ -16,9 +16,11 @@ import numpy as np
 from fgslam.cameras.assembly import at_size
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.formats.trees import read_tree
 from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.cameras.rectification import MapArray, View, sampling_maps
 from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
@@ -39,6 +41,9 @@ BASELINE_M = 0.08
 _FOUND_AGAIN_PX = 0.15  # by which SIFT finds a point again in a view made of the same image
 _TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
 _NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
+# Where 16 bits are only assumed to be millimetres: farther than RealSense, Kinect and Orbbec see.
+_FARTHEST_GUESSED_M = 10.0
+_SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor")
 _TUM_CAMERAS = {
     "1": (517.3, 516.5, 318.6, 255.3),
     "2": (520.9, 521.0, 325.1, 249.7),
@@ -138,18 +143,32 @@ def _scale(
     """Units a metre, and the depth that follows from it in words. Raises DatasetError."""
     depth = _first_depth(root, pairs)
     assumed = _TUM_SCALE if (root / "depth.txt").is_file() else _MILLIMETRES
-    scale = settings.depth_scale or (assumed if depth.dtype == np.uint16 else 1.0)
+    stated = settings.depth_scale or _stated_scale(root, settings)
+    scale = stated or (assumed if depth.dtype == np.uint16 else 1.0)
     seen = depth[np.isfinite(depth) & (depth > 0)]
     if len(seen) == 0:
         raise DatasetError(f"{pairs[0][1]} holds no depth at all; check the depth images")
     median = float(np.median(seen)) / scale
-    if not _NEAREST_M < median < _FARTHEST_M:
+    guessed = stated is None and depth.dtype == np.uint16
+    if not _NEAREST_M < median < (_FARTHEST_GUESSED_M if guessed else _FARTHEST_M):
         raise DatasetError(
             f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
-            "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, 1 "
-            "for metres"
+            "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, "
+            "10000 for tenths of them, 1 for metres"
         )
     return scale, f"depth is taken as {scale:g} units a metre: its median is {median:.3g} m"
+
+
+def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
+    """Units a metre by the calibration's file; RealSense's tools state metres a unit there."""
+    given = settings.camera_file
+    files = [Path(given)] if given is not None else _own_files(root)
+    tree = read_tree(files[0]) if len(files) == 1 else None
+    for key in _SCALES:
+        value = (tree or {}).get(key)
+        if is_finite_number(value) and value > 0.0:
+            return 1.0 / float(value) if value < 1.0 else float(value)
+    return None
 
 
 def _first_depth(root: Path, pairs: tuple[tuple[Path, Path], ...]) -> FloatArray | Image:
@@ -171,7 +190,7 @@ def _camera(
     """The colour camera by the given file, the folder's own, or as TUM publishes it."""
     if settings.camera_file is not None:
         return _of_file(Path(settings.camera_file), size, settings.resized), ()
-    own = sorted(p for p in root.iterdir() if p.suffix in (".json", ".yaml", ".yml", ".xml"))
+    own = _own_files(root)
     if len(own) == 1:
         return _of_file(own[0], size, settings.resized), ()
     known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
@@ -184,6 +203,10 @@ def _camera(
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     camera = RawCamera(*size, matrix, np.zeros(4), np.eye(4), f"freiburg{known[1]}")
     return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
+
+
+def _own_files(root: Path) -> list[Path]:
+    return sorted(p for p in root.iterdir() if p.suffix in (".json", ".yaml", ".yml", ".xml"))
 
 
 def _of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:

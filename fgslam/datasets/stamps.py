@@ -21,6 +21,11 @@ _UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanosecon
 _SLOWEST_S = 10.0  # between two images: what makes a unit plausible
 SLOWEST_MOTION_S = 1.0
 """The same between two samples of odometry."""
+_FASTEST_S = 1e-3
+_DATE_IN_NAME = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[-_.,]?(\d{1,9}))?(?!\d)"
+)
 _NAME = re.compile(r"^\d{10,19}(\.\d+)?$")
 _DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
 
@@ -61,10 +66,32 @@ def written_stamps(
             if path.is_file():
                 found, unit = _in_seconds(_listed(path, images), str(path))
                 return found, unit, (path,)
+    by_date = _dates([image.stem for image in images])
+    if by_date is not None:
+        return by_date, ("times are the dates in the names of the images",), ()
     if len(images) > 1 and all(_NAME.match(image.stem) for image in images):
         found, unit = _in_seconds(_numbers([p.stem for p in images]), "names of the images")
         return found, unit, ()
     return None
+
+
+def _dates(names: Sequence[str]) -> FloatArray | None:
+    """Seconds (n,) since 1970 by dates in names, UTC; None where they say no camera's times.
+
+    What follows the seconds is their fraction, unless that makes no times of a camera: then it
+    counts the images.
+    """
+    found = [_DATE_IN_NAME.search(name) for name in names]
+    if len(names) < 2 or not all(found):
+        return None
+    try:
+        whole = [datetime(*map(int, m.groups()[:6]), tzinfo=UTC).timestamp() for m in found if m]
+    except ValueError:  # no date
+        return None
+    parts = [float(f"0.{m[7] or 0}") for m in found if m]
+    stamps = np.array(whole) + parts
+    steps = np.diff(stamps)
+    return stamps if steps.min() > 0.0 and np.median(steps) >= _FASTEST_S else None
 
 
 def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from fgslam.cameras.rig import StereoRig
-from fgslam.core.arrays import Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.datasets.calibrated import calibrated_rig
 from fgslam.datasets.images import sized
@@ -23,6 +23,7 @@ from fgslam.datasets.video_frames import VideoFrames
 _VIEWS: dict[str, tuple[int, int]] = {"side_by_side": (2, 1), "over_under": (1, 2)}
 """Views beside each other and above each other."""
 
+_UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
 _USUAL_SHAPE = 1.5  # width over height of a camera's image
 
 
@@ -48,19 +49,39 @@ def open_video(settings: VideoSettings) -> Recording:
     views, rig, said = _views(settings, frames, films[0].parent)
     count = min(each.count for each in frames)
     chosen = select_frames(count, settings)
-    numbers = np.arange(count, dtype=np.int64)
+    times, told = _times(frames, count, rate, settings.fps is not None)
     return Recording(
         name=given.stem if len(films) == 1 else given.resolve().name.replace("*", ""),
         rig=rig.plain(),
         rectifier=rig.rectifier,
-        timestamps=(numbers / rate)[chosen],
+        timestamps=times[chosen],
         identity=recording_identity([], films),
         ground_truth=None,
-        notes=(*rig.remarks, *(note for each in frames for note in each.notes), *said),
+        notes=(*rig.remarks, *(note for each in frames for note in each.notes), *said, *told),
         indices=chosen,
         load_images=_Film(views, rig, grey=True).load,
         load_colour=_Film(views, rig, grey=False).load,
     )
+
+
+def _times(
+    frames: list[VideoFrames], count: int, rate: float, stated: bool
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Seconds (n,) of the frames by the rate, or each by its own; and what was found, in words."""
+    even = np.arange(count, dtype=np.int64) / rate
+    if stated or count < 2:
+        return even, ()
+    own = [found[:count] for film in frames if (found := film.stamps()) is not None]
+    if len(own) < len(frames):
+        return even, ()
+    notes: tuple[str, ...] = ()
+    if len(own) > 1 and (apart := float(np.abs(own[0] - own[1]).max())) > _UNEVEN / rate:
+        notes = (f"frames of one number differ in time by up to {1e3 * apart:.0f} ms in the films",)
+    if np.abs(own[0] - even).max() <= _UNEVEN / rate:
+        return even, notes
+    steps = 1e3 * np.diff(own[0])
+    note = f"frames are {steps.min():.0f} to {steps.max():.0f} ms apart: each has its own time"
+    return own[0], (note, *notes)
 
 
 Views = Callable[[int], tuple[Image, Image]]

@@ -9,9 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fgslam.core.arrays import Image
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
 
+_AS_STORED = -1  # packets of the file instead of decoded frames
 _KEPT = 10  # decoded frames: threads ask for neighbours out of order
 
 
@@ -50,6 +51,21 @@ class VideoFrames:
             if index not in self._kept:
                 self._go_to(index)
             return self._kept[index].copy()
+
+    def stamps(self) -> FloatArray | None:
+        """Seconds (count,) from the first frame on, each as the file states it; None without.
+
+        Nothing is decoded. Frames are stored in another order than they are shown.
+        """
+        capture, found = self._open(), []
+        if capture.set(cv2.CAP_PROP_FORMAT, _AS_STORED):
+            while capture.grab():
+                found.append(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+        capture.release()
+        times = np.sort(np.array(found, np.float64))[: self.count]
+        if len(times) < self.count or np.any(np.diff(times) <= 0.0):
+            return None
+        return np.asarray(times - times[0])
 
     def _go_to(self, index: int) -> None:
         if index < self._next:

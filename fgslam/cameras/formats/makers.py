@@ -1,4 +1,4 @@
-"""Files of other programs and of cameras' makers: Basalt, OAK, ZED, OCamCalib."""
+"""Files of other programs and of cameras' makers: Basalt, OAK, ZED, RealSense, OCamCalib."""
 
 from __future__ import annotations
 
@@ -196,6 +196,38 @@ def _zed_camera(part: Values, name: str, bTc: FloatArray) -> RawCamera:
     parameters = part.named(("k1", "k2", "p1", "p2", "k3"), 0.0)
     label = f"{part.path.name}: {part.where[:-2]}"
     return checked_camera(RawCamera(*_ZED_SIZES[name], matrix, parameters, bTc, label))
+
+
+# --------------------------------------------------------------------------------------------
+# RealSense, and what Open3D writes of it
+
+
+_PRINCIPAL = ("fx", "fy", "ppx", "ppy")  # rs2_intrinsics
+
+
+def is_realsense(tree: Tree) -> bool:
+    """Whether it is the intrinsics of one camera as librealsense, Open3D or people name them."""
+    plain = tree.keys() >= {*_FOCAL, "width", "height"}
+    alone = plain and not {"baseline_m", "baseline", "rectified"} & tree.keys()
+    return alone or "intrinsic_matrix" in tree or tree.keys() >= set(_PRINCIPAL)
+
+
+def read_realsense(path: Path, tree: Tree) -> Calibration:
+    """One camera; Open3D's matrix goes column by column.
+
+    Raises:
+        CalibrationError: a value is missing or impossible.
+    """
+    part = Values(path, tree)
+    if "intrinsic_matrix" in part:
+        matrix = part.numbers("intrinsic_matrix", 9).reshape(3, 3).T
+    else:
+        matrix = intrinsic_matrix(*part.named(_PRINCIPAL if "ppx" in part else _FOCAL))
+    coefficients = part.numbers("coeffs") if "coeffs" in part else np.zeros(4)
+    if np.any(coefficients) and "inverse" in part.text("model"):
+        raise part.refuse("model inverse_brown_conrady is not known with coefficients other than 0")
+    camera = RawCamera(*part.size("width", "height"), matrix, coefficients, np.eye(4), path.name)
+    return Calibration(str(path), "RealSense intrinsics", (checked_camera(camera),))
 
 
 # --------------------------------------------------------------------------------------------

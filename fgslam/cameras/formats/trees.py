@@ -22,7 +22,7 @@ from fgslam.core.yaml_text import PlainLoader
 Tree: TypeAlias = Mapping[str, Any]
 """Keys and values of a file; OpenCV's matrices are arrays."""
 
-_MATRIX = "opencv-matrix"
+_MATRICES = ("opencv-matrix", "opencv-nd-matrix")
 _TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])")
 _DEEPEST = 20  # levels of nesting: no calibration has ten
 
@@ -37,7 +37,8 @@ def _plain(loader: yaml.SafeLoader, node: Any) -> Any:
     return loader.construct_mapping(node, deep=True)
 
 
-_Loader.add_constructor("tag:yaml.org,2002:" + _MATRIX, _plain)
+for _tag in _MATRICES:
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _plain)
 
 
 def read_tree(path: Path) -> Tree | None:
@@ -119,6 +120,8 @@ def _arrays(path: Path, key: str, value: Any, depth: int) -> Any:
         return value
     if {"rows", "cols", "data"} <= value.keys():
         return _array(path, key, value)
+    if {"sizes", "dt", "data"} <= value.keys():
+        return _array_of_sizes(path, key, value)
     return {str(k): _arrays(path, str(k), v, depth + 1) for k, v in value.items()}
 
 
@@ -134,6 +137,14 @@ def _array(path: Path, key: str, block: Mapping[str, Any]) -> FloatArray:
     shape = (round(rows), round(columns))
     # Points have several numbers a cell.
     return data.reshape(shape if len(data) == cells else (*shape, -1))
+
+
+def _array_of_sizes(path: Path, key: str, block: Mapping[str, Any]) -> FloatArray:
+    """An array of any number of axes: OpenCV 5 writes a row of numbers with one."""
+    sizes, data = flat_numbers(block["sizes"]), flat_numbers(block["data"])
+    if sizes is None or data is None or np.prod(sizes) != len(data) or (sizes < 0.0).any():
+        raise CalibrationError(f"{path}: {key} must be finite numbers of its sizes; correct it")
+    return data.reshape(tuple(np.rint(sizes).astype(int)))
 
 
 # --------------------------------------------------------------------------------------------

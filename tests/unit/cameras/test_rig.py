@@ -186,6 +186,29 @@ def test_one_pair_in_every_format_is_one_rig(kind: str, tmp_path: Path) -> None:
         assert (a != image).any()
 
 
+OF_OPENCV_5 = """%YAML 1.2
+---
+K1: !!opencv-matrix { rows: 3, cols: 3, dt: d, data: [ 30., 0, 15.5, 0, 30., 11.5, 0, 0, 1. ] }
+D1: !!opencv-nd-matrix { sizes: [ 4 ], dt: d, data: [ 0.01, 0., -0.02, 0. ] }
+K2: !!opencv-nd-matrix { sizes: [ 3, 3 ], dt: d, data: [ 30., 0, 15.5, 0, 30., 11.5, 0, 0, 1. ] }
+D2: !!opencv-nd-matrix { sizes: [ 4 ], dt: d, data: [ 0.01, 0., -0.02, 0. ] }
+R: !!opencv-matrix { rows: 3, cols: 3, dt: d, data: [ 1., 0., 0., 0., 1., 0., 0., 0., 1. ] }
+T: !!opencv-nd-matrix { sizes: [ 3 ], dt: d, data: [ -0.2, 0., 0. ] }
+"""
+
+
+def test_rows_of_numbers_as_opencv_5_writes_them(tmp_path: Path) -> None:
+    """The only file of a folder may have any name; where it cannot be read, that is said."""
+    path = tmp_path / "rig_of_tuesday.yml"
+    path.write_text(OF_OPENCV_5, encoding="utf-8")
+    rig = StereoRig.load(tmp_path, (WIDTH, HEIGHT))
+    assert rig.baseline == pytest.approx(0.2, abs=1e-12)
+    assert any("taken as those of cv2.fisheye" in remark for remark in rig.remarks)
+    path.write_text(OF_OPENCV_5.replace("sizes: [ 3 ]", "sizes: [ 4 ]"), encoding="utf-8")
+    with pytest.raises(CalibrationError, match=r"rig_of_tuesday\.yml: T must be finite numbers of"):
+        StereoRig.load(tmp_path, (WIDTH, HEIGHT))
+
+
 def test_camera_info_is_rectified_as_it_says(tmp_path: Path) -> None:
     rig = StereoRig.load(write_camera_info(tmp_path))
     stated = yaml.safe_load((tmp_path / "right.yaml").read_text())["projection_matrix"]["data"]

@@ -108,6 +108,15 @@ def test_image_folder_reader_names_the_layout_that_it_finds_instead(tmp_path: Pa
             open_image_folder(ImageFolderSettings(path=str(folder)))
 
 
+@pytest.mark.parametrize("inside", [".", "images", "cam0/data"])
+def test_images_of_one_camera_are_called_so(tmp_path: Path, inside: str) -> None:
+    (tmp_path / "gyro.csv").write_text("time,gyro_x,gyro_y,gyro_z\n0,0,0,0\n", encoding="utf-8")
+    for k in range(4):
+        save(tmp_path / inside / f"{k:06d}.png", picture(k))
+    with pytest.raises(DatasetError, match=r"holds images of one camera only; .* a gyroscope, too"):
+        recognise_layout(tmp_path)
+
+
 def test_unknown_layout_lists_what_is_missing(tmp_path: Path) -> None:
     (tmp_path / "calib.json").write_text("{}", encoding="utf-8")
     with pytest.raises(DatasetError) as caught:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,44 @@ def test_names_that_are_times_and_no_times_at_all(tmp_path: Path) -> None:
     root = loose(tmp_path / "b", NAMES["left, right"], [1, 2, 3])
     assert "no list of times: taken as 10 frames a second" in opened(root).notes[0]
     assert np.allclose(opened(root, fps=25.0).timestamps, [0.0, 0.04, 0.08], rtol=0.0, atol=1e-12)
+
+
+MINUTE = datetime(2026, 11, 23, 23, 59, 59, 900_000, UTC)  # frames 2 to 5 are of the next day
+
+
+def named(k: int, form: str, places: int = 3) -> str:
+    moment = MINUTE + timedelta(milliseconds=50 * k)
+    return moment.strftime(form).replace("#", f"{moment.microsecond:06d}"[:places])
+
+
+@pytest.mark.parametrize(
+    ("form", "places"),
+    [
+        ("%Y-%m-%dT%H-%M-%S.#Z_{}", 3),
+        ("%Y%m%d_%H%M%S_#_{}", 6),
+        ("{}_%Y%m%d%H%M%S#", 3),
+        ("IMG_{}_%Y-%m-%d %H.%M.%S,#", 2),
+    ],
+)
+def test_names_that_are_dates(tmp_path: Path, form: str, places: int) -> None:
+    left, right = (form.replace("{}", side) + ".png" for side in ("left", "right"))
+    root = loose(tmp_path, lambda k: (named(k, left, places), named(k, right, places)), [*range(6)])
+    recording = opened(root)
+    expected = MINUTE.timestamp() + 0.05 * np.arange(6)
+    np.testing.assert_allclose(recording.timestamps, expected, rtol=0.0, atol=1e-6)
+    assert "times are the dates in the names of the images" in recording.notes
+
+
+@pytest.mark.parametrize(
+    "form", ["20261123_235959_{k:06d}_{{}}", "20261399_235959_{k}_{{}}", "20261123_235959_{{}}_{k}"]
+)
+def test_dates_that_are_no_times_of_images(tmp_path: Path, form: str) -> None:
+    """A counter behind one date; no date; the camera between both."""
+    name = lambda k: form.format(k=k) + ".png"  # noqa: E731 - one line
+    root = loose(tmp_path, lambda k: (name(k).format("l"), name(k).format("r")), [*range(5)])
+    recording = opened(root)
+    np.testing.assert_allclose(np.diff(recording.timestamps), 0.1, rtol=0.0, atol=1e-9)
+    assert any("no list of times" in note for note in recording.notes)
 
 
 @pytest.mark.parametrize(

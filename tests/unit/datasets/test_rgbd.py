@@ -142,6 +142,55 @@ def test_depth_in_the_wrong_unit_is_said(tmp_path: Path) -> None:
         opened(root, depth_scale=1e6)
 
 
+def folders(root: Path, unit_m: float) -> Path:
+    """Colour and depth of a wall as RealSense's tools write them, without lists."""
+    for k in range(3):
+        save(root / "color" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
+        depth = np.full((HEIGHT, WIDTH), round(DEPTH_M / unit_m), np.uint16)
+        save(root / "depth" / f"{k}.png", depth)
+    return root
+
+
+INTRINSICS: dict[str, dict[str, Any]] = {
+    "Open3D": {"intrinsic_matrix": [FOCAL, 0, 0, 0, FOCAL, 0, 15.5, 11.5, 1]},
+    "librealsense": {
+        "fx": FOCAL,
+        "fy": FOCAL,
+        "ppx": 15.5,
+        "ppy": 11.5,
+        "coeffs": [0, 0, 0, 0, 0],
+        "model": "distortion.inverse_brown_conrady",
+    },
+    "by hand": {"fx": FOCAL, "fy": FOCAL, "cx": 15.5, "cy": 11.5},
+}
+
+
+@pytest.mark.parametrize("form", INTRINSICS)
+@pytest.mark.parametrize("stated", [{"depth_scale": 1e-4}, {"DepthMapFactor": 10000.0}])
+def test_intrinsics_of_depth_cameras_and_their_unit(
+    tmp_path: Path, form: str, stated: dict[str, float]
+) -> None:
+    root = folders(tmp_path, 1e-4)
+    values = {"width": WIDTH, "height": HEIGHT, **INTRINSICS[form]}
+    file = root / "camera_intrinsic.json"
+    file.write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(DatasetError, match=r"median depth is 20 m at 1000 .* 10000 for tenths"):
+        opened(root)
+    file.write_text(json.dumps(values | stated), encoding="utf-8")
+    recording = opened(root)
+    rig = recording.rig
+    assert (rig.fx, rig.fy, rig.cx, rig.cy) == (FOCAL, FOCAL, 15.5, 11.5)
+    assert recording.notes[-1] == "depth is taken as 10000 units a metre: its median is 2 m"
+
+
+def test_distortion_that_goes_the_other_way_is_refused(tmp_path: Path) -> None:
+    values = INTRINSICS["librealsense"] | {"coeffs": [0.1, 0, 0, 0, 0], "width": 32, "height": 24}
+    root = folders(tmp_path, 1e-3)
+    (root / "camera.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(CalibrationError, match="inverse_brown_conrady is not known with coeff"):
+        opened(root)
+
+
 def test_the_colour_camera(tmp_path: Path) -> None:
     root = tum(tmp_path / "walk")
     (root / "calib.json").rename(tmp_path / "mine.json")

@@ -58,6 +58,48 @@ def levels(recording: Recording, i: int) -> np.ndarray:
     return np.array([np.median(image) for image in recording.frame(i).images])
 
 
+def uneven(path: Path, lengths: list[int]) -> None:
+    """Gives every frame its own length: the film's table of them (stts) is in its last box."""
+    data = bytearray(path.read_bytes())
+    at = data.find(b"stts") - 4
+    old = int.from_bytes(data[at : at + 4], "big")
+    entries = b"".join((1).to_bytes(4, "big") + n.to_bytes(4, "big") for n in lengths)
+    new = (16 + len(entries)).to_bytes(4, "big") + b"stts" + bytes(4)
+    new += len(lengths).to_bytes(4, "big") + entries
+    data[at : at + old] = new
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+        box = data.find(name) - 4
+        size = int.from_bytes(data[box : box + 4], "big") + len(new) - old
+        data[box : box + 4] = size.to_bytes(4, "big")
+    path.write_bytes(data)
+
+
+def test_frames_of_a_phone_have_their_own_times(tmp_path: Path) -> None:
+    """Of 20 frames a second by their mean, as long as the light needs; --fps says otherwise."""
+    calibrated(tmp_path)
+    path = film(tmp_path / "walk.mp4", stereo_frames(np.hstack))
+    even = opened(path)
+    np.testing.assert_allclose(np.diff(even.timestamps), 0.05, rtol=0.0, atol=1e-9)
+    assert not any("apart" in note for note in even.notes)
+    uneven(path, [256, 768, 256, 1024, 256, 512])  # 512 are 50 ms
+    recording = opened(path)
+    expected = [0.0, 0.025, 0.1, 0.125, 0.225, 0.25]
+    np.testing.assert_allclose(recording.timestamps, expected, rtol=0.0, atol=1e-6)
+    assert "frames are 25 to 100 ms apart: each has its own time" in recording.notes
+    assert levels(recording, 5).tolist() == pytest.approx([190, 90], abs=_NEAR)
+    stated = opened(path, fps=10.0)
+    np.testing.assert_allclose(np.diff(stated.timestamps), 0.1, rtol=0.0, atol=1e-9)
+
+
+def test_two_films_whose_frames_drift_apart_are_told(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    for side, level in (("left", 40), ("right", 140)):
+        film(tmp_path / f"{side}.mp4", [view(level + 10 * k) for k in range(6)])
+    uneven(tmp_path / "right.mp4", [256, 256, 256, 1024, 768, 512])
+    notes = opened(tmp_path).notes
+    assert "frames of one number differ in time by up to 75 ms in the films" in notes
+
+
 @pytest.mark.parametrize("ending", [".avi", ".mp4"])
 @pytest.mark.parametrize(("name", "join"), [("side by side", np.hstack), ("over under", np.vstack)])
 def test_both_views_in_one_film(
