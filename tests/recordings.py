@@ -72,7 +72,7 @@ def views(
         for camera, (columns, rows) in zip(cameras, maps, strict=True):
             wTc = wTb @ camera.bTc
             wide = _render(textures, wTc[:3, :3], wTc[:3, 3], rng, _WIDE)
-            seen.append(cv2.remap(wide, columns, rows, cv2.INTER_LINEAR))
+            seen.append(np.asarray(cv2.remap(wide, columns, rows, cv2.INTER_LINEAR), np.uint8))
         yield tuple(seen)
 
 

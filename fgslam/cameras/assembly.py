@@ -192,6 +192,11 @@ def _require_side_by_side(chosen: Sequence[RawCamera], turn: FloatArray) -> None
             f"{left.name} and {right.name} are {1e3 * np.linalg.norm(offset):.3g} mm apart, as one "
             "camera; check T_BS (or T) in the calibration, and the unit of its lengths (--unit)"
         )
+    if np.abs(offset[1]) > 2.0 * np.hypot(offset[0], offset[2]):
+        raise CalibrationError(
+            f"{left.name} and {right.name} are above each other, not side by side; turn both "
+            "cameras' images by 90 degrees and calibrate with these, or correct T_BS (or R and T)"
+        )
     if np.abs(offset[0]) < 2.0 * np.hypot(offset[1], offset[2]):
         x, y, z = offset
         raise CalibrationError(

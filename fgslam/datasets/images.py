@@ -345,7 +345,7 @@ def check_sizes(files: StereoFiles, where: Path) -> None:
         named = ", ".join(f"{n} {s}" for n, s in zip(CAMERA_NAMES, sizes, strict=False))
         raise DatasetError(
             f"{where}: the cameras' images differ in size ({named}); all must be rectified to one "
-            "size"
+            "size: resize the larger ones, and calibrate them so"
         )
     if sizes[0] != f"{files.width}x{files.height}":
         raise CalibrationError(

@@ -161,13 +161,14 @@ def _scale(
 
 def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
     """Units a metre by the calibration's file; RealSense's tools state metres a unit there."""
-    given = settings.camera_file
-    files = [Path(given)] if given is not None else _own_files(root)
+    named = settings.camera_file
+    files = _own_files(root) if named is None else [Path(named)]
     tree = read_tree(files[0]) if len(files) == 1 else None
     for key in _SCALES:
-        value = (tree or {}).get(key)
-        if is_finite_number(value) and value > 0.0:
-            return 1.0 / float(value) if value < 1.0 else float(value)
+        given = (tree or {}).get(key)
+        value = float(given) if is_finite_number(given) else 0.0  # type: ignore[arg-type]
+        if value > 0.0:
+            return 1.0 / value if value < 1.0 else value
     return None
 
 

@@ -85,13 +85,17 @@ def _dates(names: Sequence[str]) -> FloatArray | None:
     if len(names) < 2 or not all(found):
         return None
     try:
-        whole = [datetime(*map(int, m.groups()[:6]), tzinfo=UTC).timestamp() for m in found if m]
+        whole = [_seconds(*map(int, match.groups()[:6])) for match in found if match]
     except ValueError:  # no date
         return None
     parts = [float(f"0.{m[7] or 0}") for m in found if m]
     stamps = np.array(whole) + parts
     steps = np.diff(stamps)
     return stamps if steps.min() > 0.0 and np.median(steps) >= _FASTEST_S else None
+
+
+def _seconds(year: int, month: int, day: int, hour: int, minute: int, second: int) -> float:
+    return datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
 
 
 def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:
