@@ -173,6 +173,8 @@ def test_swapped_names_are_taken_by_geometry() -> None:
     [
         (((0.0, 0.0, 0.0),), "one camera alone"),
         (((0.0, 0.0, 0.0), (0.0, 0.0, 0.3)), "not side by side"),
+        (((0.0, 0.0, 0.0), (0.02, 0.3, 0.0)), "are above each other.* by 90 degrees"),
+        (((0.0, 0.0, 0.0), (0.0, 0.0, 1e-4)), r"are 0\.1 mm apart, as one camera"),
         (((0.0, 0.0, 0.0),) * 4, r"holds 4 cameras; say which .* cameras=\(0, 1\)"),
     ],
 )
