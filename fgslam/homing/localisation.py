@@ -49,6 +49,7 @@ class Localiser:
         belief: (n,) probabilities; uniform before the first image.
         likelihood: (n,) of the last image at each node, up to a factor.
         answers: homing vectors of the last image to those nodes that it was matched with.
+        leap: chance to be anywhere at all by the next image; the settings' unless it is set.
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Localiser:
         settings: LocalisationSettings,
         weigh: Weigher | None = None,
         transition: FloatArray | None = None,
+        power: float = 1.0,
     ) -> None:
         """Begins with a uniform belief.
 
@@ -70,6 +72,7 @@ class Localiser:
             weigh: evidence of answers; None: their inliers.
             transition: (n, n) chances to go from row to column between two images, without leaps;
                 None: along the links, those that cost less sooner.
+            power: of the likelihood of an image: how much it counts.
         """
         self._map = topology
         self._words = words
@@ -77,6 +80,8 @@ class Localiser:
         self._settings = settings
         self._weigh = weigh or inliers_of
         self._transition = _transition(topology) if transition is None else transition
+        self._power = power
+        self.leap = settings.leap
         self.belief: FloatArray = np.full(len(topology), 1.0 / max(len(topology), 1))
         self.answers: dict[int, Answer] = {}
         self.likelihood: FloatArray = np.ones(len(topology))
@@ -95,7 +100,7 @@ class Localiser:
         expected = self.expected()
         self._fresh = False
         self.likelihood = likelihoods(self._supports(image, expected, also), _BACKGROUND)
-        posterior = expected * self.likelihood
+        posterior = expected * (self.likelihood / self.likelihood.max()) ** self._power
         self.belief = posterior / posterior.sum()
         return self.belief.copy()
 
@@ -109,8 +114,8 @@ class Localiser:
         return node, float(self.belief[node])
 
     def _moved(self) -> FloatArray:
-        leap = self._settings.leap
-        return (1.0 - leap) * (self.belief @ self._transition) + leap / len(self.belief)
+        moved = self.belief @ self._transition
+        return (1.0 - self.leap) * moved + self.leap / len(self.belief)
 
     def _supports(
         self, image: OmniFeatures, expected: FloatArray, also: Collection[int]
