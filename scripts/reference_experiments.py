@@ -8,16 +8,11 @@ from typing import Any
 
 import yaml
 
-from scripts.reference_settings import item
+from scripts.reference_settings import item, paragraph
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 _GROUPS = ("odometry", "frontend", "estimator", "compare")
 _NAMES = ("kind", "label")
-REAL = frozenset(
-    {"image_folder", "kitti", "euroc", "light_field", "stereo_tracks"}
-    | {"utias_stereo", "utias_range_bearing"}
-)
-"""Kinds of data sets that are real recordings."""
 PAPER = "lab_paper"
 """The experiment whose settings are its subject: the paper's own pipeline."""
 
@@ -59,13 +54,8 @@ _HEAD = """# What each experiment still sets
 <!-- Made by `python -m scripts.make_reference` from experiments/*.yaml: edit those. -->
 
 Every experiment of SLAM, and a recording without any (`fgslam run RECORDING`), takes the same
-defaults for features, matching, ego-motion and noise. A file says what is its own: the data, the
-robot, the estimators that it compares, and what it is about. This page lists all that the files set
-beside the data set. A test fails where a setting has no reason here.
-"""
-_WHY = """## Why
-
-`lab_paper` is the paper's own pipeline: its settings are its subject. Of the others:
+defaults for features, matching, ego-motion and noise. Beside the data set the files set what
+follows, for the reason given. A test fails where a setting has no reason here.
 """
 _STILL = """## Still set by hand
 
@@ -75,20 +65,25 @@ Numbers of estimation that are to become estimates themselves; no other may be s
 
 def experiments_page() -> str:
     """The whole page, in Markdown."""
-    lines, used = [_HEAD], set[str]()
-    for name, values in slam_experiments():
-        found = settings_of(values)
-        used |= set(found)
-        data = "real recording" if is_real(values) else values["dataset"]["kind"]
-        told = "; ".join(f"`{key}: {_short(value)}`" for key, value in found.items())
-        lines += item(f"`{name}` ({data}): {told or 'nothing'}")
-    lines += ["", _WHY]
-    for key, why in REASONS.items():
-        lines += item(f"`{key}`: {why}") if key in used else []
-    lines += ["", _STILL]
-    for key, why in BY_HAND.items():
-        lines += item(f"`{key}`: {why}") if key in used else []
-    return "\n".join(lines) + "\n"
+    sets = {name: settings_of(values) for name, values in slam_experiments()}
+    paper = "; ".join(f"`{key}: {_short(value)}`" for key, value in sets.pop(PAPER).items())
+    nothing = ", ".join(f"`{name}`" for name, found in sets.items() if not found)
+    lines = [_HEAD, *_settings(sets, REASONS), *item(f"nothing at all: {nothing}"), ""]
+    lines += [*paragraph(f"`{PAPER}` is the paper's own pipeline, its settings its subject:"), ""]
+    return "\n".join([*lines, *item(paper), "", _STILL, *_settings(sets, BY_HAND)]) + "\n"
+
+
+def _settings(
+    sets: Mapping[str, Mapping[str, object]], reasons: Mapping[str, str]
+) -> Iterator[str]:
+    """An item for each setting that has a reason: why, and which experiments set it to what."""
+    for key, why in reasons.items():
+        users: dict[str, list[str]] = {}
+        for name, found in sets.items():
+            if key in found:
+                users.setdefault(_short(found[key]), []).append(f"`{name}`")
+        for value, names in users.items():
+            yield from item(f"`{key}: {value}`: {why} ({', '.join(names)})")
 
 
 def slam_experiments() -> Iterator[tuple[str, dict[str, Any]]]:
@@ -119,11 +114,6 @@ def unreasoned() -> list[str]:
         for key in settings_of(values)
         if name != PAPER and key not in REASONS and key not in BY_HAND
     ]
-
-
-def is_real(values: Mapping[str, Any]) -> bool:
-    """Whether the data set is a real recording."""
-    return values["dataset"]["kind"] in REAL
 
 
 def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

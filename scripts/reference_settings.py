@@ -51,11 +51,10 @@ of a key wins; choosing another `kind` drops the file's keys of the old one. Unk
 given twice, NaN and infinity are refused. `RUN/config.yaml` holds every key with its value.
 
 A line gives the key, its default, then other choices or the range (a bracket includes the limit),
-and its meaning. A default without decimal point takes integers. Units are those of the key's name
-(`_m`, `_s`, `_px`, `_deg`). `null` is off, `{}` switches a group on with its defaults. Keys
-described further up are named as *alike*; `start`, `stop` and `stride` are keys of every recording,
-`label` of every estimator, `name` and `seed` of every task. See also [homing
-experiments](#homing-experiments).
+and its meaning. A default without decimal point takes integers. Units are those of the key's name.
+`null` is off, `{}` switches a group on with its defaults. Keys described further up are named as
+*alike*; `start`, `stop` and `stride` are keys of every recording, `label` of every estimator,
+`name` and `seed` of every task.
 """
 
 _LOCALISATION = """## Task `localisation`
@@ -130,8 +129,7 @@ def _sections(schema: Node, node: Node, dotted: str, level: int, known: Known) -
         if (title, group["title"]) not in known:
             known.add((title, group["title"]))
             about = [*paragraph(_summary(group)), ""] if kind or not lines else []
-            head = f"{'#' * level} {title} (`{group['title']}`)"
-            yield "\n".join([head, "", *about, *lines]).rstrip()
+            yield "\n".join([f"{'#' * level} {title}", "", *about, *lines]).rstrip()
         yield from inner
 
 
@@ -208,8 +206,8 @@ def _meaning(schema: Node, node: Node) -> str:
         if "kind" in part.get("properties", {})
     ]
     if kinds:
-        return f"`kind`: {', '.join(f'`{kind}`' for kind in kinds)}; its keys are below"
-    return "a group; its keys are below"
+        return f"`kind`: {', '.join(f'`{kind}`' for kind in kinds)}"
+    return "group below"
 
 
 def _default(node: Node) -> str:

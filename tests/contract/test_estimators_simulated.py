@@ -40,7 +40,7 @@ from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.replay import replay_frame
 
-DRIVE = Drive(frames=10)
+DRIVE = Drive(frames=8, points=90)
 SIXDOF = EgoMotionSettings(dof=6)
 
 
@@ -139,7 +139,7 @@ def test_a_replay_is_the_three_calls(settings: EstimatorSettings) -> None:
 # A live run, from ideal features on, against the replay of its log
 
 
-FRAMES, POINTS = 14, 150
+FRAMES, POINTS = 12, 100
 NO_IMAGE, NO_ODOMETRY = (5, 6), (4, 9)
 
 

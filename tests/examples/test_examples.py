@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -20,10 +21,25 @@ LONG = (
     "homing_vector",
     "own_features",
 )
+OWN = [script for script in EXAMPLES if script.stem.startswith("own_") and script.stem not in LONG]
 SCRIPTS = [
     pytest.param(script, marks=pytest.mark.slow if script.stem in LONG else ())
     for script in EXAMPLES
+    if script not in OWN
 ]
+
+
+@pytest.mark.parametrize("script", OWN, ids=lambda path: path.stem)
+def test_extension_runs_to_its_end(
+    script: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """What a user adds, in this process: one of its own would import everything first."""
+    monkeypatch.chdir(tmp_path)
+    runpy.run_path(str(script), run_name="__main__")
+    assert capsys.readouterr().out
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)

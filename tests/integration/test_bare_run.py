@@ -16,6 +16,13 @@ pytestmark = pytest.mark.usefixtures("in_this_process")
 EVERYTHING = tuple(name.replace(KIND, DEFAULT_ESTIMATOR) for name in SAME_BYTES)
 MEASURED = tuple(name for name in EVERYTHING if name != "ground_truth.tum")
 QUIET = ("--set", "output.pictures=false", "--set", "output.report=false")
+UNSEEN = {"output.pictures": False, "output.report": False}
+
+
+@pytest.fixture(scope="module")
+def bare(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of the recording alone, without pictures and page; read only."""
+    return fg.run(recording, tmp_path_factory.mktemp("runs") / "bare", UNSEEN).folder
 
 
 def test_a_recording_alone_gives_a_run_folder_that_compares(
@@ -36,38 +43,36 @@ def test_a_recording_alone_gives_a_run_folder_that_compares(
 
 def test_the_printed_configuration_gives_the_same_bytes_as_the_recording(
     recording: Path,
+    bare: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     assert main(monkeypatch, "init", recording) == 0
     (tmp_path / "mine.yaml").write_text(capfd.readouterr().out, encoding="utf-8")
-    for given, out in ((recording, "bare"), (tmp_path / "mine.yaml", "written")):
-        assert main(monkeypatch, "run", given, "--out", tmp_path / out, *QUIET) == 0
-    assert bytes_of(tmp_path / "bare", EVERYTHING) == bytes_of(tmp_path / "written", EVERYTHING)
+    written = tmp_path / "written"
+    assert main(monkeypatch, "run", tmp_path / "mine.yaml", "--out", written, *QUIET) == 0
+    assert bytes_of(bare, EVERYTHING) == bytes_of(written, EVERYTHING)
 
 
 def test_truth_in_the_folder_changes_nothing_but_the_evaluation(
-    recording: Path, tmp_path: Path
+    recording: Path, bare: Path, tmp_path: Path
 ) -> None:
     blind = Path(shutil.copytree(recording, tmp_path / "boards"))
     (blind / "gt_right_cam.txt").unlink()
-    quiet = {"output.pictures": False, "output.report": False}
-    seen = fg.run(recording, tmp_path / "seen", quiet)
-    unseen = fg.run(blind, tmp_path / "unseen", quiet)
-    assert bytes_of(seen.folder, MEASURED) == bytes_of(unseen.folder, MEASURED)
+    unseen = fg.run(blind, tmp_path / "unseen", UNSEEN)
+    assert bytes_of(bare, MEASURED) == bytes_of(unseen.folder, MEASURED)
     assert unseen.metrics["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] is None
 
 
 def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
-    recording: Path, tmp_path: Path
+    recording: Path, bare: Path, tmp_path: Path
 ) -> None:
-    ran = fg.run(recording, tmp_path / "run", {"output.pictures": False, "output.report": False})
     slam = fg.Slam.from_config(recording)
     for t, images, odometry in fg.open_recording(recording):
         slam.track(t, images, odometry)
     slam.result().trajectory.save(tmp_path / "pushed.tum")
-    expected = (ran.folder / DEFAULT_ESTIMATOR / "final.tum").read_bytes()
+    expected = (bare / DEFAULT_ESTIMATOR / "final.tum").read_bytes()
     assert (tmp_path / "pushed.tum").read_bytes() == expected
 
 
@@ -76,7 +81,7 @@ def test_a_drone_that_turns_by_tens_of_degrees_a_frame_is_located(
     shared_data: Path, tmp_path: Path
 ) -> None:
     """No odometry, and steps of 20 degrees and 0.3 m in the mean: no velocity foretells them."""
-    quiet = {"output.pictures": False, "output.report": False, "dataset.stop": 18}
+    quiet = {**UNSEEN, "dataset.stop": 18}
     path = shared_data / "euroc_v101_kf100"
     run = fg.run(path, tmp_path / "run", {**quiet, "estimator.kind": "landmark_kalman"})
     numbers = run.metrics["estimators"]["landmark_kalman"]

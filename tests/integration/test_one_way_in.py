@@ -72,15 +72,15 @@ def test_a_session_in_a_saved_map_gives_the_bytes_of_the_configured_run(
     tmp_path: Path, extend: bool
 ) -> None:
     lab = QUIET | {"compare": [], "estimator.kind": "landmark_kalman"}
-    first = pushed("lab_loop", lab | {"dataset.stop": 12}, tmp_path / "first")
+    first = pushed("lab_loop", lab | {"dataset.stop": 9}, tmp_path / "first")
     place = tmp_path / "first" / "map.fgmap"
     assert (first / "map.ply").is_file()
-    later = lab | {"dataset.start": 4, "dataset.stop": 12, "map.load": place, "map.extend": extend}
+    later = lab | {"dataset.start": 3, "dataset.stop": 8, "map.load": place, "map.extend": extend}
     live = pushed("lab_loop", later, tmp_path / "live")
     run = fg.run("lab_loop", tmp_path / "run", later)
     assert_same_files(live, [run.folder], "landmark_kalman")
 
-    config = lab | {"dataset.start": 4, "dataset.stop": 12}
+    config = lab | {"dataset.start": 3, "dataset.stop": 8}
     recording = fg.open_recording("lab_loop", config)
     settings = slam_config("lab_loop", config)
     slam = fg.Slam(

@@ -3,21 +3,22 @@
 The commands run in a copy of the checkout whose `.venv` is the environment that runs the tests. Two
 are replaced: `make test` is shown but not run, since it would run this test again; `pip install .`
 would change that environment, so that it installs into a folder of its own, without dependencies
-and without downloading the build system. The fast test shortens the demo to its first frames and
-draws no pictures, the slow one drives it whole.
+and without downloading the build system. The fast test shortens the demo to its first frames, draws
+no pictures and runs fgslam in this process; the slow one drives it whole, each command its own.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from running import ROOT, copy_of_checkout
+from running import ROOT, copy_of_checkout, main
 
 import fgslam
 
@@ -61,7 +62,7 @@ def provide_environment(folder: Path) -> None:
 def installed_elsewhere(folder: Path) -> list[str]:
     """The installation into a folder of its own."""
     target = ["--target", str(folder.parent / "installed"), "--no-deps", "--no-build-isolation"]
-    return [sys.executable, "-m", "pip", "install", "--quiet", *target, str(folder)]
+    return [sys.executable, "-m", "pip", "install", "--quiet", "--no-compile", *target, str(folder)]
 
 
 @pytest.fixture
@@ -84,6 +85,11 @@ def run_all(folder: Path, replaced: dict[str, list[str]]) -> None:
     for command in commands():
         run(replaced.get(command, shlex.split(command)), folder)
     run_python(folder)
+    assert_results(folder)
+
+
+def assert_results(folder: Path) -> None:
+    """What the Python block saves."""
     assert (folder / "path.tum").is_file()
     assert (folder / "map.ply").is_file()
 
@@ -118,11 +124,22 @@ def assert_demo_and_installation(folder: Path) -> None:
     assert_whole(folder.parent / "installed/fgslam")
 
 
-def test_commands_run_in_order_with_a_short_demo(checkout: Path) -> None:
+def test_commands_run_in_order_with_a_short_demo(
+    checkout: Path, in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run(["make", "--dry-run", "demo"], checkout)
     replaced = replaced_in(checkout) | {"make demo": shlex.split(DEMO_SHORT)}
     assert set(replaced) <= set(commands())
-    run_all(checkout, replaced)
+    monkeypatch.chdir(checkout)
+    for command in commands():
+        words = replaced.get(command, shlex.split(command))
+        if words[0] == "fgslam":
+            assert main(monkeypatch, *words[1:]) == 0, command
+        else:
+            run(words, checkout)
+    (checkout / "readme.py").write_text(blocks("python")[0], encoding="utf-8")
+    runpy.run_path("readme.py")
+    assert_results(checkout)
     assert_demo_and_installation(checkout)
 
 

@@ -76,16 +76,6 @@ def test_page_loads_offline_without_error_or_request(browser: Browser) -> None:
     assert browser.js("navigator.onLine") is False
 
 
-def test_the_browser_does_see_errors_and_requests(offline: Browser, tmp_path: Path) -> None:
-    """Guards the guards: a page that breaks the rules is noticed."""
-    bad = tmp_path / "bad.html"
-    bad.write_text('<script>nowhere()</script><img src="https://example.org/a.png">')
-    offline.complaints(), offline.requests()
-    offline.driver.get(bad.as_uri())
-    assert any("nowhere is not defined" in line for line in offline.complaints())
-    assert offline.requests() == ["https://example.org/a.png"]
-
-
 def test_the_table_has_a_row_for_each_estimator(browser: Browser) -> None:
     titles = browser.js(
         "[...document.querySelectorAll('tbody th')].map(cell => cell.innerText.trim())"
@@ -262,6 +252,30 @@ def test_a_picture_opens_large_and_closes(browser: Browser) -> None:
     browser.wait("!document.getElementById('closer').open")
 
 
+def test_a_foreign_script_is_refused_by_the_page(browser: Browser) -> None:
+    browser.complaints()
+    browser.driver.execute_script(
+        "const s = document.createElement('script'); s.textContent = 'window.ran = 1';"
+        "document.body.append(s)"
+    )
+    assert browser.js("window.ran === undefined") is True
+    assert any("Content Security Policy" in line for line in browser.complaints())
+
+
+# --------------------------------------------------------------------------------------------
+# Other pages: after all tests of the first one, which takes seconds to load
+
+
+def test_the_browser_does_see_errors_and_requests(offline: Browser, tmp_path: Path) -> None:
+    """Guards the guards: a page that breaks the rules is noticed."""
+    bad = tmp_path / "bad.html"
+    bad.write_text('<script>nowhere()</script><img src="https://example.org/a.png">')
+    offline.complaints(), offline.requests()
+    offline.driver.get(bad.as_uri())
+    assert any("nowhere is not defined" in line for line in offline.complaints())
+    assert offline.requests() == ["https://example.org/a.png"]
+
+
 def test_nothing_from_outside_is_run_or_taken_for_markup(offline: Browser, tmp_path: Path) -> None:
     data = full_report()
     hostile = dataclasses.replace(data.estimators[0], title=HOSTILE, remarks=(HOSTILE,))
@@ -282,16 +296,6 @@ def test_nothing_from_outside_is_run_or_taken_for_markup(offline: Browser, tmp_p
     assert offline.js("document.title") == HOSTILE
     assert offline.js("document.querySelector('h1').innerText") == HOSTILE
     assert offline.js(f"{DRAWN.format('time')}[0].name").count("&lt;script&gt;") == 1
-
-
-def test_a_foreign_script_is_refused_by_the_page(browser: Browser) -> None:
-    browser.complaints()
-    browser.driver.execute_script(
-        "const s = document.createElement('script'); s.textContent = 'window.ran = 1';"
-        "document.body.append(s)"
-    )
-    assert browser.js("window.ran === undefined") is True
-    assert any("Content Security Policy" in line for line in browser.complaints())
 
 
 def one_estimator() -> ReportData:

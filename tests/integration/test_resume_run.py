@@ -38,7 +38,12 @@ from fgslam.core.measurements import Odometry
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
-from fgslam.runs.engine import resume_command
+from fgslam.runs.config import make_config
+from fgslam.runs.engine import Opening, resume_command
+from fgslam.runs.tasks.slam import begin, open_run
+
+LONG = 20
+"""Frames that are enough to be interrupted for certain after the fifth."""
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 11])
@@ -147,12 +152,15 @@ def test_a_checkpoint_that_does_not_fit_is_refused(recording: Path, tmp_path: Pa
     values = experiment(recording)
     run = run_values(values, tmp_path / "run", stopped=stop_after(5)).folder
     whole = load_arrays(run / "checkpoint.npz")
+    opened = open_run(make_config(values, "test"), Opening(run, True, lambda *_: None))
     for name in whole:
         others = {key: array for key, array in whole.items() if key != name}
         write_arrays(run / "checkpoint.npz", others)
         with pytest.raises(OutputError, match="not a state that this fgslam wrote") as caught:
-            run_values(values, run, "resume")
+            begin(opened, lambda *_: None)
         assert "\n" not in str(caught.value)
+    with pytest.raises(OutputError, match="not a state that this fgslam wrote"):
+        run_values(values, run, "resume")
     (run / "checkpoint.npz").write_bytes(b"PK\x03\x04 half a file")
     with pytest.raises(MeasurementLogError, match=r"checkpoint\.npz: not a readable"):
         run_values(values, run, "resume")
@@ -221,7 +229,7 @@ def wait_for_frames(folder: Path, frames: int, process: subprocess.Popen[str]) -
 @pytest.fixture(scope="module")
 def long_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Long enough to be interrupted for certain."""
-    return write_recording(tmp_path_factory.mktemp("recordings") / "long", frames=40)
+    return write_recording(tmp_path_factory.mktemp("recordings") / "long", frames=LONG)
 
 
 @pytest.fixture(scope="module")
@@ -256,7 +264,7 @@ def test_signals(
     out, error = process.communicate(timeout=HANGS_AFTER_S)
     assert "Traceback" not in error
     done = assert_valid_results(folder, split_saves=int(number == signal.SIGKILL))
-    assert 5 <= done < 40
+    assert 5 <= done < LONG
     if number == signal.SIGKILL:
         assert process.returncode == -signal.SIGKILL
     else:
@@ -265,7 +273,7 @@ def test_signals(
         assert f"interrupted after {done} frames; go on: {resume_command(folder)}" in out
     # The printed command's own words: the run folder's config.yaml is enough to go on.
     assert main(monkeypatch, "run", folder / "config.yaml", "--out", folder, "--resume") == 0
-    assert "40 of 40" in capfd.readouterr().out
+    assert f"{LONG} of {LONG}" in capfd.readouterr().out
     assert bytes_of(folder) == long_bytes
     assert not list(folder.rglob("*partial*"))
 

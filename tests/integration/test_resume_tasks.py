@@ -103,7 +103,8 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
     """A small experiment of each task."""
-    images = experiment(recording, output=QUIET)
+    dataset = {"kind": "image_folder", "path": str(recording), "stop": 7}
+    images = experiment(recording, dataset=dataset, output=QUIET)
     panoramas = {"name": "x", "jobs": 1, "dataset": {"kind": "panoramas", "path": str(views)}}
     known: dict[str, dict[str, Any]] = {
         "slam": images,
