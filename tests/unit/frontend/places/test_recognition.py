@@ -22,9 +22,10 @@ from rings import (
 from simulated import RIG, assert_same_bits
 
 from fgslam.backend.filters import loop_correction
+from fgslam.backend.protocol import Resumable
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.settings import ConstantVelocitySettings
@@ -54,14 +55,39 @@ def refuse_closures(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(loop_correction, "GATE_SIGMAS", 1e-6)
 
 
+@dataclasses.dataclass(frozen=True)
+class State:
+    """What a drive goes on from."""
+
+    database: StateArrays
+    estimator: StateArrays
+    places: StateArrays
+    taken: tuple[bool, ...]
+
+
+def state_of(pipeline: SlamPipeline) -> State:
+    assert pipeline.places is not None
+    assert isinstance(pipeline.estimator, Resumable)
+    parts = (pipeline.tracker.database, pipeline.estimator, pipeline.places)
+    return State(*(part.state() for part in parts), taken=pipeline.places.taken)
+
+
 @lru_cache(maxsize=2)
-def ring(refusing: bool = False) -> tuple[SlamPipeline, list[FrameReport]]:
-    """Once round and past the start, a stretch of it in the dark."""
-    pipeline = round_the_ring()
+def ring_and_states(refusing: bool) -> tuple[SlamPipeline, list[FrameReport], list[State]]:
+    """Once round and past the start, a stretch of it in the dark; the state before each frame."""
+    pipeline, reports, states = round_the_ring(), list[FrameReport](), list[State]()
     with pytest.MonkeyPatch.context() as patch:
         if refusing:
             refuse_closures(patch)
-        return pipeline, drive(pipeline, seen(RING, DARK))
+        for frame in seen(RING, DARK):
+            states.append(state_of(pipeline))
+            reports += drive(pipeline, [frame])
+    return pipeline, reports, states
+
+
+def ring(refusing: bool = False) -> tuple[SlamPipeline, list[FrameReport]]:
+    pipeline, reports, _ = ring_and_states(refusing)
+    return pipeline, reports
 
 
 def test_return_is_recognised_and_the_drift_corrected() -> None:
@@ -230,21 +256,20 @@ def test_a_replay_closes_the_same_loops_to_the_bit(
 def test_continued_from_its_state_it_goes_on_to_the_bit(
     refusing: bool, after_closing: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, reports = ring(refusing)
+    _, reports, states = ring_and_states(refusing)
     if refusing:
         refuse_closures(monkeypatch)
     stop = closings(reports)[0] + after_closing
-    whole = round_the_ring()
-    frames = list(seen(RING, DARK))
+    state, frames = states[stop], list(seen(RING, DARK))
     log = MeasurementLog(RIG, {})
-    for report in drive(whole, frames[:stop]):
+    for report in reports[:stop]:
         log.append(report.increment)
     again = round_the_ring()
-    again.tracker.database.restore(whole.tracker.database.state())
-    again.estimator.restore(whole.estimator.state())
-    again.places.restore(whole.places.state(), log)
-    assert_same_bits(again.places.state(), whole.places.state())
-    assert again.places.taken == whole.places.taken
+    again.tracker.database.restore(state.database)
+    again.estimator.restore(state.estimator)
+    again.places.restore(state.places, log)
+    assert_same_bits(again.places.state(), state.places)
+    assert again.places.taken == state.taken
     for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_increments(report.increment, expected.increment)
