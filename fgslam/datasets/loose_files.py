@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.datasets.sides import camera_pairs, without_side
@@ -116,13 +117,21 @@ def _two_folders(root: Path) -> tuple[Path, Path] | None:
     return with_images[left], with_images[right]
 
 
-def pair_files(found: CameraFiles) -> tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]:
+Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]
+"""Files (right, left) of each moment, and notes on what is left out."""
+
+TOLERANCE_MS = 20.0
+
+
+def pair_files(found: CameraFiles, tolerance_ms: float = TOLERANCE_MS) -> Pairs:
     """Pairs (right, left) in natural order, and notes on what is left out.
 
-    Files are paired by their names without the side; where those do not match, by their order.
+    Files are paired by their names without the side; where those do not match, by the times that
+    the names are, at most ``tolerance_ms`` apart; else by their order.
 
     Raises:
-        DatasetError: names do not match, and the cameras have different numbers of images.
+        DatasetError: names do not match, and the cameras have different numbers of images, or names
+            are times and no two are near.
     """
     for key in _KEYS:
         right, left = ({key(path.stem): path for path in f} for f in (found.right, found.left))
@@ -136,6 +145,9 @@ def pair_files(found: CameraFiles) -> tuple[tuple[tuple[Path, Path], ...], tuple
                 if n
             )
             return tuple((right[name], left[name]) for name in common), notes
+    by_time = _by_time(found, tolerance_ms)
+    if by_time is not None:
+        return by_time
     if len(found.right) != len(found.left):
         raise DatasetError(
             f"{found.folder}: {len(found.left)} images of the left camera and {len(found.right)} "
@@ -144,6 +156,26 @@ def pair_files(found: CameraFiles) -> tuple[tuple[tuple[Path, Path], ...], tuple
         )
     note = "left and right images are paired by their order: their names do not match"
     return tuple(zip(found.right, found.left, strict=True)), (note,)
+
+
+def _by_time(found: CameraFiles, tolerance_ms: float) -> Pairs | None:
+    """Pairs of files whose names are times; None where they are none."""
+    import numpy as np  # layouts are recognised without arrays
+
+    from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
+    from fgslam.datasets.stamps import written_stamps
+
+    written = [written_stamps(files, ()) for files in (found.right, found.left)]
+    stamps = [
+        np.rint(each[0] / NANOSECONDS).astype(np.int64) for each in written if each is not None
+    ]
+    if len(stamps) < len(written):
+        return None
+    names = (f"{found.folder}, right", f"{found.folder}, left")
+    (rows, partners), notes = pair_stamps(stamps[0], stamps[1], 1e-3 * tolerance_ms, names)
+    chosen = zip(rows.tolist(), partners.tolist(), strict=True)
+    note = "left and right images are paired by the times that their names are"
+    return tuple((found.right[i], found.left[j]) for i, j in chosen), (note, *notes)
 
 
 _KEYS: tuple[Callable[[str], object], ...] = (

@@ -26,7 +26,7 @@ def open_loose_images(
     """
     cameras = _cameras(Path(settings.path))
     root = cameras.folder
-    pairs, unpaired = pair_files(cameras)
+    pairs, unpaired = pair_files(cameras, settings.pairing_tolerance_ms)
     own = [right.parent for right, _ in pairs[:1]]
     stamps, assumed, lists = stamps_of(
         [right for right, _ in pairs], (*own, own[0].parent, root), settings.fps

@@ -117,7 +117,8 @@ def _pairs(
     for folder, found in zip(folders, files, strict=True):
         if not found:
             raise DatasetError(f"{folder} holds no image; restore it")
-    pairs, notes = pair_files(CameraFiles(files[1], files[0], root, interleaved=False))
+    cameras = CameraFiles(files[1], files[0], root, interleaved=False)
+    pairs, notes = pair_files(cameras, settings.pairing_tolerance_ms)
     stamps, assumed, used = stamps_of([colour for colour, _ in pairs], (folders[0], root), None)
     return pairs, stamps, (*notes, *assumed), used
 

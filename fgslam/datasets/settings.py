@@ -117,6 +117,14 @@ class LooseImagesSettings(CalibratedSettings):
             description="frames a second; null: by the list of times or by names, else 10",
         ),
     ] = None
+    pairing_tolerance_ms: Annotated[
+        float,
+        Field(
+            gt=0.0,
+            le=1000.0,
+            description="largest time between the images of a pair, where only times name them, ms",
+        ),
+    ] = 20.0
     odometry_file: Annotated[
         str | None,
         Field(description="odometry inside the folder; null: odometry.txt or odom*.csv"),

@@ -164,6 +164,26 @@ def test_names_that_are_dates(tmp_path: Path, form: str, places: int) -> None:
     assert "times are the dates in the names of the images" in recording.notes
 
 
+def late(k: int, form: str, by_ms: int) -> str:
+    moment = MINUTE + timedelta(milliseconds=50 * k + by_ms)
+    return f"{form}/{moment:%Y%m%d_%H%M%S}_{moment.microsecond:06d}.png"
+
+
+def test_names_that_are_times_pair_by_them(tmp_path: Path) -> None:
+    """Each camera is started by itself, and has lost another image: by order none would fit."""
+    root = loose(tmp_path, lambda k: (late(k, "left", 0), late(k, "right", 3)), [*range(7)])
+    (root / late(2, "left", 0)).unlink()
+    (root / late(4, "right", 3)).unlink()
+    recording = opened(root)
+    assert codes(recording) == [(10 + k, 60 + k) for k in (0, 1, 3, 5, 6)]
+    assert "1 right images have no partner within 20 ms and are left out" in recording.notes
+    assert any("differ in time by 3 ms in the median" in note for note in recording.notes)
+    with pytest.raises(
+        DatasetError, match=r"within 1 ms, the nearest differ by 3 ms; raise dataset"
+    ):
+        opened(root, pairing_tolerance_ms=1.0)
+
+
 @pytest.mark.parametrize(
     "form", ["20261123_235959_{k:06d}_{{}}", "20261399_235959_{k}_{{}}", "20261123_235959_{{}}_{k}"]
 )
