@@ -17,6 +17,7 @@ from fgslam.backend.settings import (
     EstimatorSettings,
     FixedLagSettings,
     Isam2Settings,
+    SlidingWindowSettings,
 )
 from fgslam.backend.smoothers import admission, graph_builder
 from fgslam.backend.smoothers.whole_graph import WholeGraph
@@ -40,6 +41,7 @@ SMOOTHERS: dict[str, EstimatorSettings] = {
     "isam2, every frame": Isam2Settings(update_every=1),
     "isam2, keyframes": Isam2Settings(keyframe_every=4),
     "fixed_lag": FixedLagSettings(lag_frames=5),
+    "sliding_window": SlidingWindowSettings(window=5, update_every=2),
 }
 PIXELS = np.array([0.3, 0.3, 0.2])
 

@@ -19,6 +19,7 @@ _FAMILIES: dict[str, Family] = {
     "landmark_kalman_graph": "filter",
     "ekf": "filter",
     "fixed_lag": "smoother",
+    "sliding_window": "smoother",
     "isam2": "smoother",
     "batch": "smoother",
 }
@@ -203,6 +204,18 @@ class Isam2Settings(GraphSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
+class SlidingWindowSettings(GraphSettings):
+    """Sliding window online, old landmarks taken back into it; in the end everything at once."""
+
+    kind: Literal["sliding_window"] = "sliding_window"
+    window: Annotated[int, Field(ge=2, description="frames that are solved together online")] = 20
+    update_every: Annotated[
+        int,
+        Field(ge=1, description="frames between solutions; a tracker answers in between"),
+    ] = 4
+
+
+@dataclass(frozen=True, config=STRICT)
 class BatchSettings(GraphSettings):
     """Everything at once, the reference of the comparison."""
 
@@ -241,6 +254,7 @@ EstimatorSettings: TypeAlias = Annotated[
     | EkfSettings
     | FixedLagSettings
     | Isam2Settings
+    | SlidingWindowSettings
     | BatchSettings,
     Field(discriminator="kind"),
 ]

@@ -24,6 +24,7 @@ from fgslam.backend.settings import (
     Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
+    SlidingWindowSettings,
 )
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Prediction, Relocalisation
@@ -160,6 +161,11 @@ def make_estimator(
 
             floor = make_floor(rig, settings.floor, ego_motion.dof)
             estimator = isam2_smoother(rig, settings, floor, prior)
+        case SlidingWindowSettings():
+            from fgslam.backend.smoothers.sliding_window import sliding_window_smoother
+
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = sliding_window_smoother(rig, settings, floor, prior)
         case BatchSettings():
             from fgslam.backend.smoothers.batch import batch_smoother
 

@@ -7,6 +7,7 @@ nothing about poses. One that is contradicted frame after frame has moved, and s
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -158,6 +159,7 @@ class LandmarkAdmission:
         track = self.tracks.get(identity)
         if track is None:
             track = self.tracks[identity] = Track(LEAST_PARALLAX, sighting)
+        self._recent.pop(identity, None)  # the order is that of the last sightings
         self._recent[identity] = track
         track.last = sighting
         track.sightings += 1
@@ -215,13 +217,17 @@ class LandmarkAdmission:
             del self._recent[identity]
         return [(i, track) for i, track in left if track.variable >= 0]
 
-    def waiting(self) -> Iterator[tuple[int, Track]]:
-        """Landmarks that are not in the graph, seen since a bounded lag began."""
-        return ((i, track) for i, track in self._recent.items() if track.variable < 0)
+    def waiting(self, since: int = 0) -> Iterator[tuple[int, Track]]:
+        """Landmarks that are not in the graph, seen in a frame or later, within a bounded lag."""
+        return ((i, track) for i, track in self._seen(since) if track.variable < 0)
 
-    def in_graph(self) -> Iterator[tuple[int, Track]]:
-        """Landmarks that are in the graph."""
-        return ((i, track) for i, track in self._recent.items() if track.variable >= 0)
+    def in_graph(self, since: int = 0) -> Iterator[tuple[int, Track]]:
+        """Landmarks that are in the graph, seen in a frame or later."""
+        return ((i, track) for i, track in self._seen(since) if track.variable >= 0)
+
+    def _seen(self, since: int) -> Iterator[tuple[int, Track]]:
+        latest = reversed(self._recent.items())
+        return itertools.takewhile(lambda each: each[1].last.frame >= since, latest)
 
     def describe(self, identity: int, variable: int) -> str:
         """A landmark's identity and sightings, in words."""

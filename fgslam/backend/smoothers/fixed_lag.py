@@ -7,21 +7,19 @@ forgotten it, which is the price of a constant effort.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import gtsam
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import (
     Constraint,
     constraint_factor,
-    nearest_positive,
     refusal,
 )
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.admission import Track
+from fgslam.backend.smoothers.drift_undone import drift_undone
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.loop_closing import misfit
 from fgslam.backend.smoothers.marginals import UndeterminedError
@@ -35,12 +33,8 @@ from fgslam.backend.smoothers.solver import (
     allowed_parts,
     solver_failed,
 )
-from fgslam.backend.smoothers.window import (
-    Landmarks,
-    LandmarkUndeterminedError,
-    Solved,
-    Window,
-)
+from fgslam.backend.smoothers.window import Window
+from fgslam.backend.smoothers.window_parts import Landmarks, Solved
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import LandmarkMap, Prediction
@@ -50,15 +44,11 @@ from fgslam.core.geometry import (
     congruence,
     inverse,
     point_pose_jacobian,
-    se3_exp,
-    se3_log,
     transform_to_camera,
 )
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
-
-_REPAIRS = 20  # landmarks taken out in one update before the graph itself must be wrong
 
 
 def fixed_lag_smoother(
@@ -115,23 +105,29 @@ class FixedLagSolver:
         last = len(self._poses) - 1
         for frame in frames:
             self._covariances[frame] = self._covariance(frame)
-        return Smoothed(self._values(), Prediction(self._poses[last], self._covariances[last]))
+        return Smoothed(
+            self._window.values(), Prediction(self._poses[last], self._covariances[last])
+        )
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
-        The earlier frame's pose is known as it was when it left. What the last pose is less certain
-        by than that one is drift, and the loop measures the drift: a Kalman correction of one pose,
-        after which the window is solved anew from there.
+        After that the window is solved anew from there.
         """
         if loop.before >= self._oldest:  # both poses are variables
             if not self._taken_in(loop, what):
                 return None
         else:
-            moved = self._drift_undone(loop, what)
-            if moved is None:
+            earlier, last = (
+                Prediction(self._poses[frame], self._covariances[frame])
+                for frame in (loop.before, loop.after)
+            )
+            found = drift_undone(self._floor, earlier, last, loop, what)
+            with_it = "" if found.last is None else ", and what lies within the lag"
+            self.remarks.append(found.remark + with_it)
+            if found.last is None:
                 return None
-            self._move_all(moved)
+            self._move_all(found.last)
         return ClosedLoop(self._smoothed({loop.after}))
 
     def _taken_in(self, known: Constraint, what: str) -> bool:
@@ -145,31 +141,6 @@ class FixedLagSolver:
         self._solve()
         self.remarks.append(f"{what}: within the lag, a factor more")
         return True
-
-    def _drift_undone(self, known: Constraint, what: str) -> Prediction | None:
-        """The last pose by the loop; None, and a remark, where the loop is refused."""
-        wTo, wTc = self._poses[known.before], self._poses[known.after]
-        carried = adjoint(inverse(known.motion))
-        shared = congruence(carried, self._covariances[known.before])
-        drift = nearest_positive(self._covariances[known.after] - shared)
-        # On a hard floor nothing drifts, and nothing is measured, in the other directions.
-        basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
-        off = basis.T @ se3_log(inverse(wTc) @ wTo @ known.motion)
-        drift = basis.T @ drift @ basis
-        innovation = drift + basis.T @ known.covariance @ basis
-        gain = np.linalg.solve(innovation, drift).T
-        refused = refusal(what, float(off @ np.linalg.solve(innovation, off)))
-        if refused:
-            self.remarks.append(refused)
-            return None
-        target = wTc @ se3_exp(basis @ gain @ off)
-        target = self._floor.constrain(target) if self._floor.rigid_dof < 6 else target
-        covariance = shared + congruence(basis, nearest_positive(drift - gain @ drift))
-        shift = float(np.linalg.norm(target[:3, 3] - wTc[:3, 3]))
-        self.remarks.append(
-            f"{what}: the camera moved by {shift:.2f} m, and what lies within the lag"
-        )
-        return Prediction(target, self._floor.allowed_part(target, covariance))
 
     def _move_all(self, last: Prediction) -> None:
         """Takes the window along with its last pose, as it is, and starts from there."""
@@ -228,24 +199,17 @@ class FixedLagSolver:
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""
-        for _ in range(_REPAIRS):
-            try:
-                self._solved = self._window.solve()
-                break
-            except LandmarkUndeterminedError as error:
-                self._take_out(error)
-            except (UndeterminedError, np.linalg.LinAlgError) as error:
-                raise solver_failed(self.kind, error, self._builder.frames[-1]) from None
-        else:
-            many = EstimatorError("too many landmarks left it indeterminate")
-            raise solver_failed(self.kind, many, self._builder.frames[-1])
+        self._solved = self._window.repaired(self._take_out, self._failed)
         for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
             self._poses[frame] = pose.copy()  # a view would keep the whole window's array
 
-    def _take_out(self, error: LandmarkUndeterminedError) -> None:
-        self._window.take_out(error.variable)
+    def _failed(self, error: Exception) -> Exception:
+        return solver_failed(self.kind, error, self._builder.frames[-1])
+
+    def _take_out(self, variable: int) -> None:
+        self._window.take_out(variable)
         self.remarks.append(
-            f"{self._builder.take_out(error.variable)} left the system indeterminate at frame "
+            f"{self._builder.take_out(variable)} left the system indeterminate at frame "
             f"{self._builder.frames[-1]}: taken out"
         )
 
@@ -257,7 +221,7 @@ class FixedLagSolver:
         try:
             self._window.let_go_before(self._oldest)
         except (UndeterminedError, np.linalg.LinAlgError) as error:
-            raise solver_failed(self.kind, error, self._builder.frames[-1]) from None
+            raise self._failed(error) from None
         last_seen: dict[int, list[tuple[int, Track]]] = {}
         for identity, track in self._builder.forget_before(self._oldest):
             last_seen.setdefault(track.last.frame, []).append((identity, track))
@@ -286,33 +250,6 @@ class FixedLagSolver:
         covariance = solved.eliminated.pose(solved.frames.index(frame))
         kept = allowed_parts(self._floor, self._poses[frame][None], covariance[None])
         return np.asarray(kept[0])
-
-    def _values(self) -> WindowValues:
-        frames, known = self._window.frames, self._window.landmarks
-        return WindowValues(
-            dict(zip(map(pose_key, frames), self._window.poses, strict=True)),
-            dict(zip(map(landmark_key, known.variables.tolist()), known.points, strict=True)),
-        )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class WindowValues:
-    """What is asked of GTSAM's values between two frames, by key: poses (4, 4) and points (3,)."""
-
-    poses: dict[int, FloatArray]
-    points: dict[int, FloatArray]
-
-    def exists(self, key: int) -> bool:
-        """Whether the window holds a variable."""
-        return key in self.points or key in self.poses
-
-    def atPoint3(self, key: int) -> FloatArray:
-        """A landmark."""
-        return self.points[key]
-
-    def atPose3(self, key: int) -> Any:
-        """A pose."""
-        return gtsam.Pose3(self.poses[key])
 
 
 def _landmarks(new: NewFactors, entered: list[int]) -> Landmarks:

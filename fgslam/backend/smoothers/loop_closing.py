@@ -41,6 +41,7 @@ _LONG_UNSEEN = 60  # frames, as the front-end's LoopSettings.forgotten_after
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small
+_EXACT = 1e-4  # radians and metres: a pose that is given
 
 Minimum: TypeAlias = Callable[[WholeGraph, State], State]
 
@@ -66,7 +67,7 @@ class GraphLoops:
     def __init__(self, builder: GraphBuilder, kernel: KernelSettings | None = None) -> None:
         """No loop yet; the kernel is that of the observations where the graph is solved."""
         self._builder, self._kernel = builder, kernel
-        self._accepted: list[Constraint] = []
+        self.accepted: list[Constraint] = []
 
     def judge(
         self,
@@ -90,11 +91,11 @@ class GraphLoops:
             what: begins the remark.
         """
         if misfit(constraint_factor(known), values) <= _AGREES:
-            self._accept(known)
+            self.accept(known)
             return Acceptance(True, None, f"{what}: as expected, nothing moved")
         graph, state = self._builder.whole_graph(values, self._kernel)
         state = minimum(graph, state)
-        loops = [*self._accepted, known]
+        loops = [*self.accepted, known]
         guess = first_guess(self._builder, graph.values(state), drive.chain, loops)
         closed = graph.plus(constraint_factor(known))
         solution = solved(closed, State.of(guess))
@@ -107,7 +108,7 @@ class GraphLoops:
             refused = refusal(what, rise)
         if refused:
             return Acceptance(False, None, refused)
-        self._accept(known)
+        self.accept(known)
         found = closed.values(solution)
         here = poses_of_frame(found, known.after)[:3, 3]
         shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
@@ -125,15 +126,15 @@ class GraphLoops:
         frames, variables, *_ = self._builder.kept_observed()
         return found_again(frames, variables) & (squared > gate)
 
-    def _accept(self, known: Constraint) -> None:
+    def accept(self, known: Constraint) -> None:
         """Believed now, it is doubted when later ones contradict it."""
         known = dataclasses.replace(known, doubted=True)
         self._builder.add_factor(constraint_factor(known))
-        self._accepted.append(known)
+        self.accepted.append(known)
 
     def last_factor(self) -> Any:
         """The factor of the loop accepted last."""
-        return constraint_factor(self._accepted[-1])
+        return constraint_factor(self.accepted[-1])
 
 
 def found_again(frames: IntArray, variables: IntArray) -> BoolArray:
@@ -183,12 +184,35 @@ def first_guess(builder: GraphBuilder, values: Any, chain: Chain, loops: list[Co
     """
     frames = np.array(builder.frames)
     poses = np.array([poses_of_frame(values, frame) for frame in builder.frames])
-    held = [_as_solved(known, frames, poses) for known in (*chain.constraints, *loops[:-1])]
     ends = [_row(frames, loops[-1].before), _row(frames, loops[-1].after)]
     new = dataclasses.replace(loops[-1], before=ends[0], after=ends[1])
-    constraints = [known for known in held if known.before != known.after]
-    found, _ = corrected(poses, chain.steps_between(frames), [*constraints, new])
+    found = _closed(frames, poses, chain, loops[:-1], new)
     return _moved(builder, values, frames, found, changes(poses, found))
+
+
+def closed_chain(
+    poses: FloatArray, chain: Chain, loops: list[Constraint], last: FloatArray
+) -> FloatArray:
+    """Poses (n, 4, 4) of all frames where the last of ``loops`` has brought the last one.
+
+    Args:
+        poses: (n, 4, 4) before.
+        chain: as for :func:`first_guess`, as is ``loops``.
+        loops: all that are closed.
+        last: (4, 4) where the last pose is now.
+    """
+    before = loops[-1].before
+    motion = inverse(poses[before]) @ last
+    new = Constraint(before, len(poses) - 1, motion, _EXACT**2 * np.eye(6))
+    return _closed(np.arange(len(poses)), poses, chain, loops[:-1], new)
+
+
+def _closed(
+    frames: IntArray, poses: FloatArray, chain: Chain, loops: list[Constraint], new: Constraint
+) -> FloatArray:
+    held = [_as_solved(known, frames, poses) for known in (*chain.constraints, *loops)]
+    constraints = [known for known in held if known.before != known.after]
+    return corrected(poses, chain.steps_between(frames), [*constraints, new])[0]
 
 
 def solved(graph: WholeGraph, state: State) -> State:

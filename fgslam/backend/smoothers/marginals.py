@@ -293,7 +293,7 @@ class ChainMarginals:
             )
             border[np.ix_(stretch.columns, stretch.columns)] -= taken
             stretches.append(stretch)
-        return ChainMarginals(system, stretches, kept, *scaled_cholesky(border))
+        return ChainMarginals(system, stretches, kept, *scaled_cholesky(border, in_place=True))
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum."""
@@ -404,15 +404,19 @@ def _inverse_blocks(factor: FloatArray) -> FloatArray:
     return out
 
 
-def scaled_cholesky(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+def scaled_cholesky(
+    information: FloatArray, in_place: bool = False
+) -> tuple[FloatArray, FloatArray]:
     """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
 
-    Without the scaling, digits would be lost beside poses that are held stiffly.
+    Without the scaling, digits would be lost beside poses that are held stiffly. A large matrix is
+    better overwritten.
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
     if not (size > 0.0).all():
         raise UndeterminedError(int(np.argmin(size > 0.0)), _UNDETERMINED)
-    scaled = information / size[:, None]
+    scaled = information if in_place else information.copy()
+    scaled /= size[:, None]
     scaled /= size
     factor, status = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
     if status != 0:

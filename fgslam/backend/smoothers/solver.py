@@ -89,11 +89,13 @@ class Smoothed:
     Attributes:
         values: GTSAM values of the poses and landmarks that the solver holds.
         last: pose ``wTc`` (4, 4) and covariance (6, 6) of the frame that entered last.
+        since: frame; the values hold no landmark that was seen last before it.
         by_loop: a loop moved the map: landmarks that the solver does not hold move with the camera.
     """
 
     values: Any
     last: Prediction
+    since: int = 0
     by_loop: bool = False
 
 

@@ -49,8 +49,8 @@ class TrackerMap:
         Landmarks that the graph knows nothing of stay; where a loop moved the map they
         move along with the last pose, near which they are, unless they are a saved map's.
         """
-        ids, positions = self._in_graph(smoothed.values)
-        waiting_ids, waiting_positions = self._waiting(smoothed.values)
+        ids, positions = self._in_graph(smoothed.values, smoothed.since)
+        waiting_ids, waiting_positions = self._waiting(smoothed.values, smoothed.since)
         ids = np.concatenate([ids, waiting_ids])
         positions = np.concatenate([positions, waiting_positions])
         if smoothed.by_loop:
@@ -69,7 +69,7 @@ class TrackerMap:
         positions, covariances = np.empty((len(known), 3)), np.empty((len(known), 3, 3))
         for row, identity in enumerate(known.ids.tolist()):
             track = self._admission.tracks.get(identity)
-            if track is None:  # seen since the last keyframe only
+            if track is None:
                 positions[row], covariances[row] = known.positions[row], known.covariances[row]
             elif track.variable in answer.points:
                 positions[row] = answer.points[track.variable]
@@ -80,10 +80,10 @@ class TrackerMap:
                 positions[row], covariances[row] = self._seen_from(answer, track.last)
         return LandmarkMap(known.ids, positions, covariances)
 
-    def _in_graph(self, values: Any) -> tuple[IntArray, FloatArray]:
+    def _in_graph(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
         """Identities and positions of the tracker's landmarks that ``values`` hold."""
         ids, positions = [], []
-        for identity, track in self._admission.in_graph():
+        for identity, track in self._admission.in_graph(since):
             key = landmark_key(track.variable)
             if values.exists(key):
                 ids.append(identity)
@@ -92,10 +92,10 @@ class TrackerMap:
         known = np.isin(found, self._tracker.landmarks().ids)
         return found[known], np.array(positions, np.float64).reshape(-1, 3)[known]
 
-    def _waiting(self, values: Any) -> tuple[IntArray, FloatArray]:
+    def _waiting(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
         """Landmarks outside the graph, moved along with the pose that saw them last."""
         last_seen: dict[int, list[int]] = {}
-        for identity, track in self._admission.waiting():
+        for identity, track in self._admission.waiting(since):
             last_seen.setdefault(track.last.frame, []).append(identity)
         known = self._tracker.landmarks()
         ids, positions = [np.empty(0, np.int64)], [np.empty((0, 3))]

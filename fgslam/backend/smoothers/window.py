@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -24,11 +23,29 @@ from fgslam.backend.smoothers.landmark_elimination import (
     UndeterminedLandmarkError,
 )
 from fgslam.backend.smoothers.marginals import UndeterminedError
+from fgslam.backend.smoothers.window_parts import (
+    Landmarks,
+    LandmarkUndeterminedError,
+    Look,
+    Observed,
+    Solved,
+    Tie,
+    WindowValues,
+)
 from fgslam.backend.smoothers.window_prior import WindowPrior
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
-from fgslam.core.geometry import reorthonormalise, se3_exp, transform_to_world
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import (
+    adjoint,
+    inverse,
+    point_pose_jacobian,
+    reorthonormalise,
+    se3_exp,
+    transform_to_camera,
+    transform_to_world,
+)
 from fgslam.core.sensors import Sensor
-from fgslam.factors.graphs import number, pose_key
+from fgslam.factors.graphs import landmark_key, number, pose_key
 from fgslam.factors.noise import kernel_weights
 from fgslam.factors.stacked import (
     LinearRows,
@@ -43,64 +60,8 @@ _SHORT = 0.01
 """Radians and metres of a pose, iSAM2's threshold of linearising anew: covariances are those of
 within it."""
 _STEPS = 3  # with a frame: what is left after them is gone with the next frame
+_REPAIRS = 20  # landmarks taken out in one solution before the graph itself must be wrong
 _LEFT_BETWEEN = 5  # poses that leave until their hidden numbers are looked through again
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Observed(Rows):
-    """Observations of the window (k, ...): frame, landmark variable, numbers and whitening."""
-
-    frame: IntArray
-    variable: IntArray
-    measurement: FloatArray
-    root: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Landmarks(Rows):
-    """Landmarks of the window (m, ...): variables ascending, places, what was known beforehand.
-
-    That is a mean and its information (3, 3), zero where nothing was known.
-    """
-
-    variables: IntArray
-    points: FloatArray
-    mean: FloatArray
-    information: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """Observations (k,) as they are linearised now: rows of their poses and landmarks, and theirs.
-
-    Residuals are those of the estimate, weights (in the rows) those of where it is linearised.
-    """
-
-    pose: IntArray
-    point: IntArray
-    rows: LinearRows
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solved:
-    """The window's normal equations at its solution, and what their rows are."""
-
-    eliminated: Eliminated
-    frames: list[int]
-    variables: IntArray
-
-    def rows(self, variables: list[int]) -> IntArray:
-        """Rows of landmark variables."""
-        return np.searchsorted(self.variables, variables).astype(np.int64)
-
-
-class LandmarkUndeterminedError(UndeterminedError):
-    """``variable`` is not determined by its observations."""
-
-    def __init__(self, variable: int, message: str) -> None:
-        """The landmark's variable, and why."""
-        super().__init__(variable, message)
-        self.variable = variable
 
 
 class Window:
@@ -113,6 +74,7 @@ class Window:
         observed: from these poses.
         factors: GTSAM's graph on these poses alone.
         prior: what has left.
+        places: where they began, (4, 4): of landmarks that came back, in the order of the prior's.
         kernel: around each observation.
     """
 
@@ -126,6 +88,7 @@ class Window:
         self.observed = Observed(none, none, np.empty((0, 3)), np.empty((0, 3, 3)))
         self.factors = gtsam.NonlinearFactorGraph()
         self.prior = WindowPrior.none()
+        self.places: dict[int, FloatArray] = {}
         self._anchors: dict[int, FloatArray] = {}
         self._shift = np.empty((0, 6))
         self._least_hidden = 0
@@ -141,8 +104,9 @@ class Window:
         self.prior = self.prior.with_pose()
 
     def add_landmarks(self, new: Landmarks) -> None:
-        """New landmarks, numbered above all others."""
-        self.landmarks = self.landmarks.join(new)
+        """Landmarks that are not in the window."""
+        joined = self.landmarks.join(new)
+        self.landmarks = joined.select(np.argsort(joined.variables, kind="stable"))
 
     def observe(
         self, frame: IntArray, variable: IntArray, measurement: FloatArray, noise: FloatArray
@@ -171,6 +135,32 @@ class Window:
             if np.abs(eliminated.corner[eliminated.hidden :]).max() < _SHORT:
                 break
         return Solved(eliminated, list(self.frames), self.landmarks.variables)
+
+    def repaired(
+        self, take_out: Callable[[int], None], failed: Callable[[Exception], Exception]
+    ) -> Solved:
+        """The solution without landmarks on which it fails.
+
+        Args:
+            take_out: takes a landmark variable out of the window.
+            failed: the error to raise where that is no cure.
+        """
+        for _ in range(_REPAIRS):
+            try:
+                return self.solve()
+            except LandmarkUndeterminedError as error:
+                take_out(error.variable)
+            except (UndeterminedError, np.linalg.LinAlgError) as error:
+                raise failed(error) from None
+        raise failed(EstimatorError("too many landmarks left it indeterminate"))
+
+    def values(self) -> WindowValues:
+        """The window's poses and landmarks as they are now."""
+        known = self.landmarks
+        return WindowValues(
+            dict(zip(map(pose_key, self.frames), self.poses, strict=True)),
+            dict(zip(map(landmark_key, known.variables.tolist()), known.points, strict=True)),
+        )
 
     def _eliminated(self, equations: Equations) -> Eliminated:
         try:
@@ -286,11 +276,15 @@ class Window:
 
     # -- what leaves -------------------------------------------------------------------------
 
-    def let_go_before(self, first: int) -> None:
-        """Marginalises poses before a frame, and landmarks that only they saw."""
+    def let_go_before(self, first: int) -> Landmarks:
+        """Marginalises poses before a frame, and landmarks that only they saw.
+
+        Returns:
+            The latter, with what was known of them given the poses.
+        """
         leaving = int(np.searchsorted(self.frames, first))
         if not leaving:
-            return
+            return self.landmarks.select(np.empty(0, np.int64))
         gone = self.observed.frame < first
         touched, untouched = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
         for row in range(self.factors.size()):
@@ -301,7 +295,7 @@ class Window:
         self.factors = untouched
         self.observed = self.observed.select(~gone)
         self._drop_poses(leaving)
-        self._eliminate(~np.isin(self.landmarks.variables, self.observed.variable))
+        return self._eliminate(~np.isin(self.landmarks.variables, self.observed.variable))
 
     def _into_prior(self, look: Look, factors: Any, leaving: int) -> None:
         """Adds what the first poses said to the prior, and hides them there."""
@@ -334,10 +328,13 @@ class Window:
         self.frames = self.frames[leaving:]
         self.poses, self._shift = self.poses[leaving:], self._shift[leaving:]
 
-    def _eliminate(self, gone: BoolArray) -> None:
+    def _eliminate(self, gone: BoolArray) -> Landmarks:
         """Takes landmarks (by a mask of all) out of the window; what they said stays."""
         prior, weak = self.prior, self.landmarks
         tied = self._tied()
+        known = weak.information.copy()
+        known[tied] += prior.own
+        left = dataclasses.replace(weak, mean=weak.points, information=known).select(gone)
         leaving = gone[tied]
         own = prior.own + np.where(leaving[:, None, None], weak.information[tied], 0.0)
         off = prior.points - weak.mean[tied]
@@ -345,10 +342,57 @@ class Window:
         gradient = prior.gradient + np.where(leaving[:, None], pull, 0.0)
         prior = dataclasses.replace(prior, own=own, gradient=gradient)
         self.prior = prior.without(leaving)
+        self.landmarks = weak.select(~gone)
+        self._leave_places()
         if self.prior.hidden >= self._least_hidden + 6 * _LEFT_BETWEEN:
             self.prior = self.prior.compressed()
             self._least_hidden = self.prior.hidden
-        self.landmarks = weak.select(~gone)
+        return left
+
+    def bring_back(self, known: Landmarks, place: int, tie: Tie | None) -> None:
+        """Landmarks that had left come back, with what was known of them given the poses.
+
+        Those of a place are off together, by one motion of it.
+
+        Args:
+            known: the landmarks, where they left.
+            place: its number.
+            tie: what is known of its motion, where the place is new.
+        """
+        none = np.zeros_like(known.information)
+        if tie is not None:
+            self._add_place(place, tie)
+        row = list(self.places).index(place)
+        at = self.places[place]
+        by_place = at[:3, :3] @ -point_pose_jacobian(transform_to_camera(at, known.points))
+        self.add_landmarks(dataclasses.replace(known, information=none))
+        prior = self.prior.with_landmarks(known.variables, known.points)
+        rows = np.searchsorted(prior.variables, known.variables).astype(np.int64)
+        self.prior = prior.with_known(rows, known.information, 6 * row, by_place)
+
+    def _add_place(self, place: int, tie: Tie) -> None:
+        """A place whose motion follows another's, or the window's first pose."""
+        self.prior, new = self.prior.with_place(), self.prior.kept
+        first = self.frames[0]
+        self._anchors.setdefault(first, self.poses[0])
+        self.places[place] = at = self._anchors[first]
+        if tie.follows is None:
+            to, shift, carried = self.prior.hidden, self._shift[0], np.eye(6)
+        else:
+            to, shift = 6 * list(self.places).index(tie.follows), np.zeros(6)
+            carried = adjoint(inverse(at) @ self.places[tie.follows])
+        both = np.hstack([np.eye(6), -tie.gain @ carried])
+        information = both.T @ tie.information @ both
+        columns = np.concatenate([new + np.arange(6), to + np.arange(6)])
+        self.prior = self.prior.with_tie(columns, information, -information[:, 6:] @ shift)
+
+    def _leave_places(self) -> None:
+        """Places on which no landmark depends any more are like any pose that left."""
+        for place in list(self.places):
+            at = 6 * list(self.places).index(place)
+            if not self.prior.coupling[:, :, at : at + 6].any():
+                self.prior = self.prior.without_place(at)
+                del self.places[place]
 
     def take_out(self, variable: int) -> None:
         """Takes a landmark out, with what the window's poses saw of it."""
@@ -363,5 +407,6 @@ class Window:
         points, mean = transform_to_world(by, weak.points), transform_to_world(by, weak.mean)
         self.landmarks = Landmarks(weak.variables, points, mean, turned)
         self.prior, self._least_hidden = WindowPrior.none(len(self.frames)), 0
+        self.places = {}
         self._anchors, self._shift = {}, np.zeros((len(self.frames), 6))
         self.factors.add(prior)

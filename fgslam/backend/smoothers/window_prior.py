@@ -38,6 +38,7 @@ class WindowPrior:
         gradient: (p, 3) g of the same.
         coupling: (p, 3, r) H between landmarks and hidden numbers.
         points: (p, 3) where the landmarks were linearised.
+        kept: so many of the hidden numbers, the first, stay what they are.
     """
 
     corner: FloatArray
@@ -47,6 +48,7 @@ class WindowPrior:
     gradient: FloatArray
     coupling: FloatArray
     points: FloatArray
+    kept: int = 0
 
     @staticmethod
     def none(poses: int = 0) -> WindowPrior:
@@ -78,6 +80,53 @@ class WindowPrior:
         coupling = np.pad(self.coupling, ((0, 0), (0, 0), (0, 6 * poses)))
         return self._with_corner(self.corner + corner, self.corner_gradient + gradient, coupling)
 
+    def with_place(self) -> WindowPrior:
+        """With six hidden numbers more that stay what they are, behind the others that do."""
+        at = [self.kept] * 6
+        corner = np.insert(np.insert(self.corner, at, 0.0, axis=0), at, 0.0, axis=1)
+        coupling = np.insert(self.coupling, at, 0.0, axis=2)
+        new = self._with_corner(corner, np.insert(self.corner_gradient, at, 0.0), coupling)
+        return dataclasses.replace(new, kept=self.kept + 6)
+
+    def with_known(
+        self, landmark: IntArray, information: FloatArray, place: int, by_place: FloatArray
+    ) -> WindowPrior:
+        """With what is known of landmarks that lie where they were linearised, but for a place.
+
+        Args:
+            landmark: (k,) their rows.
+            information: (k, 3, 3) of each, given the place.
+            place: first of its hidden numbers.
+            by_place: (k, 3, 6) how they move along with it.
+        """
+        moving, at = information @ by_place, slice(place, place + 6)
+        corner, coupling = self.corner.copy(), self.coupling.copy()
+        corner[at, at] += (np.swapaxes(by_place, 1, 2) @ moving).sum(axis=0)
+        coupling[landmark, :, at] -= moving
+        own = self.own + summed(landmark, information, len(self.variables))
+        found = self._with_corner(corner, self.corner_gradient, coupling)
+        return dataclasses.replace(found, own=own)
+
+    def with_tie(
+        self, columns: IntArray, information: FloatArray, gradient: FloatArray
+    ) -> WindowPrior:
+        """With a quadratic (k, k) and (k,) more over some of the corner."""
+        corner, whole = self.corner.copy(), self.corner_gradient.copy()
+        corner[np.ix_(columns, columns)] += information
+        whole[columns] += gradient
+        return self._with_corner(corner, whole, self.coupling)
+
+    def without_place(self, place: int) -> WindowPrior:
+        """A place's six hidden numbers are like any others."""
+        order = np.arange(len(self.corner))
+        order[place : self.kept] = np.roll(order[place : self.kept], -6)
+        found = self._with_corner(
+            self.corner[np.ix_(order, order)],
+            self.corner_gradient[order],
+            self.coupling[:, :, order[: self.hidden]],
+        )
+        return dataclasses.replace(found, kept=self.kept - 6)
+
     def with_rows(self, landmark: IntArray, columns: IntArray, rows: LinearRows) -> WindowPrior:
         """With what observations (k,) said of landmarks, by row, and of hidden poses.
 
@@ -106,8 +155,13 @@ class WindowPrior:
         gradient = np.concatenate([self.gradient, np.zeros((more, 3))])[order]
         coupling = np.concatenate([self.coupling, np.zeros((more, 3, self.hidden))])[order]
         at = np.concatenate([self.points, points])[order]
-        return WindowPrior(
-            self.corner, self.corner_gradient, every[order], own, gradient, coupling, at
+        return dataclasses.replace(
+            self,
+            variables=every[order],
+            own=own,
+            gradient=gradient,
+            coupling=coupling,
+            points=at,
         )
 
     def without(self, gone: BoolArray) -> WindowPrior:
@@ -120,15 +174,13 @@ class WindowPrior:
         less = coupling.reshape(rows, r).T @ gain.reshape(rows, r)
         corner[:r, :r] -= 0.5 * (less + less.T)
         corner_gradient[:r] -= gain.reshape(rows, r).T @ gradient.ravel()
-        kept = ~gone
-        return WindowPrior(
-            corner,
-            corner_gradient,
-            self.variables[kept],
-            self.own[kept],
-            self.gradient[kept],
-            self.coupling[kept],
-            self.points[kept],
+        left = ~gone
+        return dataclasses.replace(
+            self._with_corner(corner, corner_gradient, self.coupling[left]),
+            variables=self.variables[left],
+            own=self.own[left],
+            gradient=self.gradient[left],
+            points=self.points[left],
         )
 
     def compressed(self) -> WindowPrior:
@@ -137,33 +189,35 @@ class WindowPrior:
         Hidden numbers are turned so that each has unit information and a coupling of its own
         strength, the singular values of the whitened coupling; those without one are eliminated.
         """
-        r = self.hidden
-        if r == 0:
+        q, r = self.kept, self.hidden
+        if r == q:
             return self
-        factor, size = scaled_cholesky(self.corner[:r, :r])
+        rest = np.r_[:q, r : len(self.corner)]
+        factor, size = scaled_cholesky(self.corner[q:r, q:r])
         factor = size[:, None] * np.tril(factor)
         by_landmark = self._whitened(factor)
         strength, turn = np.linalg.eigh(by_landmark.T @ by_landmark)
-        rest, gradient = self.corner[:r, r:], self.corner_gradient[:r]
-        turned = turn.T @ solve_triangular(
-            factor, np.column_stack([rest, gradient]), lower=True, check_finite=False
-        )
-        kept = strength > _UNCOUPLED
-        gone = turned[~kept]
-        corner = self.corner[r:, r:] - gone[:, :-1].T @ gone[:, :-1]
-        corner_gradient = self.corner_gradient[r:] - gone[:, :-1].T @ gone[:, -1]
-        kept_rest, kept_gradient = turned[kept, :-1], turned[kept, -1]
-        back = solve_triangular(factor, turn[:, kept], trans="T", lower=True, check_finite=False)
+        right = np.column_stack([self.corner[q:r, rest], self.corner_gradient[q:r]])
+        turned = turn.T @ solve_triangular(factor, right, lower=True, check_finite=False)
+        stays = strength > _UNCOUPLED
+        gone, own = turned[~stays], turned[stays]
+        corner = self.corner[np.ix_(rest, rest)] - gone[:, :-1].T @ gone[:, :-1]
+        gradient = self.corner_gradient[rest] - gone[:, :-1].T @ gone[:, -1]
+        back = solve_triangular(factor, turn[:, stays], trans="T", lower=True, check_finite=False)
+        coupling = np.concatenate([self.coupling[:, :, :q], self.coupling[:, :, q:] @ back], axis=2)
+        order = np.r_[len(own) : len(own) + q, : len(own), len(own) + q : len(own) + len(rest)]
+        whole = np.block([[np.eye(len(own)), own[:, :-1]], [own[:, :-1].T, corner]])
         return self._with_corner(
-            np.block([[np.eye(int(kept.sum())), kept_rest], [kept_rest.T, corner]]),
-            np.concatenate([kept_gradient, corner_gradient]),
-            self.coupling @ back,
+            whole[np.ix_(order, order)],
+            np.concatenate([own[:, -1], gradient])[order],
+            coupling,
         )
 
     def _whitened(self, factor: FloatArray) -> FloatArray:
         """(3p, r) coupling of landmarks and hidden numbers, both of unit information."""
         root = np.linalg.cholesky(self.own)
-        half = np.linalg.solve(root, self.coupling).reshape(3 * len(root), self.hidden)
+        half = np.linalg.solve(root, self.coupling[:, :, self.kept :])
+        half = half.reshape(3 * len(root), self.hidden - self.kept)
         whitened = solve_triangular(factor, half.T, lower=True, check_finite=False)
         return np.asarray(whitened.T)
 

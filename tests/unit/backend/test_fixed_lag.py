@@ -26,7 +26,7 @@ from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.fixed_lag import FixedLagSolver
 from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.smoother import Smoother
-from fgslam.backend.smoothers.window import LandmarkUndeterminedError
+from fgslam.backend.smoothers.window_parts import LandmarkUndeterminedError
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction

@@ -31,6 +31,7 @@ from fgslam.backend.settings import (
     Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
+    SlidingWindowSettings,
 )
 from fgslam.backend.smoothers.loop_closing import _LONG_UNSEEN, found_again
 from fgslam.core import geometry as g
@@ -46,6 +47,7 @@ CLOSING: dict[str, EstimatorSettings] = {
     "landmark_kalman_graph": LandmarkKalmanGraphSettings(),
     "ekf": EkfSettings(),
     "fixed_lag": FixedLagSettings(),
+    "sliding_window": SlidingWindowSettings(),
     "isam2": Isam2Settings(),
     "isam2, keyframes": Isam2Settings(keyframe_every=4),
     "batch": BatchSettings(),
@@ -144,7 +146,7 @@ def test_without_the_gate_the_wrong_loop_is_taken(
     assert turned < 0.35  # the lie is of 0.5, and the filter believes it in part
 
 
-@pytest.mark.parametrize("name", ["landmark_kalman", "ekf", "isam2, keyframes"])
+@pytest.mark.parametrize("name", ["landmark_kalman", "ekf", "isam2, keyframes", "sliding_window"])
 def test_state_and_replay_keep_every_bit_over_a_loop(name: str) -> None:
     increments = returned().increments
     straight = at_end(name)[0]
@@ -313,7 +315,9 @@ def carried_off(relocalised: bool) -> tuple[FloatArray, list[Increment]]:
     return np.array(poses), increments
 
 
-@pytest.mark.parametrize("name", ["landmark_kalman", "ekf", "fixed_lag", "isam2", "batch"])
+@pytest.mark.parametrize(
+    "name", ["landmark_kalman", "ekf", "fixed_lag", "sliding_window", "isam2", "batch"]
+)
 def test_relocalised_robot_is_where_its_landmarks_are(name: str) -> None:
     poses, increments = carried_off(relocalised=True)
     estimator = build(CLOSING[name])

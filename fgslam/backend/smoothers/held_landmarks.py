@@ -1,0 +1,57 @@
+"""Landmarks of a whole drive: where each was when it left a window, and what was known of it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fgslam.backend.smoothers.window_parts import Landmarks
+from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
+
+
+class HeldLandmarks:
+    """By variable: place, mean and information given the poses, frame with which it is off."""
+
+    def __init__(self) -> None:
+        """None yet."""
+        self._rows = GrowingColumns(
+            point=np.empty((0, 3)),
+            mean=np.empty((0, 3)),
+            information=np.empty((0, 3, 3)),
+            home=np.empty(0, np.int64),
+        )
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def points(self) -> FloatArray:
+        """(m, 3) places; may be written to."""
+        return self._rows["point"]
+
+    @property
+    def homes(self) -> IntArray:
+        """(m,) the last frame that saw each before it left a window; -1: it never did."""
+        return self._rows["home"]
+
+    def enter(self, point: FloatArray) -> None:
+        """A new variable, of which nothing is known."""
+        row = {"point": point, "mean": point, "information": np.zeros((3, 3)), "home": np.array(-1)}
+        self._rows.append({name: value[None] for name, value in row.items()})
+
+    def know(self, variable: int, mean: FloatArray, covariance: FloatArray) -> None:
+        """What is known of a new variable beforehand."""
+        self._rows["mean"][variable] = mean
+        self._rows["information"][variable] = np.linalg.inv(covariance)
+
+    def of(self, variables: IntArray) -> Landmarks:
+        """Some of them, for a window."""
+        rows = self._rows
+        names = ("point", "mean", "information")
+        return Landmarks(variables, *(rows[name][variables] for name in names))
+
+    def left(self, landmarks: Landmarks, home: int) -> None:
+        """Takes back what has left a window, last seen in a frame."""
+        at = landmarks.variables
+        self._rows["point"][at], self._rows["mean"][at] = landmarks.points, landmarks.mean
+        self._rows["information"][at] = landmarks.information
+        self._rows["home"][at] = home

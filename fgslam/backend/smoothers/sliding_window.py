@@ -1,0 +1,286 @@
+"""Sliding window over a drive that is kept: online the last frames, for the answer all of them.
+
+Poses that leave the window are marginalised as the fixed lag's are. But what has left is not
+forgotten: each landmark keeps its place and what was known of it given the poses, and comes back
+with that into the window, off by the drift of the frame that saw it last. So a drive that returns
+is pulled to where it has been, as far as that is known better, though what lies in between stays
+where it is until a loop closure moves it. The answer is the minimum over everything that was
+measured, as batch's. Derivation: docs/derivations/smoothers.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gtsam
+import numpy as np
+
+from fgslam.backend.filters.loop_correction import (
+    Constraint,
+    changes,
+    home_changes,
+    nearest_positive,
+    transported,
+)
+from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.settings import SlidingWindowSettings
+from fgslam.backend.smoothers.drift_undone import drift_undone
+from fgslam.backend.smoothers.graph_builder import NewFactors
+from fgslam.backend.smoothers.held_landmarks import HeldLandmarks
+from fgslam.backend.smoothers.loop_closing import closed_chain
+from fgslam.backend.smoothers.marginals import UndeterminedError
+from fgslam.backend.smoothers.refinement import MINIMUM, WholeGraphSolver, trimmed
+from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
+from fgslam.backend.smoothers.solver import (
+    ClosedLoop,
+    Drive,
+    Smoothed,
+    allowed_parts,
+)
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.backend.smoothers.window import Window
+from fgslam.backend.smoothers.window_parts import Solved, Tie, WindowValues
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.floor import Floor
+from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise
+from fgslam.core.sensors import Sensor
+from fgslam.factors.graphs import is_pose, landmark_key, pose_key
+from fgslam.factors.motion import pose_prior
+
+_PLACE = 20  # frames: what they saw last comes back as one
+_STIFF = 1e-4  # radians and metres: the least deviation between two places
+
+
+def sliding_window_smoother(
+    sensor: Sensor, settings: SlidingWindowSettings, floor: Floor, prior: Prediction
+) -> MapSmoother:
+    """Estimator of kind ``sliding_window``, at the prior pose with an empty map."""
+    problem = GraphProblem.of(sensor, settings, floor, prior)
+    return MapSmoother(problem, SlidingWindowSolver(problem, settings))
+
+
+class SlidingWindowSolver(WholeGraphSolver):
+    """Solves the last frames every few frames; everything for the answer."""
+
+    kind: ClassVar[str] = "sliding_window"
+
+    def __init__(self, problem: GraphProblem, settings: SlidingWindowSettings) -> None:
+        """An empty window."""
+        super().__init__(problem.builder, problem.floor)
+        self._settings = settings
+        self._window = Window(problem.sensor, problem.builder.kernel)
+        self._held = HeldLandmarks()
+        self._new: list[NewFactors] = []
+        self._solved_at = 0
+        self._taken = 0  # observations of the builder's that the window has had
+        self._poses: list[FloatArray] = []
+        self._drift: list[FloatArray] = []  # (6, 6) covariances, as motions of the world
+        self._sizes: list[float] = []  # m^2, variance of each place
+
+    # -- a frame -----------------------------------------------------------------------------
+
+    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+        """Keeps a frame for the window's next solution."""
+        self._answer = None
+        self._new.append(new)
+        self._poses.append(new.values.atPose3(pose_key(new.frame)).matrix())
+        self._drift.append(self._drift[-1] if self._drift else np.zeros((6, 6)))
+        self._sizes.append(np.inf)
+        for variable in range(len(self._held), self._builder.variables):
+            self._held.enter(new.values.atPoint3(landmark_key(variable)))
+
+    def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
+        """Solves the window where the last solution lies `update_every` frames back."""
+        if closes_loop or (frame and frame - self._solved_at < self._settings.update_every):
+            return None
+        solved = self._solve()
+        since, values = self._window.frames[0], self._window.values()
+        last = self._measured(solved, len(solved.frames) - 1)
+        self._let_go(solved)
+        return Smoothed(values, last, since)
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Looks again at the window; what has left it moves with where it was seen last."""
+        super().recalibrate(change)
+        self._take_in()
+        self._window.remeasure(change.measured)
+        frames, variables, *_ = self._builder.kept_observed()
+        if len(frames):
+            last = np.zeros(len(self._held), np.int64)
+            np.maximum.at(last, variables, frames)
+            self._held.points[:] = change.moved(np.array(self._poses)[last], self._held.points)[0]
+
+    # -- into the window and out of it -------------------------------------------------------
+
+    def _take_in(self) -> None:
+        """The frames since the last solution, and what they saw."""
+        window, new, self._new = self._window, self._new, []
+        window.kernel = self._builder.kernel
+        for frame in new:
+            factors = gtsam.NonlinearFactorGraph()
+            for row in range(frame.graph.size()):
+                factor = frame.graph.at(row)
+                (key, *_) = factor.keys()
+                if is_pose(key):
+                    factors.add(factor)
+                else:
+                    known = factor.prior(), factor.noiseModel().covariance()
+                    self._held.know(key - landmark_key(0), *known)
+            window.add_pose(frame.frame, self._poses[frame.frame], factors)
+        self._observe()
+
+    def _observe(self) -> None:
+        seen, rows = self._builder.observed, np.arange(self._taken, len(self._builder.observed))
+        self._taken = len(seen)
+        inside = seen["frame"][rows] >= self._window.frames[0]
+        rows = rows[inside & ~seen["gone"][rows]]
+        variables = seen["variable"][rows]
+        self._bring(np.setdiff1d(variables, self._window.landmarks.variables))
+        covariance = self._builder.noise.power * seen["covariance"][rows]
+        measured = seen["measurement"][rows]
+        self._window.observe(seen["frame"][rows], variables, measured, covariance)
+
+    def _bring(self, variables: IntArray) -> None:
+        """Landmarks into the window; what was known of them when they left it comes along."""
+        homes = self._held.homes[variables]
+        self._window.add_landmarks(self._held.of(variables[homes < 0]))
+        places = homes // _PLACE
+        for place in np.unique(places[homes >= 0]).tolist():
+            tie = None if place in self._window.places else self._tie(place)
+            self._window.bring_back(self._held.of(variables[places == place]), place, tie)
+
+    def _tie(self, place: int) -> Tie:
+        """How a place is off, given the one next to it, or the window's first pose.
+
+        Drift adds up: two frames share that of the best known one between them.
+        """
+        first, here = self._window.frames[0], inverse(self._window.poses[0])
+        own, frame, follows = self._frame_of(place), first, None
+        for other in self._window.places:
+            if abs(self._frame_of(other) - own) < abs(frame - own):
+                frame, follows = self._frame_of(other), other
+        begin, end = min(own, frame), max(own, frame)
+        least = begin + int(np.argmin(self._sizes[begin : end + 1]))
+        shared, drift, of_other = (
+            congruence(adjoint(here), self._drift[k]) + _STIFF**2 * np.eye(6)
+            for k in (least, own, frame)
+        )
+        gain = np.linalg.solve(of_other, shared).T
+        rest = nearest_positive(drift - gain @ shared) + _STIFF**2 * np.eye(6)
+        return Tie(follows, np.asarray(gain), np.asarray(np.linalg.inv(rest)))
+
+    def _frame_of(self, place: int) -> int:
+        """The frame whose drift is a place's."""
+        return min(place * _PLACE + _PLACE // 2, self._window.frames[0])
+
+    def _solve(self) -> Solved:
+        self._take_in()
+        self._solved_at = self._window.frames[-1]
+        try:
+            solved = self._window.repaired(self._window.take_out, self._failed)
+        except EstimatorError:
+            self._begin_anew()
+            solved = self._window.repaired(self._window.take_out, self._failed)
+        for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
+            self._poses[frame] = pose.copy()  # a view would keep the whole window's array
+        self._held.points[self._window.landmarks.variables] = self._window.landmarks.points
+        return solved
+
+    def _let_go(self, solved: Solved) -> None:
+        """Lets the window begin so many frames back."""
+        leaving = len(self._window.frames) - self._settings.window
+        if leaving > 0:
+            first, home = self._window.frames[leaving], self._window.frames[leaving - 1]
+            for row in (leaving - 1, leaving):
+                self._measured(solved, row)
+            try:
+                self._held.left(self._window.let_go_before(first), home)
+            except (UndeterminedError, np.linalg.LinAlgError):
+                self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        """What has left, known too unevenly to be solved, gives way to the first pose's place."""
+        first = self._window.frames[0]
+        self._window.carried_along(np.eye(4), pose_prior(pose_key(first), self._at(first)))
+        self.remarks.append(
+            f"known too unevenly at frame {self._builder.frames[-1]}: the window begun anew"
+        )
+
+    def _measured(self, solved: Solved, row: int) -> Prediction:
+        """A pose of the window's solution, and its covariance, which is noted as its drift."""
+        frame, pose = self._window.frames[row], self._window.poses[row]
+        covariance = solved.eliminated.pose(row)
+        found = Prediction(pose, allowed_parts(self._floor, pose[None], covariance[None])[0])
+        self._note(frame, found)
+        return found
+
+    def _note(self, frame: int, found: Prediction) -> None:
+        self._drift[frame] = congruence(adjoint(found.wTc), found.covariance)
+        self._sizes[frame] = float(np.trace(found.covariance[3:, 3:]))
+
+    # -- loops -------------------------------------------------------------------------------
+
+    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+        """Moves the drive and all that it saw to where the loop has it, the window in one piece."""
+        self._measured(solved := self._solve(), len(solved.frames) - 1)
+        before, last = self._at(loop.before), self._at(loop.after)
+        found = drift_undone(self._floor, before, last, loop, what)
+        self.remarks.append(found.remark + ("" if found.last is None else ", the drive with it"))
+        if found.last is None:
+            return None
+        self._loops.accept(loop)
+        self._answer = None
+        self._move(found.last, loop, drive)
+        every = range(len(self._held))
+        values = WindowValues(
+            dict(zip(map(pose_key, range(len(self._poses))), self._poses, strict=True)),
+            dict(zip(map(landmark_key, every), self._held.points, strict=True)),
+        )
+        return ClosedLoop(Smoothed(values, found.last, by_loop=True))
+
+    def _at(self, frame: int) -> Prediction:
+        """A pose as it is now, as uncertain as when it left."""
+        pose = self._poses[frame]
+        return Prediction(pose, congruence(adjoint(inverse(pose)), self._drift[frame]))
+
+    def _move(self, last: Prediction, loop: Constraint, drive: Drive) -> None:
+        """Spreads the last pose's change over the drive, and takes all landmarks along."""
+        window, poses = self._window, np.array(self._poses)
+        moved = closed_chain(poses, drive.chain, self._loops.accepted, last.wTc)
+        by = changes(poses, moved)
+        self._poses = list(moved)
+        held = self._held
+        held.points[:] = transported(home_changes(held.homes, by), held.points)
+        oldest = window.frames[0]
+        whole = last.wTc @ inverse(window.poses[-1])
+        to_oldest = adjoint(inverse(window.poses[0]) @ window.poses[-1])
+        there = Prediction(whole @ window.poses[0], congruence(to_oldest, last.covariance))
+        window.carried_along(whole, pose_prior(pose_key(oldest), there))
+        held.points[window.landmarks.variables] = window.landmarks.points
+        for frame, pose in zip(window.frames, window.poses, strict=True):
+            self._poses[frame] = pose.copy()
+            self._drift[frame], self._sizes[frame] = self._drift[oldest], np.inf
+        self._note(oldest, there)
+        self._note(window.frames[-1], last)
+
+    # -- all of it ---------------------------------------------------------------------------
+
+    def _refine(self) -> Any:
+        self._values = self._everything()
+        return super()._refine()
+
+    def _everything(self) -> Any:
+        """GTSAM values of all poses and landmarks."""
+        values = gtsam.Values()
+        for frame, pose in enumerate(self._poses):
+            values.insert(pose_key(frame), gtsam.Pose3(reorthonormalise(pose)))
+        for variable, point in enumerate(self._held.points):
+            if self._builder.in_graph(variable):
+                values.insert(landmark_key(variable), point)
+        return values
+
+    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
+        """Values at the minimum, and the factors that count there."""
+        return trimmed(graph, state, MINIMUM, self._builder.noise_factor)
