@@ -149,7 +149,7 @@ def test_help_of_run_lists_every_experiment(monkeypatch: Patch, capfd: Capture) 
 # run
 
 
-def test_run_as_a_process(recording: Path, tmp_path: Path) -> None:
+def test_run_as_a_process(recording: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     """Statuses, streams and the lines that name the results."""
     config = write_config(tmp_path / "c.yaml", experiment(recording))
     folder = tmp_path / "run"
@@ -164,7 +164,7 @@ def test_run_as_a_process(recording: Path, tmp_path: Path) -> None:
     assert (status, out) == (2, "")
     assert error.count("\n") == 1
     assert "add --overwrite or --resume" in error
-    assert call("run", config, "--out", folder, "--overwrite")[0] == 0
+    assert main(monkeypatch, "run", config, "--out", folder, "--overwrite") == 0
     assert_valid_results(folder, 12)
 
 

@@ -60,6 +60,11 @@ TASKS = (
     "compare_homing",
     "trials",
 )
+EACH_TASK = pytest.mark.parametrize(
+    "task",
+    [pytest.param(task, marks=pytest.mark.slow if task == "homing" else ()) for task in TASKS],
+)
+"""A homing is a path of one leg, done by the same module."""
 HOUSE: dict[str, Any] = {
     "name": "short",
     "jobs": 1,
@@ -313,7 +318,7 @@ def unfinished(folder: Path) -> bool:
     return begun or not metrics.is_file() or '"interrupted"' in metrics.read_text()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@EACH_TASK
 def test_killed_once_a_run_resumes_to_the_same_bytes(
     task: str,
     straight: Straight,
@@ -323,7 +328,7 @@ def test_killed_once_a_run_resumes_to_the_same_bytes(
     killed_and_resumed(task, 1, straight, doing, tmp_path)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@EACH_TASK
 def test_overwriting_deletes_every_file_of_a_run(
     task: str, straight: Straight, tmp_path: Path
 ) -> None:
