@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import norm
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
 from fgslam.homing.active_homing import CONTRADICTION_DEG, parallax
 from fgslam.homing.command import SURE, PathPlace
@@ -52,8 +52,8 @@ _NEAR = 0.25
 """Parallax to a path image over that to the one after it, at which the robot turns to the latter:
 a third of a leg is left. Nearer, the direction to it is noise."""
 
-_REACHED, _PASSED = 0.07, 0.25
-"""Parts of the last leg: as `switch_fraction` of control, and as its passing by."""
+_REACHED, _BESIDE = 0.07, 0.25
+"""Parts of the last leg: along it, as `switch_fraction` of control, and in all."""
 
 _CONTRADICTION = np.deg2rad(CONTRADICTION_DEG)
 _AGREEING = 3  # images in a row that agree, until what contradicts those before is believed
@@ -74,7 +74,7 @@ class _Aim:
         after: as ``across``, of the path image after the target, in the last image.
         fresh: it was not looked at yet.
         elsewhere: the last image was taken where the robot would not come by on its way.
-        reached: the last image was taken at the path's end.
+        left: of the last leg, along it, in the last image; NaN where it was not seen.
     """
 
     target: int
@@ -85,7 +85,7 @@ class _Aim:
     after: float = float("nan")
     fresh: bool = True
     elsewhere: bool = False
-    reached: bool = False
+    left: float = float("nan")
 
 
 class PathPlaces:
@@ -117,6 +117,7 @@ class PathPlaces:
             _POWER,
         )
         self._aim: _Aim | None = None
+        self._last_leg: tuple[float, float] | None = None
 
     @property
     def belief(self) -> FloatArray:
@@ -278,19 +279,34 @@ class PathPlaces:
         return after / (before + after) if before + after > 0.0 else float("nan")
 
     def _reached(self, aim: _Aim, nearest: int) -> bool:
-        """Whether two images in a row were taken at the path's end, or just past it."""
-        last = len(self._path) - 1
-        before, aim.reached = aim.reached, aim.target == last == nearest and self._at_end(aim)
-        return before and aim.reached
+        """Whether the path's end is: two images in a row approach it, or are there.
 
-    def _at_end(self, aim: _Aim) -> bool:
+        What is left is measured along the last leg as it was taught, as the robot may pass beside
+        the end; and no nearer than to half its last step, as the next image would be farther off.
+        """
         last = len(self._path) - 1
-        seen = self._parallax.get(last)
-        if seen is None:
+        before, aim.left = aim.left, float("nan")
+        if aim.target != last or last not in self._parallax:
             return False
-        left = seen / max(self._parallax.get(last - 1, 0.0), aim.widest, 1e-9)
-        beyond = last > 0 and 0.0 < self._apart(last - 1, last) < np.pi / 2
-        return seen == 0.0 or left <= _REACHED or (beyond and left <= _PASSED)
+        far, aim.left = self._left_of_last_leg(aim)
+        if nearest != last or not np.isfinite(before):
+            return False
+        return far <= _BESIDE and aim.left <= max(_REACHED, 0.5 * (before - aim.left))
+
+    def _left_of_last_leg(self, aim: _Aim) -> tuple[float, float]:
+        """Distance of the path's end, and the part of it along the last leg; in legs."""
+        last = len(self._path) - 1
+        seen, answer = self._parallax[last], self._localiser.answers[last]
+        if last > 0 and self._last_leg is None:
+            ends = self._path.images[last - 1], self._path.images[last]
+            self._last_leg = _leg_of(*compare_views(*ends, self._settings, self._rng))
+        across, length = self._last_leg or (float("nan"), float("nan"))
+        if not np.isfinite(length):
+            length = max(self._parallax.get(last - 1, 0.0), aim.widest, 1e-9)
+        far = seen / length
+        if isinstance(answer, Refusal) or not np.isfinite(across):
+            return far, far
+        return far, far * float(np.cos(_across(answer) - across))
 
     def _vector(self, aim: _Aim) -> tuple[TwoViewVector | None, str]:
         """The homing vector to the target, unless it contradicts those before it for once."""
@@ -323,6 +339,13 @@ def _most_by_chance(counts: Sequence[int]) -> float:
     middle = float(np.median(counts))
     spread = max(1.4826 * float(np.median(np.abs(np.array(counts) - middle))), np.sqrt(middle))
     return float(middle + spread * norm.ppf(1.0 - 1.0 / (len(counts) + 1.0)))
+
+
+def _leg_of(answer: Answer, matches: BearingMatches) -> tuple[float, float]:
+    """Direction of a leg in the axes of its end, and its parallax, radians; NaN if refused."""
+    if isinstance(answer, Refusal):
+        return float("nan"), float("nan")
+    return _across(answer), parallax(matches.select(answer.inliers), answer.rotation)
 
 
 def _across(vector: TwoViewVector) -> float:

@@ -19,6 +19,7 @@ from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.homing.command import HomingState
 from fgslam.homing.compact import MOST_COLUMNS, MOST_SIFT, Votes, best_all_around, compacted
 from fgslam.homing.feature_files import pack_features
+from fgslam.homing.path_places import PathPlaces
 from fgslam.homing.settings import DRIVING
 from fgslam.homing.teaching import (
     BEND,
@@ -219,6 +220,18 @@ def test_each_image_finds_its_place_and_the_next_path_image(taught: Taught) -> N
     assert follower.finished
     assert end.state is HomingState.ARRIVED
     assert end.homing.stop
+
+
+def test_the_end_is_said_by_who_passes_it_and_not_by_who_stops_short(taught: Taught) -> None:
+    """Images a step apart, beside the taught way: none is at the end itself."""
+    numbers = np.array([row.number for row in taught.rows]) * STEP_M
+    places = PathPlaces(taught.memory, DRIVING)
+    extract = OmniFeatureExtractor(CAMERA, DRIVING.features).extract
+    said = []
+    for before_end in (1.4, 1.0, 0.6, 0.05):
+        pose = at(float(numbers[-1]) - before_end) + np.array([0.0, 0.06, 0.2])
+        said.append(places.look(extract(picture(pose))).reached)
+    assert said == [False, False, False, True]
 
 
 def test_a_robot_put_down_anywhere_knows_its_place_after_a_few_images(taught: Taught) -> None:
