@@ -114,7 +114,8 @@ def test_another_drive_follows_it(
         assert abs(float(row["direction_deg"])) < 5.0
         assert float(row["sigma_direction_deg"]) < 5.0
         assert float(row["v_mps"]) > 0.0
-    assert all(row["state"] == "wait" for row in rows if row["refusal"])
+    assert all(row["state"] == "wait" for row in rows[:-1] if row["refusal"])
+    assert rows[-1]["state"] == "arrived"  # 0.2 m past the end
     metres = [(0.2 + 0.8 * k, row) for k, row in enumerate(rows) if row["x_m"]]
     assert len(metres) >= 2
     for truth, row in metres:
