@@ -12,7 +12,7 @@ from fgslam.cameras.formats.trees import Tree, read_tree
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_text
+from fgslam.core.files import read_text, shown_in
 
 Size: TypeAlias = tuple[int, int]
 Reader: TypeAlias = Callable[[Path, Tree, Size | None], Calibration]
@@ -156,7 +156,7 @@ def _of_folder(folder: Path, size: Size | None) -> Calibration:
             return read_calibration_file(folder / name, size=size)
     if (folder / "right.yaml").is_file():
         raise CalibrationError(f"{folder}: has right.yaml but no left.yaml; a pair needs both")
-    found = tuple(_rigs(sorted(folder.iterdir()), size))
+    found = tuple(_rigs(shown_in(folder), size))
     by_name = tuple(one for one in found if one.source.endswith("camchain.yaml"))
     found = by_name if len(by_name) == 1 else found
     if len(found) == 1:
@@ -164,7 +164,7 @@ def _of_folder(folder: Path, size: Size | None) -> Calibration:
     if found:
         names = ", ".join(Path(one.source).name for one in found)
         raise CalibrationError(f"{folder}: holds several calibrations ({names}); name one")
-    own = [path for path in sorted(folder.iterdir()) if path.suffix.lower() in _SUFFIXES[:4]]
+    own = [path for path in shown_in(folder) if path.suffix.lower() in _SUFFIXES[:4]]
     if len(own) == 1 and own[0].is_file():
         _require_readable(own[0], size)
     raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {KNOWN}")

@@ -192,6 +192,11 @@ _KINDS = (
 )
 
 
+def shown_in(folder: Path) -> list[Path]:
+    """What a folder holds, sorted, but for hidden files: macOS puts a ``._NAME`` beside NAME."""
+    return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+
+
 def read_lines(path: Path, error: type[DatasetError] = DatasetError) -> list[tuple[int, str]]:
     """Numbered lines, without blank ones and comments (``#``). Raises ``error`` if unreadable."""
     stripped = ((k, line.strip()) for k, line in enumerate(read_text(path, error).splitlines(), 1))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
+from fgslam.core.files import shown_in
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural, one_camera
 from fgslam.datasets.sides import camera_pairs
 
@@ -87,7 +88,8 @@ def files_of(given: Path) -> list[Path]:
     """What a path or a pattern of file names means: the path itself where it is there."""
     if given.exists() or not any(mark in given.name for mark in "*?["):
         return [given]
-    return sorted(given.parent.glob(given.name), key=natural)
+    found = given.parent.glob(given.name)
+    return sorted((path for path in found if not path.name.startswith(".")), key=natural)
 
 
 def _fitting_files(given: Path) -> tuple[str, ...]:
@@ -173,7 +175,7 @@ def _unknown(folder: Path) -> str:
             f"{folder} is a run folder, not a recording; give what it was made from: "
             f"{folder / _RUN_CONFIG}"
         )
-    if not any(folder.iterdir()):
+    if not shown_in(folder):
         return f"{folder} is empty; give the folder of a recording, docs/datasets/ has the layouts"
     if (alone := one_camera(folder)) is not None:
         return (
@@ -235,7 +237,7 @@ BAG_ENDINGS = (".bag", ".db3", ".mcap")
 
 
 def _lacking_of_bag(folder: Path) -> tuple[str, ...]:
-    found = any(file.suffix in BAG_ENDINGS for file in folder.iterdir())
+    found = any(file.suffix in BAG_ENDINGS for file in shown_in(folder))
     return () if found else ("a file *.bag, *.db3 or *.mcap",)
 
 
@@ -261,7 +263,7 @@ VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg
 
 def films_in(given: Path) -> list[Path]:
     """The film or the two that a file, folder or pattern means, left first; none where unclear."""
-    within = sorted(given.iterdir(), key=natural) if given.is_dir() else files_of(given)
+    within = sorted(shown_in(given), key=natural) if given.is_dir() else files_of(given)
     films = {p.name: p for p in within if p.suffix.lower() in VIDEO_ENDINGS and p.is_file()}
     pairs = camera_pairs(films)
     if len(films) == 1:

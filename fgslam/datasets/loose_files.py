@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from fgslam.core.errors import DatasetError
+from fgslam.core.files import shown_in
 from fgslam.datasets.sides import camera_pairs, without_side
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
@@ -42,13 +43,13 @@ def natural(path: Path) -> tuple[tuple[int, str], ...]:
 
 def images_in(folder: Path) -> list[Path]:
     """Image files of a folder, in natural order."""
-    found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    found = (p for p in shown_in(folder) if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
     return sorted(found, key=natural)
 
 
 def one_camera(root: Path) -> Path | None:
     """The only folder with images, this one or one in it; None where there are none or more."""
-    inside = sorted(path for path in root.iterdir() if path.is_dir())
+    inside = [path for path in shown_in(root) if path.is_dir()]
     places = [root, *inside, *(path / _INSIDE for path in inside)]
     found = [path for path in places if path.is_dir() and images_in(path)]
     return found[0] if len(found) == 1 else None
@@ -104,7 +105,7 @@ def _moment(stem: str) -> str:
 def _two_folders(root: Path) -> tuple[Path, Path] | None:
     """Folders of images whose names differ in the side; of several pairs the first."""
     with_images = {}
-    for folder in sorted(path for path in root.iterdir() if path.is_dir()):
+    for folder in (path for path in shown_in(root) if path.is_dir()):
         for place in (folder, folder / _INSIDE):
             if place.is_dir() and images_in(place):
                 with_images[folder.name] = place

@@ -15,6 +15,7 @@ import numpy as np
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.files import shown_in
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES, natural
 from fgslam.datasets.stamps import written_stamps
 
@@ -100,7 +101,7 @@ def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
         )
     found = [
         path
-        for path in folder.iterdir()
+        for path in shown_in(folder)
         if fnmatchcase(path.name, pattern)
         and path.suffix.lower() in IMAGE_SUFFIXES
         and path.is_file()

@@ -14,7 +14,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.files import read_text
+from fgslam.core.files import read_text, shown_in
 from fgslam.datasets.loose_files import natural
 from fgslam.datasets.odometry import checked_speeds, recorded_motions
 from fgslam.datasets.recording import OdometrySource
@@ -67,7 +67,11 @@ def read_oxts(drive: Path) -> Oxts | None:
     """
     folder = drive / "oxts"
     data = folder / "data"
-    files = sorted(data.glob("*.txt"), key=natural) if data.is_dir() else []
+    files = (
+        sorted((p for p in shown_in(data) if p.suffix == ".txt"), key=natural)
+        if data.is_dir()
+        else []
+    )
     if not files:
         return None
     found = written_stamps(files, (folder,)) if (folder / "timestamps.txt").is_file() else None

@@ -23,7 +23,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.files import read_lines
+from fgslam.core.files import read_lines, shown_in
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, sized
 from fgslam.datasets.layouts import colour_and_depth
@@ -208,7 +208,7 @@ def _camera(
 
 
 def _own_files(root: Path) -> list[Path]:
-    return sorted(p for p in root.iterdir() if p.suffix in (".json", ".yaml", ".yml", ".xml"))
+    return [p for p in shown_in(root) if p.suffix in (".json", ".yaml", ".yml", ".xml")]
 
 
 def _of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:

@@ -20,6 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.files import shown_in
 from fgslam.datasets.bags.cut import BROKEN, CutBag, CutDatabase, CutMcap, Message
 from fgslam.datasets.layouts import BAG_ENDINGS, files_of
 
@@ -131,7 +132,7 @@ def bag_files(path: Path) -> list[Path]:
     """The files of a folder that are bags, or the file itself."""
     if not path.is_dir():
         return [path]
-    return sorted(file for file in path.iterdir() if file.suffix in BAG_ENDINGS and file.is_file())
+    return [file for file in shown_in(path) if file.suffix in BAG_ENDINGS and file.is_file()]
 
 
 def _open(paths: list[Path], cut: bool) -> AnyReader:

@@ -1,10 +1,22 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from dataset_builders import euroc, image_folder, kitti
+from bags import stereo, write_bag
+from dataset_builders import (
+    HEIGHT,
+    WIDTH,
+    euroc,
+    image_folder,
+    kitti,
+    picture,
+    save,
+    write_calibration,
+)
 from pydantic import TypeAdapter, ValidationError
 
 from fgslam.core.geometry import pose
@@ -18,6 +30,7 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
+from fgslam.runs.bare_recording import bare_experiment
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -33,6 +46,59 @@ def test_each_kind_opens_its_layout(tmp_path: Path) -> None:
         len(open_recording(EurocSettings(path=str(flight)))),
     ]
     assert counts == [3, 4, 5]
+
+
+def two_folders(root: Path) -> Path:
+    return of_images(root, "left/{}.png", "right/{}.png")
+
+
+def one_folder(root: Path) -> Path:
+    return of_images(root, "{}_left.png", "{}_right.png")
+
+
+def of_images(root: Path, left: str, right: str) -> Path:
+    for k in range(3):
+        save(root / left.format(k), picture(60 + k))
+        save(root / right.format(k), picture(10 + k))
+    write_calibration(root)
+    return root
+
+
+def films(root: Path) -> Path:
+    root.mkdir()
+    for name in ("left.avi", "right.avi"):
+        code = cv2.VideoWriter.fourcc(*"MJPG")
+        writer = cv2.VideoWriter(str(root / name), code, 20.0, (WIDTH, HEIGHT))
+        for k in range(3):
+            writer.write(np.dstack([picture(10 + k)] * 3))
+        writer.release()
+    write_calibration(root)
+    return root
+
+
+def bag(root: Path) -> Path:
+    root.mkdir()
+    write_bag(root / "walk.bag", stereo(3))
+    return root
+
+
+def depth(root: Path) -> Path:
+    for k in range(3):
+        save(root / "color" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
+        save(root / "depth" / f"{k}.png", np.full((HEIGHT, WIDTH), 2000, np.uint16))
+    write_calibration(root)
+    return root
+
+
+@pytest.mark.parametrize("make", [image_folder, two_folders, one_folder, films, bag, depth])
+def test_files_that_macos_hides_beside_others_are_none(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    expected = bare_experiment(root).said
+    for path in [path for path in root.rglob("*") if path.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(b"\x00\x05\x16\x07Mac OS X" + bytes(60))
+    assert bare_experiment(root).said == expected
 
 
 def test_noise_settings_reach_the_odometry(tmp_path: Path) -> None:
