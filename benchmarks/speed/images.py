@@ -9,18 +9,16 @@ that what else a shared machine does cancels; medians over the blocks are quoted
 
 from __future__ import annotations
 
-import resource
 import statistics
 import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import cv2
-import numpy as np
 
 from benchmarks.runs import EXPERIMENTS
+from benchmarks.speed.blocks import Memory
 from fgslam.cli.console import progress_bar
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError
@@ -108,8 +106,7 @@ class Series:
     rest: list[float] = field(default_factory=list)
     whole_ratio: list[float] = field(default_factory=list)
     rest_ratio: list[float] = field(default_factory=list)
-    memory_mb: list[float] = field(default_factory=list)
-    log_mb: list[float] = field(default_factory=list)
+    memory: Memory = field(default_factory=Memory)
 
 
 def timed(work: Callable[..., object], *arguments: object) -> float:
@@ -177,8 +174,7 @@ def run_blocks(
         through_system(config, pipeline, recorder, (block, start, number % 2 == 0), series)
         sift = 0.5 * (before + timed(way, images))
         book(series, 1e3 * sift / len(frames), whole=number % 2 == 0)
-        series.memory_mb.append(resident_mb())
-        series.log_mb.append(log_mb(recorder.log))
+        series.memory.book(recorder.log)
         tell(stop)
     return series, len(pipeline.tracker.database)
 
@@ -213,33 +209,15 @@ def book(series: Series, sift_ms: float, whole: bool) -> None:
     ratios.append(last / sift_ms)
 
 
-def resident_mb() -> float:
-    """Resident memory now, mebibytes."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() / 2**20
-
-
-def log_mb(log: MeasurementLog) -> float:
-    """Size of the measurement log, which grows with the drive by design, mebibytes."""
-    arrays = [
-        value
-        for increment in log
-        for part in (increment, increment.observations, increment.odometry)
-        if part is not None
-        for name in part.__dataclass_fields__
-        if isinstance(value := getattr(part, name), np.ndarray)
-    ]
-    return sum(array.nbytes for array in arrays) / 2**20
-
-
 def ratios_of(series: Series) -> dict[str, float]:
     """The flat map of bench.json."""
     fifth = max(1, len(series.rest_ratio) // 5)
     # The first block finds an empty map and loads libraries; it would flatter the growth.
     first = statistics.median(series.rest_ratio[1 : 1 + fifth])
     last = statistics.median(series.rest_ratio[-fifth:])
-    half = len(series.memory_mb) // 2
-    flat = [total - log for total, log in zip(series.memory_mb, series.log_mb, strict=True)]
+    process, log = series.memory.process_mb, series.memory.log_mb
+    half = len(process) // 2
+    flat = [total - part for total, part in zip(process, log, strict=True)]
     tail = series.whole_ratio[len(series.whole_ratio) // 2 :]
     return {
         "whole_loop_over_sift": statistics.median(tail),
@@ -247,9 +225,9 @@ def ratios_of(series: Series) -> dict[str, float]:
             series.rest_ratio[len(series.rest_ratio) // 2 :]
         ),
         "time_last_fifth_over_first": last / first,
-        "memory_end_over_middle": series.memory_mb[-1] / series.memory_mb[half],
+        "memory_end_over_middle": process[-1] / process[half],
         "memory_without_log_end_over_middle": flat[-1] / flat[half],
-        "log_mb_per_1000_frames": 1e3 * series.log_mb[-1] / (len(series.log_mb) * BLOCK),
+        "log_mb_per_1000_frames": 1e3 * log[-1] / (len(log) * BLOCK),
         "frames_per_second": 1e3 / statistics.median(series.whole),
         "sift_ms_per_frame": statistics.median(series.sift),
         "all_but_sift_ms_per_frame": statistics.median(series.rest),

@@ -11,10 +11,8 @@ from __future__ import annotations
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 
-import numpy as np
-
+from benchmarks.speed.blocks import Memory, of_blocks, resident_mb
 from benchmarks.speed.drives import Player, open_drive
-from benchmarks.speed.images import resident_mb
 from fgslam.backend.settings import EstimatorSettings, FixedLagSettings, LandmarkKalmanSettings
 from fgslam.core.threads import one_blas_thread
 
@@ -44,19 +42,12 @@ def _trace(given: tuple[str, int, int]) -> dict[str, float]:
     drive = open_drive("lab_trials", _endless(frames))
     player = Player(drive, ESTIMATORS[name])
     player.on_to(1)
-    out: dict[str, float] = {}
-    before = resident_mb()
-    mb: list[float] = []
+    before, memory = resident_mb(), Memory()
     for stop in range(block, frames + 1, block):
         player.on_to(stop)
-        mb.append(resident_mb() - before)
-        ms = 1e3 * player.played().cpu_s[-block:]
-        at = f"soak_{name}_{stop}"
-        out |= {
-            f"{at}_ms": float(np.median(ms)),
-            f"{at}_ms_99": float(np.percentile(ms, 99)),
-            f"{at}_mb": mb[-1],
-        }
+        memory.book()
+    mb = [process - before for process in memory.process_mb]
+    out = of_blocks(f"soak_{name}", player.played().cpu_s, mb, block)
     last, second = (out[f"soak_{name}_{stop}_ms"] for stop in (block * len(mb), 2 * block))
     half = len(mb) // 2
     grown = (mb[-1] - mb[half - 1]) / (block * (len(mb) - half))

@@ -320,16 +320,30 @@ class SubMaps:
         places = self._parts.places
         if places is None or not self._stored or not (places.lost or places.wants_features):
             return
-        among = self._numbers if places.lost else self._within_drift()
-        ranked = self._index.rank(features.descriptors, among, surely=not places.lost)
-        for number in ranked[: _TRIED_LOST if places.lost else _TRIED].tolist():
+        number, found = self.recognise(features, places.lost)
+        if number >= 0:
+            self._guest, self._guest_until = found, self._frame + _GUEST_FRAMES
+            around = np.union1d(self._within(found, self._area.radius_m), [number])
+            self.recognised += len(around)
+            self._bring(around)
+
+    def recognise(self, features: StereoFeatures, lost: bool) -> tuple[int, FloatArray]:
+        """The sub-map on disk that a frame sees, and where the frame is; nothing is changed.
+
+        Args:
+            features: the frame's, with descriptors.
+            lost: whether it may be anywhere, or only as far off as a drift takes it.
+
+        Returns:
+            Number of the sub-map and position (3,) in the world; -1 and NaN where there is none.
+        """
+        among = self._numbers if lost else self._within_drift()
+        ranked = self._index.rank(features.descriptors, among, surely=not lost)
+        for number in ranked[: _TRIED_LOST if lost else _TRIED].tolist():
             found = self._place_in(self._read(number), features)
             if found is not None:
-                self._guest, self._guest_until = found, self._frame + _GUEST_FRAMES
-                around = np.union1d(self._within(found, self._area.radius_m), [number])
-                self.recognised += len(around)
-                self._bring(around)
-                return
+                return int(number), found
+        return -1, np.full(3, np.nan)
 
     def _place_in(self, submap: SubMap, features: StereoFeatures) -> FloatArray | None:
         """Where (3,) a sub-map's landmarks place the frame without a prior; None if nowhere."""

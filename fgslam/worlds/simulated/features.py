@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core import geometry as g
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.features import Features
 from fgslam.core.sensors import CameraRig
 
@@ -30,13 +30,25 @@ class FeatureWorld:
     independent normal noise.
     """
 
-    def __init__(self, points: FloatArray, rng: np.random.Generator, rig: CameraRig) -> None:
-        """Draws the looks of points (n, 3) of the world, metres."""
+    def __init__(
+        self,
+        points: FloatArray,
+        rng: np.random.Generator,
+        rig: CameraRig,
+        descriptors: ByteArray | None = None,
+    ) -> None:
+        """Draws the looks of points (n, 3) of the world, metres.
+
+        Uniform descriptors are told apart, but fall into a few dozen words of places; others (n,
+        128) may be given.
+        """
         count = len(points)
         self.points = points
         self._rig = rig
         self._rng = rng
-        self._descriptors = rng.integers(0, 120, (count, 128)).astype(np.uint8)
+        if descriptors is None:
+            descriptors = rng.integers(0, 120, (count, 128)).astype(np.uint8)
+        self._descriptors = descriptors
         self._orientation = rng.uniform(0.0, 2.0 * np.pi, count)
         self._size = rng.uniform(4.0, 12.0, count)
 

@@ -189,6 +189,26 @@ def test_a_robot_carried_off_is_found_by_looks_in_a_sub_map(tmp_path: Path) -> N
     assert error_m(reports[-1], poses[-1]) < 0.02
 
 
+def test_asking_where_a_frame_is_changes_nothing(driven: Driven) -> None:
+    submaps, before = submaps_of(driven.pipeline), states(driven.pipeline)
+    numbers = before["submaps/numbers"][:, 0].tolist()
+    asked = [on_ring(k + 0.5) for k in range(ROUND)]
+    stereo, found = driven.pipeline.stereo, {}
+    for seen in frames(asked):
+        features = stereo.match_all(seen.features, None)
+        found[seen.i] = submaps.recognise(features, lost=True)
+    known = {k: position for k, (number, position) in found.items() if number in numbers}
+    assert len(known) >= 12, "the others are in memory, or looked past a sparse sub-map"
+    for k, position in known.items():
+        np.testing.assert_allclose(position, asked[k][:3, 3], rtol=0, atol=0.05)
+    for k in found.keys() - known.keys():
+        assert found[k][0] == -1
+        assert np.isnan(found[k][1]).all()
+    after = states(driven.pipeline)
+    for name, array in before.items():
+        np.testing.assert_array_equal(after[name], array, err_msg=name)
+
+
 def test_a_damaged_or_foreign_or_missing_sub_map_is_one_line(
     driven: Driven, tmp_path: Path
 ) -> None:
