@@ -110,7 +110,7 @@ def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
     rays = (pixels.reshape(-1, 2) - [rig.cx, rig.cy]) / focal
     of_lens = focal[:, None] * _terms(rays)[..., [TERMS.index(name) for name in SHARED[:-1]]]
     out = np.zeros((len(pixels), 2 * rig.cameras, len(SHARED)))
-    out[..., :-1] = of_lens.reshape(len(pixels), 2 * rig.cameras, -1)
+    out[..., :-1] = of_lens.reshape(len(pixels), 2 * rig.cameras, len(SHARED) - 1)
     out[:, 2, -1] = pixels[:, 1, 0] - pixels[:, 0, 0]
     if rig.cameras == 3:
         out[:, 5, -1] = pixels[:, 2, 1] - pixels[:, 0, 1]
