@@ -73,7 +73,7 @@ def overview(records: dict[str, Record]) -> str:
     ]
     for group, names in GROUPS.items():
         lines += ["", f"## {group}", "", *(_counted(records[name]) for name in names)]
-    lines += ["", "## Missed", "", *_missed(records.values())]
+    lines += ["", "## Missed", "", *(list(_missed(records.values())) or ["None."])]
     return _joined(lines)
 
 
@@ -83,14 +83,14 @@ def _counted(record: Record) -> str:
     return f"- [{record.title}]({record.name}.md)" + (f": {met} of {of} bounds met" if of else "")
 
 
-def _missed(records: Iterable[Record]) -> list[str]:
-    rows = [
-        (record.title, row.name, shown_number(row), shown_bound(row))
-        for record in records
-        for row in record.rows
-        if row.met is False
-    ]
-    return grid(("page", "", "measured", "bound"), rows) if rows else ["None."]
+def _missed(records: Iterable[Record]) -> Iterator[str]:
+    """An item for each page: what it misses, the number and its bound."""
+    for record in records:
+        rows = [row for row in record.rows if row.met is False]
+        told = "; ".join(f"{row.name}: {shown_number(row)} ({shown_bound(row)})" for row in rows)
+        if rows:
+            lines = _wrapped(f"- [{record.title}]({record.name}.md): {told}")
+            yield from (lines[0], *(f"  {line}" for line in lines[1:]))
 
 
 def page(record: Record) -> str:
