@@ -12,7 +12,13 @@ from fgslam.cameras.corrected import rectifier_of, write_corrected
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.rig_correction import RigCorrection, camera_displacements, term_names
+from fgslam.core.rig_correction import (
+    SHARED,
+    RigCorrection,
+    camera_displacements,
+    shared_displacements,
+    term_names,
+)
 from fgslam.core.sensors import CameraRig
 
 PAIR = CameraRig(160, 120, 130.0, 131.0, 79.5, 59.5, 0.1, None, np.diag([-1.0, 1.0, -1.0, 1.0]))
@@ -90,3 +96,9 @@ def test_what_is_no_correction_is_refused(
     path.write_text(json.dumps(values | {"corrections": [1.0]}))
     with pytest.raises(CalibrationError, match="must be an object"):
         StereoRig.load(path)
+
+
+@pytest.mark.parametrize("rig", [PAIR, THREE], ids=["two cameras", "three cameras"])
+def test_a_frame_that_shows_nothing_is_displaced_by_nothing(rig: CameraRig) -> None:
+    found = shared_displacements(rig, np.empty((0, rig.cameras, 2)))
+    assert found.shape == (0, 2 * rig.cameras, len(SHARED))
