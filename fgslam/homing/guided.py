@@ -75,7 +75,7 @@ class GuidedHoming:
         """
         self._time = later_time(time, self._time, "homing", EstimatorError)
         if self._ended is not None:
-            return replace(self._ended, time=time), None
+            return replace(self._ended, time=time), None if self._tracks else self._where(image)
         command, place = self._tracked(image, time) if self._tracks else self._looked(image, time)
         if self._is_end(command):
             self._ended = command
@@ -138,6 +138,11 @@ class GuidedHoming:
             final=final,
         )
         return command, place
+
+    def _where(self, image: ByteArray) -> PathPlace | None:
+        """The place of an image after the end: a recording may go on."""
+        place = self._place(image)
+        return None if isinstance(place, Refusal) else place
 
     def _place(self, image: ByteArray) -> PathPlace | Refusal:
         features = self._extractor.extract(image)

@@ -220,6 +220,10 @@ def test_each_image_finds_its_place_and_the_next_path_image(taught: Taught) -> N
     assert follower.finished
     assert end.state is HomingState.ARRIVED
     assert end.homing.stop
+    after = follower.step(picture(at(float(numbers[-1]) + 0.1)), 200.0)  # a recording may go on
+    assert after.state is HomingState.ARRIVED
+    assert after.place is not None
+    assert after.place.nearest == last
 
 
 def test_the_end_is_said_by_who_passes_it_and_not_by_who_stops_short(taught: Taught) -> None:
