@@ -76,8 +76,8 @@ class SlamPipeline:
         watch: says which frames' images cannot be used; None uses all.
         submaps: landmarks far from the robot, on disk; None where all are in memory.
         describe: finds the features of all images of a frame that came without.
-        describe_reference: of a frame that carried landmarks have placed, those of its reference
-            image alone: patches tell the rest.
+        describe_reference: of the first frame, and of one that carried landmarks have placed,
+            those of its reference image alone: patches tell the rest.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
     """
@@ -187,8 +187,9 @@ class SlamPipeline:
         return carried.suffices and (self.places is None or not self.places.wants_features)
 
     def _described(self, found: FeatureFrame, carried: CarriedFrame | None) -> FeatureFrame:
-        """The frame with features; of all images where no landmark could be carried into it."""
-        patches = carried is not None and carried.placed
+        """The frame with features; of all images where carried landmarks do not place it."""
+        first = self.key_frames is not None and found.i == 0
+        patches = first or (carried is not None and carried.placed)
         find = self.describe_reference if patches else self.describe
         return found if find is None else find(found)
 

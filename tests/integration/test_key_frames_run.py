@@ -12,6 +12,7 @@ from running import Finished, bytes_of, metrics_of, run_values, stop_after, writ
 
 import fgslam as fg
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 FRAMES = 12
 
@@ -54,17 +55,24 @@ def test_it_is_as_accurate_as_features_on_every_frame(
     assert errors[0] < 1.3 * errors[1] + 0.001
 
 
-def test_frames_too_far_apart_to_carry_anything_are_tracked_as_by_features_alone(
-    recording: Path, tmp_path: Path
+def test_frames_too_far_apart_to_carry_anything_are_left_to_features_in_all_images(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every sixth: a step moves the image by more than its sixteenth."""
-    logs = []
-    for tracking in ("hybrid", "sift"):
-        values = values_of(recording, frontend={"tracking": tracking})
-        values["dataset"] |= {"stride": 6}
-        run_values(values, tmp_path / tracking)
-        logs.append((tmp_path / tracking / "measurements.npz").read_bytes())
-    assert logs[0] == logs[1]
+    """Every sixth: a step moves the image by more than its sixteenth. The first has patches."""
+    images: list[int] = []
+    process = SlamPipeline.process
+
+    def watched(self: SlamPipeline, *frame: Any) -> FrameReport:
+        report = process(self, *frame)
+        images.append(len(report.found.features))
+        return report
+
+    monkeypatch.setattr(SlamPipeline, "process", watched)
+    values = values_of(recording)
+    values["dataset"] |= {"stride": 6}
+    run = run_values(values, tmp_path / "run")
+    assert images == [1, 3]
+    assert metrics_of(run.folder)["status_counts"] == {"first": 1, "ok": 1}
 
 
 @pytest.mark.parametrize("frames", [1, 5, 9])

@@ -49,6 +49,12 @@ class ReferencePatches(Rows):
     contrast: FloatArray
     maps: FloatArray
 
+    @staticmethod
+    def none(size: int) -> ReferencePatches:
+        """Of no point."""
+        parts = [np.empty((0, *shape, size * size), np.float32) for shape in ((), (2,), (6,))]
+        return ReferencePatches(size, *parts, np.empty(0), np.empty((0, 2, 2)))
+
     def select(self, keep: BoolArray | IntArray) -> ReferencePatches:
         """The chosen patches; none are copied where all are wanted."""
         if keep.dtype == np.bool_ and keep.all():

@@ -84,7 +84,7 @@ class LandmarkCarrier:
         self._stereo = stereo
         self._last: Image | None = None
         self._points = _Points.none()
-        self._patches: ReferencePatches | None = None
+        self._patches = ReferencePatches.none(PATCH_PX)
         self._fresh = _Points.none()  # of the last image, their patches yet to be taken
 
     @property
@@ -122,7 +122,7 @@ class LandmarkCarrier:
         self._fresh = self._fresh.select(np.isin(self._fresh.ids, expected.ids))
         if last is None or not self._within_reach(expected):
             self._points = self._fresh = _Points.none()
-            self._patches = None
+            self._patches = ReferencePatches.none(PATCH_PX)
             return None
         patches = self._anchored(last)
         rows = np.searchsorted(expected.ids, self._points.ids)
@@ -153,9 +153,7 @@ class LandmarkCarrier:
         out: StateArrays = {f"fresh_{name}": getattr(fresh, name) for name in fresh.__slots__}
         out |= {name: getattr(points, name) for name in points.__slots__}
         out["last"] = np.empty((0, 0), np.uint8) if self._last is None else self._last
-        if self._patches is not None:
-            out |= {f"patch_{name}": getattr(self._patches, name) for name in _PATCH_ARRAYS}
-        return out
+        return out | {f"patch_{name}": getattr(self._patches, name) for name in _PATCH_ARRAYS}
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`, to the same bits."""
@@ -163,17 +161,14 @@ class LandmarkCarrier:
         self._points = _Points(**{name: state[name] for name in names})
         self._fresh = _Points(**{name: state[f"fresh_{name}"] for name in names})
         self._last = state["last"] if state["last"].size else None
-        self._patches = None
-        if "patch_first" in state:
-            patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
-            self._patches = ReferencePatches(PATCH_PX, **patches)
+        patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
+        self._patches = ReferencePatches(PATCH_PX, **patches)
 
     # ----------------------------------------------------------------------------------------
 
     def _keep(self, keep: BoolArray) -> None:
         self._points = self._points.select(keep)
-        if self._patches is not None:
-            self._patches = self._patches.select(keep)
+        self._patches = self._patches.select(keep)
 
     def _within_reach(self, expected: ExpectedLandmarks) -> bool:
         """False where there is nothing to look for, or the image has moved too far."""
@@ -187,10 +182,9 @@ class LandmarkCarrier:
     def _anchored(self, last: Image) -> ReferencePatches:
         """The patches of all points, those of the fresh ones taken now."""
         fresh, self._fresh = self._fresh, _Points.none()
-        if len(fresh) or self._patches is None:
+        if len(fresh):
             new = anchor(last, fresh.places, PATCH_PX, GREY_NOISE, DEFORMATION)
-            patches = new if self._patches is None else self._patches.join(new)
-            points = self._points.join(fresh)
+            patches, points = self._patches.join(new), self._points.join(fresh)
             order = np.argsort(points.ids)
             self._points, self._patches = points.select(order), patches.select(order)
         return self._patches

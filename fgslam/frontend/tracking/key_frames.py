@@ -110,7 +110,8 @@ class KeyFrameTracker:
         the image has not changed, and described by SIFT.
         """
         if frame is None or not frame.placed:
-            return self._tracker.track(prediction, landmarks, sift), sift
+            tracked = self._tracker.track(prediction, landmarks, sift)
+            return (tracked if len(landmarks) else _spread(tracked, sift)), sift
         pose = frame.tracked.ego_motion
         around = Prediction(pose.wTc, pose.covariance)
         expected, matches = self._tracker.matched_around(around, landmarks, sift)
