@@ -52,8 +52,15 @@ class ReferencePatches(Rows):
     @staticmethod
     def none(size: int) -> ReferencePatches:
         """Of no point."""
-        parts = [np.empty((0, *shape, size * size), np.float32) for shape in ((), (2,), (6,))]
-        return ReferencePatches(size, *parts, np.empty(0), np.empty((0, 2, 2)))
+        pixels = size * size
+        return ReferencePatches(
+            size,
+            np.empty((0, pixels), np.float32),
+            np.empty((0, 2, pixels), np.float32),
+            np.empty((0, 6, pixels), np.float32),
+            np.empty(0),
+            np.empty((0, 2, 2)),
+        )
 
     def select(self, keep: BoolArray | IntArray) -> ReferencePatches:
         """The chosen patches; none are copied where all are wanted."""
