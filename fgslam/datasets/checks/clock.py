@@ -286,10 +286,13 @@ def _turn_between(before: _Look, after: _Look, camera: FloatArray) -> FloatArray
     if len(rows) < _FEWEST_MATCHES:
         return None
     cv2.setRNGSeed(0)  # RANSAC draws the same samples each time
-    found, turn, _, inliers = cv2.solvePnPRansac(
-        before.points[rows], after.pixels[partners], camera, np.zeros(4),
-        reprojectionError=_INLIER_PX, iterationsCount=300, flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
+    try:
+        found, turn, _, inliers = cv2.solvePnPRansac(
+            before.points[rows], after.pixels[partners], camera, np.zeros(4),
+            reprojectionError=_INLIER_PX, iterationsCount=300, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # those that agree lie in one place
+        return None
     if not found or inliers is None or len(inliers) < _FEWEST_MATCHES:
         return None
     # It takes points from the first camera to the second: the inverse of the camera's own turn.

@@ -129,6 +129,11 @@ def test_images_far_off_against_each_other_are_taken_to_be_off_as_far() -> None:
     np.testing.assert_allclose(of(4.0), 4.0 * of(0.0), rtol=1e-6)
 
 
+def test_a_frame_without_observations_shares_nothing() -> None:
+    none = shared_displacements(RIG, np.empty((0, RIG.cameras, 2)))
+    assert none.shape == (0, 2 * RIG.cameras, len(SHARED))
+
+
 def test_what_is_shared_is_as_large_as_stated() -> None:
     information = shared_information(RIG, 0.2)
     rng = np.random.default_rng(4)

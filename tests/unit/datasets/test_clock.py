@@ -10,7 +10,14 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
 from fgslam.core.geometry import so3_exp, so3_log
-from fgslam.datasets.checks.clock import Judged, SeenTurns, judged, judged_turns
+from fgslam.datasets.checks.clock import (
+    Judged,
+    SeenTurns,
+    _Look,
+    _turn_between,
+    judged,
+    judged_turns,
+)
 from fgslam.datasets.gyroscope import GyroscopeLog, integrated
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry import recorded_motions
@@ -74,6 +81,16 @@ def test_a_gyroscope_in_other_axes_is_not_used() -> None:
     assert found.fault
     assert "does not turn as the images do" in found.note
     assert "T_cam_imu" in found.note
+
+
+def test_images_whose_matches_lie_in_one_place_say_no_turn() -> None:
+    """A sticker before an even wall: OpenCV's solver ends with an exception there."""
+    rng = np.random.default_rng(0)
+    codes = rng.integers(0, 256, (40, 32), np.uint8)
+    pixels = np.tile([16.0, 12.0], (40, 1))
+    look = _Look(pixels, codes, np.tile([0.0, 0.0, 2.0], (40, 1)))
+    camera = np.array([[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]])
+    assert _turn_between(look, look, camera) is None
 
 
 @pytest.mark.data
