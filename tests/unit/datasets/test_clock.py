@@ -87,9 +87,10 @@ def test_images_whose_matches_lie_in_one_place_say_no_turn() -> None:
     """A sticker before an even wall: OpenCV's solver ends with an exception there."""
     rng = np.random.default_rng(0)
     codes = rng.integers(0, 256, (40, 32), np.uint8)
-    pixels = np.tile([16.0, 12.0], (40, 1))
-    look = _Look(pixels, codes, np.tile([0.0, 0.0, 2.0], (40, 1)))
-    camera = np.array([[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]])
+    camera = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])
+    points = np.array([0.0, 0.0, 2.0]) + rng.normal(0.0, 1e-3, (40, 3))
+    pixels = points @ camera.T
+    look = _Look(pixels[:, :2] / pixels[:, 2:], codes, points)
     assert _turn_between(look, look, camera) is None
 
 
