@@ -17,7 +17,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse, se3_log
 from fgslam.core.quantiles import chi_square_quantile
 
@@ -26,6 +26,7 @@ ConsistencyVerdict: TypeAlias = Literal["consistent", "overconfident", "conserva
 # Directions whose variance is this much below the largest one (of radians and metres, which are
 # of like size here) are constraints, not knowledge: a ratio of 1e5 in standard deviation.
 _RELATIVE_RANK_TOLERANCE = 1e-10
+_LEAST_SHARE = 1e-3  # of an axis that lies in that subspace: two degrees out of what is excluded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,16 +93,25 @@ def within(errors: FloatArray, covariances: FloatArray, sigmas: float = 2.0) -> 
     """Shares (d,) of errors (n, d) within so many reported standard deviations, axis by axis.
 
     Of two, 95 % lie within where the errors are normal and the covariances right. Items with a
-    value that is not finite are left out; NaN along an axis that was never uncertain.
+    value that is not finite are left out; NaN along an axis that was never uncertain, or leans
+    towards an uncertain one by rounding alone, as on a floor that holds stiffly.
     """
     variances = np.diagonal(covariances, axis1=1, axis2=2)
     largest = variances.max(axis=1, initial=0.0, keepdims=True)
     known = np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     counted = np.asarray(known)[:, None] & (variances > _RELATIVE_RANK_TOLERANCE * largest)
+    counted &= _in_support(np.where(counted.any(axis=1)[:, None, None], covariances, 0.0))
     held = counted & (errors**2 <= sigmas**2 * np.where(counted, variances, 0.0))
     number = counted.sum(axis=0)
     shares = np.full(len(number), np.nan)
     return np.asarray(np.divide(held.sum(axis=0), number, out=shares, where=number > 0))
+
+
+def _in_support(covariances: FloatArray) -> BoolArray:
+    """(n, d) axes that lie in the subspace of covariances (n, d, d), and not just beside it."""
+    variances, directions = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, 1, 2)))
+    supported = variances > _RELATIVE_RANK_TOLERANCE * variances[:, -1:]
+    return np.asarray(np.einsum("nij,nj->ni", directions**2, supported) > _LEAST_SHARE)
 
 
 def pose_errors(estimate: FloatArray, truth: FloatArray) -> FloatArray:

@@ -59,8 +59,11 @@ class MeasurementNoise(Protocol):
         """Variance over the stated one by which a graph of independent measurements weighs them."""
         ...
 
-    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
-        """Takes in a frame's observations that fit, ``step`` (4, 4) on from the frame before."""
+    def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
+        """Takes in a frame's observations that fit.
+
+        ``step`` (4, 4) leads there from the frame before; None: no landmark has measured it.
+        """
         ...
 
 
@@ -80,7 +83,7 @@ class StatedNoise:
         """The factor squared."""
         return self.factor**2
 
-    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
+    def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
         """Nothing."""
 
 
@@ -106,11 +109,15 @@ class Persistence:
         """What independent measurements would need to lean those tracks as much as they do."""
         return _ratio(self._sums[1])
 
-    def learn(self, frame: int, step: FloatArray, accepted: Observations) -> None:
+    def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
         """Takes in a frame's observations that fit, and judges tracks that have ended.
 
-        Poses are chained by steps: a smoother's correction of the whole path leans no track.
+        Poses are chained by steps: a smoother's correction of the whole path leans no track. An
+        unmeasured step would: all tracks end before it.
         """
+        if step is None:
+            self._judge(frame, list(self._tracks))
+            step = np.eye(4)
         self._pose = reorthonormalise(self._pose @ step)
         self._poses[frame] = self._pose
         measured = zip(
@@ -122,10 +129,9 @@ class Persistence:
             track.measurement.append(measurement)
             track.covariance.append(covariance)
         if frame % _EVERY == 0:
-            self._judge(frame)
+            self._judge(frame, [i for i, track in self._tracks.items() if _over(track, frame)])
 
-    def _judge(self, frame: int) -> None:
-        ended = [i for i, track in self._tracks.items() if _over(track, frame)]
+    def _judge(self, frame: int, ended: list[int]) -> None:
         tracks = [self._tracks.pop(i) for i in ended]
         tracks = [track for track in tracks if len(track.frames) >= _LEAST_SIGHTINGS]
         if tracks:

@@ -35,7 +35,7 @@ from fgslam.backend.smoothers.loop_closing import carried_to
 from fgslam.backend.smoothers.recorded_inputs import RecordedInputs
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import (
     EgoMotion,
@@ -54,6 +54,9 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
+
+_FITS = 3.2
+"""Medians of an image residual within which 99.9 % lie that are normal in column and row."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -248,10 +251,11 @@ class Smoother:
     def _learn_noise(self, increment: Increment, tracking: EgoMotion, before: FloatArray) -> None:
         """What fits of a frame teaches how large errors are, and how long they persist."""
         observed = increment.observations
-        matched = observed.select(~observed.is_new).select(tracking.inliers)
+        matched = observed.select(~observed.is_new).select(_fits(tracking))
         fitting = matched.join(observed.select(observed.is_new))
         frame = len(self._inputs.increments) - 1
-        self._builder.noise.learn(frame, inverse(before) @ tracking.wTc, fitting)
+        step = inverse(before) @ tracking.wTc if tracking.status.measured else None
+        self._builder.noise.learn(frame, step, fitting)
 
     def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
         """The frame with those observations that fit; landmarks that moved have started anew."""
@@ -341,7 +345,8 @@ class Smoother:
             return self._smoothed
         moved = adjoint(inverse(now.wTc) @ self._smoothed.wTc)
         drift = congruence(moved, self._smoothed.covariance)
-        return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + tracking.covariance))
+        since = self._builder.noise.power * tracking.covariance  # as the graph weighs it
+        return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + since))
 
     def _solved(self) -> Solution:
         """The graph's answer, with the poses of frames between keyframes."""
@@ -415,6 +420,18 @@ class MapSmoother(Smoother):
         self._prior = self._smoothed = prior
         self._builder.start_at(prior)
         self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
+
+
+def _fits(tracking: EgoMotion) -> BoolArray:
+    """(k,) matches that teach the noise: those that the pose was found by.
+
+    Where these are the fewer, the noise is not what they were judged by: then what is not far off
+    beside the others.
+    """
+    if tracking.coherent:
+        return tracking.inliers
+    off_px = tracking.residuals
+    return np.asarray(off_px <= _FITS * np.median(off_px))
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 from simulated import RIG
+from smoothing import answer, drawn
 
-from fgslam.backend.settings import GraphSettings
+from fgslam.backend.settings import FixedLagSettings, GraphSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.persistence import Persistence, StatedNoise
 from fgslam.core import geometry as g
@@ -31,11 +32,16 @@ def observed(ids: FloatArray, measurement: FloatArray) -> Observations:
 
 
 def driven(
-    scale: float, kept: float = 0.0, wrong: float = 0.0, frames: int = FRAMES
+    scale: float,
+    kept: float = 0.0,
+    wrong: float = 0.0,
+    frames: int = FRAMES,
+    lost: FloatArray | None = STEP,
 ) -> Persistence:
     """Learned on a drive whose errors are ``scale`` of those stated, ``kept`` from frame to frame.
 
-    Each landmark is seen for 12 frames; ``wrong`` of the sightings are of something else.
+    Each landmark is seen for 12 frames; ``wrong`` of the sightings are of something else. Every
+    tenth step is said to be ``lost``.
     """
     rng = np.random.default_rng(5)
     noise, wTc = Persistence(RIG), np.eye(4)
@@ -55,7 +61,7 @@ def driven(
         measurement = g.project(RIG, local) + scale * SIGMA * drawn
         elsewhere = rng.uniform(size=len(ids)) < wrong
         measurement[elsewhere, 0] += 15.0
-        noise.learn(k, STEP, observed(ids, measurement))
+        noise.learn(k, STEP if k % 10 else lost, observed(ids, measurement))
     return noise
 
 
@@ -81,6 +87,25 @@ def test_few_wrong_matches_do_not_carry_it_away() -> None:
     noise = driven(1.0, wrong=0.01)
     assert noise.spread == pytest.approx(1.0, rel=0.15)
     assert noise.power == pytest.approx(1.0, rel=0.4)
+
+
+def test_tracks_end_where_no_landmark_has_measured_the_step() -> None:
+    aside = STEP @ g.se3_exp(np.array([0.0, 0.02, 0.0, 0.02, 0.0, 0.0]))
+    assert driven(1.0, frames=60, lost=aside).spread > 2.0
+    ended = driven(1.0, frames=60, lost=None)
+    assert ended.spread == pytest.approx(1.0, rel=0.1)
+    assert ended.power == pytest.approx(1.0, rel=0.3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_a_smoother_finds_the_noise_though_most_matches_lie_beyond_the_stated(scale: float) -> None:
+    increments = []
+    for each in drawn(3, frames=24, points=90).increments:
+        seen = each.observations
+        stated = dataclasses.replace(seen, covariance=seen.covariance / scale**2)
+        increments.append(dataclasses.replace(each, observations=stated))
+    found = answer(FixedLagSettings(lag_frames=4), increments).noise_factor
+    assert found == pytest.approx(scale, rel=0.25)
 
 
 def test_until_tracks_have_ended_noise_is_as_stated() -> None:

@@ -40,7 +40,7 @@ from fgslam.core.rig_correction import (
     term_names,
 )
 from fgslam.core.sensors import CameraRig
-from fgslam.evaluation.consistency import pose_nees
+from fgslam.evaluation.consistency import pose_errors, pose_nees, within
 from fgslam.slam.factory import make_estimator
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
@@ -289,3 +289,31 @@ def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: st
     second.restore(first.state())
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), through.estimate())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf", "fixed_lag", "isam2"])
+def test_reported_sigmas_of_rigs_a_pixel_off_hold_errors_of_poses_and_landmarks(kind: str) -> None:
+    """Shares within two sigmas over 50 drives, each with a calibration of its own."""
+    covariance, rng = shared_covariance(CALIBRATED), np.random.default_rng(6)
+    online, final, landmarks = [], [], []
+    for seed in range(50):
+        terms = np.zeros(len(ALL))
+        terms[-len(SHARED) :] = rng.multivariate_normal(np.zeros(len(SHARED)), covariance)
+        drive = drawn(seed)
+        increments = [
+            dataclasses.replace(displaced(each, terms), rig_correction=UNCORRECTED)
+            for each in drive.increments
+        ]
+        estimator = make_estimator(CALIBRATED.rig, ONLINE[kind], FREE)
+        said = play(estimator, increments, FREE, CALIBRATED.rig)[1:]
+        found = estimator.estimate()
+        truth, places = drive.poses[1:], drive.points_by_id[found.landmarks.ids]
+        poses = np.array([each.wTc for each in said]), np.array([each.covariance for each in said])
+        online.append(within(pose_errors(poses[0], truth), poses[1]))
+        last = found.trajectory.poses[1:], found.covariances[1:]
+        final.append(within(pose_errors(last[0], truth), last[1]))
+        landmarks.append(within(places - found.landmarks.positions, found.landmarks.covariances))
+    shares = [float(np.mean(each)) for each in (online, final, landmarks)]
+    assert min(shares) > 0.88, shares
+    assert max(shares) < 0.99, shares

@@ -127,3 +127,11 @@ def test_an_axis_that_is_held_has_no_share() -> None:
     covariances = np.tile(np.diag([1e-4, 0.0, 1e-4]), (3, 1, 1))
     errors = np.array([[0.0, 0.0, 0.03], [0.01, 0.0, 0.0], [np.nan, 0.0, 0.0]])
     np.testing.assert_equal(within(errors, covariances), [1.0, np.nan, 0.5])
+
+
+def test_an_axis_that_leans_out_of_a_constraint_by_rounding_is_not_judged() -> None:
+    """A floor held stiffly: what it excludes is tilted by a ten-thousandth."""
+    basis = np.array([[1.0, 0.0], [0.0, 1.0], [1e-4, 0.0]])
+    covariances = np.tile(basis @ np.diag([1.0, 0.25]) @ basis.T, (4, 1, 1))
+    errors = np.tile([0.5, 0.5, 1e-3], (4, 1))
+    np.testing.assert_equal(within(errors, covariances), [1.0, 1.0, np.nan])
