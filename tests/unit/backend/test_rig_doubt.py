@@ -292,7 +292,7 @@ def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: st
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf", "fixed_lag", "isam2"])
+@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf"])
 def test_reported_sigmas_of_rigs_a_pixel_off_hold_errors_of_poses_and_landmarks(kind: str) -> None:
     """Shares within two sigmas over 50 drives, each with a calibration of its own."""
     covariance, rng = shared_covariance(CALIBRATED), np.random.default_rng(6)
