@@ -16,6 +16,7 @@ from fgslam.backend.settings import (
     Isam2Settings,
     KernelSettings,
     LandmarkKalmanSettings,
+    SlidingWindowSettings,
 )
 from fgslam.core.estimates import Estimate
 from fgslam.core.threads import one_blas_thread
@@ -70,6 +71,18 @@ def keyframes(drive: MeasuredDrive) -> tuple[dict[str, float], Estimate]:
     return ratios, answers[0]
 
 
+def sliding_window(drive: MeasuredDrive) -> tuple[dict[str, float], Estimate]:
+    """The sliding window: milliseconds of the processor a frame, and the answer."""
+    played = play(drive, SlidingWindowSettings())
+    cpu = 1e3 * played.cpu_s
+    ratios = {
+        "sliding_window_ms_median": float(np.median(cpu)),
+        "sliding_window_99_over_median": float(np.percentile(cpu, 99) / np.median(cpu)),
+        "sliding_window_ms_worst": float(cpu.max()),
+    }
+    return ratios, played.estimator.estimate()
+
+
 def without_batch(drive: MeasuredDrive) -> dict[str, float]:
     """What `make bench` takes over."""
     return fixed_lag_flat(drive) | keyframes(drive)[0]
@@ -101,4 +114,6 @@ def with_batch(drive: MeasuredDrive) -> dict[str, float]:
 def ratios_beside_batch() -> dict[str, float]:
     """Everything measured on the 2,500 frames, batch included (some ten minutes, 2 GB)."""
     drive = open_drive("long_drive")
-    return fixed_lag_flat(drive) | with_batch(drive)
+    window, estimate = sliding_window(drive)
+    window["sliding_window_ate_cm"] = ate_cm(estimate, drive)
+    return fixed_lag_flat(drive) | window | with_batch(drive)

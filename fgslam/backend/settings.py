@@ -212,7 +212,7 @@ class SlidingWindowSettings(GraphSettings):
     update_every: Annotated[
         int,
         Field(ge=1, description="frames between solutions; a tracker answers in between"),
-    ] = 4
+    ] = 5
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -74,6 +74,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         self._held = HeldLandmarks()
         self._new: list[NewFactors] = []
         self._solved_at = 0
+        self._leaving: Solved | None = None  # the solution, until what is too old has left
         self._taken = 0  # observations of the builder's that the window has had
         self._poses: list[FloatArray] = []
         self._drift: list[FloatArray] = []  # (6, 6) covariances, as motions of the world
@@ -93,17 +94,19 @@ class SlidingWindowSolver(WholeGraphSolver):
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Solves the window where the last solution lies `update_every` frames back."""
-        if closes_loop or (frame and frame - self._solved_at < self._settings.update_every):
+        if closes_loop:
             return None
-        solved = self._solve()
-        since, values = self._window.frames[0], self._window.values()
+        if frame and frame - self._solved_at < self._settings.update_every:
+            self._let_go()
+            return None
+        self._leaving = solved = self._solve()
         last = self._measured(solved, len(solved.frames) - 1)
-        self._let_go(solved)
-        return Smoothed(values, last, since)
+        return Smoothed(self._window.values(), last, self._window.frames[0])
 
     def recalibrate(self, change: RigChange) -> None:
         """Looks again at the window; what has left it moves with where it was seen last."""
         super().recalibrate(change)
+        self._let_go()
         self._take_in()
         self._window.remeasure(change.measured)
         frames, variables, *_ = self._builder.kept_observed()
@@ -176,6 +179,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         return min(place * _PLACE + _PLACE // 2, self._window.frames[0])
 
     def _solve(self) -> Solved:
+        self._let_go()
         self._take_in()
         self._solved_at = self._window.frames[-1]
         try:
@@ -188,10 +192,11 @@ class SlidingWindowSolver(WholeGraphSolver):
         self._held.points[self._window.landmarks.variables] = self._window.landmarks.points
         return solved
 
-    def _let_go(self, solved: Solved) -> None:
-        """Lets the window begin so many frames back."""
+    def _let_go(self) -> None:
+        """Lets the window begin so many frames back, in the frame after its solution."""
+        solved, self._leaving = self._leaving, None
         leaving = len(self._window.frames) - self._settings.window
-        if leaving > 0:
+        if solved is not None and leaving > 0:
             first, home = self._window.frames[leaving], self._window.frames[leaving - 1]
             for row in (leaving - 1, leaving):
                 self._measured(solved, row)
