@@ -73,7 +73,7 @@ class _Aim:
         widest: largest parallax so far, radians.
         after: as ``across``, of the path image after the target, in the last image.
         fresh: it was not looked at yet.
-        elsewhere: the last image was taken where the robot would not come by on its way.
+        elsewhere: images in a row from where the robot would not come by on its way.
         left: of the last leg, along it, in the last image; NaN where it was not seen.
     """
 
@@ -84,7 +84,7 @@ class _Aim:
     widest: float = 0.0
     after: float = float("nan")
     fresh: bool = True
-    elsewhere: bool = False
+    elsewhere: int = 0
     left: float = float("nan")
 
 
@@ -233,9 +233,9 @@ class PathPlaces:
         return self._aim
 
     def _elsewhere(self, aim: _Aim, nearest: int) -> bool:
-        """Whether the target lies behind, or two images in a row say that it is not near."""
-        before, aim.elsewhere = aim.elsewhere, aim.target > nearest + 1
-        return aim.target < nearest or (before and aim.elsewhere)
+        """Whether the target lies behind, or images in a row agree that it is not near."""
+        aim.elsewhere = aim.elsewhere + 1 if aim.target > nearest + 1 else 0
+        return aim.target < nearest or aim.elsewhere >= _AGREEING
 
     def _passed(self, aim: _Aim) -> bool:
         """Whether the path image lies behind, as seen from the robot's way to the one after it.
