@@ -69,7 +69,9 @@ def _corrections(path: Path, values: Mapping[str, Any], rig: CameraRig) -> Float
         raise CalibrationError(
             f"{path}: {_KEY} has {unknown[0]!r}, which is no term; known: {', '.join(names)}"
         )
-    return np.array([number(path, values, name) for name in names])
+    later = [name for name in names if name.startswith("all.") or name.endswith("_outer")]
+    every = {**dict.fromkeys(later, 0.0), **values}  # older files have none of these
+    return np.array([number(path, every, name) for name in names])
 
 
 def rectifier_of(rig: CameraRig, correction: FloatArray) -> Rectifier:

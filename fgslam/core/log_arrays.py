@@ -1,8 +1,8 @@
 """Frames of a measurement log as plain arrays, and back: the layout of its file.
 
 A log without loop closures and relocalised frames is written as version 2, to the same bytes as
-before there were any; one that has them is version 3, one of a rig that calibrated itself version
-4, one with turns of a gyroscope version 5. All are read.
+before there were any; one that has them is version 3, one with turns of a gyroscope or of a rig
+that calibrated itself version 6. All are read.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from fgslam.core.array_files import (
 from fgslam.core.array_values import require_covariances, require_finite, require_single
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry, SettledRig
 from fgslam.core.rig_checks import rig_fault
-from fgslam.core.rig_correction import term_names
+from fgslam.core.rig_correction import FIRST_TERMS, term_names, with_all_terms
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
 LOG = ArrayFile(
     name="fgslam measurement log",
-    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope.
-    versions=(1, 2, 3, 4, 5),
+    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope, 5 no
+    # correction for all frames alike, and fewer terms.
+    versions=(1, 2, 3, 4, 5, 6),
     error=MeasurementLogError,
     give="give a run folder's measurements.npz",
     again="run again",
 )
-_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, WITH_EVERYTHING = 2, 3, 4, 5
+_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, WITH_EVERYTHING = 2, 3, 4, 6
 CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
 _UPPER = np.triu_indices(3)
 
@@ -91,12 +92,7 @@ def arrays_of(
     if version >= _WITH_LOOPS:
         out |= _loop_arrays(frames)
     if version >= _WITH_CORRECTIONS and isinstance(sensor, CameraRig):
-        terms = len(term_names(sensor))
-        known = any(s.rig_correction is not None for s in frames)
-        none = np.full(terms, 0.0 if known else np.nan)
-        corrections = [s.rig_correction for s in frames]
-        rows = [none if c is None else c for c in corrections]
-        out[CORRECTIONS] = _stack(rows, (terms,))
+        out |= _correction_arrays(frames, len(term_names(sensor)))
     return out
 
 
@@ -105,7 +101,7 @@ def version_of(frames: Sequence[Increment]) -> int:
     if any(s.odometry is not None and s.odometry.turned for s in frames):
         return WITH_EVERYTHING
     if any(s.rig_correction is not None for s in frames):
-        return _WITH_CORRECTIONS
+        return WITH_EVERYTHING
     return _WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else _BEFORE_LOOPS
 
 
@@ -128,6 +124,7 @@ def frames_of(
     loops, relocalised = _loops(arrays, header["version"], where, first)
     sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
     corrections = _corrections(arrays, header["version"], sensor, where)
+    settled = _settled(arrays, header["version"], sensor, where)
     observed = _split_observations(arrays, "")
     missed, pruned = _split(arrays, "missed"), _split(arrays, "pruned")
     start = arrays["observation_start"]
@@ -143,6 +140,7 @@ def frames_of(
             loops=loops[k],
             relocalised=bool(relocalised[k]),
             rig_correction=corrections[k],
+            settled_rig=settled[k],
         )
         for k, index in enumerate(arrays["frame_index"])
     ]
@@ -160,6 +158,18 @@ def _loop_arrays(frames: Sequence[Increment]) -> StateArrays:
         "loop_merged_start": offsets([len(loop.merged) for loop in loops]),
         "loop_merged": joined([loop.merged for loop in loops], (2,), np.int64),
     } | _observation_arrays([loop.observations for loop in loops], _LOOPS)
+
+
+def _correction_arrays(frames: Sequence[Increment], terms: int) -> StateArrays:
+    known = any(s.rig_correction is not None for s in frames)
+    none, unknown = np.full(terms, 0.0 if known else np.nan), np.full(terms, np.nan)
+    corrections = [s.rig_correction for s in frames]
+    settled = [s.settled_rig for s in frames]
+    return {
+        CORRECTIONS: _stack([none if c is None else c for c in corrections], (terms,)),
+        "rig_settled": _stack([unknown if s is None else s.values for s in settled], (terms,)),
+        "rig_knocks": np.array([0 if s is None else s.knocks for s in settled], np.int64),
+    }
 
 
 def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
@@ -277,10 +287,28 @@ def _corrections(
     frames = len(arrays["frame_index"])
     if version < _WITH_CORRECTIONS or not isinstance(rig, CameraRig):
         return [None] * frames
-    terms = len(term_names(rig))
+    older = version < WITH_EVERYTHING
+    terms = FIRST_TERMS * (rig.cameras - 1) if older else len(term_names(rig))
     LOG.require(arrays, {CORRECTIONS: ("f", (frames, terms))}, where)
-    rows = arrays[CORRECTIONS]
-    return [None] * frames if np.isnan(rows).all() else list(rows)
+    rows = with_all_terms(rig, arrays[CORRECTIONS]) if older else arrays[CORRECTIONS]
+    return [None] * frames if np.isnan(rows[:, :1]).all() else list(rows)
+
+
+def _settled(
+    arrays: StateArrays, version: int, rig: Sensor, where: str
+) -> list[SettledRig | None]:
+    """What each frame knew of the rig for all frames alike; None before version 6.
+
+    Raises MeasurementLogError where it is not there, or of another rig.
+    """
+    frames = len(arrays["frame_index"])
+    if version < WITH_EVERYTHING or not isinstance(rig, CameraRig):
+        return [None] * frames
+    terms = len(term_names(rig))
+    expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
+    LOG.require(arrays, expected, where)
+    rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), strict=True)
+    return [SettledRig(row, n) if np.isfinite(row).all() else None for row, n in rows]
 
 
 def _motion(increment: Increment) -> FloatArray:

@@ -112,6 +112,19 @@ class LoopClosure(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SettledRig(Brief):
+    """What a rig that calibrates itself is known to be off by, for all frames alike.
+
+    Attributes:
+        values: (p,) of the correction (:func:`fgslam.core.rig_correction.term_names`).
+        knocks: how often the rig was found to have moved before.
+    """
+
+    values: FloatArray
+    knocks: int
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Increment(Brief):
     """Everything that one frame adds to the problem: what the log stores, what estimators consume.
 
@@ -130,6 +143,8 @@ class Increment(Brief):
         rig_correction: (p,) of the rig against its calibration
             (:func:`fgslam.core.rig_correction.term_names`), taken off the measurements already, not
             off the raw pixels; None where the calibration was taken as it is.
+        settled_rig: what was known then of the rig for all frames alike, taken off nothing; None
+            where the calibration was taken as it is, and in older logs.
     """
 
     index: int
@@ -142,6 +157,7 @@ class Increment(Brief):
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
     rig_correction: FloatArray | None = None
+    settled_rig: SettledRig | None = None
 
     @property
     def kept(self) -> Observations:

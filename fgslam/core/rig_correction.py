@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import Brief, FloatArray
+from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.features import Features
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, partial_map, vertical_to_horizontal
@@ -28,14 +28,22 @@ TERMS = (
     "decentring_x",  # of the lens
     "decentring_y",
     "radial",
+    "decentring_x_outer",  # the same times r^2: Brown's third decentring value, along each axis
+    "decentring_y_outer",
 )
-"""Of each camera beside the reference, in units of the focal length.
+"""Of each camera beside the reference, in units of the focal length."""
 
-What all cameras share is taken as calibrated, as a straight drive hides it; see SHARED."""
+FIRST_TERMS = 9
+"""How many of TERMS are taken off a frame before it is matched, and logs knew before version 6. The
+others, and COMMON, take a drive to be told apart from its motion: whole graphs have them."""
+
+COMMON = ("radial",)
+"""What is estimated of all cameras alike, the reference among them."""
 
 SHARED = ("column", "row", "focal", "decentring_x", "decentring_y", "radial", "baseline")
-"""What all cameras may share: the same terms, in all images alike, and the baseline's length,
-relative. A turn that they share is one of the robot."""
+"""What all cameras may share, and covariances take as unknown: the same terms, in all images alike,
+and the baseline's length, relative. A turn that they share is one of the robot. COMMON is among
+them, as many drives show it less well than they seem to."""
 
 EXPECTED_PX = 1.0
 """Displacement that a calibration is taken to leave, root mean square over the image: what the
@@ -44,13 +52,28 @@ matcher's epipolar gate (``StereoSettings.epipolar_px``) admits; a worse rig mat
 _CAMERAS = ("left", "top")
 _CHANGES = ("yaw_deg", "pitch_deg", "roll_deg", "focal_percent")
 _CHANGE_UNITS = np.array([180.0 / np.pi] * 3 + [100.0])
+_COMMON = [TERMS.index(name) for name in COMMON]
 _GRID = 7  # points along each axis of the image at which the prior is stated
 
 
 def term_names(rig: CameraRig) -> tuple[str, ...]:
-    """Names of a correction's values, as ``left.yaw``: those of each camera in turn."""
-    cameras = _CAMERAS[: rig.cameras - 1]
-    return tuple(f"{camera}.{term}" for camera in cameras for term in TERMS)
+    """Names of the values: ``left.yaw`` and so on of each camera in turn, then ``all.radial``."""
+    of_each = [f"{camera}.{term}" for camera in _CAMERAS[: rig.cameras - 1] for term in TERMS]
+    return (*of_each, *(f"all.{term}" for term in COMMON))
+
+
+def early_terms(rig: CameraRig) -> BoolArray:
+    """Which values (p,) are taken off a frame before it is matched."""
+    own = np.tile(np.arange(len(TERMS)) < FIRST_TERMS, rig.cameras - 1)
+    return np.concatenate([own, np.zeros(len(COMMON), np.bool_)])
+
+
+def with_all_terms(rig: CameraRig, rows: FloatArray) -> FloatArray:
+    """Values (n, p) of corrections (n, q) with the first of each camera's terms; the others 0."""
+    known = rows.reshape(len(rows), rig.cameras - 1, -1)
+    out = np.zeros((*known.shape[:2], len(TERMS)))
+    out[..., : known.shape[2]] = known
+    return np.column_stack([out.reshape(len(rows), -1), np.zeros((len(rows), len(COMMON)))])
 
 
 def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
@@ -67,22 +90,25 @@ def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
 def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> FloatArray:
     """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term."""
     focal = np.array([rig.fx, rig.fy])
+    own = focal[:, None] * _terms((pixels - [rig.cx, rig.cy]) / focal)
     count = len(TERMS)
-    out = np.zeros((len(pixels), 2, count * (rig.cameras - 1)))
+    out = np.zeros((len(pixels), 2, count * (rig.cameras - 1) + len(COMMON)))
     if camera:
-        at = slice(count * (camera - 1), count * camera)
-        out[..., at] = focal[:, None] * _terms((pixels - [rig.cx, rig.cy]) / focal)
+        out[..., count * (camera - 1) : count * camera] = own
+    out[..., -len(COMMON) :] = own[..., _COMMON]
     return out
 
 
 def _terms(rays: FloatArray) -> FloatArray:
-    """Displacements (k, 2, 9) of normalised image points (k, 2) in the order of TERMS."""
+    """Displacements (k, 2, 11) of normalised image points (k, 2) in the order of TERMS."""
     x, y = rays.T
     r2 = x * x + y * y
     zero, one = np.zeros_like(x), np.ones_like(x)
-    columns = (one, zero, 1.0 + x * x, x * y, -y, x, r2 + 2.0 * x * x, 2.0 * x * y, x * r2)
-    rows = (zero, one, x * y, 1.0 + y * y, x, y, 2.0 * x * y, r2 + 2.0 * y * y, y * r2)
-    return np.stack([np.stack(columns, axis=1), np.stack(rows, axis=1)], axis=1)
+    along_x, across, along_y = r2 + 2.0 * x * x, 2.0 * x * y, r2 + 2.0 * y * y
+    columns = (one, zero, 1.0 + x * x, x * y, -y, x, along_x, across, x * r2)
+    rows = (zero, one, x * y, 1.0 + y * y, x, y, across, along_y, y * r2)
+    out = np.stack([np.stack(columns, axis=1), np.stack(rows, axis=1)], axis=1)
+    return np.concatenate([out, out[..., 6:8] * r2[:, None, None]], axis=2)
 
 
 def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> FloatArray:
@@ -93,9 +119,10 @@ def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> Float
     """
     unit = _grid_displacements(rig)
     out = np.zeros((unit.shape[2], unit.shape[2]))
-    for k in range(rig.cameras - 1):
-        group = slice(len(TERMS) * k, len(TERMS) * (k + 1))
-        jacobian = unit[:, 2 * k + 2 : 2 * k + 4, group].reshape(-1, len(TERMS))
+    for k in range(rig.cameras):  # the reference camera's own are those of all
+        first = len(TERMS) * (k - 1)
+        group = slice(first, first + len(TERMS)) if k else slice(-len(COMMON), None)
+        jacobian = unit[:, 2 * k : 2 * k + 2, group].reshape(2 * len(unit), -1)
         scale = jacobian.shape[1] / (len(jacobian) * expected_px**2)
         out[group, group] = scale * (jacobian.T @ jacobian)
     return out
@@ -185,8 +212,10 @@ class RigCorrection(Brief):
 
     def rms_px(self) -> float:
         """Displacement of the other cameras against the right one, rms over the image, pixels."""
-        moved = (_grid_displacements(self.rig) @ self.values).reshape(-1, self.rig.cameras, 2)
-        return float(np.sqrt((moved[:, 1:] ** 2).sum(axis=2).mean()))
+        own = slice(-len(COMMON))
+        moved = _grid_displacements(self.rig)[..., own] @ self.values[own]
+        pixels = moved.reshape(-1, self.rig.cameras, 2)[:, 1:]
+        return float(np.sqrt((pixels**2).sum(axis=2).mean()))
 
     def changes(self) -> dict[str, tuple[float, float]]:
         """The turn and zoom of each other camera that fits its displacements best, with sigmas.

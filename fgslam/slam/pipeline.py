@@ -219,6 +219,7 @@ class SlamPipeline:
             loops=seen.loops,
             relocalised=seen.relocalised,
             rig_correction=None if calibration is None else calibration.found.applied.values,
+            settled_rig=None if calibration is None else calibration.settled,
         )
 
     def _fused(self) -> tuple[LandmarkMap, IntArray]:

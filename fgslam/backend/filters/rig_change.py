@@ -8,12 +8,13 @@ docs/derivations/self_calibration.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import in_front, project, triangulate
+from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import displacements
 from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
 
@@ -60,3 +61,47 @@ class RigChange:
         off = (after - before)[seen, 2]
         rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
         return np.where(seen[:, None], anew, positions), rms
+
+
+@dataclass(slots=True, eq=False)
+class KnownCorrections:
+    """Which correction the measurements of which frames contain, and what became known later.
+
+    Attributes:
+        begins: first frame of each stretch with one correction and one rig, ascending.
+        applied: (p,) of each, the correction that its measurements contain.
+        knocks: of each, how often the rig was found to have moved before.
+        settled: after so many knocks, what was known last for all frames alike.
+    """
+
+    begins: list[int] = field(default_factory=list)
+    applied: list[FloatArray] = field(default_factory=list)
+    knocks: list[int] = field(default_factory=list)
+    settled: dict[int, FloatArray] = field(default_factory=dict)
+
+    def note(self, frame: int, increment: Increment) -> None:
+        """Takes in one more frame; one without a correction says nothing."""
+        applied, known = increment.rig_correction, increment.settled_rig
+        if applied is None:
+            return
+        knocks = 0 if known is None else known.knocks
+        if known is not None:
+            self.settled[knocks] = known.values
+        if not (self.begins and knocks == self.knocks[-1] and (applied == self.applied[-1]).all()):
+            self.begins.append(frame)
+            self.applied.append(applied)
+            self.knocks.append(knocks)
+
+    def recalibrate(self, change: RigChange) -> None:
+        """All measurements so far were corrected anew by a change."""
+        self.applied = [then + change.values for then in self.applied]
+
+    def settle(self, rig: CameraRig, frames: IntArray, measurement: FloatArray) -> FloatArray:
+        """Measurements (k, 3) of frames (k,) by what was known last of the rig as it was then."""
+        out = measurement.copy()
+        stretch = np.searchsorted(self.begins, frames, side="right") - 1
+        for k, (applied, knocks) in enumerate(zip(self.applied, self.knocks, strict=True)):
+            change, rows = self.settled.get(knocks, applied) - applied, stretch == k
+            if change.any() and rows.any():
+                out[rows] = RigChange(rig, change).measured(measurement[rows])
+        return out

@@ -12,14 +12,15 @@ import dataclasses
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.core.rig_correction import RigCorrection, early_terms, term_names
 
 MODELS: dict[str, frozenset[str]] = {
     "exact": frozenset(),
     "bent": frozenset({"yaw", "pitch"}),
     "turned": frozenset({"yaw", "pitch", "roll", "focal"}),
 }
-"""Terms of the other cameras that are free, by name of the model; in `lens` all of them are."""
+"""Terms of the other cameras that are free, by name of the model; in `lens` all early ones are
+(:func:`fgslam.core.rig_correction.early_terms`), in `whole` every term is."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -28,28 +29,43 @@ class WeighedCorrection:
 
     Attributes:
         estimated: with all terms free; its sigmas are the honest ones.
-        applied: the mean over the models, or an older one that lies within the noise of it; with
-            the covariance of the above.
+        applied: what is taken off the next frames: the mean over models of the early terms, or an
+            older one that lies within the noise of it.
+        settled: what the frames so far are best corrected by, all alike: the mean over all models.
         probabilities: of each model.
     """
 
     estimated: RigCorrection
     applied: RigCorrection
+    settled: RigCorrection
     probabilities: dict[str, float]
 
 
-def weighed(estimated: RigCorrection, prior: FloatArray) -> WeighedCorrection:
-    """The estimate averaged over MODELS.
+def weighed(estimated: RigCorrection, early: RigCorrection, prior: FloatArray) -> WeighedCorrection:
+    """Both estimates averaged over models.
 
     Args:
         estimated: with all terms free.
+        early: with the early ones free, the others held at zero.
         prior: (p, p) information before the drive, about zero.
     """
-    information = np.linalg.inv(estimated.covariance)
-    pull = information @ estimated.values
     models = _free_terms(estimated)
+    names = list(models)
+    applied, _ = _mean(early, [models[name] for name in names[:-1]], prior)
+    settled, shares = _mean(estimated, list(models.values()), prior)
+    return WeighedCorrection(
+        estimated, applied, settled, dict(zip(names, shares.tolist(), strict=True))
+    )
+
+
+def _mean(
+    known: RigCorrection, models: list[BoolArray], prior: FloatArray
+) -> tuple[RigCorrection, FloatArray]:
+    """The mean over models, by which terms (p,) each frees, and their probabilities (n,)."""
+    information = np.linalg.inv(known.covariance)
+    pull = information @ known.values
     means, evidence = [], []
-    for free in models.values():
+    for free in models:
         inner = np.ix_(free, free)
         mean = np.zeros(len(pull))
         mean[free] = np.linalg.solve(information[inner], pull[free])
@@ -58,16 +74,14 @@ def weighed(estimated: RigCorrection, prior: FloatArray) -> WeighedCorrection:
         evidence.append(0.5 * (pull @ mean - gain))
     weight = np.exp(np.array(evidence) - max(evidence))
     weight /= weight.sum()
-    applied = dataclasses.replace(estimated, values=weight @ np.array(means))
-    shares = dict(zip(models, weight.tolist(), strict=True))
-    return WeighedCorrection(estimated, applied, shares)
+    return dataclasses.replace(known, values=weight @ np.array(means)), weight
 
 
 def _free_terms(correction: RigCorrection) -> dict[str, BoolArray]:
     """Which values (p,) are free, by name of the model."""
-    names = [name.split(".")[-1] for name in term_names(correction.rig)]
+    names, early = term_names(correction.rig), early_terms(correction.rig)
     out = {
-        model: np.array([name in terms for name in names], np.bool_)
+        model: early & np.array([name.split(".")[-1] in terms for name in names], np.bool_)
         for model, terms in MODELS.items()
     }
-    return out | {"lens": np.ones(len(names), np.bool_)}
+    return out | {"lens": early, "whole": np.ones(len(names), np.bool_)}

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.persistence import MeasurementNoise, Persistence, StatedNoise
@@ -122,7 +122,7 @@ class GraphBuilder:
         self._prior = prior
         given = settings.noise_factor
         self.noise: MeasurementNoise = Persistence(sensor) if given is None else StatedNoise(given)
-        self._applied: FloatArray | None = None
+        self.corrections = KnownCorrections()
         self._variance_of: dict[int, float] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
@@ -149,22 +149,19 @@ class GraphBuilder:
         """By which the factors' deviations exceed those by which wrong matches are judged."""
         return float(np.sqrt(self.noise.power / self.noise.spread))
 
-    def corrects(self, correction: FloatArray | None) -> None:
-        """Takes note of what a frame's measurements were corrected by; None: they were not."""
-        if correction is not None:
-            self._applied = correction
-
     def recalibrate(self, change: RigChange) -> None:
         """Corrects all observations so far anew."""
         self.observed["measurement"][:] = change.measured(self.observed["measurement"])
+        self.corrections.recalibrate(change)
         self.admission.recalibrate(change)
 
     @property
     def doubted(self) -> RigCorrection | None:
         """A rig that calibrates itself, with the correction applied last; None for a known one."""
-        if self._applied is None or not isinstance(self._sensor, CameraRig):
+        applied = self.corrections.applied
+        if not applied or not isinstance(self._sensor, CameraRig):
             return None
-        return dataclasses.replace(RigCorrection.none(self._sensor), values=self._applied)
+        return dataclasses.replace(RigCorrection.none(self._sensor), values=applied[-1])
 
     @property
     def variables(self) -> int:
@@ -285,16 +282,20 @@ class GraphBuilder:
         return out
 
     def whole_graph(
-        self, values: Any, kernel: KernelSettings | None = None
+        self, values: Any, kernel: KernelSettings | None = None, settled: bool = False
     ) -> tuple[WholeGraph, State]:
-        """The same in arrays, at values of all variables; with another kernel where given."""
+        """The same in arrays, at values of all variables; with another kernel where given.
+
+        With ``settled`` all measurements are corrected by what was known last of the rig.
+        """
         kernel = kernel or self.kernel
         if not isinstance(self._sensor, CameraRig):
             return WholeGraph.of(self.kept_factors(), values, kernel)
-        others = self._other_factors()
         frames, variables, measured, covariances = self.kept_observed()
+        if settled:
+            measured = self.corrections.settle(self._sensor, frames, measured)
         return WholeGraph.of_rig(
-            others,
+            self._other_factors(),
             values,
             kernel,
             (pose_key(0) + frames, landmark_key(0) + variables),

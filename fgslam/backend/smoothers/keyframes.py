@@ -21,7 +21,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
 from fgslam.backend.smoothers.graph_builder import TrackedFrame
 from fgslam.backend.smoothers.solver import Solution, allowed_parts
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -174,6 +174,13 @@ class Segments:
         self._block = [_corrected(frame, change) for frame in self._block]
         self.between = [_corrected(frame, change) for frame in self.between]
 
+    def settled(self, known: KnownCorrections) -> list[TrackedFrame]:
+        """Those between, by what was known last of a rig that calibrates itself."""
+        rig = self._sensor
+        if not isinstance(rig, CameraRig):
+            return self.between
+        return [_measured(frame, known.settle(rig, *_seen_in(frame))) for frame in self.between]
+
     def forget(self, identities: list[int]) -> None:
         """Landmarks that start anew: what the open block saw of them is not the same landmark."""
         gone = np.array(identities, np.int64)
@@ -189,7 +196,17 @@ class Segments:
 
 
 def _corrected(frame: TrackedFrame, change: RigChange) -> TrackedFrame:
-    measured = change.measured(frame.accepted.measurement)
+    return _measured(frame, change.measured(frame.accepted.measurement))
+
+
+def _seen_in(frame: TrackedFrame) -> tuple[IntArray, FloatArray]:
+    """The frame's number (k,) and its measurements (k, 3)."""
+    measured = frame.accepted.measurement
+    return np.full(len(measured), frame.frame), measured
+
+
+def _measured(frame: TrackedFrame, measured: FloatArray) -> TrackedFrame:
+    """The frame with other measurements (k, 3)."""
     accepted = dataclasses.replace(frame.accepted, measurement=measured)
     return dataclasses.replace(frame, accepted=accepted)
 

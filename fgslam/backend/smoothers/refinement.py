@@ -208,7 +208,7 @@ class Refined:
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Solves, without landmarks that come out behind a camera or that nothing supports."""
-    graph, state = builder.whole_graph(values)
+    graph, state = builder.whole_graph(values, settled=True)
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)

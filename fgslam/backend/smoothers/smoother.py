@@ -244,7 +244,8 @@ class Smoother:
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)
-        self._builder.corrects(increment.rig_correction)
+        frame = len(self._inputs.increments) - 1
+        self._builder.corrections.note(frame, increment)
         self._eras.append(self._takeovers)
         self._answer = None
 
@@ -355,7 +356,8 @@ class Smoother:
             if self._segments is not None:
                 tracks = self._builder.admission.tracks
                 variable_of = {i: track.variable for i, track in tracks.items()}
-                between, motions = self._segments.between, self._inputs.motions()
+                between = self._segments.settled(self._builder.corrections)
+                motions = self._inputs.motions()
                 self._answer = fill_between(
                     self._sensor, self._floor, self._answer, between, motions, variable_of
                 )

@@ -21,7 +21,7 @@ from fgslam.backend.settings import (
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.measurements import Increment
+from fgslam.core.measurements import Increment, SettledRig
 from fgslam.core.rig_correction import displacements, term_names
 from fgslam.core.sensors import measurement_map, pixel_model
 from fgslam.slam.factory import make_estimator
@@ -94,6 +94,45 @@ def test_a_landmark_moves_along_its_ray_to_where_it_is() -> None:
     )
     np.testing.assert_array_equal(moved[1], at[1])  # behind the camera
     assert off_px == pytest.approx(1.0, abs=0.02)
+
+
+def found_late(drive: Simulation, knocked_px: float) -> list[Increment]:
+    """The drive with a rig that is off by a pixel, which is known in the eighth frame; from then on
+    it is off by other pixels, which is known in the last. Frames are not corrected."""
+    out = []
+    for k, increment in enumerate(drive.increments):
+        seen, knocks = increment.observations, int(k >= 8)
+        off, known = (knocked_px, knocked_px * (k == 11)) if knocks else (1.0, float(k == 7))
+        measured = RigChange(RIG, -yaw(off)).measured(seen.measurement)
+        out.append(
+            dataclasses.replace(
+                increment,
+                observations=dataclasses.replace(seen, measurement=measured),
+                rig_correction=yaw(0.0),
+                settled_rig=SettledRig(yaw(known), knocks),
+            )
+        )
+    return out
+
+
+@pytest.mark.parametrize("knocked_px", [1.0, 2.0], ids=["unmoved", "a knock"])
+@pytest.mark.parametrize("kind", ["isam2", "isam2, keyframes", "batch"])
+def test_whole_graphs_correct_all_frames_by_what_became_known_of_the_rig_as_it_was(
+    kind: str, knocked_px: float, drive: Simulation
+) -> None:
+    increments = found_late(drive, knocked_px)
+    unknown = [dataclasses.replace(each, settled_rig=None) for each in increments]
+    exact = places(drive.increments, kind)
+    before, after = (np.abs(places(of, kind) - exact).max() for of in (unknown, increments))
+    assert before > 0.01
+    assert after < 0.2 * before  # what the front-end lost by the knock stays lost
+
+
+def places(increments: list[Increment], kind: str) -> FloatArray:
+    """(n, 3) of the final estimate."""
+    estimator = make_estimator(RIG, SETTINGS[kind])
+    play(estimator, increments)
+    return estimator.estimate().trajectory.poses[:, :3, 3]
 
 
 def test_a_landmark_started_anew_moves_with_the_others(drive: Simulation) -> None:

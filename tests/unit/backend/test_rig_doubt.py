@@ -100,7 +100,7 @@ def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() ->
     np.testing.assert_allclose(found.correction, covariance[-k:, -k:], rtol=1e-5, atol=1e-12)
 
 
-@pytest.mark.parametrize("term", ["left.yaw", "row", "focal", "radial", "baseline"])
+@pytest.mark.parametrize("term", ["left.yaw", "row", "focal", "all.radial", "radial", "baseline"])
 def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     """By some tenth of a pixel; to first order."""
     by = 0.1 / RIG.fx * (np.array(ALL) == term)

@@ -15,7 +15,7 @@ from fgslam.core import geometry as g
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry, SettledRig
 from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
 
@@ -187,13 +187,13 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-@pytest.mark.parametrize("version", [6, 99, "1", None])
+@pytest.mark.parametrize("version", [7, 99, "1", None])
 def test_another_version_is_refused(file: Path, version: object) -> None:
     arrays = load_arrays(file)
     header = json.loads(str(arrays["header"])) | {"version": version}
     arrays["header"] = np.array(json.dumps(header))
     with pytest.raises(
-        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 5"
+        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 6"
     ):
         MeasurementLog.from_arrays(arrays, "x.npz")
 
@@ -336,20 +336,43 @@ def test_a_loop_that_does_not_lead_back_is_refused(looped: MeasurementLog, frame
         MeasurementLog.from_arrays(arrays, "x.npz")
 
 
-def test_corrections_of_the_rig_make_version_4(log: MeasurementLog, tmp_path: Path) -> None:
+def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Path) -> None:
     terms = len(term_names(RIG))
     log.increments[1] = replace(
-        log.increments[1], rig_correction=np.arange(terms, dtype=np.float64)
+        log.increments[1],
+        rig_correction=np.arange(terms, dtype=np.float64),
+        settled_rig=SettledRig(np.arange(1.0, 1.0 + terms), 2),
     )
     log.save(tmp_path / "log.npz")
     arrays = load_arrays(tmp_path / "log.npz")
-    assert json.loads(str(arrays["header"]))["version"] == 4
+    assert json.loads(str(arrays["header"]))["version"] == 6
     back = MeasurementLog.load(tmp_path / "log.npz")
     np.testing.assert_array_equal(back.increments[0].rig_correction, np.zeros(terms))
     np.testing.assert_array_equal(back.increments[1].rig_correction, np.arange(terms))
+    assert back.increments[0].settled_rig is None
+    settled = back.increments[1].settled_rig
+    assert settled is not None
+    assert settled.knocks == 2
+    np.testing.assert_array_equal(settled.values, np.arange(1.0, 1.0 + terms))
     write_arrays(tmp_path / "log.npz", arrays | {"rig_correction": arrays["rig_correction"][:, 1:]})
     with pytest.raises(MeasurementLogError, match="rig_correction"):
         MeasurementLog.load(tmp_path / "log.npz")
+
+
+def test_a_correction_of_fewer_terms_has_none_of_the_others(log: MeasurementLog) -> None:
+    names = term_names(RIG)
+    later = np.array([name.endswith("_outer") or name.startswith("all.") for name in names])
+    given = np.arange(1.0, 1.0 + len(names))
+    log.increments[1] = replace(log.increments[1], rig_correction=given)
+    arrays = log.to_arrays()
+    header = json.loads(str(arrays["header"])) | {"version": 5}
+    before = arrays | {
+        "header": np.array(json.dumps(header)),
+        "rig_correction": arrays["rig_correction"][:, ~later],
+    }
+    found = MeasurementLog.from_arrays(before, "x.npz").increments[1]
+    np.testing.assert_array_equal(found.rig_correction, np.where(later, 0.0, given))
+    assert found.settled_rig is None
 
 
 # --------------------------------------------------------------------------------------------

@@ -1,0 +1,130 @@
+"""An information filter over a rig's correction: what windows of a drive say of it, added up.
+
+The noise of what windows say is estimated from how far they lie from what is known. Terms that the
+filter does not free stay at zero, as uncertain as before the drive. Derived in
+docs/derivations/self_calibration.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from fgslam.backend.filters.rig_alignment import RigEvidence
+from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
+from fgslam.core.quantiles import chi_square_quantile
+from fgslam.core.rig_correction import RigCorrection, prior_information
+from fgslam.core.sensors import CameraRig
+
+TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
+_KERNEL_FACTOR = {2: 0.61, 3: 0.49}
+"""By cameras: variance under Gaussian noise as multiple of what the kernel's weights alone claim.
+
+Sandwich of an M-estimator (Huber 1981, ch. 6): E[w] E[w^2 s / d] / E[w - 2 w^2 s / (c^2 d)]^2 with
+Cauchy's weights w = 1 / (1 + s / c^2), s the squared residual of d = 2 * cameras coordinates.
+"""
+_KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are a knock
+_DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigFilter:
+    """What is known of a rig's correction, and how noisy the windows are that tell it.
+
+    Attributes:
+        known: the correction so far.
+        free: (p,) terms that windows inform; the others are held at zero.
+        prior: (p, p) information before the drive, about zero.
+        misfit: squared distances of windows from what was known, in their own deviations, added up.
+        freedom: how many numbers that is of.
+    """
+
+    known: RigCorrection
+    free: BoolArray
+    prior: FloatArray
+    misfit: float = 0.0
+    freedom: float = 0.0
+
+    @staticmethod
+    def of(rig: CameraRig, free: BoolArray) -> RigFilter:
+        """Before the drive; terms that are held tell nothing of the free ones."""
+        prior = np.where(free[:, None] == free, prior_information(rig), 0.0)
+        covariance = np.asarray(np.linalg.inv(prior), np.float64)
+        none = dataclasses.replace(RigCorrection.none(rig), covariance=covariance)
+        return RigFilter(none, free, prior)
+
+    @property
+    def information(self) -> FloatArray:
+        """(p, p) of what is known."""
+        return np.asarray(np.linalg.inv(self.known.covariance), np.float64)
+
+    @property
+    def noise_factor(self) -> float:
+        """Variance of what windows say, as multiple of what their pixels alone would give."""
+        stated = TRUSTED_WINDOWS * int(self.free.sum())
+        usual = _KERNEL_FACTOR[self.known.rig.cameras]
+        return max((usual * stated + self.misfit) / (stated + self.freedom), 1e-3)
+
+    def grown(self, share: float) -> RigFilter:
+        """The same, less certain by a share of the prior's covariance."""
+        covariance = self.known.covariance + share * np.linalg.inv(self.prior)
+        return dataclasses.replace(
+            self, known=dataclasses.replace(self.known, covariance=covariance)
+        )
+
+    def judged(self, evidence: RigEvidence) -> tuple[bool, RigFilter]:
+        """Whether what is known cannot explain a window; and the filter that knows its noise.
+
+        Judged in the window's own principal directions, those in which it says anything: how far
+        it lies from what is known, in units of its own noise and of what is known.
+        """
+        information, score = self._told(evidence)
+        size, axes = np.linalg.eigh(information)
+        telling = size > _DOUBTFUL * np.diagonal(axes.T @ self.prior @ axes)
+        score = (axes.T @ score)[telling] / np.sqrt(size[telling])
+        root = axes[:, telling] * np.sqrt(size[telling])
+        known = root.T @ self.known.covariance @ root / self.noise_factor
+        known_share, turn = np.linalg.eigh(known)
+        squared = (turn.T @ score) ** 2 / (1.0 + known_share)
+        likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, len(score))
+        unlikely = bool(squared.sum() / self.noise_factor > likely)
+        noisy = known_share < 1.0  # elsewhere it is the prior that is judged
+        booked = dataclasses.replace(
+            self,
+            misfit=self.misfit + float(squared[noisy].sum()),
+            freedom=self.freedom + float(np.count_nonzero(noisy)),
+        )
+        return unlikely, booked
+
+    def after(self, evidence: RigEvidence) -> RigFilter:
+        """With what a window says."""
+        told, score = self._told(evidence)
+        factor = self.noise_factor
+        covariance = np.asarray(np.linalg.inv(self.information + told / factor), np.float64)
+        covariance = (covariance + covariance.T) / 2.0
+        values = self.known.values + covariance @ (score / factor)
+        known = dataclasses.replace(self.known, values=values, covariance=covariance)
+        return dataclasses.replace(self, known=known)
+
+    def state(self, prefix: str) -> StateArrays:
+        """All that changes."""
+        return {
+            f"{prefix}values": self.known.values,
+            f"{prefix}covariance": self.known.covariance,
+            f"{prefix}evidence": np.array([self.misfit, self.freedom]),
+        }
+
+    def restored(self, state: StateArrays, prefix: str) -> RigFilter:
+        """The filter as it was at :meth:`state`."""
+        values, covariance = state[f"{prefix}values"], state[f"{prefix}covariance"]
+        known = dataclasses.replace(self.known, values=values, covariance=covariance)
+        misfit, freedom = map(float, state[f"{prefix}evidence"])
+        return RigFilter(known, self.free, self.prior, misfit, freedom)
+
+    def _told(self, evidence: RigEvidence) -> tuple[FloatArray, FloatArray]:
+        """Information (p, p) and score (p,) of a window about the free terms, at what is known."""
+        score = evidence.score + evidence.information @ (evidence.at - self.known.values)
+        both = np.outer(self.free, self.free)
+        return np.where(both, evidence.information, 0.0), np.where(self.free, score, 0.0)
