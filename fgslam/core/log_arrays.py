@@ -294,9 +294,7 @@ def _corrections(
     return [None] * frames if np.isnan(rows[:, :1]).all() else list(rows)
 
 
-def _settled(
-    arrays: StateArrays, version: int, rig: Sensor, where: str
-) -> list[SettledRig | None]:
+def _settled(arrays: StateArrays, version: int, rig: Sensor, where: str) -> list[SettledRig | None]:
     """What each frame knew of the rig for all frames alike; None before version 6.
 
     Raises MeasurementLogError where it is not there, or of another rig.
