@@ -164,11 +164,13 @@ def _correction_arrays(frames: Sequence[Increment], terms: int) -> StateArrays:
     known = any(s.rig_correction is not None for s in frames)
     none, unknown = np.full(terms, 0.0 if known else np.nan), np.full(terms, np.nan)
     corrections = [s.rig_correction for s in frames]
-    settled = [s.settled_rig for s in frames]
+    settled = [s.settled_rig or SettledRig(None, 0) for s in frames]
     return {
         CORRECTIONS: _stack([none if c is None else c for c in corrections], (terms,)),
-        "rig_settled": _stack([unknown if s is None else s.values for s in settled], (terms,)),
-        "rig_knocks": np.array([0 if s is None else s.knocks for s in settled], np.int64),
+        "rig_settled": _stack(
+            [unknown if s.values is None else s.values for s in settled], (terms,)
+        ),
+        "rig_knocks": np.array([s.knocks for s in settled], np.int64),
     }
 
 
@@ -306,7 +308,8 @@ def _settled(arrays: StateArrays, version: int, rig: Sensor, where: str) -> list
     expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
     LOG.require(arrays, expected, where)
     rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), strict=True)
-    return [SettledRig(row, n) if np.isfinite(row).all() else None for row, n in rows]
+    found = [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
+    return [None if one.values is None and not one.knocks else one for one in found]
 
 
 def _motion(increment: Increment) -> FloatArray:

@@ -116,11 +116,12 @@ class SettledRig(Brief):
     """What a rig that calibrates itself is known to be off by, for all frames alike.
 
     Attributes:
-        values: (p,) of the correction (:func:`fgslam.core.rig_correction.term_names`).
+        values: (p,) of the correction (:func:`fgslam.core.rig_correction.term_names`); None where
+            each frame's own is no worse.
         knocks: how often the rig was found to have moved before.
     """
 
-    values: FloatArray
+    values: FloatArray | None
     knocks: int
 
 

@@ -111,20 +111,25 @@ def _terms(rays: FloatArray) -> FloatArray:
     return np.concatenate([out, out[..., 6:8] * r2[:, None, None]], axis=2)
 
 
-def prior_information(rig: CameraRig, expected_px: float = EXPECTED_PX) -> FloatArray:
+def prior_information(
+    rig: CameraRig, expected_px: float = EXPECTED_PX, free: BoolArray | None = None
+) -> FloatArray:
     """Information (p, p) of a calibration taken to leave ``expected_px`` over the image.
 
     As if a grid of displacements in every image had been measured as zero, with a noise for which
-    the displacements predicted by the terms have this standard deviation in the mean.
+    the displacements predicted by the terms have this standard deviation in the mean: by all of
+    them, or by the ``free`` (p,) ones alone and by the others alone.
     """
     unit = _grid_displacements(rig)
     out = np.zeros((unit.shape[2], unit.shape[2]))
+    free = np.ones(len(out), np.bool_) if free is None else free
     for k in range(rig.cameras):  # the reference camera's own are those of all
         first = len(TERMS) * (k - 1)
-        group = slice(first, first + len(TERMS)) if k else slice(-len(COMMON), None)
-        jacobian = unit[:, 2 * k : 2 * k + 2, group].reshape(2 * len(unit), -1)
-        scale = jacobian.shape[1] / (len(jacobian) * expected_px**2)
-        out[group, group] = scale * (jacobian.T @ jacobian)
+        group = np.arange(first, first + len(TERMS)) if k else len(out) - 1 - np.arange(len(COMMON))
+        for at in (group[free[group]], group[~free[group]]):
+            jacobian = unit[:, 2 * k : 2 * k + 2][..., at].reshape(2 * len(unit), len(at))
+            scale = len(at) / (len(jacobian) * expected_px**2)
+            out[np.ix_(at, at)] = scale * (jacobian.T @ jacobian)
     return out
 
 

@@ -82,9 +82,13 @@ class RigAlignment:
         rig: CameraRig,
         frames: Sequence[tuple[FloatArray, Observations]],
         pixel_sigma: float,
+        free: BoolArray,
     ) -> None:
-        """Frames are (wTc, what the ego-motion accepted), in order of time."""
-        self._rig, self._sigma = rig, pixel_sigma
+        """Frames are (wTc, what the ego-motion accepted), in order of time.
+
+        Of the correction's terms (p,) those that are not ``free`` are held at zero.
+        """
+        self._rig, self._sigma, self._free = rig, pixel_sigma, free
         self._poses = np.array([wTc for wTc, _ in frames])
         ids = np.concatenate([seen.ids for _, seen in frames])
         frame = np.repeat(np.arange(len(frames)), [len(seen) for _, seen in frames])
@@ -174,7 +178,7 @@ class RigAlignment:
         local = self._local(state)
         safe = np.where(local[:, 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
         exact = project(self._rig, safe) @ self._model.T
-        unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2))
+        unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2)) * self._free
         residual = (exact + unit @ state.correction - self._raw()) / self._sigma
         return residual, local[:, 2], unit
 

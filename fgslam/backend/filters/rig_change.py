@@ -71,13 +71,13 @@ class KnownCorrections:
         begins: first frame of each stretch with one correction and one rig, ascending.
         applied: (p,) of each, the correction that its measurements contain.
         knocks: of each, how often the rig was found to have moved before.
-        settled: after so many knocks, what was known last for all frames alike.
+        settled: after so many knocks, what was known last for all frames alike, if anything.
     """
 
     begins: list[int] = field(default_factory=list)
     applied: list[FloatArray] = field(default_factory=list)
     knocks: list[int] = field(default_factory=list)
-    settled: dict[int, FloatArray] = field(default_factory=dict)
+    settled: dict[int, FloatArray | None] = field(default_factory=dict)
 
     def note(self, frame: int, increment: Increment) -> None:
         """Takes in one more frame; one without a correction says nothing."""
@@ -101,7 +101,7 @@ class KnownCorrections:
         out = measurement.copy()
         stretch = np.searchsorted(self.begins, frames, side="right") - 1
         for k, (applied, knocks) in enumerate(zip(self.applied, self.knocks, strict=True)):
-            change, rows = self.settled.get(knocks, applied) - applied, stretch == k
-            if change.any() and rows.any():
-                out[rows] = RigChange(rig, change).measured(measurement[rows])
+            settled, rows = self.settled.get(knocks), stretch == k
+            if settled is not None and rows.any():
+                out[rows] = RigChange(rig, settled - applied).measured(measurement[rows])
         return out

@@ -8,12 +8,14 @@ docs/derivations/self_calibration.md.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.backend.filters.rig_alignment import RigEvidence
+from fgslam.backend.filters.rig_alignment import RigAlignment, RigEvidence
 from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
+from fgslam.core.measurements import Observations
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import RigCorrection, prior_information
 from fgslam.core.sensors import CameraRig
@@ -50,7 +52,7 @@ class RigFilter:
     @staticmethod
     def of(rig: CameraRig, free: BoolArray) -> RigFilter:
         """Before the drive; terms that are held tell nothing of the free ones."""
-        prior = np.where(free[:, None] == free, prior_information(rig), 0.0)
+        prior = prior_information(rig, free=free)
         covariance = np.asarray(np.linalg.inv(prior), np.float64)
         none = dataclasses.replace(RigCorrection.none(rig), covariance=covariance)
         return RigFilter(none, free, prior)
@@ -80,8 +82,8 @@ class RigFilter:
         Judged in the window's own principal directions, those in which it says anything: how far
         it lies from what is known, in units of its own noise and of what is known.
         """
-        information, score = self._told(evidence)
-        size, axes = np.linalg.eigh(information)
+        size, axes = np.linalg.eigh(evidence.information)
+        score = evidence.score + evidence.information @ (evidence.at - self.known.values)
         telling = size > _DOUBTFUL * np.diagonal(axes.T @ self.prior @ axes)
         score = (axes.T @ score)[telling] / np.sqrt(size[telling])
         root = axes[:, telling] * np.sqrt(size[telling])
@@ -100,13 +102,20 @@ class RigFilter:
 
     def after(self, evidence: RigEvidence) -> RigFilter:
         """With what a window says."""
-        told, score = self._told(evidence)
-        factor = self.noise_factor
+        factor, told = self.noise_factor, evidence.information
+        score = evidence.score + told @ (evidence.at - self.known.values)
         covariance = np.asarray(np.linalg.inv(self.information + told / factor), np.float64)
         covariance = (covariance + covariance.T) / 2.0
         values = self.known.values + covariance @ (score / factor)
         known = dataclasses.replace(self.known, values=values, covariance=covariance)
         return dataclasses.replace(self, known=known)
+
+    def heard(
+        self, rig: CameraRig, frames: Sequence[tuple[FloatArray, Observations]], sigma_px: float
+    ) -> RigEvidence | None:
+        """What a window (wTc, what the ego-motion accepted) says of the free terms, if anything."""
+        alignment = RigAlignment(rig, frames, sigma_px, self.free)
+        return alignment.evidence(self.known.values, self.information)
 
     def state(self, prefix: str) -> StateArrays:
         """All that changes."""
@@ -122,9 +131,3 @@ class RigFilter:
         known = dataclasses.replace(self.known, values=values, covariance=covariance)
         misfit, freedom = map(float, state[f"{prefix}evidence"])
         return RigFilter(known, self.free, self.prior, misfit, freedom)
-
-    def _told(self, evidence: RigEvidence) -> tuple[FloatArray, FloatArray]:
-        """Information (p, p) and score (p,) of a window about the free terms, at what is known."""
-        score = evidence.score + evidence.information @ (evidence.at - self.known.values)
-        both = np.outer(self.free, self.free)
-        return np.where(both, evidence.information, 0.0), np.where(self.free, score, 0.0)

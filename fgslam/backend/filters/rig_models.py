@@ -32,29 +32,41 @@ class WeighedCorrection:
         applied: what is taken off the next frames: the mean over models of the early terms, or an
             older one that lies within the noise of it.
         settled: what the frames so far are best corrected by, all alike: the mean over all models.
+            None where `whole` is not the likeliest: then each frame's own is no worse.
         probabilities: of each model.
     """
 
     estimated: RigCorrection
     applied: RigCorrection
-    settled: RigCorrection
+    settled: RigCorrection | None
     probabilities: dict[str, float]
 
+    @property
+    def best(self) -> RigCorrection:
+        """The one settled, else the one applied."""
+        return self.applied if self.settled is None else self.settled
 
-def weighed(estimated: RigCorrection, early: RigCorrection, prior: FloatArray) -> WeighedCorrection:
+
+def weighed(
+    estimated: RigCorrection, early: RigCorrection, priors: tuple[FloatArray, FloatArray]
+) -> WeighedCorrection:
     """Both estimates averaged over models.
 
     Args:
         estimated: with all terms free.
         early: with the early ones free, the others held at zero.
-        prior: (p, p) information before the drive, about zero.
+        priors: (p, p) information of each before the drive, about zero.
     """
     models = _free_terms(estimated)
     names = list(models)
-    applied, _ = _mean(early, [models[name] for name in names[:-1]], prior)
-    settled, shares = _mean(estimated, list(models.values()), prior)
+    applied, _ = _mean(early, [models[name] for name in names[:-1]], priors[1])
+    settled, shares = _mean(estimated, list(models.values()), priors[0])
+    whole = bool(shares.argmax() == len(shares) - 1)
     return WeighedCorrection(
-        estimated, applied, settled, dict(zip(names, shares.tolist(), strict=True))
+        estimated,
+        applied,
+        settled if whole else None,
+        dict(zip(names, shares.tolist(), strict=True)),
     )
 
 

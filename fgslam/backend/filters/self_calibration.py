@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fgslam.backend.filters.rig_alignment import RigAlignment
 from fgslam.backend.filters.rig_filter import TRUSTED_WINDOWS, RigFilter
 from fgslam.backend.filters.rig_models import WeighedCorrection, weighed
 from fgslam.core.arrays import FloatArray, StateArrays
@@ -82,7 +81,7 @@ class SelfCalibration:
         self._rig, early = rig, early_terms(rig)
         self._whole = RigFilter.of(rig, np.ones_like(early))
         self._early = RigFilter.of(rig, early)
-        self.found = weighed(self._whole.known, self._early.known, self._whole.prior)
+        self.found = weighed(self._whole.known, self._early.known, self._priors)
         """As known now, and what of it is worth applying."""
         self.steps: list[CalibrationStep] = []
         """How it became known, window by window."""
@@ -103,7 +102,12 @@ class SelfCalibration:
     @property
     def settled(self) -> SettledRig:
         """What all frames since the rig was moved last are best corrected by, as known now."""
-        return SettledRig(self.found.settled.values, self.knocks)
+        settled = self.found.settled
+        return SettledRig(None if settled is None else settled.values, self.knocks)
+
+    @property
+    def _priors(self) -> tuple[FloatArray, FloatArray]:
+        return self._whole.prior, self._early.prior
 
     def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
@@ -111,31 +115,33 @@ class SelfCalibration:
             self._frames.clear()
         self._frames.append((wTc, _accepted(increment)))
         if len(self._frames) >= WINDOW:
-            alignment = RigAlignment(self._rig, self._frames, self._sigma)
-            self._frames = []
-            self._take(alignment, increment.timestamp)
+            frames, self._frames = self._frames, []
+            self._take(frames, increment.timestamp)
         return self.found
 
-    def _take(self, alignment: RigAlignment, timestamp: float) -> None:
+    def _take(self, frames: list[tuple[FloatArray, Observations]], timestamp: float) -> None:
         since = 0.0 if self._last_time is None else timestamp - self._last_time
         self._last_time = timestamp
-        whole, early = self._whole.grown(since / _DRIFT_S), self._early.grown(since / _DRIFT_S)
-        evidence = alignment.evidence(whole.known.values, whole.information)
-        if evidence is None:
+        filters = [of.grown(since / _DRIFT_S) for of in (self._early, self._whole)]
+        evidence = [of.heard(self._rig, frames, self._sigma) for of in filters]
+        said = [(of, what) for of, what in zip(filters, evidence, strict=True) if what is not None]
+        if len(said) < len(filters):
             return
         self.windows += 1
-        unlikely, judged = whole.judged(evidence)
-        if unlikely and self.windows > TRUSTED_WINDOWS:
+        judged = [of.judged(what) for of, what in said]
+        if judged[0][0] and self.windows > TRUSTED_WINDOWS:
             if not self._suspected:  # once is something that passed through the view
                 self._suspected = True
                 return
             self.knocks += 1
-            whole, early = whole.grown(1.0), early.grown(1.0)
+            filters = [of.grown(1.0) for of in filters]
         else:
-            whole, early = judged, early.judged(evidence)[1]
+            filters = [of for _, of in judged]
         self._suspected = False
-        self._whole, self._early = whole.after(evidence), early.after(evidence)
-        self.found = self._held(weighed(self._whole.known, self._early.known, whole.prior))
+        pairs = zip(filters, said, strict=True)
+        self._early, self._whole = (of.after(what) for of, (_, what) in pairs)
+        found = weighed(self._whole.known, self._early.known, self._priors)
+        self.found = self._held(found)
         self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
 
     # ----------------------------------------------------------------------------------------
@@ -163,7 +169,7 @@ class SelfCalibration:
         self.windows, self.knocks, suspected, waiting = map(int, state["counts"])
         self._suspected = bool(suspected)
         self.steps = _steps_of(state)
-        found = weighed(self._whole.known, self._early.known, self._whole.prior)
+        found = weighed(self._whole.known, self._early.known, self._priors)
         applied = dataclasses.replace(found.applied, values=state["applied"])
         self.found = dataclasses.replace(found, applied=applied)
         begin = len(log) - waiting

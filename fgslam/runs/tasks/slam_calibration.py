@@ -34,7 +34,7 @@ def write_calibration(folder: Path, calibration: SelfCalibration) -> None:
 
     Raises OutputError.
     """
-    write_corrected(folder / CAMERA_FILE, calibration.found.settled)
+    write_corrected(folder / CAMERA_FILE, calibration.found.best)
     known = calibration.found.estimated
     terms = term_names(known.rig)
     changes = list(known.changes())

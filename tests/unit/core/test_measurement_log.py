@@ -352,6 +352,7 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
     assert back.increments[0].settled_rig is None
     settled = back.increments[1].settled_rig
     assert settled is not None
+    assert settled.values is not None
     assert settled.knocks == 2
     np.testing.assert_array_equal(settled.values, np.arange(1.0, 1.0 + terms))
     write_arrays(tmp_path / "log.npz", arrays | {"rig_correction": arrays["rig_correction"][:, 1:]})
