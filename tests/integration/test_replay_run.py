@@ -19,7 +19,7 @@ from fgslam.slam.replay import replay_frame
 
 
 def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:
-    estimator = factory.make_estimator(log.rig, config.estimator)
+    estimator = factory.make_estimator(log.rig, config.estimator, config.frontend.ego_motion)
     motion = factory.make_motion(log.rig, config.odometry)
     solver = EgoMotionSolver(log.rig, config.frontend.ego_motion)
     for k, increment in enumerate(log):

@@ -86,6 +86,8 @@ class FullEkf:
         self._covariance.append_independent(landmarks.covariances)
         self._ids, self._positions = landmarks.ids, landmarks.positions
         self._fixed = fixed
+        if fixed:
+            self._doubt.hold_map()
         self._map = None
 
     def predict(self, odometry: Odometry | None) -> Prediction:

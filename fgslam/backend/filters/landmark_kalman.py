@@ -100,6 +100,8 @@ class LandmarkKalman:
         unseen = np.full(len(landmarks), -1)
         self._rows.load(landmarks, hits, unseen, unseen)
         self._fixed = fixed
+        if fixed:
+            self._doubt.hold_map()
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""

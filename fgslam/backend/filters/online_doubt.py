@@ -63,6 +63,7 @@ class OnlineDoubt:
         self._covariance: FloatArray | None = None  # (q, q) of the terms; None: no doubt
         self._wTc: FloatArray | None = None
         self._gain = np.zeros((6, len(SHARED)))
+        self._held = False
         # By landmark: identity, derivative in world axes, information given the poses.
         self._map = GrowingColumns(
             ids=np.empty(0, np.int64),
@@ -93,6 +94,10 @@ class OnlineDoubt:
         self._add(look.select(~known))
         self.forget(increment.pruned_ids)
         self._wTc = wTc
+
+    def hold_map(self) -> None:
+        """The map is a saved one that nothing changes: it is as well known as it was then."""
+        self._held = True
 
     def forget(self, ids: IntArray) -> None:
         """Landmarks that somebody else holds now, or nobody."""
@@ -150,10 +155,11 @@ class OnlineDoubt:
         self._covariance = shared_covariance(dataclasses.replace(none, values=correction))
 
     def _gains(self, ids: IntArray) -> FloatArray:
-        """(k, 3, q) of landmarks; zero of those too far away to be known."""
-        rows, known = self._rows(ids)
+        """(k, 3, q) of landmarks; zero of those too far away to be known, or of a map held."""
         gain = np.zeros((len(ids), 3, len(SHARED)))
-        gain[known] = self._map["gain"][rows[known]]
+        if not self._held:
+            rows, known = self._rows(ids)
+            gain[known] = self._map["gain"][rows[known]]
         return gain
 
     def _rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
