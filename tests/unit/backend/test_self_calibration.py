@@ -182,15 +182,25 @@ def test_fifty_rigs_are_recovered(term: str) -> None:
 
 @pytest.mark.slow
 def test_fifty_rigs_with_other_lenses_are_recovered() -> None:
-    """As both KITTI rigs are off: outer decentring, and a radial term of all cameras."""
-    left = []
+    """As both KITTI rigs are off: outer decentring, and a radial term of all cameras.
+
+    The left camera's own terms are found; the radial term, which 36 m of road hardly show, is as
+    uncertain as it is off.
+    """
+    left, own, deviations = [], [], []
     for seed in range(50):
         x, y, radial = np.random.default_rng(seed).choice([-1.0, 1.0], 3) * [4e-3, 2e-3, 0.012]
         outer = errors(decentring_x_outer=x, decentring_y_outer=y, radial_of_all=radial)
         wrong = errors(**wrong_by(np.random.default_rng(seed))) + outer
-        left.append(image_error(calibrated(Road(), wrong, seed).found.best, wrong))
-    assert np.median(left) < 0.05
-    assert np.max(left) < 0.12
+        found = calibrated(Road(), wrong, seed).found
+        left.append(image_error(found.best, wrong) / image_error(found.applied, wrong))
+        of_all = found.estimated.values[-1]
+        own.append(image_error(found.estimated, np.append(wrong[:-1], of_all)))
+        deviations.append((of_all - radial) / np.sqrt(found.estimated.covariance[-1, -1]))
+    assert np.median(left) < 0.2
+    assert np.median(own) < 0.05
+    assert np.max(own) < 0.15
+    assert np.mean(np.abs(deviations) < 2.0) >= 0.88  # of 50, in 99 of 100 sets
 
 
 @pytest.mark.slow
