@@ -43,6 +43,40 @@ def test_what_followed_a_leap_does_not_count_as_usual() -> None:
     assert after([*usual, 5, *usual], 5) > 0.9
 
 
+def alarms(steps: Iterable[int]) -> list[bool]:
+    """Of each step, whether the robot was rather carried off than not."""
+    drive = Continuity(CHANCE)
+    return [drive.carried_off(one, 1000) > 0.5 for one in steps]
+
+
+@pytest.mark.parametrize(
+    ("before", "lasting"),
+    [
+        ([900] * 25, [200] * 200),  # stood, and drives on
+        ([300, 310, 290, 305, 295] * 5, [60, 55, 62, 58] * 50),  # faster, or the light went down
+        ([900] * 25, [200, 900, 900] * 60),  # by fits and starts
+        ([900] * 25, [200] * 30 + [900] * 3 + [200] * 30),  # a short stand more
+    ],
+)
+def test_a_lasting_change_is_taken_as_usual_after_two_alarms(
+    before: list[int], lasting: list[int]
+) -> None:
+    said = alarms([*before, *lasting])
+    assert not any(said[: len(before)])
+    assert sum(said) == sum(said[len(before) : len(before) + 5]) == 2
+
+
+def test_being_carried_off_is_noticed_at_the_new_level_too() -> None:
+    assert alarms([*[900] * 25, *[200, 190, 210] * 4, 3])[-1]
+
+
+def test_carried_off_again_and_again_is_noticed_each_time() -> None:
+    """Every seventh image, as by somebody who plays with the robot."""
+    legs = [200, 190, 210, 205, 195, 200]
+    said = alarms([*legs * 2, *[4, *legs] * 5])
+    assert [k for k, one in enumerate(said) if one] == [12, 19, 26, 33, 40]
+
+
 def test_the_first_step_says_nothing() -> None:
     assert after([], 3) == CHANCE
 
