@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from pathlib import Path
@@ -213,21 +214,59 @@ def is_realsense(tree: Tree) -> bool:
 
 
 def read_realsense(path: Path, tree: Tree) -> Calibration:
-    """One camera; Open3D's matrix goes column by column.
+    """One camera; Open3D's matrix goes column by column, other people's row by row.
 
     Raises:
-        CalibrationError: a value is missing or impossible.
+        CalibrationError: a value is missing or impossible, or the lens is of a model that is not
+            known.
     """
     part = Values(path, tree)
-    if "intrinsic_matrix" in part:
-        matrix = part.numbers("intrinsic_matrix", 9).reshape(3, 3).T
-    else:
-        matrix = intrinsic_matrix(*part.named(_PRINCIPAL if "ppx" in part else _FOCAL))
-    coefficients = part.numbers("coeffs") if "coeffs" in part else np.zeros(4)
-    if np.any(coefficients) and "inverse" in part.text("model"):
-        raise part.refuse("model inverse_brown_conrady is not known with coefficients other than 0")
-    camera = RawCamera(*part.size("width", "height"), matrix, coefficients, np.eye(4), path.name)
+    model, coefficients = _realsense_lens(part)
+    size, matrix = part.size("width", "height"), _realsense_matrix(part)
+    camera = RawCamera(*size, matrix, coefficients, np.eye(4), path.name, model)
     return Calibration(str(path), "RealSense intrinsics", (checked_camera(camera),))
+
+
+def _realsense_matrix(part: Values) -> FloatArray:
+    if "intrinsic_matrix" not in part:
+        return intrinsic_matrix(*part.named(_PRINCIPAL if "ppx" in part else _FOCAL))
+    given = part.matrix("intrinsic_matrix", 3, 3)
+    matrix = given.T if given[2, :2].any() else given
+    if not np.array_equal(matrix[2], (0.0, 0.0, 1.0)):
+        raise part.refuse("intrinsic_matrix must end with the row 0 0 1; correct the file")
+    return matrix
+
+
+_BROWN = ("", "brownconrady", "modifiedbrownconrady", "plumbbob", "radtan", "pinhole", "opencv")
+_KANNALA = ("kannalabrandt4", "kannalabrandt", "equidistant", "fisheye", "opencvfisheye")
+_RS2_MODELS = {"1": "modifiedbrownconrady", "4": "brownconrady", "5": "kannalabrandt4"}
+_LISTS = ("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "dist", "D")
+_SINGLE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+def _realsense_lens(part: Values) -> tuple[str, FloatArray]:
+    """Model and parameters, by rs2_distortion where that is stated, else OpenCV's."""
+    key = next((k for k in ("model", "distortion_model", "camera_model") if k in part), "model")
+    stated = re.sub(r"[^a-z0-9]|^(rs2_)?distortion[._]", "", part.text(key))
+    name = _RS2_MODELS.get(stated, stated)
+    fisheye = name in _KANNALA
+    listed = next((k for k in _LISTS if k in part), None)
+    if listed is not None:
+        found = part.numbers(listed)
+    elif fisheye:
+        found = part.named(("k1", "k2", "k3", "k4"), 0.0)
+    else:
+        found = part.named(_SINGLE if "k4" in part else _SINGLE[:5], 0.0)
+        if found[5:].any() and "p1" not in part:
+            raise part.refuse('k1 to k4 without p1, p2 need "model": fisheye or brown_conrady')
+    if fisheye:
+        return "equidistant", found[:4]
+    if found.any() and name not in _BROWN:
+        raise part.refuse(
+            f"{key} {part.text(key)} is not known with coefficients other than 0; known: "
+            "brown_conrady, kannala_brandt4"
+        )
+    return "radtan", found if found.any() else np.zeros(4)
 
 
 # --------------------------------------------------------------------------------------------
