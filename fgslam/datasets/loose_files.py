@@ -9,11 +9,15 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
 from fgslam.datasets.sides import camera_pairs, without_side
+from fgslam.datasets.time_names import time_parts
+
+if TYPE_CHECKING:
+    from fgslam.core.arrays import IntArray
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
 _INSIDE = "data"  # where EuRoC and KITTI keep a camera's images
@@ -42,9 +46,14 @@ def natural(path: Path) -> tuple[tuple[int, str], ...]:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Image files of a folder, in natural order."""
-    found = (p for p in shown_in(folder) if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
-    return sorted(found, key=natural)
+    """Image files of a folder, in natural order; by time where all names are times."""
+    files = (p for p in shown_in(folder) if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    found = sorted(files, key=natural)
+    times = time_parts([path.stem for path in found])
+    if times is None:
+        return found
+    # Digits behind the point sort as text: .98 comes after .1234567.
+    return [path for _, _, path in sorted(zip(*times, found, strict=True))]
 
 
 def one_camera(root: Path) -> Path | None:
@@ -124,17 +133,31 @@ Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]
 TOLERANCE_MS = 20.0
 
 
-def pair_files(found: CameraFiles, tolerance_ms: float = TOLERANCE_MS) -> Pairs:
+def pair_files(found: CameraFiles, tolerance_ms: float | None = TOLERANCE_MS) -> Pairs:
     """Pairs (right, left) in natural order, and notes on what is left out.
 
     Files are paired by their names without the side; where those do not match, by the times that
-    the names are, at most ``tolerance_ms`` apart; else by their order.
+    the names are, at most ``tolerance_ms`` apart; else by their order. None as tolerance: images
+    that were not taken at once, as of a board that stands still; times say nothing then.
 
     Raises:
         DatasetError: names do not match, and the cameras have different numbers of images, or names
             are times and no two are near.
     """
-    for key in _KEYS:
+    named = _by_names(found, _KEYS)
+    if named is not None:
+        return named
+    times = None if found.interleaved else _times(found)
+    if times is None:
+        named = _by_names(found, (_by_moment,))
+    elif tolerance_ms is not None:
+        named = _by_time(found, times, tolerance_ms)
+    return _by_order(found) if named is None else named
+
+
+def _by_names(found: CameraFiles, keys: Sequence[Callable[[str], object]]) -> Pairs | None:
+    """By the first of the keys that most names have in common; None where none is."""
+    for key in keys:
         right, left = ({key(path.stem): path for path in f} for f in (found.right, found.left))
         common = [name for name in right if name in left]
         unique = len(right) == len(found.right) and len(left) == len(found.left)
@@ -146,43 +169,63 @@ def pair_files(found: CameraFiles, tolerance_ms: float = TOLERANCE_MS) -> Pairs:
                 if n
             )
             return tuple((right[name], left[name]) for name in common), notes
-    by_time = _by_time(found, tolerance_ms)
-    if by_time is not None:
-        return by_time
+    return None
+
+
+def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pairs:
     if len(found.right) != len(found.left):
         raise DatasetError(
             f"{found.folder}: {len(found.left)} images of the left camera and {len(found.right)} "
             f"of the right one, and their names ({found.left[0].name}, {found.right[0].name}) do "
             "not match: which belong together cannot be told; name both of a pair alike"
         )
-    note = "left and right images are paired by their order: their names do not match"
+    note = f"left and right images are paired by their order: {why}"
     return tuple(zip(found.right, found.left, strict=True)), (note,)
 
 
-def _by_time(found: CameraFiles, tolerance_ms: float) -> Pairs | None:
-    """Pairs of files whose names are times; None where they are none."""
+def _times(found: CameraFiles) -> tuple[IntArray, IntArray] | None:
+    """Nanoseconds (n,), (m,) of right and left files whose names are times; None otherwise."""
     import numpy as np  # layouts are recognised without arrays
 
-    from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
+    from fgslam.datasets.pairing import NANOSECONDS
     from fgslam.datasets.stamps import written_stamps
 
     written = [written_stamps(files, ()) for files in (found.right, found.left)]
-    stamps = [
-        np.rint(each[0] / NANOSECONDS).astype(np.int64) for each in written if each is not None
-    ]
-    if len(stamps) < len(written):
-        return None
+    right, left = (
+        None if each is None else np.rint(each[0] / NANOSECONDS).astype(np.int64)
+        for each in written
+    )
+    return None if right is None or left is None else (right, left)
+
+
+def _by_time(found: CameraFiles, times: tuple[IntArray, IntArray], tolerance_ms: float) -> Pairs:
+    """The nearest in time; by order where each camera has a clock of its own that goes alike."""
+    import numpy as np
+
+    from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
+
+    right, left = times
     names = (f"{found.folder}, right", f"{found.folder}, left")
-    (rows, partners), notes = pair_stamps(stamps[0], stamps[1], 1e-3 * tolerance_ms, names)
+    try:
+        (rows, partners), notes = pair_stamps(right, left, 1e-3 * tolerance_ms, names)
+    except DatasetError:
+        apart = NANOSECONDS * (left - right) if len(left) == len(right) else np.array([np.inf])
+        if not np.ptp(apart) <= 1e-3 * tolerance_ms:
+            raise
+        away = abs(float(np.median(apart)))
+        return _by_order(found, f"the times that their names are lie {away:.6g} s apart throughout")
     chosen = zip(rows.tolist(), partners.tolist(), strict=True)
     note = "left and right images are paired by the times that their names are"
     return tuple((found.right[i], found.left[j]) for i, j in chosen), (note, *notes)
+
+
+def _by_moment(stem: str) -> object:
+    return natural(Path(_moment(stem)))
 
 
 _KEYS: tuple[Callable[[str], object], ...] = (
     lambda stem: natural(Path(stem)),
     lambda stem: natural(Path(without_side(stem))),
     lambda stem: natural(Path(without_side(stem, camera_number=True))),
-    lambda stem: natural(Path(_moment(stem))),
 )
 """What two names of a pair have in common; the first that most of them have counts."""

@@ -12,6 +12,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines
+from fgslam.datasets.time_names import counts_by_one, time_parts
 
 LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "data.csv")
 """Names of lists of times, the first that is there counts."""
@@ -21,12 +22,12 @@ _UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanosecon
 _SLOWEST_S = 10.0  # between two images: what makes a unit plausible
 SLOWEST_MOTION_S = 1.0
 """The same between two samples of odometry."""
-_FASTEST_S = 1e-3
+_FASTEST_S = 2e-3
 _DATE_IN_NAME = re.compile(
     r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?"
-    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:[-_.,]?(\d{1,9}))?(?!\d)"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:([-_.,]?)(\d{1,9}))?(?!\d)"
 )
-_NAME = re.compile(r"^\d{10,19}(\.\d+)?$")
+_COUNTED = 10_000  # six digits below: the first hour after midnight, or a counter
 _DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
 
 
@@ -69,8 +70,11 @@ def written_stamps(
     by_date = _dates([image.stem for image in images])
     if by_date is not None:
         return by_date, ("times are the dates in the names of the images",), ()
-    if len(images) > 1 and all(_NAME.match(image.stem) for image in images):
-        found, unit = _in_seconds(_numbers([p.stem for p in images]), "names of the images")
+    named = time_parts([image.stem for image in images]) if len(images) > 1 else None
+    if named is not None:
+        texts = [f"{whole}.{part}" for whole, part in zip(*named, strict=True)]
+        mend = "two names of a folder are one time: remove one"
+        found, unit = _in_seconds(_numbers(texts), "names of the images", mend)
         return found, unit, ()
     return None
 
@@ -78,20 +82,35 @@ def written_stamps(
 def _dates(names: Sequence[str]) -> FloatArray | None:
     """Seconds (n,) since 1970 by dates in names, UTC; None where they say no camera's times.
 
-    What follows the seconds is their fraction, unless that makes no times of a camera: then it
-    counts the images.
+    What follows the seconds is their fraction, unless it counts the images: by one, or with fewer
+    than three digits and no point. Neither are six digits from 000000 on that count by one.
     """
-    found = [_DATE_IN_NAME.search(name) for name in names]
-    if len(names) < 2 or not all(found):
+    found = [match for name in names if (match := _DATE_IN_NAME.search(name))]
+    if len(names) < 2 or len(found) < len(names):
         return None
     try:
-        whole = [_seconds(*map(int, match.groups()[:6])) for match in found if match]
+        whole = [_seconds(*map(int, match.groups()[:6])) for match in found]
     except ValueError:  # no date
         return None
-    parts = [float(f"0.{m[7] or 0}") for m in found if m]
+    clock = [int(match[4] + match[5] + match[6]) for match in found]
+    joined = all(match[4] + match[5] + match[6] in match[0] for match in found)
+    parts = _fractions(found)
+    if joined and not any(parts) and clock[-1] < _COUNTED and counts_by_one(clock):
+        return None
     stamps = np.array(whole) + parts
     steps = np.diff(stamps)
     return stamps if steps.min() > 0.0 and np.median(steps) >= _FASTEST_S else None
+
+
+def _fractions(found: Sequence[re.Match[str]]) -> list[float]:
+    """Of a second, by what follows it in each name; 0 where that counts the images."""
+    if counts_by_one([int(match[8]) for match in found if match[8]]):
+        return [0.0] * len(found)
+    written = [
+        match[8] if match[8] and (match[7] in (".", ",") or len(match[8]) > 2) else ""
+        for match in found
+    ]
+    return [float(f"0.{digits or 0}") for digits in written]
 
 
 def _seconds(year: int, month: int, day: int, hour: int, minute: int, second: int) -> float:
@@ -108,7 +127,9 @@ def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:
 
 
 def _in_seconds(
-    numbers: tuple[FloatArray, float], where: str
+    numbers: tuple[FloatArray, float],
+    where: str,
+    mend: str = "put the lines in time order and remove duplicates",
 ) -> tuple[FloatArray, tuple[str, ...]]:
     """Times in seconds by the unit that makes the rate of a camera, and a note where not seconds.
 
@@ -120,8 +141,7 @@ def _in_seconds(
     if len(steps) and steps.min() <= 0.0:
         k = int(np.argmax(steps <= 0.0))
         raise DatasetError(
-            f"{where}: the time of image {k + 2} does not come after that of image {k + 1}; put "
-            "the lines in time order and remove duplicates"
+            f"{where}: the time of image {k + 2} does not come after that of image {k + 1}; {mend}"
         )
     name, unit = time_unit(values)
     note = () if name == "seconds" else (f"times of {where} are taken as {name}",)

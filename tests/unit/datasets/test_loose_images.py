@@ -26,6 +26,7 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
 )
 from fgslam.datasets.sides import camera_pairs
+from fgslam.datasets.stamps import written_stamps
 from fgslam.runs.bare_recording import bare_experiment
 
 STAMP = 1_403_715_273_262_142_976
@@ -194,6 +195,69 @@ def test_dates_that_are_no_times_of_images(tmp_path: Path, form: str) -> None:
     recording = opened(root)
     np.testing.assert_allclose(np.diff(recording.timestamps), 0.1, rtol=0.0, atol=1e-9)
     assert any("no list of times" in note for note in recording.notes)
+
+
+def paired(root: Path, lefts: list[str], rights: list[str], **options: Any) -> list[list[str]]:
+    """Names (left, right) of the pairs of empty files, and the notes."""
+    for folder, names in (("left", lefts), ("right", rights)):
+        (root / folder).mkdir(parents=True)
+        for name in names:
+            (root / folder / f"{name}.png").touch()
+    found = find_cameras(root)
+    assert found is not None
+    pairs, notes = pair_files(found, **options)
+    return [[left.stem, right.stem] for right, left in pairs] + [list(notes)]
+
+
+def test_what_is_behind_an_underscore_is_a_fraction(tmp_path: Path) -> None:
+    """At 1 Hz the seconds alone would pair images 940 ms apart."""
+    rights = [f"{1_700_000_001 + k}_010000" for k in range(4)]
+    lefts = [f"{1_700_000_000 + k}_995000" for k in range(4)]
+    assert paired(tmp_path, lefts, rights)[:-1] == [
+        list(p) for p in zip(lefts, rights, strict=True)
+    ]
+
+
+def test_clocks_of_their_own_go_by_order(tmp_path: Path) -> None:
+    """Names by str(time.time()): .98 lies before .1234567 of the next, not by its digits."""
+    rights = ["1700000001.1234567", "1700000001.98", "1700000002.5"]
+    lefts = ["1700007001.1234", "1700007001.98", "1700007002.5"]
+    *pairs, notes = paired(tmp_path, lefts, rights)
+    assert pairs == [list(pair) for pair in zip(lefts, rights, strict=True)]
+    assert "paired by their order: the times that their names are lie 7000 s apart" in notes[0]
+
+
+def test_a_board_at_rest_is_paired_without_times(tmp_path: Path) -> None:
+    lefts = [f"20230101_1200{s}_{ms}" for s, ms in ((10, 100), (14, 900), (19, 300))]
+    rights = [f"20230101_1200{s}_{ms}" for s, ms in ((10, 800), (15, 310), (19, 305))]
+    expected = [list(pair) for pair in zip(lefts, rights, strict=True)]
+    assert paired(tmp_path / "a", lefts, rights, tolerance_ms=None)[:-1] == expected
+    assert len(paired(tmp_path / "b", lefts, rights)) == 2, "of those in motion one pair is near"
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"20230101_120000_{k:02d}" for k in range(30)],
+        [f"20230101_120000_{k:04d}" for k in range(30)],
+        [f"20230101_{k:06d}" for k in range(40)],
+        [f"{k:010d}" for k in range(40)],
+        [f"1700000000_{k:06d}" for k in range(40)],
+    ],
+)
+def test_counters_are_no_times(names: list[str]) -> None:
+    assert written_stamps([Path(f"{name}.png") for name in names], ()) is None
+
+
+def test_times_that_look_like_counters_are_times() -> None:
+    """Images every second at noon, and many whose milliseconds take nearly all values."""
+    noon = [Path(f"20230101_1200{k:02d}.png") for k in range(40)]
+    milliseconds = np.cumsum(np.full(900, 37))
+    dense = [Path(f"{1_700_000_000 + t // 1000}_{t % 1000:03d}.png") for t in milliseconds]
+    for files, step in ((noon, 1.0), (dense, 0.037)):
+        written = written_stamps(files, ())
+        assert written is not None
+        np.testing.assert_allclose(np.diff(written[0]), step, rtol=0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
