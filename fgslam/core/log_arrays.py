@@ -124,7 +124,7 @@ def frames_of(
     loops, relocalised = _loops(arrays, header["version"], where, first)
     sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
     corrections = _corrections(arrays, header["version"], sensor, where)
-    settled = _settled(arrays, header["version"], sensor, where)
+    settled = _settled(arrays, header["version"], corrections, where)
     observed = _split_observations(arrays, "")
     missed, pruned = _split(arrays, "missed"), _split(arrays, "pruned")
     start = arrays["observation_start"]
@@ -296,20 +296,21 @@ def _corrections(
     return [None] * frames if np.isnan(rows[:, :1]).all() else list(rows)
 
 
-def _settled(arrays: StateArrays, version: int, rig: Sensor, where: str) -> list[SettledRig | None]:
-    """What each frame knew of the rig for all frames alike; None before version 6.
+def _settled(
+    arrays: StateArrays, version: int, corrections: Sequence[FloatArray | None], where: str
+) -> list[SettledRig | None]:
+    """What each frame with a correction knew for all frames alike; None before version 6.
 
     Raises MeasurementLogError where it is not there, or of another rig.
     """
     frames = len(arrays["frame_index"])
-    if version < WITH_EVERYTHING or not isinstance(rig, CameraRig):
+    terms = next((len(row) for row in corrections if row is not None), 0)
+    if version < WITH_EVERYTHING or not terms:
         return [None] * frames
-    terms = len(term_names(rig))
     expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
     LOG.require(arrays, expected, where)
     rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), strict=True)
-    found = [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
-    return [None if one.values is None and not one.knocks else one for one in found]
+    return [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
 
 
 def _motion(increment: Increment) -> FloatArray:

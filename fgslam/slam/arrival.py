@@ -106,7 +106,7 @@ def require_map_user(estimator: Estimator, extends: bool) -> MapUser:
     if not isinstance(estimator, MapUser):
         raise ConfigError(
             f"estimator.kind {estimator.kind} cannot begin in a saved map; use landmark_kalman, "
-            "ekf, isam2 or batch"
+            "ekf, isam2, sliding_window or batch"
         )
     if not extends and not estimator.keeps_maps:
         raise ConfigError(

@@ -138,10 +138,10 @@ class OnlineDoubt:
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
-        of = {name.removeprefix("doubt_"): array for name, array in state.items()}
-        self._hear(of["applied"] if of["applied"].size else None)
-        self._wTc = next(iter(of["pose"]), None)
-        self._gain = of["pose_gain"]
+        applied = state["doubt_applied"]
+        self._hear(applied if applied.size else None)
+        self._wTc = next(iter(state["doubt_pose"]), None)
+        self._gain = state["doubt_pose_gain"]
         self._map.restore({name: state[f"doubt_{name}"] for name in ("ids", "gain", "information")})
 
     # ----------------------------------------------------------------------------------------

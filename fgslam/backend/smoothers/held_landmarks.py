@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.backend.smoothers.window_parts import Landmarks
-from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 
 
 class HeldLandmarks:
@@ -18,6 +18,7 @@ class HeldLandmarks:
             mean=np.empty((0, 3)),
             information=np.empty((0, 3, 3)),
             home=np.empty(0, np.int64),
+            saved=np.empty(0, np.bool_),
         )
 
     def __len__(self) -> int:
@@ -33,15 +34,22 @@ class HeldLandmarks:
         """(m,) the last frame that saw each before it left a window; -1: it never did."""
         return self._rows["home"]
 
+    @property
+    def saved(self) -> BoolArray:
+        """(m,) whether something was known of it beforehand, from a saved map."""
+        return self._rows["saved"]
+
     def enter(self, point: FloatArray) -> None:
         """A new variable, of which nothing is known."""
-        row = {"point": point, "mean": point, "information": np.zeros((3, 3)), "home": np.array(-1)}
-        self._rows.append({name: value[None] for name, value in row.items()})
+        row = {"point": point, "mean": point, "information": np.zeros((3, 3))}
+        last = {"home": np.array(-1), "saved": np.array(False)}
+        self._rows.append({name: value[None] for name, value in (row | last).items()})
 
     def know(self, variable: int, mean: FloatArray, covariance: FloatArray) -> None:
         """What is known of a new variable beforehand."""
         self._rows["mean"][variable] = mean
         self._rows["information"][variable] = np.linalg.inv(covariance)
+        self._rows["saved"][variable] = True
 
     def of(self, variables: IntArray) -> Landmarks:
         """Some of them, for a window."""

@@ -18,6 +18,7 @@ import numpy as np
 from fgslam.backend.filters.loop_correction import (
     Constraint,
     changes,
+    constraint_factor,
     home_changes,
     nearest_positive,
     transported,
@@ -107,13 +108,14 @@ class SlidingWindowSolver(WholeGraphSolver):
         """Looks again at the window; what has left it moves with where it was seen last."""
         super().recalibrate(change)
         self._let_go()
-        self._take_in()
         self._window.remeasure(change.measured)
+        self._take_in()  # the builder has measured these anew already
         frames, variables, *_ = self._builder.kept_observed()
         if len(frames):
             last = np.zeros(len(self._held), np.int64)
             np.maximum.at(last, variables, frames)
-            self._held.points[:] = change.moved(np.array(self._poses)[last], self._held.points)[0]
+            own, poses = ~self._held.saved, np.array(self._poses)[last]
+            self._held.points[own] = change.moved(poses[own], self._held.points[own])[0]
 
     # -- into the window and out of it -------------------------------------------------------
 
@@ -228,8 +230,14 @@ class SlidingWindowSolver(WholeGraphSolver):
     # -- loops -------------------------------------------------------------------------------
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
-        """Moves the drive and all that it saw to where the loop has it, the window in one piece."""
+        """Moves the drive and all that it saw to where the loop has it, the window in one piece.
+
+        A loop within the window is a factor more.
+        """
         self._measured(solved := self._solve(), len(solved.frames) - 1)
+        inside = loop.before >= self._window.frames[0]
+        if inside:
+            self._measured(solved, solved.frames.index(loop.before))
         before, last = self._at(loop.before), self._at(loop.after)
         found = drift_undone(self._floor, before, last, loop, what)
         self.remarks.append(found.remark + ("" if found.last is None else ", the drive with it"))
@@ -237,6 +245,8 @@ class SlidingWindowSolver(WholeGraphSolver):
             return None
         self._loops.accept(loop)
         self._answer = None
+        if inside:
+            return self._closed_inside(loop)
         self._move(found.last, loop, drive)
         every = range(len(self._held))
         values = WindowValues(
@@ -244,6 +254,12 @@ class SlidingWindowSolver(WholeGraphSolver):
             dict(zip(map(landmark_key, every), self._held.points, strict=True)),
         )
         return ClosedLoop(Smoothed(values, found.last, by_loop=True))
+
+    def _closed_inside(self, loop: Constraint) -> ClosedLoop:
+        self._window.factors.add(constraint_factor(loop))
+        self._leaving = solved = self._solve()
+        last = self._measured(solved, len(solved.frames) - 1)
+        return ClosedLoop(Smoothed(self._window.values(), last, self._window.frames[0]))
 
     def _at(self, frame: int) -> Prediction:
         """A pose as it is now, as uncertain as when it left."""
@@ -266,8 +282,9 @@ class SlidingWindowSolver(WholeGraphSolver):
         held.points[window.landmarks.variables] = window.landmarks.points
         for frame, pose in zip(window.frames, window.poses, strict=True):
             self._poses[frame] = pose.copy()
-            self._drift[frame], self._sizes[frame] = self._drift[oldest], np.inf
         self._note(oldest, there)
+        for frame in window.frames[1:]:
+            self._drift[frame], self._sizes[frame] = self._drift[oldest], np.inf
         self._note(window.frames[-1], last)
 
     # -- all of it ---------------------------------------------------------------------------

@@ -282,6 +282,7 @@ class Smoother:
         why = "was seen elsewhere in frame after frame: moved, started anew"
         self._builder.admission.start_anew(ids, why)
         self._tracker.restart(moved)
+        self._doubt.forget(moved.ids)
         if self._segments is not None:
             self._segments.forget(ids)
 

@@ -34,6 +34,8 @@ from fgslam.backend.settings import (
     SlidingWindowSettings,
 )
 from fgslam.backend.smoothers.loop_closing import _LONG_UNSEEN, found_again
+from fgslam.backend.smoothers.sliding_window import SlidingWindowSolver
+from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
@@ -92,6 +94,21 @@ def test_the_drive_is_corrected_backwards(name: str) -> None:
     late = slice(2 * ROUND // 3, CLOSED)
     assert after[late].mean() < 0.75 * without[late].mean()
     assert after.max() < without.max()
+
+
+def test_a_loop_within_the_sliding_window_is_a_factor_more() -> None:
+    """The window does not move along as one piece, nor the drive's start with it."""
+    drive = returned()
+    increments = drive.increments[: CLOSED + 1]
+    estimator = build(SlidingWindowSettings(window=len(drive.increments), update_every=5))
+    online = play(estimator, increments, FREE)
+    before = errors(at_end("sliding_window", lies=True)[1], drive)[CLOSED]
+    off = np.linalg.norm(online[-1].wTc[:3, 3] - drive.poses[CLOSED, :3, 3])
+    assert off < 0.6 * before
+    assert isinstance(estimator, MapSmoother)
+    solver = estimator._solver
+    assert isinstance(solver, SlidingWindowSolver)
+    np.testing.assert_allclose(solver._poses[0], drive.poses[0], rtol=0, atol=1e-6)
 
 
 @every

@@ -17,6 +17,7 @@ from fgslam.backend.settings import (
     FixedLagSettings,
     Isam2Settings,
     LandmarkKalmanSettings,
+    SlidingWindowSettings,
 )
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
@@ -32,6 +33,7 @@ SETTINGS: dict[str, EstimatorSettings] = {
     "isam2, keyframes": Isam2Settings(keyframe_every=4),
     "batch": BatchSettings(),
     "fixed_lag": FixedLagSettings(lag_frames=20),
+    "sliding_window": SlidingWindowSettings(window=8, update_every=4),
 }
 
 
@@ -116,7 +118,7 @@ def found_late(drive: Simulation, knocked_px: float) -> list[Increment]:
 
 
 @pytest.mark.parametrize("knocked_px", [1.0, 2.0], ids=["unmoved", "a knock"])
-@pytest.mark.parametrize("kind", ["isam2", "isam2, keyframes", "batch"])
+@pytest.mark.parametrize("kind", ["isam2", "isam2, keyframes", "sliding_window", "batch"])
 def test_whole_graphs_correct_all_frames_by_what_became_known_of_the_rig_as_it_was(
     kind: str, knocked_px: float, drive: Simulation
 ) -> None:

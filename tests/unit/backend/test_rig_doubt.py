@@ -286,7 +286,7 @@ def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: st
     through, first, second = (make_estimator(CALIBRATED.rig, ONLINE[kind], FREE) for _ in range(3))
     play(through, increments, FREE)
     play(first, increments[:7], FREE)
-    second.restore(first.state())
+    second.restore(dict(sorted(first.state().items())))  # as a saved map's session has it
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), through.estimate())
 

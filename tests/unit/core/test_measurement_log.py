@@ -343,13 +343,18 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
         rig_correction=np.arange(terms, dtype=np.float64),
         settled_rig=SettledRig(np.arange(1.0, 1.0 + terms), 2),
     )
+    log.increments[2] = replace(
+        log.increments[2], rig_correction=np.zeros(terms), settled_rig=SettledRig(None, 0)
+    )
     log.save(tmp_path / "log.npz")
     arrays = load_arrays(tmp_path / "log.npz")
     assert json.loads(str(arrays["header"]))["version"] == 6
     back = MeasurementLog.load(tmp_path / "log.npz")
     np.testing.assert_array_equal(back.increments[0].rig_correction, np.zeros(terms))
     np.testing.assert_array_equal(back.increments[1].rig_correction, np.arange(terms))
-    assert back.increments[0].settled_rig is None
+    withdrawn = back.increments[2].settled_rig
+    assert withdrawn is not None
+    assert (withdrawn.values, withdrawn.knocks) == (None, 0)
     settled = back.increments[1].settled_rig
     assert settled is not None
     assert settled.values is not None
