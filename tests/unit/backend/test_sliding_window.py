@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from simulated import Simulation, play
+from simulated import RIG, Simulation, play
 from smoothing import FREE, answer, assert_consistent, build, drawn
 
+from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import BatchSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.landmark_elimination import Eliminated
@@ -17,6 +18,7 @@ from fgslam.backend.smoothers.window import Window
 from fgslam.backend.smoothers.window_parts import Solved
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.rig_correction import term_names
 from fgslam.evaluation.consistency import pose_nees
 
 SHORT = SlidingWindowSettings(window=6, update_every=2)
@@ -143,3 +145,21 @@ def test_what_is_known_too_unevenly_is_begun_anew_with_a_remark(
     assert len(failed) == 1
     assert max(off) < 0.03
     assert sum("begun anew" in remark for remark in estimator.estimate().remarks) == 1
+
+
+def test_a_change_of_the_rig_is_taken_once_also_by_frames_that_wait() -> None:
+    estimator = build(SlidingWindowSettings(window=6, update_every=4))
+    play(estimator, drawn(3, frames=7).increments, FREE)  # the last two wait for a solution
+    solver, turned = solver_of(estimator), np.zeros(len(term_names(RIG)))
+    turned[term_names(RIG).index("left.yaw")] = 1e-2
+    change = RigChange(RIG, turned)
+    solver._builder.recalibrate(change)
+    solver.recalibrate(change)
+    frames, variables, measured, _ = solver._builder.kept_observed()
+    expected = dict(
+        zip(zip(frames.tolist(), variables.tolist(), strict=True), measured, strict=True)
+    )
+    seen = solver._window.observed
+    assert seen.frame.max() == 6
+    for frame, variable, found in zip(seen.frame, seen.variable, seen.measurement, strict=True):
+        np.testing.assert_allclose(found, expected[frame, variable], rtol=0, atol=1e-9)
