@@ -21,6 +21,7 @@ from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import pose
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 
@@ -145,8 +146,7 @@ def load_rig(
             impossible, the size is another one, or the cameras are no stereo rig.
     """
     require_options(size, unit_m, fov_deg)
-    metres = path2 is None and unit_m == 1.0
-    own = _own_rectified(Path(path), cameras) if metres else None
+    own = _own_rectified(Path(path), cameras, unit_m) if path2 is None else None
     if own is not None and fov_deg is None and size in (None, (own.width, own.height)):
         return with_masks(own, Path(path))
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
@@ -208,7 +208,7 @@ def _hidden(rectifier: Rectifier) -> str:
     return f"masks hide {', '.join(parts)}"
 
 
-def _own_rectified(path: Path, cameras: Sequence[int] | None) -> StereoRig | None:
+def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> StereoRig | None:
     """The rig of a ``calib.json`` of rectified cameras, number by number; None for other files."""
     path = path / "calib.json" if path.is_dir() else path
     if not path.is_file() or path.suffix.lower() != ".json":
@@ -219,8 +219,17 @@ def _own_rectified(path: Path, cameras: Sequence[int] | None) -> StereoRig | Non
         return None
     three = "vertical_baseline_m" in values if cameras is None else len(cameras) == 3
     found = read_own_format(path, three)
-    rig, raw = (found.rig, found) if isinstance(found, Rectifier) else (found, None)
+    rig = _rig_in_metres(found.rig if isinstance(found, Rectifier) else found, unit_m)
+    raw = replace(found, rig=rig) if isinstance(found, Rectifier) else None
     return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
+
+
+def _rig_in_metres(rig: CameraRig, unit_m: float) -> CameraRig:
+    """The rig with its lengths in metres; what corrects its images is in pixels and stays."""
+    up = rig.vertical_baseline
+    bTc = pose(rig.bTc[:3, :3], unit_m * rig.bTc[:3, 3])
+    vertical = None if up is None else unit_m * up
+    return replace(rig, baseline=unit_m * rig.baseline, vertical_baseline=vertical, bTc=bTc)
 
 
 def _stereo_rig(

@@ -351,6 +351,7 @@ def inspect(
     frames: Annotated[
         int, typer.Option(min=1, help="in how many frames, evenly spread, features are matched")
     ] = 12,
+    unit: options.Unit = None,
 ) -> None:
     """Say what is in a recording, and what is wrong with it, in words.
 
@@ -359,8 +360,9 @@ def inspect(
     from fgslam.cli.console import progress_bar
     from fgslam.runs.inspection import inspect_recording
 
+    chosen = [*(overrides or ()), *options.as_overrides({"dataset.unit_m": unit})]
     with stop_flag() as stopped, progress_bar() as progress:
-        report = inspect_recording(recording, overrides or (), frames, stoppable(progress, stopped))
+        report = inspect_recording(recording, chosen, frames, stoppable(progress, stopped))
     typer.echo(report)
 
 

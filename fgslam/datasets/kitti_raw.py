@@ -54,7 +54,7 @@ def open_kitti_raw(
     left, right = (tuple(images_in(drive / name / "data")) for name in names)
     pairs, notes = pair_files(CameraFiles(left, right, drive, interleaved=False))
     folder = drive / names[1]
-    stamps, assumed, lists = stamps_of([path for path, _ in pairs], (folder,), None)
+    stamps, assumed, lists = stamps_of([path for path, _ in pairs], (folder,), None, right)
     rig, iTc = _rig(settings, drive, names, first_size(right))
     oxts = read_oxts(drive)
     files = StereoFiles(pairs, *rig.image_size)

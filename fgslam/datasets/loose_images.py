@@ -29,7 +29,7 @@ def open_loose_images(
     pairs, unpaired = pair_files(cameras, settings.pairing_tolerance_ms)
     own = [right.parent for right, _ in pairs[:1]]
     stamps, assumed, lists = stamps_of(
-        [right for right, _ in pairs], (*own, own[0].parent, root), settings.fps
+        [right for right, _ in pairs], (*own, own[0].parent, root), settings.fps, cameras.right
     )
     rig = calibrated_rig(settings, root, first_size(right for right, _ in pairs))
     files = StereoFiles(pairs, *rig.image_size)

@@ -119,7 +119,8 @@ def _pairs(
             raise DatasetError(f"{folder} holds no image; restore it")
     cameras = CameraFiles(files[1], files[0], root, interleaved=False)
     pairs, notes = pair_files(cameras, settings.pairing_tolerance_ms)
-    stamps, assumed, used = stamps_of([colour for colour, _ in pairs], (folders[0], root), None)
+    colours = [colour for colour, _ in pairs]
+    stamps, assumed, used = stamps_of(colours, (folders[0], root), None, files[0])
     return pairs, stamps, (*notes, *assumed), used
 
 
@@ -164,7 +165,7 @@ def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
     """Units a metre by the calibration's file; RealSense's tools state metres a unit there."""
     named = settings.camera_file
     files = _own_files(root) if named is None else [Path(named)]
-    tree = read_tree(files[0]) if len(files) == 1 else None
+    tree = read_tree(files[0]) if len(files) == 1 and files[0].is_file() else None
     for key in _SCALES:
         given = (tree or {}).get(key)
         value = float(given) if is_finite_number(given) else 0.0  # type: ignore[arg-type]

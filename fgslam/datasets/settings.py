@@ -159,7 +159,8 @@ class RgbdSettings(CalibratedSettings):
         float | None,
         Field(
             gt=0.0,
-            description="depth units in a metre; null: 5000 (TUM), 1000 (16 bits), 1 (floats)",
+            description="depth units in a metre; null: by the calibration's file, else 5000 (TUM), "
+            "1000 (16 bits), 1 (floats)",
         ),
     ] = None
     depth_sigma_m: Annotated[

@@ -32,7 +32,10 @@ _DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
 
 
 def stamps_of(
-    images: Sequence[Path], folders: Sequence[Path], fps: float | None
+    images: Sequence[Path],
+    folders: Sequence[Path],
+    fps: float | None,
+    every: Sequence[Path] | None = None,
 ) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]]:
     """Seconds (n,) of images in their order, notes, and the list they were read from, if any.
 
@@ -42,11 +45,12 @@ def stamps_of(
         images: one file a frame.
         folders: where a list may be.
         fps: the rate at which they were taken; None where nobody knows: 10 is assumed.
+        every: all images of that camera, which lists without names and rates count; None: these.
 
     Raises:
         DatasetError: the list is malformed, or lacks an image.
     """
-    written = written_stamps(images, folders) if fps is None else None
+    written = written_stamps(images, folders, every) if fps is None else None
     if written is not None:
         return written
     rate = fps or _ASSUMED_FPS
@@ -55,17 +59,25 @@ def stamps_of(
         if fps
         else (f"no list of times: taken as {rate:g} frames a second (--fps says otherwise)",)
     )
-    return np.arange(len(images)) / rate, note, ()
+    return np.array(_places(images, every)) / rate, note, ()
+
+
+def _places(images: Sequence[Path], every: Sequence[Path] | None) -> list[int]:
+    """Of each image its place among all of the camera."""
+    if every is None:
+        return list(range(len(images)))
+    known = {path: k for k, path in enumerate(every)}
+    return [known[path] for path in images]
 
 
 def written_stamps(
-    images: Sequence[Path], folders: Sequence[Path]
+    images: Sequence[Path], folders: Sequence[Path], every: Sequence[Path] | None = None
 ) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]] | None:
     """As :func:`stamps_of`, from a list or from names; None where neither says anything."""
     for folder in folders:
         for path in (folder / name for name in LISTS):
             if path.is_file():
-                found, unit = _in_seconds(_listed(path, images), str(path))
+                found, unit = _in_seconds(_listed(path, images, every), str(path))
                 return found, unit, (path,)
     by_date = _dates([image.stem for image in images])
     if by_date is not None:
@@ -160,7 +172,9 @@ def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, fl
     )
 
 
-def _listed(path: Path, images: Sequence[Path]) -> tuple[FloatArray, float]:
+def _listed(
+    path: Path, images: Sequence[Path], every: Sequence[Path] | None
+) -> tuple[FloatArray, float]:
     """Times of the images by a list: a time a line, or name or number and time in either order."""
     lines = read_lines(path)
     if lines and _DATE.match(lines[0][1]):
@@ -171,14 +185,15 @@ def _listed(path: Path, images: Sequence[Path]) -> tuple[FloatArray, float]:
             rows, lines = rows[1:], lines[1:]  # names of columns
     if rows and all(len(row) >= 2 for row in rows):
         return _by_name(path, rows, images)
-    if len(rows) < len(images):
+    count = len(every or images)
+    if len(rows) < count:
         raise DatasetError(
-            f"{path} has {len(rows)} times for {len(images)} images; restore the list, or leave it "
+            f"{path} has {len(rows)} times for {count} images; restore the list, or leave it "
             "out and say --fps"
         )
     for row, (number, _) in zip(rows, lines, strict=True):
         _require_number(path, number, row[0])
-    return _numbers([row[0] for row in rows[: len(images)]])
+    return _numbers([rows[k][0] for k in _places(images, every)])
 
 
 def _by_name(

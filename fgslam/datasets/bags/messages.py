@@ -150,8 +150,7 @@ def _pixels(
     if height < 1 or used < 1 or step < used or len(data) < height * step:
         raise FrameError(
             f"{where}: {len(data)} bytes are no image of {message.width}x{message.height} "
-            f"{encoding}; "
-            "record it again"
+            f"{encoding}; record it again"
         )
     rows = data[: height * step].reshape(height, step)[:, :used]
     return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="), copy=False)

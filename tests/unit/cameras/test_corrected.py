@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.corrected import rectifier_of, write_corrected
-from fgslam.cameras.rig import StereoRig
+from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.rig_correction import (
@@ -57,6 +57,18 @@ def test_it_is_read_back(rig: CameraRig, tmp_path: Path) -> None:
     expected = rectifier_of(rig, knocked(rig).values)
     for found, wanted in zip(back.rectifier.maps, expected.maps, strict=True):
         np.testing.assert_array_equal(found, wanted)
+
+
+@pytest.mark.parametrize("rig", [PAIR, THREE], ids=["two cameras", "three cameras"])
+def test_another_unit_of_length_leaves_the_correction(rig: CameraRig, tmp_path: Path) -> None:
+    path = tmp_path / "camera.json"
+    write_corrected(path, knocked(rig))
+    metres, half = StereoRig.load(path), load_rig(path, unit_m=0.5)
+    assert half.baseline == 0.5 * metres.baseline
+    assert half.rectifier is not None
+    assert metres.rectifier is not None
+    assert half.rectifier.rig.baseline == half.baseline
+    np.testing.assert_array_equal(half.rectifier.maps, metres.rectifier.maps)
 
 
 def test_images_are_corrected_to_where_an_exact_rig_sees() -> None:

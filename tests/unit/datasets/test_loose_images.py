@@ -130,6 +130,18 @@ def test_lists_of_times(tmp_path: Path, name: str) -> None:
     assert any(f"taken as {unit}" in note for note in recording.notes) == bool(unit)
 
 
+def test_times_by_place_count_images_without_a_partner(tmp_path: Path) -> None:
+    """A list of one time a line is of all images of the right camera, and so is a rate."""
+    root = loose(tmp_path, NAMES["left, right"], [0, 1, 2, 3])
+    (root / "left" / "1.png").unlink()
+    np.testing.assert_allclose(opened(root, fps=10.0).timestamps, [0.0, 0.2, 0.3])
+    (root / "times.txt").write_text("5.0\n5.5\n6.0\n7.0", encoding="utf-8")
+    np.testing.assert_allclose(opened(root).timestamps, [5.0, 6.0, 7.0])
+    (root / "times.txt").write_text("5.0\n6.0\n7.0", encoding="utf-8")
+    with pytest.raises(DatasetError, match="has 3 times for 4 images"):
+        opened(root)
+
+
 def test_names_that_are_times_and_no_times_at_all(tmp_path: Path) -> None:
     numbers = [STAMP + k * 50_000_000 for k in range(3)]
     named = opened(loose(tmp_path / "a", NAMES["left, right"], numbers))
@@ -373,6 +385,13 @@ def test_a_drive_of_kitti_raw(tmp_path: Path, cameras: tuple[str, str]) -> None:
         assert codes(recording) == [(10, 60), (11, 61), (12, 62)]
         assert np.allclose(np.diff(recording.timestamps), 0.1, rtol=0.0, atol=1e-6)
     assert recording.name == "2011_09_26_drive_0001_sync"
+
+
+def test_kitti_raw_that_lacks_a_left_image(tmp_path: Path) -> None:
+    drive = kitti_raw(tmp_path)
+    next((drive / "image_00" / "data").glob("*1.png")).unlink()
+    recording = open_kitti_raw(KittiRawSettings(path=str(drive)))
+    assert np.allclose(np.diff(recording.timestamps), 0.2, rtol=0.0, atol=1e-6)
 
 
 def test_kitti_raw_that_lacks_a_part(tmp_path: Path) -> None:

@@ -191,6 +191,21 @@ def test_distortion_that_goes_the_other_way_is_refused(tmp_path: Path) -> None:
         opened(root)
 
 
+def test_a_folder_as_calibration_states_no_unit(tmp_path: Path) -> None:
+    root = tum(tmp_path / "walk")
+    (tmp_path / "mine").mkdir()
+    (root / "calib.json").rename(tmp_path / "mine" / "calib.json")
+    assert opened(root, camera_file=str(tmp_path / "mine")).rig.fx == FOCAL
+
+
+def test_a_colour_image_without_depth_takes_its_time_along(tmp_path: Path) -> None:
+    root = folders(tmp_path, 1e-3)
+    camera(root)
+    (root / "depth" / "1.png").unlink()
+    (root / "times.txt").write_text("5.0\n5.5\n7.0", encoding="utf-8")
+    assert opened(root).timestamps.tolist() == [5.0, 7.0]
+
+
 def test_the_colour_camera(tmp_path: Path) -> None:
     root = tum(tmp_path / "walk")
     (root / "calib.json").rename(tmp_path / "mine.json")
