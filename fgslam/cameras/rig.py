@@ -15,7 +15,7 @@ from fgslam.cameras.assembly import assembled, at_size, implausible, in_metres
 from fgslam.cameras.calibration import read_json_object
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.corrected import read_own_format
-from fgslam.cameras.formats.own import is_rectified
+from fgslam.cameras.formats.own import calibration_of, is_rectified
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
@@ -221,6 +221,8 @@ def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> 
     found = read_own_format(path, three)
     rig = _rig_in_metres(found.rig if isinstance(found, Rectifier) else found, unit_m)
     raw = replace(found, rig=rig) if isinstance(found, Rectifier) else None
+    if unit_m != 1.0:
+        assembled(calibration_of(rig, path))  # refuses a unit that makes one camera of two
     return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
 
 

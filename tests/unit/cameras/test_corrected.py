@@ -69,6 +69,8 @@ def test_another_unit_of_length_leaves_the_correction(rig: CameraRig, tmp_path: 
     assert metres.rectifier is not None
     assert half.rectifier.rig.baseline == half.baseline
     np.testing.assert_array_equal(half.rectifier.maps, metres.rectifier.maps)
+    with pytest.raises(CalibrationError, match="as one camera"):
+        load_rig(path, unit_m=1e-3)
 
 
 def test_images_are_corrected_to_where_an_exact_rig_sees() -> None:
