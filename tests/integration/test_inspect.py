@@ -366,8 +366,10 @@ def test_command_prints_the_report_and_succeeds(
     root = write(tmp_path, {"right": (1.0, 0.0), "left": (0.0, 0.0)})
     assert run_cli(monkeypatch, "inspect", str(root), "--frames", "3") == 0
     assert "cameras look swapped" in capsys.readouterr().out
-    assert run_cli(monkeypatch, "inspect", str(root), "--frames", "1", "--unit", "1e-5") == 0
-    assert "the baseline of 1e-06 m is unusual" in capsys.readouterr().out
+    assert run_cli(monkeypatch, "inspect", str(root), "--frames", "1", "--unit", "1e-5") == 2
+    assert "0.001 mm apart, as one camera" in capsys.readouterr().err
+    assert run_cli(monkeypatch, "inspect", str(root), "--frames", "1", "--unit", "0.5") == 0
+    assert re.search(r"baseline +0\.05 m", capsys.readouterr().out)
 
 
 def test_command_refuses_what_is_no_recording_in_one_line(
