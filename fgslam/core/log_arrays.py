@@ -43,6 +43,7 @@ LOG = ArrayFile(
 _BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, WITH_EVERYTHING = 2, 3, 4, 6
 CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
 _UPPER = np.triu_indices(3)
+_UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig
 
 # Arrays by the count that their first axis has, with type and the shape of an item.
 _PER_FRAME: Items = {
@@ -164,7 +165,7 @@ def _correction_arrays(frames: Sequence[Increment], terms: int) -> StateArrays:
     known = any(s.rig_correction is not None for s in frames)
     none, unknown = np.full(terms, 0.0 if known else np.nan), np.full(terms, np.nan)
     corrections = [s.rig_correction for s in frames]
-    settled = [s.settled_rig or SettledRig(None, 0) for s in frames]
+    settled = [s.settled_rig or SettledRig(None, _UNSETTLED) for s in frames]
     return {
         CORRECTIONS: _stack([none if c is None else c for c in corrections], (terms,)),
         "rig_settled": _stack(
@@ -310,7 +311,8 @@ def _settled(
     expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
     LOG.require(arrays, expected, where)
     rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), strict=True)
-    return [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
+    found = [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
+    return [None if one.knocks == _UNSETTLED else one for one in found]
 
 
 def _motion(increment: Increment) -> FloatArray:

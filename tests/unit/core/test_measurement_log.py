@@ -352,6 +352,7 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
     back = MeasurementLog.load(tmp_path / "log.npz")
     np.testing.assert_array_equal(back.increments[0].rig_correction, np.zeros(terms))
     np.testing.assert_array_equal(back.increments[1].rig_correction, np.arange(terms))
+    assert back.increments[0].settled_rig is None
     withdrawn = back.increments[2].settled_rig
     assert withdrawn is not None
     assert (withdrawn.values, withdrawn.knocks) == (None, 0)
