@@ -202,7 +202,8 @@ def test_forgotten_and_pruned_landmarks_leave_the_open_block() -> None:
 # In iSAM2
 
 
-@pytest.mark.parametrize("every", [2, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("every", [2, 5])
 def test_pose_and_landmarks_are_consistent_over_20_drives(every: int) -> None:
     assert_consistent(Isam2Settings(keyframe_every=every))
 

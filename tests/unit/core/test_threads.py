@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from fgslam.core.threads import one_blas_thread
@@ -80,6 +81,7 @@ def test_nested_thread_limits_end_independently() -> None:
         assert max(blas_threads()) == 2
 
 
+@pytest.mark.slow
 def test_the_same_bytes_whatever_the_environment_says() -> None:
     (one, first), (two, second) = digest_with(1), digest_with(2)
     assert (one, two) == (1, min(2, len(os.sched_getaffinity(0))))
