@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
-from fgslam.core.arrays import IntArray
+from fgslam.backend.protocol import Estimator, Resumable, predicted, recalibrated, updated
+from fgslam.core.arrays import IntArray, StateArrays
 from fgslam.core.estimates import (
     EgoMotion,
     EgoMotionStatus,
@@ -65,6 +65,14 @@ class Stopwatch:
         self._last = now
 
 
+_Before: TypeAlias = "list[tuple[Resumable, StateArrays]]"
+"""Parts, and what they were like before a frame."""
+
+
+def _nobody() -> IntArray:
+    return np.empty(0, np.int64)
+
+
 @dataclass(slots=True, eq=False)
 class SlamPipeline:
     """The parts of the system and the loop over them.
@@ -80,6 +88,7 @@ class SlamPipeline:
             those of its reference image alone: patches tell the rest.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
+        rewound: the last frame's features could not be found, and it left no trace.
     """
 
     stereo: StereoMatcher
@@ -94,6 +103,8 @@ class SlamPipeline:
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
     describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
     submaps: SubMaps | None = None
+    rewound: bool = False
+    _ended: IntArray = field(default_factory=_nobody, init=False)
 
     def process(
         self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
@@ -107,6 +118,7 @@ class SlamPipeline:
             body: the robot's motion since the last frame; None where none was measured.
         """
         watch = Stopwatch()
+        before = self._before(found)
         found = self._watched(found)
         watch.lap("watch")
         correction = self._correction()
@@ -117,14 +129,14 @@ class SlamPipeline:
         if self.submaps is not None:
             self.submaps.before(prediction.wTc)
             watch.lap("places")
-        landmarks, ended = self._fused()
+        landmarks = self._fused()
         carried = self._carried(prediction, found, landmarks)
         watch.lap("track")
         if self.key_frames is not None and carried is not None and self._goes_on(carried):
             stereo, described = carried.carried.features, None
             seen = _Seen(carried.tracked.ego_motion, self.key_frames.book(carried))
         else:
-            found = self._described(found, carried)
+            found = self._described(found, carried, before)
             watch.lap("sift")
             every = self._match_stereo(found)
             watch.lap("stereo")
@@ -134,7 +146,7 @@ class SlamPipeline:
             watch.lap("track")
             seen = self._recognise(seen, stereo, landmarks)
         watch.lap("places")
-        seen = seen.without(ended)
+        seen, self._ended = seen.without(self._ended), _nobody()
         increment = self._increment(index, timestamp, odometry, seen)
         stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
@@ -165,6 +177,14 @@ class SlamPipeline:
         """What is to be said of landmarks on disk."""
         return () if self.submaps is None else self.submaps.remarks
 
+    def _before(self, found: FeatureFrame) -> _Before:
+        """What a frame changes until its features are found, where it came without."""
+        self.rewound = False
+        if self.describe is None or found.frame is None or found.features:
+            return []
+        parts = self.watch, self.motion, self.key_frames
+        return [(part, part.state()) for part in parts if isinstance(part, Resumable)]
+
     def _watched(self, found: FeatureFrame) -> FeatureFrame:
         """The frame, without its images where these are not of one moment and this one."""
         if self.watch is None or found.frame is None:
@@ -186,12 +206,25 @@ class SlamPipeline:
         """Whether the frame needs no features: enough is carried, and no place is looked for."""
         return carried.suffices and (self.places is None or not self.places.wants_features)
 
-    def _described(self, found: FeatureFrame, carried: CarriedFrame | None) -> FeatureFrame:
-        """The frame with features; of all images where carried landmarks do not place it."""
+    def _described(
+        self, found: FeatureFrame, carried: CarriedFrame | None, before: _Before
+    ) -> FeatureFrame:
+        """The frame with features; of all images where carried landmarks do not place it.
+
+        Whatever an extractor of the user's raises, the loop is then as it was before the frame.
+        """
         first = self.key_frames is not None and found.i == 0
         patches = first or (carried is not None and carried.placed)
         find = self.describe_reference if patches else self.describe
-        return found if find is None else find(found)
+        if find is None:
+            return found
+        try:
+            return find(found)
+        except BaseException:
+            for part, state in before:
+                part.restore(state)
+            self.rewound = True
+            raise
 
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         if found.frame is None:
@@ -222,14 +255,15 @@ class SlamPipeline:
             settled_rig=None if calibration is None else calibration.settled,
         )
 
-    def _fused(self) -> tuple[LandmarkMap, IntArray]:
-        """The map to track on, and which landmarks a loop closed in the last frame ends.
+    def _fused(self) -> LandmarkMap:
+        """The map to track on, without the landmarks that a loop closed in the last frame ends.
 
         The estimator drops these with this frame's measurements, as the log records it.
         """
         landmarks = self.estimator.landmarks()
-        ended = np.empty(0, np.int64) if self.places is None else self.places.fuse(landmarks)
-        return (landmarks.without(ended) if len(ended) else landmarks), ended
+        if self.places is not None:
+            self._ended = np.union1d(self._ended, self.places.fuse(landmarks))
+        return landmarks.without(self._ended) if len(self._ended) else landmarks
 
     def _track(
         self,

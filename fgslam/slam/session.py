@@ -316,6 +316,8 @@ class Session:
             precision = float("nan") if precision_of is None else precision_of(report)
             self.recorder.add(report, wait_ms, precision)
         except BaseException as error:
+            if self.pipeline.rewound:
+                raise
             # Parts of the frame may be booked: going on would estimate something else.
             self._failed = True
             self._ended = f"it failed at t = {timestamp:.6f} s ({' '.join(str(error).split())})"

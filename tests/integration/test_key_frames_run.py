@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +11,17 @@ import numpy as np
 import pytest
 from recordings import experiment, write_recording
 from running import Finished, bytes_of, metrics_of, run_values, stop_after, write_config
+from simulated import assert_same_bits
 
 import fgslam as fg
+from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray, Image, StateArrays
+from fgslam.core.errors import ConfigError
+from fgslam.core.features import Features
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import BiasEffect, Odometry
+from fgslam.frontend.settings import FrontendSettings
+from fgslam.slam.factory import make_extractor
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 FRAMES = 12
@@ -104,3 +114,71 @@ def test_a_replay_finds_the_poses_of_the_live_run(hybrid: Finished) -> None:
     replayed = fg.replay(log, "landmark_kalman")
     live = fg.Trajectory.load(next(hybrid.folder.glob("landmark_kalman/final.tum")))
     np.testing.assert_allclose(replayed.online.poses, live.poses, rtol=0, atol=1e-6)
+
+
+class Moody:
+    """SIFT, and what becomes of its features."""
+
+    def __init__(self) -> None:
+        self.fault: Callable[[Features], Any] = lambda found: found
+        self._find = make_extractor(FrontendSettings())
+
+    def __call__(self, image: Image) -> Any:
+        return self.fault(self._find(image))
+
+
+def raises(_: Features) -> Any:
+    raise ZeroDivisionError("no image of mine")
+
+
+FAULTS: list[Callable[[Features], Any]] = [
+    raises,
+    lambda _: None,
+    lambda found: dataclasses.replace(found, xy=found.xy[1:]),
+    lambda found: found,
+]
+WORDS = ["no image of mine", "the extractor returned NoneType", "xy has shape"]
+
+
+def turn_of(bTc: FloatArray, steps: int) -> Odometry:
+    """What a gyroscope says of steps of the recording; its bias is unknown and wanders."""
+    turn = np.array([0.0, steps * np.radians(0.6), 0.0])
+    rotation = bTc[:3, :3] @ g.so3_exp(turn) @ bTc[:3, :3].T
+    return Odometry.turn(rotation, 1e-6 * np.eye(3), BiasEffect(-0.25 * np.eye(3), 1e-3, 1e-5))
+
+
+def watched_and_carried(slam: fg.Slam) -> dict[str, StateArrays]:
+    parts = {"watch": slam.pipeline.watch, "key_frames": slam.pipeline.key_frames}
+    return {name: dict(part.state()) for name, part in parts.items() if part is not None}
+
+
+def test_a_frame_whose_features_could_not_be_found_leaves_no_trace(
+    recording: Path, tmp_path: Path
+) -> None:
+    """Key frames fail in three ways and are handed in again: measurements as if none had failed."""
+    config = tmp_path / "hybrid.yaml"
+    write_config(config, values_of(recording))
+    opened = fg.open_recording(config)
+    frames, bTc = list(opened), opened.rig.bTc
+    finders = Moody(), Moody()
+    sound, moody = (
+        fg.Slam(opened.rig, frontend={"tracking": "hybrid"}, features=find) for find in finders
+    )
+    said: list[str] = []
+    shown = (0, 1, 2, 8, 9)  # the leap is too far for patches
+    for k, steps in zip(shown, np.diff(shown, prepend=0).tolist(), strict=True):
+        (t, images, _), turn = frames[k], turn_of(bTc, steps)
+        sound.track(t, images, turn)
+        before = watched_and_carried(moody)
+        for finders[1].fault in FAULTS:
+            try:
+                moody.track(t, images, turn)
+            except (ZeroDivisionError, ConfigError) as failure:
+                said.append(str(failure))
+                assert_same_bits(watched_and_carried(moody), before)
+            else:
+                break
+    assert len(said) == 2 * len(WORDS)  # two key frames of five
+    assert all(words in line for words, line in zip(2 * WORDS, said, strict=True))
+    assert_same_bits(sound.log.to_arrays(), moody.log.to_arrays())
+    assert_same_bits(sound.result().estimate, moody.result().estimate)
