@@ -158,6 +158,7 @@ class LandmarkKalman:
         rows = self._rows.rows(ids)
         homes = self._rows.homes[rows]
         frames = np.unique(homes[homes >= 0])
+        gain, information = self._doubt.held_aside(ids)
         return SetAside(
             landmarks=self._rows.map().select(rows),
             counts=self._rows.counts[rows],
@@ -166,6 +167,8 @@ class LandmarkKalman:
             frames=frames,
             timestamps=np.array(self._past.timestamps)[frames],
             poses=self.poses_of(frames),
+            doubt_gain=gain,
+            doubt_information=information,
         )
 
     def give_up(self, ids: IntArray) -> None:
@@ -176,7 +179,13 @@ class LandmarkKalman:
     def take_back(self, aside: SetAside) -> None:
         """Landmarks come back, moved by what closures have corrected their homes since."""
         now = aside.moved(self.poses_of(aside.frames))
-        self._rows.bring(now, aside.counts, aside.homes, aside.lasts)
+        self._rows.bring(now.landmarks, now.counts, now.homes, now.lasts)
+        self._doubt.take_back(now.landmarks.ids, now.doubt_gain, now.doubt_information)
+
+    def reported(self, aside: SetAside) -> LandmarkMap:
+        """Landmarks where closures have put them by now, with what the rig's doubt adds."""
+        now = aside.moved(self.poses_of(aside.frames))
+        return self._doubt.added(now.landmarks, now.doubt_gain)
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
         """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.
@@ -287,6 +296,7 @@ class LandmarkKalman:
         by_landmark = home_changes(self._rows.homes, moved_by)
         self._rows.positions[:] = transported(by_landmark, self._rows.positions)
         self._rows.covariances[:] = rotated(by_landmark, self._rows.covariances)
+        self._doubt.turn(self._rows.ids, by_landmark[:, :3, :3])
         return True
 
     def _update_matched(self, observed: Observations) -> tuple[float, int]:

@@ -18,6 +18,7 @@ from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
+    congruence,
     inverse,
     projection_jacobian,
     skew,
@@ -103,6 +104,30 @@ class OnlineDoubt:
         """Landmarks that somebody else holds now, or nobody."""
         self._map.drop(np.isin(self._map["ids"], ids))
 
+    def held_aside(self, ids: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Derivatives (k, 3, q) of landmarks and information (k, 3, 3); zero of unknown ones."""
+        gain, information = np.zeros((len(ids), 3, len(SHARED))), np.zeros((len(ids), 3, 3))
+        rows, known = self._rows(ids)
+        gain[known], information[known] = self._at(rows[known])
+        return gain, information
+
+    def take_back(self, ids: IntArray, gain: FloatArray, information: FloatArray) -> None:
+        """Landmarks come back with what :meth:`held_aside` gave of them."""
+        known = np.any(information, axis=(1, 2))
+        if known.any():
+            before = len(self._map)
+            back = {"ids": ids[known], "gain": gain[known], "information": information[known]}
+            self._map.append(back)
+            self._map.keep_ascending("ids", before)
+
+    def turn(self, ids: IntArray, rotations: FloatArray) -> None:
+        """A closure has turned landmarks, each by its rotation (k, 3, 3)."""
+        rows, known = self._rows(ids)
+        by, rows = rotations[known], rows[known]
+        gain, information = self._at(rows)
+        self._map["gain"][rows] = by @ gain
+        self._map["information"][rows] = congruence(by, information)
+
     def of_pose(self) -> FloatArray:
         """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
         if self._covariance is None:
@@ -117,11 +142,14 @@ class OnlineDoubt:
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with what the doubt adds to their covariances."""
-        if self._covariance is None:
+        return known if self._covariance is None else self.added(known, self._gains(known.ids))
+
+    def added(self, known: LandmarkMap, gain: FloatArray) -> LandmarkMap:
+        """The same of landmarks with these derivatives (k, 3, q), which may have been forgotten."""
+        if self._covariance is None or self._held:
             return known
-        gain = self._gains(known.ids)
-        added = gain @ self._covariance @ np.swapaxes(gain, 1, 2)
-        return dataclasses.replace(known, covariances=known.covariances + added)
+        more = gain @ self._covariance @ np.swapaxes(gain, 1, 2)
+        return dataclasses.replace(known, covariances=known.covariances + more)
 
     def joint(self, ids: IntArray, covariance: FloatArray) -> FloatArray:
         """A joint covariance (6 + 3k, 6 + 3k) of newest pose and landmarks with what it adds."""

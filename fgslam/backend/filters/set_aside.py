@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -24,6 +25,9 @@ class SetAside:
         frames: (k,) the homes, ascending, each once.
         timestamps: (k,) theirs, seconds.
         poses: (k, 4, 4) theirs, as they were then.
+        doubt_gain: (n, 3, q) derivatives by the rig's shared terms
+            (:mod:`fgslam.backend.filters.online_doubt`), world axes; zero where there is no doubt.
+        doubt_information: (n, 3, 3) given the poses; zero where there is no doubt.
     """
 
     landmarks: LandmarkMap
@@ -33,18 +37,27 @@ class SetAside:
     frames: IntArray
     timestamps: FloatArray
     poses: FloatArray
+    doubt_gain: FloatArray
+    doubt_information: FloatArray
 
-    def moved(self, poses: FloatArray) -> LandmarkMap:
+    def moved(self, poses: FloatArray) -> SetAside:
         """The landmarks beside their homes' poses (k, 4, 4) as known now; to the bit if unmoved."""
         if np.array_equal(poses, self.poses):
-            return self.landmarks
+            return self
         place = np.where(self.homes < 0, -1, np.searchsorted(self.frames, self.homes))
         by_landmark = home_changes(place, changes(self.poses, poses))
         landmarks = self.landmarks
-        return LandmarkMap(
+        there = LandmarkMap(
             landmarks.ids,
             transported(by_landmark, landmarks.positions),
             rotated(by_landmark, landmarks.covariances),
+        )
+        return dataclasses.replace(
+            self,
+            landmarks=there,
+            poses=poses,
+            doubt_gain=by_landmark[:, :3, :3] @ self.doubt_gain,
+            doubt_information=rotated(by_landmark, self.doubt_information),
         )
 
 
@@ -71,6 +84,10 @@ class SetsAside(Protocol):
 
     def give_up(self, ids: IntArray) -> None:
         """Forgets landmarks that somebody else holds now."""
+        ...
+
+    def reported(self, aside: SetAside) -> LandmarkMap:
+        """The landmarks as :meth:`Estimator.estimate` would have them, if they were back."""
         ...
 
     def take_back(self, aside: SetAside) -> None:

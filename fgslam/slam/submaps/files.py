@@ -19,7 +19,7 @@ from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
 
-_OF_ESTIMATOR = ("counts", "homes", "lasts", "frames")
+_OF_ESTIMATOR = ("counts", "homes", "lasts", "frames", "doubt_gain", "doubt_information")
 _OF_DATABASE = ("missed", "seen", "contradicted", "view_counts", "used")
 FILES = "[0-9]" * 6 + ".fgmap"
 
@@ -103,6 +103,8 @@ def _geometry(saved: SavedMap) -> SetAside:
         homes=session["homes"],
         lasts=session["lasts"],
         frames=session["frames"],
+        doubt_gain=session["doubt_gain"],
+        doubt_information=session["doubt_information"],
         timestamps=saved.trajectory.timestamps,
         poses=saved.trajectory.poses,
     )

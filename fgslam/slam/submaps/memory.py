@@ -383,17 +383,18 @@ class SubMaps:
         return read_submap(file_of(self._area.folder, number), self._stored[number].landmarks)
 
     def _now(self, submap: SubMap) -> LandmarkMap:
-        return submap.geometry.moved(self._parts.estimator.poses_of(submap.geometry.frames))
+        poses = self._parts.estimator.poses_of(submap.geometry.frames)
+        return submap.geometry.moved(poses).landmarks
 
     def _pieces(self) -> Iterator[tuple[LandmarkMap, SubMap]]:
         """What is in memory, then each sub-map."""
         parts = self._parts
         ids = parts.estimator.landmarks().ids.copy()
         active = SubMap(parts.estimator.held_aside(ids), parts.database.held_aside(ids))
-        yield active.geometry.landmarks, active
+        yield parts.estimator.reported(active.geometry), active
         for number in self._stored:
             submap = self._read(number)
-            yield self._now(submap), submap
+            yield parts.estimator.reported(submap.geometry), submap
 
     def _match_files(self) -> None:
         """All files are there; those of later frames than the state's go: these come again."""

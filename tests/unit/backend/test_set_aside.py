@@ -48,9 +48,12 @@ def test_landmarks_move_with_the_frame_that_first_saw_them() -> None:
         frames=np.array([4, 7]),
         timestamps=np.array([4.0, 7.0]),
         poses=poses,
+        doubt_gain=np.tile(np.eye(3), (3, 1, 1)),
+        doubt_information=covariances,
     )
     corrected = np.stack([np.eye(4), TURNED @ TURNED])  # frame 7 alone was moved
-    now = aside.moved(corrected)
+    moved = aside.moved(corrected)
+    now = moved.landmarks
     np.testing.assert_allclose(now.positions[[0, 2]], points[[0, 2]], rtol=0, atol=1e-15)
     # Seen from frame 7 it lies where it lay.
     there = g.transform_to_camera(TURNED, points[1:2])
@@ -59,4 +62,10 @@ def test_landmarks_move_with_the_frame_that_first_saw_them() -> None:
     )
     by = (corrected[1] @ g.inverse(TURNED))[:3, :3]
     np.testing.assert_allclose(now.covariances[1], by @ covariances[1] @ by.T, rtol=0, atol=1e-12)
-    assert aside.moved(poses) is aside.landmarks
+    # What the rig's doubt does to it is turned with it; nothing turns what stays.
+    np.testing.assert_allclose(moved.doubt_gain[1], by, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        moved.doubt_information[1], now.covariances[1], rtol=0, atol=1e-12
+    )
+    np.testing.assert_array_equal(moved.doubt_gain[[0, 2]], aside.doubt_gain[[0, 2]])
+    assert aside.moved(poses) is aside
