@@ -48,7 +48,8 @@ SETTINGS = FrontendSettings(
 )
 LIMITS = {"submaps_ate_over_one_map": 1.05}
 _SIGMA_PX = 0.2
-_TURN_M = 40.0  # way of a bend of 90 degrees
+_TURN_M = 40.0  # way of a bend of 90 degrees, on a ring that is long enough
+_APART = 500  # frames to the end of the drive from where the robot is carried, at least
 _SEEN_M = 12.0
 _ASIDE_M = (1.5, 3.5)
 _HEIGHTS_M = (-1.2, 1.2)
@@ -82,8 +83,10 @@ class Course:
     @property
     def carried(self) -> IntArray:
         """(carries,) frames of the first round where the robot is put down, far from the end."""
-        end = self.frames % int(self.round_m / self.step_m)
-        return np.linspace(end + 500, self.round_m / self.step_m - 500, self.carries).astype(int)
+        one = min(self.frames, int(self.round_m / self.step_m))
+        end = self.frames % one
+        apart = min(_APART, (one - end) // 4)
+        return np.linspace(end + apart, one - apart, self.carries).astype(int)
 
     def poses(self) -> FloatArray:
         """(n, 4, 4) ``wTc``; the first is the world."""
@@ -92,8 +95,9 @@ class Course:
 
     def at(self, frames: IntArray) -> FloatArray:
         """``wTc`` (n, 4, 4) of frames of a drive without end."""
-        side = 0.25 * self.round_m - _TURN_M
-        ring = straights_and_turns((0.0, 0.0, 0.0), [(side, 0.0), (_TURN_M, np.pi / 2)] * 4, True)
+        bend = min(_TURN_M, 0.125 * self.round_m)
+        sides = [(0.25 * self.round_m - bend, 0.0), (bend, np.pi / 2)] * 4
+        ring = straights_and_turns((0.0, 0.0, 0.0), sides, True)
         rounds, along = np.divmod(self.step_m * np.array([0, *frames]), ring.length)
         planar = [np.interp(along, ring.arc, one) for one in (*ring.xy.T, ring.heading)]
         planar[2] += 2.0 * np.pi * rounds
@@ -229,7 +233,7 @@ def asked(course: Course, session: Session, mapped: FloatArray) -> dict[str, flo
         "asked": float(ASKED),
         "recall": right / ASKED,
         "precision": right / len(off) if off else np.nan,
-        "asked_off_m": float(np.median(off)),
+        "asked_off_m": float(np.median(off)) if off else np.nan,
         "asked_ms": 1e3 * float(np.median(cpu)),
         "on_disk": float(len(submaps)),
     }

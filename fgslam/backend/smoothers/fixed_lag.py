@@ -14,14 +14,12 @@ import numpy as np
 from fgslam.backend.filters.loop_correction import (
     Constraint,
     constraint_factor,
-    refusal,
 )
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.drift_undone import drift_undone
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.loop_closing import misfit
 from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
 from fgslam.backend.smoothers.solver import (
@@ -112,35 +110,27 @@ class FixedLagSolver:
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
-        After that the window is solved anew from there.
+        After that the window is solved anew from there. A loop within the lag is a factor more.
         """
-        if loop.before >= self._oldest:  # both poses are variables
-            if not self._taken_in(loop, what):
-                return None
+        inside = loop.before >= self._oldest  # both poses are variables
+        if inside:
+            self._covariances[loop.before] = self._covariance(loop.before)
+        earlier, last = (
+            Prediction(self._poses[frame], self._covariances[frame])
+            for frame in (loop.before, loop.after)
+        )
+        found = drift_undone(self._floor, earlier, last, loop, what)
+        if found.last is None:
+            self.remarks.append(found.remark)
+            return None
+        if inside:
+            self._window.factors.add(constraint_factor(loop))
+            self._solve()
+            self.remarks.append(f"{what}: within the lag, a factor more")
         else:
-            earlier, last = (
-                Prediction(self._poses[frame], self._covariances[frame])
-                for frame in (loop.before, loop.after)
-            )
-            found = drift_undone(self._floor, earlier, last, loop, what)
-            with_it = "" if found.last is None else ", and what lies within the lag"
-            self.remarks.append(found.remark + with_it)
-            if found.last is None:
-                return None
+            self.remarks.append(f"{found.remark}, and what lies within the lag")
             self._move_all(found.last)
         return ClosedLoop(self._smoothed({loop.after}))
-
-    def _taken_in(self, known: Constraint, what: str) -> bool:
-        """Adds a loop within the lag, where hardly anything drifts, as a factor; or refuses it."""
-        factor = constraint_factor(known)
-        refused = refusal(what, misfit(factor, self._window.pose_values()))
-        if refused:
-            self.remarks.append(refused)
-            return False
-        self._window.factors.add(factor)
-        self._solve()
-        self.remarks.append(f"{what}: within the lag, a factor more")
-        return True
 
     def _move_all(self, last: Prediction) -> None:
         """Takes the window along with its last pose, as it is, and starts from there."""

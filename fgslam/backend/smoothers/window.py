@@ -264,10 +264,6 @@ class Window:
         corner[np.ix_(r + at, r + at)] += information
         right[r + at] += information @ shift.ravel()[at] - pull
 
-    def pose_values(self) -> Any:
-        """GTSAM values of the poses."""
-        return self._values(self.poses)
-
     def _values(self, poses: FloatArray) -> Any:
         values = gtsam.Values()
         for frame, wTc in zip(self.frames, poses, strict=True):

@@ -111,6 +111,23 @@ def test_a_loop_within_the_sliding_window_is_a_factor_more() -> None:
     np.testing.assert_allclose(solver._poses[0], drive.poses[0], rtol=0, atol=1e-6)
 
 
+def test_a_loop_within_a_lag_so_long_that_it_drifts_is_closed_and_a_wrong_one_refused() -> None:
+    """The drift in between explains the one and not the other; nothing moves as one piece."""
+    off, remarks = [], []
+    for lies in (False, True):
+        drive = returned(lies)
+        estimator = build(FixedLagSettings(lag_frames=len(drive.increments)))
+        online = play(estimator, drive.increments[: CLOSED + 1], FREE)
+        off.append(np.linalg.norm(online[-1].wTc[:3, 3] - drive.poses[CLOSED, :3, 3]))
+        found = estimator.estimate()
+        remarks.append(next(r for r in found.remarks if "loop closure to frame" in r))
+        first, meant = found.trajectory.poses[0], drive.poses[0]
+        np.testing.assert_allclose(first, meant, rtol=0, atol=1e-6)
+    assert off[0] < 0.6 * off[1]
+    assert "within the lag" in remarks[0]
+    assert "refused" in remarks[1]
+
+
 @every
 def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
     drive = returned()

@@ -64,8 +64,6 @@ def test_landmarks_move_with_the_frame_that_first_saw_them() -> None:
     np.testing.assert_allclose(now.covariances[1], by @ covariances[1] @ by.T, rtol=0, atol=1e-12)
     # What the rig's doubt does to it is turned with it; nothing turns what stays.
     np.testing.assert_allclose(moved.doubt_gain[1], by, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(
-        moved.doubt_information[1], now.covariances[1], rtol=0, atol=1e-12
-    )
+    np.testing.assert_allclose(moved.doubt_information[1], now.covariances[1], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(moved.doubt_gain[[0, 2]], aside.doubt_gain[[0, 2]])
     assert aside.moved(poses) is aside

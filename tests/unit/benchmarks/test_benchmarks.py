@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import benchmarks.__main__ as runner
@@ -20,7 +21,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import images, parts, soak
+from benchmarks.speed import images, parts, soak, submaps
 from benchmarks.tables import Table
 
 
@@ -230,3 +231,14 @@ def test_a_soak_gives_time_and_memory_of_every_block() -> None:
     assert found["soak_landmark_kalman_ms_last_over_second_block"] == blocks[-1] / blocks[1]
     grown = found["soak_landmark_kalman_200_mb"] - found["soak_landmark_kalman_100_mb"]
     assert found["soak_landmark_kalman_kb_a_frame_second_half"] == pytest.approx(1e3 * grown / 100)
+
+
+@pytest.mark.parametrize("frames", [100, 400, 1000, 10_000])
+def test_a_street_of_any_length_is_a_ring_that_the_robot_is_carried_back_into(frames: int) -> None:
+    course = submaps.Course(frames, 0.8 * frames * 0.25, carries=submaps.CARRIES)
+    first_round = int(0.8 * frames)
+    assert (np.diff(course.carried) > 0).all()
+    assert frames - first_round < course.carried[0]
+    assert course.carried[-1] < first_round
+    start, back = course.at(np.array([0, first_round]))
+    np.testing.assert_allclose(back, start, rtol=0, atol=1e-6)
