@@ -26,15 +26,15 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import Sensor
 
-_LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
-_LONGEST = 30  # sightings of a track, at which it is judged although it goes on
-_ENDED_AFTER = 5  # frames without a sighting
+LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
+LONGEST = 30  # sightings of a track, at which it is judged although it goes on
+ENDED_AFTER = 5  # frames without a sighting
 _EVERY = 5  # frames between judgements
 _ITERATIONS = 5
 _BENDS = 4.0  # deviations at which the weight of a residual falls while the place is fitted
 _ASTRAY = 4.0  # times the track's own median residual: it holds a wrong match
 _LEAST_PART = 0.1  # of a leaning, that no other place of the landmark explains
-_STATED = np.array([30.0, 0.3])
+STATED = np.array([30.0, 0.3])
 """Samples that the stated noise counts for: numbers of single residuals, longest tracks."""
 _BOUNDS = (0.05, 400.0)  # of variances over the stated ones
 
@@ -97,7 +97,7 @@ class Persistence:
         self._pose = np.eye(4)
         self._poses: dict[int, FloatArray] = {}
         # Of single residuals and of leanings (rows) the sum of squares, and its expectation.
-        self._sums = np.column_stack([_STATED, _STATED])
+        self._sums = np.column_stack([STATED, STATED])
 
     @property
     def spread(self) -> float:
@@ -133,7 +133,7 @@ class Persistence:
 
     def _judge(self, frame: int, ended: list[int]) -> None:
         tracks = [self._tracks.pop(i) for i in ended]
-        tracks = [track for track in tracks if len(track.frames) >= _LEAST_SIGHTINGS]
+        tracks = [track for track in tracks if len(track.frames) >= LEAST_SIGHTINGS]
         if tracks:
             sightings = _Sightings.of(tracks, self._poses)
             fitted = sightings.fitted(self._sensor)
@@ -148,24 +148,52 @@ def _ratio(sums: FloatArray) -> float:
 
 
 def _over(track: _Track, frame: int) -> bool:
-    return len(track.frames) >= _LONGEST or frame - track.frames[-1] > _ENDED_AFTER
+    return len(track.frames) >= LONGEST or frame - track.frames[-1] > ENDED_AFTER
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """Sightings (n) of m tracks, one track after the other; ``start`` (m,): each one's first."""
+
+    start: IntArray
+    sightings: int
+
+    @property
+    def counts(self) -> IntArray:
+        """(m,) sightings of each track."""
+        return np.diff(np.append(self.start, self.sightings))
+
+    @property
+    def track(self) -> IntArray:
+        """(n,) which track each sighting belongs to."""
+        return np.repeat(np.arange(len(self.start)), self.counts)
+
+    def select(self, kept: BoolArray) -> Tracks:
+        """Those of a mask (m,)."""
+        return tracks_of(self.counts[kept])
+
+
+def tracks_of(counts: IntArray) -> Tracks:
+    """Tracks of so many sightings (m,)."""
+    ends = np.cumsum(counts)
+    return Tracks(ends - counts, int(counts.sum()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sightings:
-    """All sightings (n) of m tracks, one track after the other.
+    """All sightings (n) of m tracks.
 
     Attributes:
         cTw: (n, 4, 4) poses from which they were made.
         measurement: (n, 3).
         whitening: (n, 3, 3).
-        start: (m,) row of each track's first sighting.
+        tracks: which are whose.
     """
 
     cTw: FloatArray
     measurement: FloatArray
     whitening: FloatArray
-    start: IntArray
+    tracks: Tracks
 
     @staticmethod
     def of(tracks: list[_Track], poses: dict[int, FloatArray]) -> _Sightings:
@@ -175,29 +203,17 @@ class _Sightings:
             inverse(np.array([poses[k] for track in tracks for k in track.frames])),
             np.concatenate([track.measurement for track in tracks]),
             np.linalg.inv(np.linalg.cholesky(covariance)),
-            np.cumsum(counts) - counts,
+            tracks_of(counts),
         )
 
-    @property
-    def track(self) -> IntArray:
-        """(n,) which track each belongs to."""
-        return np.repeat(np.arange(len(self.start)), self.counts)
-
-    @property
-    def counts(self) -> IntArray:
-        """(m,) sightings of each track."""
-        return np.diff(np.append(self.start, len(self.measurement)))
-
-    def select(self, tracks: BoolArray) -> _Sightings:
+    def select(self, kept: BoolArray) -> _Sightings:
         """Those of some tracks (m,), a mask."""
-        rows, counts = tracks[self.track], self.counts[tracks]
-        return _Sightings(
-            self.cTw[rows], self.measurement[rows], self.whitening[rows], np.cumsum(counts) - counts
-        )
+        rows, tracks = kept[self.tracks.track], self.tracks.select(kept)
+        return _Sightings(self.cTw[rows], self.measurement[rows], self.whitening[rows], tracks)
 
-    def fitted(self, sensor: Sensor) -> _Fitted | None:
+    def fitted(self, sensor: Sensor) -> Fitted | None:
         """With each landmark where its sightings have it; without those that hold a wrong match."""
-        last = self.start + self.counts - 1
+        last = self.tracks.start + self.tracks.counts - 1
         local = triangulate(sensor, self.measurement[last])
         wTc = inverse(self.cTw[last])
         places = np.einsum("mij,mj->mi", wTc[:, :3, :3], local) + wTc[:, :3, 3]
@@ -205,7 +221,7 @@ class _Sightings:
         for iteration in range(_ITERATIONS):
             points = found._points(places)
             sound = in_front(sensor, points) & np.isfinite(points).all(axis=1)
-            before = np.logical_and.reduceat(sound, found.start)
+            before = np.logical_and.reduceat(sound, found.tracks.start)
             if not before.all():
                 found, places = found.select(before), places[before]
                 if not len(places):
@@ -216,10 +232,10 @@ class _Sightings:
             # At first all count: where the last sighting has the landmark may be wrong itself.
             weight = 1.0 / (1.0 + length**2) if iteration else np.ones(len(length))
             places = places + found._step(residual, jacobian, weight)
-        return _Fitted.of(found, *found._linear(sensor, found._points(places)))
+        return Fitted.of(found.tracks, *found._linear(sensor, found._points(places)))
 
     def _points(self, places: FloatArray) -> FloatArray:
-        moved = np.einsum("nij,nj->ni", self.cTw[:, :3, :3], places[self.track])
+        moved = np.einsum("nij,nj->ni", self.cTw[:, :3, :3], places[self.tracks.track])
         return np.asarray(moved + self.cTw[:, :3, 3])
 
     def _linear(self, sensor: Sensor, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -230,39 +246,46 @@ class _Sightings:
 
     def _step(self, residual: FloatArray, jacobian: FloatArray, weight: FloatArray) -> FloatArray:
         weighed = weight[:, None, None] * jacobian
-        normal = np.add.reduceat(np.swapaxes(weighed, 1, 2) @ jacobian, self.start)
-        gradient = np.add.reduceat(np.einsum("nci,nc->ni", weighed, residual), self.start)
+        start = self.tracks.start
+        normal = np.add.reduceat(np.swapaxes(weighed, 1, 2) @ jacobian, start)
+        gradient = np.add.reduceat(np.einsum("nci,nc->ni", weighed, residual), start)
         return np.asarray(np.einsum("mij,mj->mi", np.linalg.pinv(normal), gradient))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fitted:
-    """Tracks' residuals after the least squares of each landmark's place."""
+class Fitted:
+    """Tracks' normalised residuals (n, 3) after the least squares of each landmark's place."""
 
-    sightings: _Sightings
+    tracks: Tracks
     residual: FloatArray
     jacobian: FloatArray
     inverse_normal: FloatArray
 
     @staticmethod
-    def of(sightings: _Sightings, residual: FloatArray, jacobian: FloatArray) -> _Fitted | None:
-        """Without tracks that hold a residual far beyond their others."""
+    def of(tracks: Tracks, residual: FloatArray, jacobian: FloatArray) -> Fitted | None:
+        """Without tracks that hold a residual far beyond their others.
+
+        Args:
+            tracks: whose sightings they are.
+            residual: (n, 3) with each landmark near its place.
+            jacobian: (n, 3, 3) their derivatives by the place.
+        """
         length = np.linalg.norm(residual, axis=1)
-        start, counts = sightings.start, sightings.counts
+        start, counts = tracks.start, tracks.counts
         ends = start + counts
         median = np.array([np.median(length[a:b]) for a, b in zip(start, ends, strict=True)])
         good = np.maximum.reduceat(length, start) <= _ASTRAY * median
         if not good.any():
             return None
-        rows = good[sightings.track]
-        kept = sightings.select(good)
+        rows = good[tracks.track]
+        kept = tracks.select(good)
         residual, jacobian = residual[rows], jacobian[rows]
         turned = np.swapaxes(jacobian, 1, 2)
         normal = np.linalg.pinv(np.add.reduceat(turned @ jacobian, kept.start))
         gradient = np.add.reduceat(np.einsum("nci,nc->ni", jacobian, residual), kept.start)
         step = np.einsum("mij,mj->mi", normal, gradient)
         residual = residual - np.einsum("nci,ni->nc", jacobian, step[kept.track])
-        return _Fitted(kept, residual, jacobian, normal)
+        return Fitted(kept, residual, jacobian, normal)
 
     def powers(self) -> FloatArray:
         """Sum and expectation of the squares of single residuals, and of leanings (2, 2).
@@ -270,8 +293,8 @@ class _Fitted:
         Expected of independent errors of variance one; what another place of the landmark would
         explain is missing from both.
         """
-        start, track = self.sightings.start, self.sightings.track
-        counts = self.sightings.counts
+        start, track = self.tracks.start, self.tracks.track
+        counts = self.tracks.counts
         single = (self.residual**2).sum(), 3.0 * (counts - 1.0).sum()
         ramp = np.arange(len(track)) - start[track] - 0.5 * (counts[track] - 1.0)
         ramp /= np.sqrt(np.add.reduceat(ramp**2, start))[track]
@@ -280,5 +303,5 @@ class _Fitted:
         part = 1.0 - np.einsum("mci,mij,mcj->mc", by_place, self.inverse_normal, by_place)
         counted = part >= _LEAST_PART
         # What a track says of a drift goes with the square of its length, times its sightings.
-        weight = np.broadcast_to((counts / _LONGEST)[:, None] ** 3, part.shape)[counted]
+        weight = np.broadcast_to((counts / LONGEST)[:, None] ** 3, part.shape)[counted]
         return np.array([single, (weight @ (lean**2)[counted], weight @ part[counted])])

@@ -8,6 +8,7 @@ estimate in the middle of a run leaves the run as it was.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,7 +23,9 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops, Minimum
 from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
+from fgslam.backend.smoothers.persistence import StatedNoise
 from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals
+from fgslam.backend.smoothers.solved_noise import power_ratio
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
@@ -166,12 +169,14 @@ class Refined:
         state: of all variables that are left.
         remarks: what was left out, in words.
         doubted: what was applied last to a rig that calibrates itself; None for a known one.
+        noise_ratio: variance of the measurements over what the builder takes it to be.
     """
 
     graph: WholeGraph
     state: State
     remarks: tuple[str, ...] = ()
     doubted: RigCorrection | None = None
+    noise_ratio: float = 1.0
 
     @property
     def variables(self) -> list[int]:
@@ -207,7 +212,22 @@ class Refined:
 
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
-    """Solves, without landmarks that come out behind a camera or that nothing supports."""
+    """Solves, weighs measurements by what they err along the solved poses, and solves again.
+
+    Their noise stays what it is where it is stated, and where only key frames are variables, whose
+    tracks were judged in all frames.
+    """
+    found = _solved(builder, values, minimise)
+    if isinstance(builder.noise, StatedNoise) or len(builder.frames) <= builder.frames[-1]:
+        return found
+    ratio = power_ratio(found.graph, found.state)
+    weighed = dataclasses.replace(found.graph, weights=found.graph.weights / ratio)
+    state = weighed.minimum(found.state, MINIMUM.iterations, MINIMUM.tolerance)
+    return dataclasses.replace(found, graph=weighed, state=state, noise_ratio=ratio)
+
+
+def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
+    """Without landmarks that come out behind a camera or that nothing supports."""
     graph, state = builder.whole_graph(values, settled=True)
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
@@ -305,6 +325,7 @@ class WholeGraphSolver:
 def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     """Everything about frames of a solved graph and its landmark variables."""
     poses, points, variables = refined.poses(), refined.points(), refined.variables
+    ratio = refined.noise_ratio
     kept = np.full((len(poses), 6, 6), np.nan)
     try:
         marginals = refined.marginals
@@ -312,8 +333,9 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
         kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
-        return Solution(poses, kept, points, missing, (*refined.remarks, str(error)))
-    return Solution(poses, kept, points, covariances, refined.remarks, considers_rig=True)
+        remarks = (*refined.remarks, str(error))
+        return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio)
+    return Solution(poses, kept, points, covariances, refined.remarks, True, ratio)
 
 
 def _lost(builder: GraphBuilder, found: Refined) -> dict[int, str]:

@@ -192,7 +192,7 @@ class Smoother:
             covariances,
             landmarks,
             (*self._solver.remarks, *self._builder.admission.remarks, *answer.remarks),
-            noise_factor=float(np.sqrt(self._builder.noise.power)),
+            noise_factor=float(np.sqrt(self._builder.noise.power * answer.noise_ratio)),
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:

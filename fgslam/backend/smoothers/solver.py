@@ -34,6 +34,7 @@ class Solution:
         remarks: what was left out, why covariances are missing; in words.
         considers_rig: covariances contain what is open of the rig's calibration; else what was
             open when each frame came is added.
+        noise_ratio: variance of the measurements over what the builder takes it to be.
     """
 
     poses: FloatArray
@@ -42,6 +43,7 @@ class Solution:
     point_covariances: dict[int, FloatArray]
     remarks: tuple[str, ...] = ()
     considers_rig: bool = False
+    noise_ratio: float = 1.0
 
 
 def poses_of(values: Any, frames: list[int]) -> FloatArray:
