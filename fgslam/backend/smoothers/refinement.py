@@ -23,7 +23,6 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops, Minimum
 from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
-from fgslam.backend.smoothers.persistence import StatedNoise
 from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals
 from fgslam.backend.smoothers.solved_noise import power_ratio
 from fgslam.backend.smoothers.solver import (
@@ -47,6 +46,9 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.factors.graphs import number, poses_of_frame
 
 _GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
+_BEYOND = (4.0 / 1.538) ** 2
+"""Variance over the stated one from which on most matches lie beyond the four stated deviations
+within which ego-motion takes them (1.538 is the median length of three normal numbers)."""
 _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 20  # trims until the observations that fit do not change any more
 _ROUGH = 1e-2  # of the cost: the minimum with the kernel only says roughly what fits
@@ -212,13 +214,12 @@ class Refined:
 
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
-    """Solves, weighs measurements by what they err along the solved poses, and solves again.
+    """Solves; where poses were tracked by the fewer matches, weighs these by what they err now.
 
-    Their noise stays what it is where it is stated, and where only key frames are variables, whose
-    tracks were judged in all frames.
+    Not where only key frames are variables, whose tracks were judged in all frames.
     """
     found = _solved(builder, values, minimise)
-    if isinstance(builder.noise, StatedNoise) or len(builder.frames) <= builder.frames[-1]:
+    if builder.noise.spread < _BEYOND or len(builder.frames) <= builder.frames[-1]:
         return found
     ratio = power_ratio(found.graph, found.state)
     weighed = dataclasses.replace(found.graph, weights=found.graph.weights / ratio)

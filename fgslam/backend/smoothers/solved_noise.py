@@ -1,8 +1,9 @@
 """Noise of measurements along a graph's solved poses.
 
 On the way, tracks are judged along the poses as tracked, whose own errors lean all of them: by four
-times the stated noise, where a quarter of a frame's matches finds its pose, by half as much again
-as their noise does. Solved poses lean none. docs/derivations/measurement_noise.md.
+times the stated noise, where a quarter of a frame's matches finds its pose, by up to half as much
+again as their noise does. Solved poses lean none; but what leans all tracks of a real recording
+alike goes into them, too, and is then missed. docs/derivations/measurement_noise.md.
 """
 
 from __future__ import annotations
