@@ -66,6 +66,10 @@ class MeasurementNoise(Protocol):
         """
         ...
 
+    def smoothed(self, frames: list[int], poses: FloatArray) -> None:
+        """Takes in how the latest frames lie to each other: poses (n, 4, 4) of a solution."""
+        ...
+
 
 @dataclass(frozen=True, slots=True)
 class StatedNoise:
@@ -84,6 +88,9 @@ class StatedNoise:
         return self.factor**2
 
     def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
+        """Nothing."""
+
+    def smoothed(self, frames: list[int], poses: FloatArray) -> None:
         """Nothing."""
 
 
@@ -130,6 +137,19 @@ class Persistence:
             track.covariance.append(covariance)
         if frame % _EVERY == 0:
             self._judge(frame, [i for i, track in self._tracks.items() if _over(track, frame)])
+
+    def smoothed(self, frames: list[int], poses: FloatArray) -> None:
+        """Takes in how the latest frames lie to each other, for tracks that are still to be judged.
+
+        Steps alone would lean tracks where a tracker's map is in doubt: where some of it has moved.
+        """
+        known = [frame in self._poses for frame in frames]
+        if any(known):
+            first = known.index(True)
+            by = self._poses[frames[first]] @ inverse(poses[first])
+            for frame, wTc in zip(frames[first:], poses[first:], strict=True):
+                self._poses[frame] = reorthonormalise(by @ wTc)
+            self._pose = self._poses[frames[-1]]
 
     def _judge(self, frame: int, ended: list[int]) -> None:
         tracks = [self._tracks.pop(i) for i in ended]

@@ -192,6 +192,8 @@ class SlidingWindowSolver(WholeGraphSolver):
         for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
             self._poses[frame] = pose.copy()  # a view would keep the whole window's array
         self._held.points[self._window.landmarks.variables] = self._window.landmarks.points
+        if self._window.places:  # the tracker's map is in doubt: some of it may have moved
+            self._builder.noise.smoothed(self._window.frames, self._window.poses)
         return solved
 
     def _let_go(self) -> None:
