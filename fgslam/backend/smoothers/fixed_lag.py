@@ -18,9 +18,9 @@ from fgslam.backend.filters.loop_correction import (
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.admission import Track
+from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.drift_undone import drift_undone
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,

@@ -229,6 +229,10 @@ class GraphBuilder:
         self.graph.add(factor)
         return int(self.graph.size()) - 1
 
+    def of_saved_map(self, variable: int) -> bool:
+        """Whether a landmark variable is on the prior of a saved map's landmark."""
+        return self.admission.saved(self._id_of[variable]) is not None
+
     def in_graph(self, variable: int) -> bool:
         """Whether a landmark variable still has its factors."""
         return variable in self._rows
@@ -251,11 +255,7 @@ class GraphBuilder:
         return [int(variable) for variable in np.unique(seen[depth <= 0.0])]
 
     def seen_last(self, poses: FloatArray) -> dict[int, FloatArray]:
-        """Places (3,) of the graph's landmark variables, each from its last sighting alone.
-
-        Args:
-            poses: (n, 4, 4) ``wTc`` by frame, those of the graph at least.
-        """
+        """Places (3,) of the graph's landmark variables as each was seen last, from such poses."""
         tracks = [t for _, t in self.admission.in_graph() if np.isfinite(poses[t.last.frame, 0, 0])]
         if not tracks:
             return {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fgslam.backend.filters.loop_correction import home_changes, rotated, transported
 from fgslam.backend.smoothers.window_parts import Landmarks
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 
@@ -36,7 +37,7 @@ class HeldLandmarks:
 
     @property
     def saved(self) -> BoolArray:
-        """(m,) whether something was known of it beforehand, from a saved map."""
+        """(m,) whether it is known from a saved map, which no change of this drive moves."""
         return self._rows["saved"]
 
     def enter(self, point: FloatArray) -> None:
@@ -45,11 +46,17 @@ class HeldLandmarks:
         last = {"home": np.array(-1), "saved": np.array(False)}
         self._rows.append({name: value[None] for name, value in (row | last).items()})
 
-    def know(self, variable: int, mean: FloatArray, covariance: FloatArray) -> None:
-        """What is known of a new variable beforehand."""
+    def know(self, variable: int, mean: FloatArray, covariance: FloatArray, saved: bool) -> None:
+        """What is known of a new variable beforehand, from a ``saved`` map or from this drive."""
         self._rows["mean"][variable] = mean
         self._rows["information"][variable] = np.linalg.inv(covariance)
-        self._rows["saved"][variable] = True
+        self._rows["saved"][variable] = saved
+
+    def carried_along(self, by_frame: FloatArray) -> None:
+        """Moves each with the frame with which it is off, by motions of the world (n, 4, 4)."""
+        by = home_changes(np.where(self.saved, -1, self.homes), by_frame)
+        self.points[:] = transported(by, self.points)
+        self._rows["information"][:] = rotated(by, self._rows["information"])
 
     def of(self, variables: IntArray) -> Landmarks:
         """Some of them, for a window."""

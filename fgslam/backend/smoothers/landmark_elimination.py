@@ -12,7 +12,11 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
 
-from fgslam.backend.smoothers.marginals import UndeterminedError, from_cholesky, scaled_cholesky
+from fgslam.backend.smoothers.dense_cholesky import (
+    UndeterminedError,
+    from_cholesky,
+    scaled_cholesky,
+)
 from fgslam.core.arrays import FloatArray, IntArray
 
 
@@ -122,8 +126,7 @@ class Eliminated:
 
     @cached_property
     def _covariance(self) -> FloatArray:
-        # LAPACK's inversion works in place of the factor.
-        return from_cholesky(self._factor.copy(), self._size)
+        return from_cholesky(self._factor, self._size)
 
     def _own(self, landmarks: IntArray) -> FloatArray:
         """(k, 3, 3) covariances of landmarks given the corner."""

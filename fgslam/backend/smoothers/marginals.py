@@ -9,20 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded, lapack
+from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import block_array, bsr_matrix, csr_matrix, diags_array
 
 from fgslam.backend.smoothers.block_cholesky import BlockCholesky, order
+from fgslam.backend.smoothers.dense_cholesky import UNDETERMINED, DenseFactor
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
 from fgslam.factors.stacked import summed
 
-_UNDETERMINED = "the measurements do not determine all variables; no covariances"
-_ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
 _POSES_A_LANDMARK = 4
 """How many times more numbers landmarks have than the poses that cut a long chain: cuts make each
 stretch see little, and the system that is left larger."""
@@ -233,7 +231,7 @@ class Stretch:
         try:
             factor = cholesky_banded(band, lower=True, check_finite=False)
         except np.linalg.LinAlgError:
-            raise EstimatorError(_UNDETERMINED) from None
+            raise EstimatorError(UNDETERMINED) from None
         columns = np.unique(coupling.indices).astype(np.int64)
         scaled = coupling[:, columns].toarray() / size[:, None]
         gain = cho_solve_banded((factor, True), scaled, check_finite=False)
@@ -257,15 +255,13 @@ class ChainMarginals:
         system: the graph.
         stretches: poses that are eliminated.
         kept: (3m + 6k,) rows in the system's information of all landmarks and the k poses kept.
-        factor: of their information, scaled; lower.
-        size: (3m + 6k,) the scale.
+        border: their information.
     """
 
     system: LinearSystem
     stretches: list[Stretch]
     kept: IntArray
-    factor: FloatArray
-    size: FloatArray
+    border: DenseFactor
 
     @staticmethod
     def of(system: LinearSystem) -> ChainMarginals:
@@ -293,7 +289,7 @@ class ChainMarginals:
             )
             border[np.ix_(stretch.columns, stretch.columns)] -= taken
             stretches.append(stretch)
-        return ChainMarginals(system, stretches, kept, *scaled_cholesky(border, in_place=True))
+        return ChainMarginals(system, stretches, kept, DenseFactor(border))
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum."""
@@ -302,21 +298,16 @@ class ChainMarginals:
         pull = gradient[self.kept]
         for stretch in self.stretches:
             pull[stretch.columns] -= stretch.gain.T @ s.pose_gradient[stretch.rows]
-        moved = -cho_solve((self.factor, True), pull / self.size, check_finite=False) / self.size
+        moved = -self.border.solve(pull)
         out = np.empty_like(gradient)
         out[self.kept] = moved
         for stretch in self.stretches:
             out[s.columns + stretch.rows] = stretch.alone - stretch.gain @ moved[stretch.columns]
         return out
 
-    @cached_property
-    def kept_covariance(self) -> FloatArray:
-        """(3m + 6k, 3m + 6k) joint of all landmarks and the poses kept."""
-        return from_cholesky(self.factor, self.size)
-
     def poses(self) -> FloatArray:
         """(n, 6, 6) marginals, in the order of ``pose_keys``."""
-        columns, covariance = self.system.columns, self.kept_covariance
+        columns, covariance = self.system.columns, self.border.inverse
         out = np.empty((len(self.system.pose_keys), 6, 6))
         out[(self.kept[columns::6] - columns) // 6] = _diagonal(covariance[columns:, columns:], 6)
         for stretch in self.stretches:
@@ -328,13 +319,13 @@ class ChainMarginals:
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         columns = self.system.columns
-        return _diagonal(self.kept_covariance[:columns, :columns], 3)
+        return _diagonal(self.border.inverse[:columns, :columns], 3)
 
     def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
         """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
         columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
         on, gain, alone = self._hangs(pose)
-        covariance = self.kept_covariance
+        covariance = self.border.inverse
         cross = -(gain @ covariance[np.ix_(on, columns)])
         own = alone + gain @ covariance[np.ix_(on, on)] @ gain.T
         return np.block([[own, cross], [cross.T, covariance[np.ix_(columns, columns)]]])
@@ -348,15 +339,6 @@ class ChainMarginals:
                 return stretch.columns, stretch.gain[first : first + 6], stretch.own[first // 6]
         first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
         return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
-
-
-class UndeterminedError(EstimatorError):
-    """The measurements do not determine all variables; ``row`` of the first one's, as ordered."""
-
-    def __init__(self, row: int, message: str) -> None:
-        """Row of the information matrix and the message."""
-        super().__init__(message)
-        self.row = row
 
 
 def _diagonal(matrix: FloatArray, size: int) -> FloatArray:
@@ -379,7 +361,7 @@ def _scaled_band(matrix: csr_matrix) -> tuple[FloatArray, FloatArray]:
     distance = entries.row - entries.col
     size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     if not (size > 0.0).all():
-        raise EstimatorError(_UNDETERMINED)
+        raise EstimatorError(UNDETERMINED)
     band = np.zeros((12, len(size)))
     lower = distance >= 0
     row, column = entries.row[lower], entries.col[lower]
@@ -402,41 +384,6 @@ def _inverse_blocks(factor: FloatArray) -> FloatArray:
     for k in range(n - 2, -1, -1):
         out[k] += carried[k].T @ out[k + 1] @ carried[k]
     return out
-
-
-def scaled_cholesky(
-    information: FloatArray, in_place: bool = False
-) -> tuple[FloatArray, FloatArray]:
-    """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
-
-    Without the scaling, digits would be lost beside poses that are held stiffly. A large matrix is
-    better overwritten.
-    """
-    size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
-    if not (size > 0.0).all():
-        raise UndeterminedError(int(np.argmin(size > 0.0)), _UNDETERMINED)
-    scaled = information if in_place else information.copy()
-    scaled /= size[:, None]
-    scaled /= size
-    factor, status = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
-    if status != 0:
-        raise UndeterminedError(int(status) - 1, _UNDETERMINED)
-    pivots = np.diagonal(factor)
-    if len(pivots) and pivots.min() ** 2 < _ROUNDING:
-        raise UndeterminedError(int(pivots.argmin()), _UNDETERMINED)
-    return factor, size
-
-
-def from_cholesky(factor: FloatArray, size: FloatArray) -> FloatArray:
-    """The inverse of the matrix that :func:`scaled_cholesky` took apart."""
-    if not len(size):  # LAPACK would complain on the terminal
-        return np.zeros((0, 0))
-    inverse, _ = lapack.dpotri(factor, lower=1)
-    for row in range(len(size)):  # in place: it may be large
-        inverse[row, row + 1 :] = inverse[row + 1 :, row]
-    inverse /= size[:, None]
-    inverse /= size
-    return np.asarray(inverse)
 
 
 def block_diagonal(blocks: FloatArray) -> csr_matrix:

@@ -19,17 +19,15 @@ from fgslam.backend.filters.loop_correction import (
     Constraint,
     changes,
     constraint_factor,
-    home_changes,
     nearest_positive,
-    transported,
 )
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import SlidingWindowSettings
+from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.drift_undone import drift_undone
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.held_landmarks import HeldLandmarks
 from fgslam.backend.smoothers.loop_closing import closed_chain
-from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.refinement import MINIMUM, WholeGraphSolver, trimmed
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
 from fgslam.backend.smoothers.solver import (
@@ -132,7 +130,9 @@ class SlidingWindowSolver(WholeGraphSolver):
                     factors.add(factor)
                 else:
                     known = factor.prior(), factor.noiseModel().covariance()
-                    self._held.know(key - landmark_key(0), *known)
+                    variable = key - landmark_key(0)
+                    saved = self._builder.of_saved_map(variable)
+                    self._held.know(variable, *known, saved)
             window.add_pose(frame.frame, self._poses[frame.frame], factors)
         self._observe()
 
@@ -275,12 +275,13 @@ class SlidingWindowSolver(WholeGraphSolver):
         by = changes(poses, moved)
         self._poses = list(moved)
         held = self._held
-        held.points[:] = transported(home_changes(held.homes, by), held.points)
+        held.carried_along(by)
         oldest = window.frames[0]
         whole = last.wTc @ inverse(window.poses[-1])
         to_oldest = adjoint(inverse(window.poses[0]) @ window.poses[-1])
         there = Prediction(whole @ window.poses[0], congruence(to_oldest, last.covariance))
-        window.carried_along(whole, pose_prior(pose_key(oldest), there))
+        prior = pose_prior(pose_key(oldest), there)
+        window.carried_along(whole, prior, np.flatnonzero(held.saved))
         held.points[window.landmarks.variables] = window.landmarks.points
         for frame, pose in zip(window.frames, window.poses, strict=True):
             self._poses[frame] = pose.copy()

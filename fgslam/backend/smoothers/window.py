@@ -17,12 +17,12 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.settings import KernelSettings
+from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.landmark_elimination import (
     Eliminated,
     Equations,
     UndeterminedLandmarkError,
 )
-from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.window_parts import (
     Landmarks,
     LandmarkUndeterminedError,
@@ -59,6 +59,7 @@ from fgslam.factors.stacked import (
 _SHORT = 0.01
 """Radians and metres of a pose, iSAM2's threshold of linearising anew: covariances are those of
 within it."""
+_NONE = np.empty(0, np.int64)
 _STEPS = 3  # with a frame: what is left after them is gone with the next frame
 _REPAIRS = 20  # landmarks taken out in one solution before the graph itself must be wrong
 _LEFT_BETWEEN = 5  # poses that leave until their hidden numbers are looked through again
@@ -395,12 +396,18 @@ class Window:
         self.observed = self.observed.select(self.observed.variable != variable)
         self._eliminate(self.landmarks.variables == variable)
 
-    def carried_along(self, by: FloatArray, prior: Any) -> None:
-        """Moves everything by a motion of the world (4, 4); what has left gives way to a factor."""
+    def carried_along(self, by: FloatArray, prior: Any, saved: IntArray = _NONE) -> None:
+        """Moves everything by a motion of the world (4, 4); what has left gives way to a factor.
+
+        What is known of ``saved`` landmark variables stays where it is: it is not of this drive.
+        """
         self.poses = np.array([reorthonormalise(by @ pose) for pose in self.poses])
         weak = self.landmarks
+        stays = np.isin(weak.variables, saved)[:, None]
         turned = by[:3, :3] @ weak.information @ by[:3, :3].T
-        points, mean = transform_to_world(by, weak.points), transform_to_world(by, weak.mean)
+        turned = np.where(stays[:, None], weak.information, turned)
+        points = transform_to_world(by, weak.points)
+        mean = np.where(stays, weak.mean, transform_to_world(by, weak.mean))
         self.landmarks = Landmarks(weak.variables, points, mean, turned)
         self.prior, self._least_hidden = WindowPrior.none(len(self.frames)), 0
         self.places = {}

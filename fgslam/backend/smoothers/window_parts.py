@@ -8,8 +8,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.landmark_elimination import Eliminated
-from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.core.arrays import FloatArray, IntArray, Rows
 from fgslam.factors.stacked import LinearRows
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from fgslam.backend.smoothers.marginals import scaled_cholesky
+from fgslam.backend.smoothers.dense_cholesky import scaled_cholesky
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse_spd3
 from fgslam.factors.stacked import LinearRows, products, summed

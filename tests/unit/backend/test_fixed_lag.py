@@ -23,8 +23,8 @@ from smoothing import (
 )
 
 from fgslam.backend.settings import FixedLagSettings
+from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.fixed_lag import FixedLagSolver
-from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.backend.smoothers.window_parts import LandmarkUndeterminedError
 from fgslam.core.arrays import FloatArray

@@ -13,12 +13,11 @@ from factor_specifications import RawPixelFactors
 from simulated import RIG, points_in_view
 
 from fgslam.backend.settings import KernelSettings
+from fgslam.backend.smoothers.dense_cholesky import from_cholesky, scaled_cholesky
 from fgslam.backend.smoothers.marginals import (
     ChainMarginals,
     GraphMarginals,
-    from_cholesky,
     reduced,
-    scaled_cholesky,
 )
 from fgslam.backend.smoothers.whole_graph import PLAIN, WholeGraph
 from fgslam.core import geometry as g

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from simulated import RIG, Simulation, play
 from smoothing import FREE, answer, assert_consistent, build, drawn
 
+from fgslam.backend.filters.loop_correction import Constraint
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import BatchSettings, SlidingWindowSettings
+from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.landmark_elimination import Eliminated
-from fgslam.backend.smoothers.marginals import UndeterminedError
 from fgslam.backend.smoothers.sliding_window import SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother
+from fgslam.backend.smoothers.solver import Drive
 from fgslam.backend.smoothers.window import Window
 from fgslam.backend.smoothers.window_parts import Solved
 from fgslam.core import geometry as g
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import term_names
 from fgslam.evaluation.consistency import pose_nees
 
@@ -163,3 +169,37 @@ def test_a_change_of_the_rig_is_taken_once_also_by_frames_that_wait() -> None:
     assert seen.frame.max() == 6
     for frame, variable, found in zip(seen.frame, seen.variable, seen.measurement, strict=True):
         np.testing.assert_allclose(found, expected[frame, variable], rtol=0, atol=1e-9)
+
+
+def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
+    """What is known of them stays, in the window and outside; those of the drive go with it."""
+    drive, estimator = drawn(3, **CIRCLE), build(SHORT)
+    saved = np.arange(0, 40, 2)
+    known = LandmarkMap(saved, drive.points_by_id[saved], np.tile(1e-4 * np.eye(3), (20, 1, 1)))
+    assert isinstance(estimator, MapSmoother)
+    estimator.begin_in(known, np.full(20, 4), fixed=False)
+    play(estimator, [matched(each, saved) for each in drive.increments[:44]], FREE)
+    solver = solver_of(estimator)
+    held, window = solver._held, solver._window
+    ours = held.saved.copy()
+    outside = ~np.isin(np.arange(len(held)), window.landmarks.variables)
+    inside = ours[window.landmarks.variables]
+    assert all(mask.sum() > 3 for mask in (ours & outside, inside, ~ours & outside, ~inside))
+    points, mean = held.points.copy(), window.landmarks.mean.copy()
+    beside = g.se3_exp(np.array([0.0, 0.3, 0.0, 0.5, 0.0, 0.0])) @ window.poses[-1]
+    there = Prediction(beside, 1e-6 * np.eye(6))
+    loop = Constraint(2, window.frames[-1], g.inverse(solver._poses[2]) @ beside, 1e-6 * np.eye(6))
+    solver._loops.accept(loop)
+    solver._move(there, loop, Drive(estimator._tracker.chain, window.poses[-1]))
+    np.testing.assert_array_equal(held.points[ours & outside], points[ours & outside])
+    np.testing.assert_array_equal(window.landmarks.mean[inside], mean[inside])
+    went = np.linalg.norm(held.points - points, axis=1)[~ours & outside & (held.homes > 10)]
+    assert went.min() > 0.01
+    assert np.linalg.norm(window.landmarks.mean - mean, axis=1)[~inside].min() > 0.01
+
+
+def matched(increment: Increment, saved: IntArray) -> Increment:
+    """With those of a saved map matched where they are seen first, not new."""
+    seen = increment.observations
+    seen = dataclasses.replace(seen, is_new=seen.is_new & ~np.isin(seen.ids, saved))
+    return dataclasses.replace(increment, observations=seen)
