@@ -10,16 +10,19 @@ import numpy as np
 
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.cameras.rectification import (
+    WIDEST_CYLINDER_DEG,
     Rectifier,
     View,
+    chosen_cylinder,
     chosen_view,
+    common_reach,
     orientation,
     rectifier,
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, RigView
 
 _LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
 # Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.
@@ -30,6 +33,8 @@ _LEAST_COMMON_VIEW = 0.707
 _LEAST_STATED = 0.5
 _SAME_PX = 1e-3  # cameras that differ by less are rectified already
 _TOLD_SHARE = 0.8  # of the angle of view; less is said to be cut off
+_TOLD_SHARE_OF_CYLINDER = 0.97  # the same of a cylinder, which is chosen not to lose any
+_WIDE_DEG = 120.0  # what both cameras see, from which on a cylinder is proposed
 _TOLD_SKEW_DEG = 0.5  # from a right angle between the baselines, of three cameras
 
 
@@ -50,22 +55,43 @@ class Assembly:
     remarks: tuple[str, ...]
 
 
-def assembled(calibration: Calibration, fov_deg: float | None = None) -> Assembly:
+@dataclass(frozen=True, slots=True)
+class ViewAsked:
+    """Which rectified view is wanted.
+
+    Attributes:
+        fov_deg: horizontal angle; None: as much as all cameras fill.
+        kind: perspective, or of two cameras cylindrical.
+    """
+
+    fov_deg: float | None = None
+    kind: RigView = "perspective"
+
+    @property
+    def is_default(self) -> bool:
+        """Whether nothing is asked for, so that what is rectified already may stay."""
+        return self.fov_deg is None and self.kind == "perspective"
+
+
+ANY_VIEW = ViewAsked()
+
+
+def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly:
     """The rig of a calibration.
 
     Args:
         calibration: of two or three cameras.
-        fov_deg: wanted horizontal angle of the rectified view; None: as much as all cameras fill.
+        asked: the rectified view.
 
     Raises:
         CalibrationError: it is of one camera only or of more than three, their images differ in
-            size, or they are no stereo pair.
+            size, they are no stereo pair, or are three and a cylinder is asked for.
     """
     cameras = _usable(calibration)
     sources, turn, told = _pair(cameras) if len(cameras) == 2 else _three(cameras)
     chosen = tuple(cameras[k] for k in sources)
     _require_side_by_side(chosen, turn)
-    rotations, view, also = _view(calibration, chosen, sources, turn, fov_deg)
+    rotations, view, also = _view(calibration, chosen, sources, turn, asked)
     found = rectifier(chosen, rotations, view)
     remarks = (*calibration.notes, *told, *also)
     if calibration.sided and len(sources) == 2:
@@ -73,7 +99,7 @@ def assembled(calibration: Calibration, fov_deg: float | None = None) -> Assembl
         if sources == (0, 1):
             remarks = (*remarks, _swapped(chosen, found.rig))
     remarks = (*remarks, *implausible(calibration.source, found.rig))
-    straight = found.order[:2] == (0, 1) and fov_deg is None and _is_rectified(chosen)
+    straight = found.order[:2] == (0, 1) and asked.is_default and _is_rectified(chosen)
     kept = None if straight else found
     return Assembly(found.rig, kept, sources, remarks)
 
@@ -221,15 +247,20 @@ def _view(
     chosen: Sequence[RawCamera],
     sources: tuple[int, ...],
     turn: FloatArray,
-    fov_deg: float | None,
+    asked: ViewAsked,
 ) -> tuple[tuple[FloatArray, ...], View, tuple[str, ...]]:
     """Rotation of each camera into the view, the view, and what to tell."""
-    if fov_deg is None and _is_rectified(chosen):
+    if asked.kind == "cylindrical" and len(chosen) > 2:
+        raise CalibrationError(
+            f"{calibration.source}: a cylindrical view is of two cameras, not of three; choose two "
+            "(--cameras 0,1, cameras=(0, 1)), or leave the view perspective"
+        )
+    if asked.is_default and _is_rectified(chosen):
         return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
     stated = calibration.view
     told: tuple[str, ...] = ()
     natural = float(np.mean([camera.focal_px for camera in chosen]))
-    if stated is not None and fov_deg is None:
+    if stated is not None and asked.is_default:
         if stated.matrix[0, 0] > _LEAST_STATED * natural:
             rotations = tuple(stated.rotations[k] for k in sources)
             return rotations, View(stated.matrix, stated.size), ()
@@ -242,17 +273,37 @@ def _view(
     axes = np.array([camera.bTc[:3, 2] for camera in chosen])
     body_to_view = orientation([camera.bTc[:3, 3] for camera in chosen], axes)
     rotations = tuple(body_to_view @ camera.bTc[:3, :3] for camera in chosen)
-    view = chosen_view(chosen, rotations, size, fov_deg)
-    return rotations, view, (*told, *_cut_off(chosen[0], view))
+    if asked.kind == "cylindrical":
+        view = chosen_cylinder(chosen, rotations, asked.fov_deg)
+    else:
+        view = chosen_view(chosen, rotations, size, asked.fov_deg)
+    return rotations, view, (*told, *_cut_off(chosen[0], view), *_wider(chosen, rotations, view))
 
 
 def _cut_off(camera: RawCamera, view: View) -> tuple[str, ...]:
     seen, kept = np.degrees(camera.field_of_view()[:2]), np.degrees(view.angles)
-    if kept[0] > _TOLD_SHARE * seen[0]:
+    cylinder = view.kind == "cylindrical"
+    if kept[0] > (_TOLD_SHARE_OF_CYLINDER if cylinder else _TOLD_SHARE) * seen[0]:
         return ()
+    most = f", at most {WIDEST_CYLINDER_DEG:.0f}" if cylinder else ""
     return (
         f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-        f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
+        f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle{most})",
+    )
+
+
+def _wider(
+    chosen: Sequence[RawCamera], rotations: Sequence[FloatArray], view: View
+) -> tuple[str, ...]:
+    """That a cylinder shows more, where two cameras see more in common than a plane shows well."""
+    if view.kind == "cylindrical" or len(chosen) > 2:
+        return ()
+    low, high = np.degrees(common_reach(chosen, rotations))
+    if high[0] - low[0] <= _WIDE_DEG:
+        return ()
+    return (
+        f"both cameras see {high[0] - low[0]:.0f} degrees; a cylindrical view shows them all "
+        "(--view cylindrical, dataset.view)",
     )
 
 

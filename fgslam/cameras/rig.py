@@ -6,24 +6,32 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.assembly import assembled, at_size, implausible, in_metres
+from fgslam.cameras.assembly import (
+    ANY_VIEW,
+    ViewAsked,
+    assembled,
+    at_size,
+    implausible,
+    in_metres,
+)
 from fgslam.cameras.calibration import read_json_object
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.corrected import read_own_format
 from fgslam.cameras.formats.own import calibration_of, is_rectified
 from fgslam.cameras.raw_cameras import Calibration
-from fgslam.cameras.rectification import Rectifier
+from fgslam.cameras.rectification import WIDEST_CYLINDER_DEG, Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose
 from fgslam.core.rig_checks import rig_fault
-from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig, RigView
 
 
 def _identity() -> FloatArray:
@@ -49,6 +57,7 @@ class StereoRig(CameraRig):
         exact: the calibration has no error, as that of a rendered rig; else covariances contain
             what one leaves.
         rectifier: how raw images become rectified ones; None where they are rectified already.
+        view: ``perspective``, or of a pair ``cylindrical``: fx and fy are pixels a radian.
         sources: which of a calibration file's cameras are right, left[, top].
         remarks: what the calibration gives rise to say, a line each.
 
@@ -119,6 +128,7 @@ def load_rig(
     scale: bool = False,
     unit_m: float = 1.0,
     fov_deg: float | None = None,
+    view: RigView = "perspective",
     cameras: Sequence[int] | None = None,
 ) -> StereoRig:
     """The rig of calibration files; the format is recognised by the content.
@@ -137,26 +147,29 @@ def load_rig(
         scale: the images were resized as a whole: scale the calibration to ``size``.
         unit_m: metres of one unit of length of the file: 0.001 for millimetres, the side of a
             square for a calibration in squares.
-        fov_deg: wanted horizontal angle of the rectified view in degrees, below 180; None: as much
-            as all cameras fill, at most 120.
+        fov_deg: wanted horizontal angle of the rectified view in degrees, below 170; None: as much
+            as all cameras fill, at most 120; of a cylindrical view at most 160.
+        view: ``perspective``, or of two cameras ``cylindrical``: angles instead of tangents, for
+            lenses that see more than 120 degrees.
         cameras: which of the file's cameras form the rig, two or three; None: all.
 
     Raises:
         CalibrationError: the format or a camera model is not known, a value is missing or
             impossible, the size is another one, or the cameras are no stereo rig.
     """
-    require_options(size, unit_m, fov_deg)
+    asked = asked_view(fov_deg, view)
+    require_options(size, unit_m)
     own = _own_rectified(Path(path), cameras, unit_m) if path2 is None else None
-    if own is not None and fov_deg is None and size in (None, (own.width, own.height)):
+    if own is not None and asked.is_default and size in (None, (own.width, own.height)):
         return with_masks(own, Path(path))
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
-    return with_masks(rig_of(found, fov_deg), Path(path))
+    return with_masks(rig_of(found, asked), Path(path))
 
 
-def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
+def rig_of(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> StereoRig:
     """The rig of a calibration that is read; see :func:`load_rig`."""
-    made = assembled(calibration, fov_deg)
+    made = assembled(calibration, asked)
     return _stereo_rig(made.rig, made.rectifier, made.sources, made.remarks)
 
 
@@ -255,7 +268,7 @@ def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> C
     return replace(calibration, cameras=chosen, view=None)
 
 
-def require_options(size: object, unit_m: object, fov_deg: object) -> None:
+def require_options(size: object, unit_m: object) -> None:
     """Raises CalibrationError where what is said beside a file cannot be meant."""
     pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
     whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
@@ -263,5 +276,22 @@ def require_options(size: object, unit_m: object, fov_deg: object) -> None:
         raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
     if not is_finite_number(unit_m) or not float(unit_m) > 0.0:  # type: ignore[arg-type]
         raise CalibrationError(f"unit_m is {unit_m!r}; give metres, 0.001 for millimetres")
-    if fov_deg is not None and not (is_finite_number(fov_deg) and 0.0 < float(fov_deg) < 170.0):  # type: ignore[arg-type]
-        raise CalibrationError(f"fov_deg is {fov_deg!r}; a perspective view takes 0 to 170 degrees")
+
+
+def asked_view(fov_deg: object, kind: object) -> ViewAsked:
+    """The view that is asked for. Raises CalibrationError where there is none of that kind."""
+    if kind not in get_args(RigView):
+        raise CalibrationError(f"view is {kind!r}; give {' or '.join(get_args(RigView))}")
+    if fov_deg is None:
+        return ViewAsked(None, kind)  # type: ignore[arg-type]
+    cylinder = kind == "cylindrical"
+    most = WIDEST_CYLINDER_DEG if cylinder else _WIDEST_PLANE_DEG
+    value = float(fov_deg) if is_finite_number(fov_deg) else math.nan  # type: ignore[arg-type]
+    if not (0.0 < value < most or (cylinder and value == most)):
+        raise CalibrationError(
+            f"fov_deg is {fov_deg!r}; a {kind} view takes 0 to {most:.0f} degrees"
+        )
+    return ViewAsked(value, kind)  # type: ignore[arg-type]
+
+
+_WIDEST_PLANE_DEG = 170.0  # not included

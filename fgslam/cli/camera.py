@@ -27,13 +27,20 @@ Unit = Annotated[
 Fov = Annotated[
     float | None, typer.Option(metavar="DEGREES", help="horizontal angle of the rectified view")
 ]
+View = Annotated[
+    str,
+    typer.Option(
+        metavar="KIND",
+        help="rectified view: perspective, or of two cameras cylindrical, up to 160 degrees",
+    ),
+]
 Cameras = Annotated[
     str | None, typer.Option(metavar="N,N", help="which of the file's cameras, as 0,1")
 ]
 
 
 @app.command()
-def show(
+def show(  # noqa: PLR0913 - each option is a parameter
     file: File,
     second: Second = None,
     size: Size = None,
@@ -41,6 +48,7 @@ def show(
     unit: Unit = 1.0,
     fov: Fov = None,
     cameras: Cameras = None,
+    view: View = "perspective",
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="the picture; default none")
     ] = None,
@@ -48,7 +56,7 @@ def show(
     """Say what a calibration file says: cameras, fields of view, baselines, rectified view."""
     from fgslam.runs.camera_files import Asked, show_calibration
 
-    asked = Asked(file, second, size, scale, unit, fov, cameras)
+    asked = Asked(file, second, size, scale, unit, fov, cameras, view)
     for line in show_calibration(asked, out):
         typer.echo(line)
 

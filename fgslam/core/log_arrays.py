@@ -69,6 +69,7 @@ _PER_LOOP: Items = {
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
 _EXACT = "exact"  # of a rig: written where it is
+_VIEW = "view"  # of a rig: written where it is cylindrical
 
 
 def arrays_of(
@@ -79,6 +80,8 @@ def arrays_of(
     about = {"kind": kind} | {name: getattr(sensor, name) for name in _SENSOR_KEYS[kind]}
     if isinstance(sensor, CameraRig) and sensor.exact:
         about[_EXACT] = True
+    if isinstance(sensor, CameraRig) and sensor.cylindrical:
+        about[_VIEW] = sensor.view
     out = LOG.header(version, sensor=about, motion=motion_model) | {
         SENSOR_POSE: sensor.bTc,
         "frame_index": np.array([s.index for s in frames], np.int64),
@@ -182,7 +185,7 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
         header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
     sensor = header.get("sensor")
     keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
-    given = set(sensor or ()) - ({_EXACT} if keys is _RIG else set())
+    given = set(sensor or ()) - ({_EXACT, _VIEW} if keys is _RIG else set())
     if keys is None or given != {"kind", *keys}:
         raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
     if not isinstance(header.get("motion"), dict):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 
 from fgslam.core.checks import is_finite_number
 from fgslam.core.geometry import is_rigid
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, RigView
 
 _FOCAL_RANGE = 1000.0
 """Of focal length and image size: at one end a telescope, at the other no picture."""
@@ -42,6 +44,9 @@ def rig_fault(rig: CameraRig) -> str:
 def _mounting_fault(rig: CameraRig) -> str:
     if not isinstance(rig.exact, bool | np.bool_):
         return f"exact is {rig.exact!r}; give True for a rig known without error, as a rendered one"
+    views = get_args(RigView)
+    if rig.view not in views or (rig.cylindrical and rig.cameras > 2):
+        return f"view is {rig.view!r}; give {views[0]}, or of two cameras {views[1]}"
     if not is_rigid(np.asarray(rig.bTc, np.float64)):
         return (
             "bTc must be a rigid motion (4, 4), the pose of the right camera in the body; "

@@ -90,7 +90,7 @@ def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
 def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> FloatArray:
     """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term."""
     focal = np.array([rig.fx, rig.fy])
-    own = focal[:, None] * _terms((pixels - [rig.cx, rig.cy]) / focal)
+    own = focal[:, None] * _terms((pixels - [rig.cx, rig.cy]) / focal, rig.cylindrical)
     count = len(TERMS)
     out = np.zeros((len(pixels), 2, count * (rig.cameras - 1) + len(COMMON)))
     if camera:
@@ -99,8 +99,12 @@ def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> Flo
     return out
 
 
-def _terms(rays: FloatArray) -> FloatArray:
-    """Displacements (k, 2, 11) of normalised image points (k, 2) in the order of TERMS."""
+def _terms(rays: FloatArray, cylindrical: bool) -> FloatArray:
+    """Displacements (k, 2, 11) of normalised image points (k, 2) in the order of TERMS.
+
+    In a cylindrical view the points are angles: a lens that is equidistant, nearly, displaces them
+    as a plain one does a plane; turns are those of the sphere.
+    """
     x, y = rays.T
     r2 = x * x + y * y
     zero, one = np.zeros_like(x), np.ones_like(x)
@@ -108,6 +112,10 @@ def _terms(rays: FloatArray) -> FloatArray:
     columns = (one, zero, 1.0 + x * x, x * y, -y, x, along_x, across, x * r2)
     rows = (zero, one, x * y, 1.0 + y * y, x, y, across, along_y, y * r2)
     out = np.stack([np.stack(columns, axis=1), np.stack(rows, axis=1)], axis=1)
+    if cylindrical:
+        sine, cosine, tangent = np.sin(y), np.cos(y), np.tan(x)
+        out[:, 0, 2:5] = np.stack([cosine, zero, -sine], axis=1)
+        out[:, 1, 2:5] = np.stack([tangent * sine, one, tangent * cosine], axis=1)
     return np.concatenate([out, out[..., 6:8] * r2[:, None, None]], axis=2)
 
 
@@ -140,7 +148,10 @@ def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
     """
     focal = np.array([rig.fx, rig.fy])
     rays = (pixels.reshape(-1, 2) - [rig.cx, rig.cy]) / focal
-    of_lens = focal[:, None] * _terms(rays)[..., [TERMS.index(name) for name in SHARED[:-1]]]
+    of_lens = (
+        focal[:, None]
+        * _terms(rays, rig.cylindrical)[..., [TERMS.index(name) for name in SHARED[:-1]]]
+    )
     out = np.zeros((len(pixels), 2 * rig.cameras, len(SHARED)))
     out[..., :-1] = of_lens.reshape(len(pixels), 2 * rig.cameras, len(SHARED) - 1)
     out[:, 2, -1] = pixels[:, 1, 0] - pixels[:, 0, 0]

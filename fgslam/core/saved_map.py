@@ -38,6 +38,7 @@ _EVIDENCE = "evidence_frame"
 _UPPER = np.triu_indices(3)
 _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: equal maps give equal bytes
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
+_VIEW = "view"  # written where it is cylindrical
 _SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
 
 # Arrays by what their first axis counts, with type and the shape of an item.
@@ -155,6 +156,11 @@ def require_rig(saved: SavedMap, rig: CameraRig, where: str) -> None:
                 f"{where}: made with another rig ({name} {theirs}, the recording's is {ours}); "
                 "give a map of the same cameras"
             )
+    if saved.rig.view != rig.view:
+        raise MapError(
+            f"{where}: made with a {saved.rig.view} view, the recording's is {rig.view}; sizes in "
+            "them differ, choose that one: --view, dataset.view"
+        )
     if not np.allclose(saved.rig.bTc, rig.bTc, rtol=0.0, atol=_SAME_RIG):
         raise MapError(
             f"{where}: made with the cameras mounted otherwise on the robot (bTc differs); give a "
@@ -282,7 +288,7 @@ def _header(saved: SavedMap, where: str) -> dict[str, Any]:
             "poses": len(saved.trajectory),
         }
         | ({} if saved.evidence is None else {"evidence": len(saved.evidence)}),
-        "rig": {name: getattr(saved.rig, name) for name in _RIG},
+        "rig": _rig_values(saved.rig),
         "about": saved.about,
     }
     try:
@@ -339,9 +345,14 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
     require_covariances(FILE, "landmark_covariance", covariances, where, definite=False)
 
 
+def _rig_values(rig: CameraRig) -> dict[str, Any]:
+    values = {name: getattr(rig, name) for name in _RIG}
+    return values | {_VIEW: rig.view} if rig.cylindrical else values
+
+
 def _rig(header: dict[str, Any], bTc: FloatArray, where: str) -> CameraRig:
     values = header["rig"]
-    if set(values) != set(_RIG):
+    if set(values) - {_VIEW} != set(_RIG):
         raise MapError(f"{where}: the map's header names no rig; make the map again")
     rig = CameraRig(**values, bTc=bTc)
     if fault := rig_fault(rig):

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
+
+RigView: TypeAlias = Literal["perspective", "cylindrical"]
+"""How images are laid out when they are rectified."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -32,6 +35,8 @@ class CameraRig(Brief):
         bTc: (4, 4) pose of the reference camera in the robot's body frame (the lever arm).
         exact: the calibration has no error, as that of a rendered rig; else covariances contain
             what one leaves (:data:`fgslam.core.rig_correction.SHARED`).
+        view: ``perspective``, or of a pair ``cylindrical`` (:mod:`fgslam.core.cylindrical`):
+            column and row are angles, focal lengths pixels a radian.
     """
 
     width: int
@@ -44,6 +49,19 @@ class CameraRig(Brief):
     vertical_baseline: float | None
     bTc: FloatArray
     exact: bool = False
+    view: RigView = "perspective"
+
+    @property
+    def cylindrical(self) -> bool:
+        """Whether the view is cylindrical."""
+        return self.view == "cylindrical"
+
+    @property
+    def angles_deg(self) -> tuple[float, float]:
+        """Horizontal and vertical angle of view around the middle of the image, degrees."""
+        half = 0.5 * np.array([self.width / self.fx, self.height / self.fy])
+        across, down = np.degrees(2.0 * (half if self.cylindrical else np.arctan(half))).tolist()
+        return across, down
 
     @property
     def cameras(self) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 from fgslam.cameras.assembly import at_size, in_metres
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.raw_cameras import Calibration
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.cameras.rig import StereoRig, asked_view, load_rig, rig_of
 from fgslam.core.errors import CalibrationError
 from fgslam.datasets.settings import CalibratedSettings
 
@@ -52,6 +52,7 @@ def loaded_rig(
         scale=settings.resized,
         unit_m=settings.unit_m,
         fov_deg=settings.fov_deg,
+        view=settings.view,
         cameras=cameras,
     )
 
@@ -61,7 +62,8 @@ def read_rig(
 ) -> StereoRig:
     """The same of a calibration that is read."""
     found = in_metres(calibration, settings.unit_m)
-    return rig_of(at_size(found, size, settings.resized), settings.fov_deg)
+    asked = asked_view(settings.fov_deg, settings.view)
+    return rig_of(at_size(found, size, settings.resized), asked)
 
 
 def mounted(rig: StereoRig, settings: CalibratedSettings) -> StereoRig:

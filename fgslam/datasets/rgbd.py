@@ -64,7 +64,11 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
     size = first_size(colour for colour, _ in pairs)
     if size is None:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
-    for name, asked in (("fov_deg", settings.fov_deg), ("unit_m", settings.unit_m != 1.0)):
+    for name, asked in (
+        ("fov_deg", settings.fov_deg),
+        ("view", settings.view != "perspective"),
+        ("unit_m", settings.unit_m != 1.0),
+    ):
         if asked:
             raise DatasetError(f"{root}: dataset.{name} is for two cameras; leave it out")
     camera, known = _camera(root, settings, size)

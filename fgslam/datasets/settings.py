@@ -10,6 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from fgslam.core.sensors import RigView
 from fgslam.core.settings import STRICT, FrameSelection
 from fgslam.worlds.lab_settings import RenderedLabSettings as RenderedLabSettings
 from fgslam.worlds.simulated.settings import Correlation
@@ -56,10 +57,17 @@ class CalibratedSettings(RecordingSettings):
         Field(
             gt=0.0,
             lt=170.0,
-            description="horizontal angle of the rectified, perspective view; null: as wide as "
-            "all cameras fill, at most 120",
+            description="horizontal angle of the rectified view; null: as wide as all cameras "
+            "fill, at most 120, of a cylindrical one 160",
         ),
     ] = None
+    view: Annotated[
+        RigView,
+        Field(
+            description="rectified view; `cylindrical`, of two cameras: angles instead of "
+            "tangents, for lenses that see more than 120 degrees"
+        ),
+    ] = "perspective"
     unit_m: Annotated[
         float,
         Field(

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.cylindrical import size_distances
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.rig_correction import RigCorrection
@@ -170,15 +171,17 @@ class StereoMatcher:
         measurement = np.concatenate(used, axis=1) @ linear.T
         covariance = np.tile(share**2 * self._covariance(linear), (len(pixels), 1, 1))
         scale, orientation = _average([(features[camera], index) for camera, index in seen])
+        position = triangulate(self._rig, measurement)
         return StereoFeatures(
             measurement=measurement,
             measurement_covariance=covariance,
             scale=scale,
             orientation=orientation,
             descriptors=features[0].descriptors[first],
-            position=triangulate(self._rig, measurement),
+            position=position,
             position_covariance=triangulation_covariance(self._rig, measurement, covariance),
             pixels=pixels,
+            distance=size_distances(self._rig, position) if self._rig.cylindrical else None,
         )
 
     def _covariance(self, linear: FloatArray) -> FloatArray:

@@ -49,14 +49,14 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
             f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted})"
             f"{other.get(given, '')}"
         )
-    grey = []
+    grey, size = [], rig.image_size if isinstance(rig, StereoRig) else (rig.width, rig.height)
     for name, image in zip(_NAMES, images, strict=False):
         converted = grey_image(image, f"{name} image")
-        if converted.shape != (rig.height, rig.width):
+        if converted.shape[::-1] != size:
             height, width = converted.shape
             raise FrameError(
-                f"{name} image is {width}x{height}, the rig's are {rig.width}x{rig.height}; give "
-                "images of that size, or the calibration of these"
+                f"{name} image is {width}x{height}, the rig's are {size[0]}x{size[1]}; give images "
+                "of that size, or the calibration of these"
             )
         grey.append(converted)
     left, right, *top = grey

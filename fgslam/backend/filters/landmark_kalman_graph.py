@@ -33,7 +33,7 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Increment, MeasurementType, Observations
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
-from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
+from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.noise import Whitening
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import MAX_ITERATIONS
@@ -92,7 +92,9 @@ class FixedMapPose:
     ) -> Any:
         graph = gtsam.NonlinearFactorGraph()
         roots = self._roots(weighted_at, landmarks, observed)
-        for i, (measured, root) in enumerate(zip(observed.measurement, roots, strict=True)):
+        planes, slopes = self._factors.in_perspective(observed.measurement)
+        roots = roots @ np.linalg.inv(slopes)
+        for i, (measured, root) in enumerate(zip(planes, roots, strict=True)):
             model = gtsam.noiseModel.Gaussian.SqrtInformation(root)
             graph.add(self._factors.with_model(_POSE, landmark_key(i), measured, model))
         if self._settings.prior:
@@ -103,7 +105,7 @@ class FixedMapPose:
     def _roots(
         self, weighted_at: FloatArray, landmarks: LandmarkMap, observed: Observations
     ) -> FloatArray:
-        """Square roots (k, 3, 3) of the information of (u_left, u_right, v)."""
+        """Square roots (k, 3, 3) of the information of (column, row, disparity)."""
         settings = self._settings
         covariance = observed.covariance
         if settings.weighting == "uniform":
@@ -116,7 +118,7 @@ class FixedMapPose:
         used = 3 if settings.residuals == "image_disparity" else 2
         roots = np.zeros((len(observed), 3, 3))
         roots[:, :used, :used] = np.linalg.inv(np.linalg.cholesky(covariance[:, :used, :used]))
-        return np.asarray(roots @ np.linalg.inv(FROM_MEASUREMENT))
+        return roots
 
 
 def _exact_prior(prediction: Prediction) -> Any:

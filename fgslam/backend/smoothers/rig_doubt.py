@@ -28,6 +28,7 @@ from fgslam.backend.smoothers.marginals import (
 )
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.cylindrical import as_perspective, from_perspective
 from fgslam.core.rig_correction import (
     RigCorrection,
     displacements,
@@ -90,11 +91,16 @@ class DoubtedMarginals:
 
 
 def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
-    """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED."""
+    """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED.
+
+    Both as graphs have them: of a perspective view.
+    """
+    if rig.cylindrical:
+        measured = from_perspective(rig, measured)
     pixels = pixels_of(rig, measured)
-    return fused(
-        rig, np.concatenate([displacements(rig, pixels), shared_displacements(rig, pixels)], axis=2)
-    )
+    of_pixels = [displacements(rig, pixels), shared_displacements(rig, pixels)]
+    moved = fused(rig, np.concatenate(of_pixels, axis=2))
+    return as_perspective(rig, measured)[1] @ moved if rig.cylindrical else moved
 
 
 def _step(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.cylindrical import size_distances
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
 from fgslam.core.sensors import CameraRig
@@ -77,7 +78,7 @@ class LandmarkDatabase(LandmarkTable):
             ids=landmarks.ids[found.rows],
             rows=found.rows,
             measurement=found.measurement,
-            scale=views.size / found.points[:, 2],
+            scale=views.size / size_distances(self._rig, found.points),
             orientation=views.orientation + lean(self._rig, wTc, found.points),
             descriptors=views.descriptors,
             certain=found.certain & known,
@@ -203,10 +204,10 @@ class LandmarkDatabase(LandmarkTable):
         return rows
 
     def _larger_than(self, least: float, ids: IntArray) -> Wanted:
-        """Predicate on landmarks, by rows and depths: expected scale at least that large."""
+        """Predicate on landmarks, by rows and distances: expected scale at least that large."""
 
-        def wanted(rows: IntArray, depth: FloatArray) -> BoolArray:
-            return np.asarray(self._largest_sizes(self.rows(ids[rows])) >= least * depth)
+        def wanted(rows: IntArray, distance: FloatArray) -> BoolArray:
+            return np.asarray(self._largest_sizes(self.rows(ids[rows])) >= least * distance)
 
         return wanted
 

@@ -137,8 +137,8 @@ class KeyFrameTracker:
         self._cells = len(_cells(observed.pixels[good, 0], image))
         fresh = np.flatnonzero(good & ~np.isin(observed.ids, self._carrier.ids))
         fresh = fresh[np.argsort(observed.ids[fresh])]
-        depths = features.position[association.features[fresh], 2]
-        self._carrier.begin(image, observed.ids[fresh], observed.pixels[fresh, 0], depths)
+        distances = features.distances[association.features[fresh]]
+        self._carrier.begin(image, observed.ids[fresh], observed.pixels[fresh, 0], distances)
 
     def state(self) -> StateArrays:
         """What the last key frame was like, and what is carried."""

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
+from fgslam.core.cylindrical import size_distances
 from fgslam.core.estimates import Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import (
@@ -27,7 +28,7 @@ from fgslam.frontend.settings import DatabaseSettings, MapMatchingSettings
 Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 """(k,) landmarks, features, and distances of their descriptors."""
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
-"""Of rows (k,) of the map and their depths: which (k,) to consider at all."""
+"""Of rows (k,) of the map and their distances by which sizes shrink: which to consider at all."""
 _CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
 _NEAREST_DEPTH_M = 0.1
 _SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
@@ -105,7 +106,7 @@ class FieldOfView:
         points = transform_to_camera(wTc, positions)
         rows = self._roughly(points)
         if wanted is not None:
-            rows = rows[wanted(rows, points[rows, 2])]
+            rows = rows[wanted(rows, size_distances(self._rig, points[rows]))]
         points = points[rows]
         measurement = project(self._rig, points)
         if self._cone:
@@ -123,7 +124,7 @@ class FieldOfView:
         """
         rows = np.flatnonzero(points[:, 2] > _NEAREST_DEPTH_M)
         rig, reach = self._rig, self._border + _SLACK_PX
-        if self._cone:
+        if self._cone or rig.cylindrical:
             return rows
         for axis, (focal, centre, size) in enumerate(
             ((rig.fx, rig.cx, rig.width), (rig.fy, rig.cy, rig.height))
@@ -185,6 +186,9 @@ def lean(rig: CameraRig, wTc: FloatArray, points: FloatArray) -> FloatArray:
     """
     x, y, z = points.T
     down = wTc[1, :3]
+    if rig.cylindrical:
+        right, below, _ = (projection_jacobian(rig, points) @ down).T
+        return np.asarray(np.arctan2(-right, below))
     right, below = rig.fx * (down[0] * z - x * down[2]), rig.fy * (down[1] * z - y * down[2])
     return np.asarray(np.arctan2(-right, below))
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.assembly import at_size
+from fgslam.cameras.assembly import ViewAsked, at_size
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.cameras.rig import StereoRig, load_rig, rig_of
@@ -151,7 +151,7 @@ def test_a_wide_fisheye_is_cut_off_and_that_is_said() -> None:
     assert "of 191 x 191 degrees the rectified view shows 120 x 120" in rig.remarks[0]
     assert rig.fx == pytest.approx(100.0 / np.tan(np.radians(60.0)))
     assert disagreement(rig, wide, scene()).max() < 0.05
-    narrow = rig_of(Calibration("made", "made", wide), fov_deg=90.0)
+    narrow = rig_of(Calibration("made", "made", wide), ViewAsked(90.0))
     assert narrow.fx == pytest.approx(100.0)
 
 
@@ -256,7 +256,7 @@ def test_a_full_view_has_no_margins_and_a_wider_one_has() -> None:
     )
     calibration = Calibration("made", "made", cameras)
     assert rig_of(calibration).margins == ()
-    wide = rig_of(calibration, fov_deg=100.0)
+    wide = rig_of(calibration, ViewAsked(100.0))
     white = np.full(SIZE[::-1], 255, np.uint8)
     for margin, image in zip(wide.margins, wide.rectified((white, white)), strict=True):
         assert 0.2 < float(np.mean(margin == 0.0)) < 0.6

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.cylindrical import size_distances
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
@@ -120,6 +121,8 @@ class KnownMap:
         depth = forward @ self.axes - forward @ wTc[:3, 3]
         across = right @ self.axes - right @ wTc[:3, 3]
         near = (depth > _NEAREST_DEPTH_M - _ROUNDING_M) & (depth <= farthest + _ROUNDING_M)
+        if rig.cylindrical:  # its columns are no planes through the camera
+            return np.flatnonzero(near)
         near &= across >= -rig.cx / rig.fx * depth - _ROUNDING_M
         near &= across <= (rig.width - 1.0 - rig.cx) / rig.fx * depth + _ROUNDING_M
         return np.flatnonzero(near)
@@ -134,12 +137,12 @@ class KnownMap:
         """
         rows, _ = self.in_view(rig, wTc, self.largest / scales[0] + _ROUNDING_M)
         sight = self.landmarks.positions[rows] - wTc[:3, 3]
-        depth = np.maximum(sight @ wTc[:3, 2], _NEAREST_DEPTH_M)
+        distance = np.maximum(size_distances(rig, sight @ wTc[:3, :3]), _NEAREST_DEPTH_M)
         sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         views, at = self.views_of(rows)
         cosine = np.einsum("vi,vi->v", self.views.direction[views], sight[at])
         near = ~(cosine < np.cos(max_angle))  # so NaN is near
-        scale = self.views.size[views] / depth[at]
+        scale = self.views.size[views] / distance[at]
         near &= (scale >= scales[0]) & (scale <= scales[1])
         out = np.zeros(len(rows), np.bool_)
         out[at[near]] = True
@@ -207,7 +210,8 @@ def gated(
     (i, v), (views, owners) = pairs, looks
     depth = np.abs(features.position[i, 2])
     sigma = np.sqrt(features.position_covariance[i, 2, 2]) / np.maximum(depth, 1e-6)
-    ratio = np.abs(np.log(features.scale[i] * depth / np.maximum(views.size[v], 1e-9)))
+    sizes = features.scale[i] * np.abs(features.distances[i])
+    ratio = np.abs(np.log(sizes / np.maximum(views.size[v], 1e-9)))
     keep = ratio <= np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     if floor.rigid_dof != 3:
         return np.asarray(keep)
@@ -276,7 +280,7 @@ def unspecific(
     views, owners = looks
     depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
     sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
-    size = np.log(np.maximum(features.scale * depth, 1e-9))
+    size = np.log(np.maximum(features.scale * np.abs(features.distances), 1e-9))
     reach = np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
     keep = gated(features, (i, v), landmarks, looks, floor)
