@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, RigView
 
 # 'baseline' is close to 'baseline_m' (0.89); 'fy' to 'fx' (0.5) and 'baseline_m' to
 # 'vertical_baseline_m' (0.69), which are keys of their own, are not.
@@ -44,7 +44,18 @@ def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
         baseline=positive(path, values, "baseline_m"),
         vertical_baseline=positive(path, values, "vertical_baseline_m") if three_cameras else None,
         bTc=_body_from_camera(path, values),
+        view=_view(path, values, three_cameras),
     )
+
+
+def _view(path: Path, values: Mapping[str, Any], three_cameras: bool) -> RigView:
+    view: RigView = values.get("view", "perspective")
+    if view not in get_args(RigView) or (view == "cylindrical" and three_cameras):
+        raise CalibrationError(
+            f"{path}: view is {view!r}; it is perspective, or of two cameras cylindrical; correct "
+            "or remove it"
+        )
+    return view
 
 
 def read_json_object(path: Path) -> Mapping[str, Any]:

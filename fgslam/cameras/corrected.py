@@ -37,6 +37,8 @@ def write_corrected(path: Path, correction: RigCorrection) -> None:
     if rig.vertical_baseline is not None:
         values["vertical_baseline_m"] = rig.vertical_baseline
     values["bTc"] = rig.bTc.tolist()
+    if rig.cylindrical:
+        values["view"] = rig.view
     if correction.values.any():
         names = term_names(rig)
         values[_KEY] = dict(zip(names, correction.values.tolist(), strict=True))

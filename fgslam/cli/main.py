@@ -66,6 +66,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     fps: options.Fps = None,
     scale: options.Scale = None,
     unit: options.Unit = None,
+    view: options.View = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -90,7 +91,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     existing = existing_folder(overwrite, resume)
     given = {**options.frames(start, stop, stride, fps, scale, unit), "estimator.kind": estimator}
-    given |= {"map.load": map_in, "map.save": map_out}
+    given |= {"dataset.view": view, "map.load": map_in, "map.save": map_out}
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
     if said:
@@ -122,6 +123,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     fps: options.Fps = None,
     scale: options.Scale = None,
     unit: options.Unit = None,
+    view: options.View = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -130,6 +132,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import short_config
 
     given = {**options.frames(start, stop, stride, fps, scale, unit), "estimator.kind": estimator}
+    given["dataset.view"] = view
     chosen = [*options.as_overrides(given), *options.topics_override(topics)]
     typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
 

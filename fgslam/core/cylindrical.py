@@ -15,6 +15,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig
 
+_NEAR_AXIS = 1e-4  # radians, below which a series is exact
+
 
 def view_angles(rig: CameraRig, measurement: FloatArray) -> tuple[FloatArray, ...]:
     """Angle in right and left view, and elevation (n,) each, of (column, row, disparity) (n, 3)."""
@@ -135,3 +137,42 @@ def from_perspective(rig: CameraRig, measurement: FloatArray) -> FloatArray:
     return np.column_stack(
         [rig.cx + rig.fx * right, rig.cy + rig.fy * np.arctan(y), rig.fx * (left - right)]
     )
+
+
+# --------------------------------------------------------------------------------------------
+# What displaces its pixels
+
+
+def turns_of_cylinder(angles: FloatArray) -> FloatArray:
+    """(k, 2, 3) by which a turn of the camera in yaw, pitch and roll moves (angle, elevation).
+
+    Signs as of :data:`fgslam.core.rig_correction.TERMS`.
+    """
+    tangent, elevation = np.tan(angles[:, 0]), angles[:, 1]
+    sine, cosine = np.sin(elevation), np.cos(elevation)
+    across = np.stack([cosine, np.zeros_like(sine), -sine], axis=1)
+    down = np.stack([tangent * sine, np.ones_like(sine), tangent * cosine], axis=1)
+    return np.stack([across, down], axis=1)
+
+
+def on_fisheye(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points (k, 2) of an equidistant fisheye's image that look along (angle, elevation) (k, 2).
+
+    Radians from its middle, with the slopes (k, 2, 2) of angle and elevation by them.
+    """
+    rays = view_rays(*angles.T)
+    sine, cosine = np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]
+    off = np.arctan2(sine, cosine)
+    share = np.sinc(off / np.pi)  # sin(off) / off
+    points = rays[:, :2] / share[:, None]
+    bend = np.where(off > _NEAR_AXIS, (cosine - share) / np.maximum(off, _NEAR_AXIS) ** 2, -1 / 3)
+    by_points = np.empty((len(rays), 3, 2))
+    by_points[:, :2] = share[:, None, None] * np.eye(2)
+    by_points[:, :2] += bend[:, None, None] * points[:, :, None] * points[:, None]
+    by_points[:, 2] = -share[:, None] * points
+    y, z = rays[:, 1], rays[:, 2]
+    away2 = y * y + z * z
+    by_ray = np.zeros((len(rays), 2, 3))
+    by_ray[:, 0, 0] = 1.0 / np.sqrt(away2)
+    by_ray[:, 1, 1:] = np.column_stack([z, -y]) / away2[:, None]
+    return points, by_ray @ by_points

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, Brief, FloatArray
+from fgslam.core.cylindrical import on_fisheye, turns_of_cylinder
 from fgslam.core.features import Features
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig, partial_map, vertical_to_horizontal
@@ -102,21 +103,22 @@ def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> Flo
 def _terms(rays: FloatArray, cylindrical: bool) -> FloatArray:
     """Displacements (k, 2, 11) of normalised image points (k, 2) in the order of TERMS.
 
-    In a cylindrical view the points are angles: a lens that is equidistant, nearly, displaces them
-    as a plain one does a plane; turns are those of the sphere.
+    In a cylindrical view the points are angles, and the lens an equidistant fisheye, whose own
+    image the terms other than turns displace.
     """
-    x, y = rays.T
+    on_lens, slopes = on_fisheye(rays) if cylindrical else (rays, None)
+    x, y = on_lens.T
     r2 = x * x + y * y
     zero, one = np.zeros_like(x), np.ones_like(x)
     along_x, across, along_y = r2 + 2.0 * x * x, 2.0 * x * y, r2 + 2.0 * y * y
     columns = (one, zero, 1.0 + x * x, x * y, -y, x, along_x, across, x * r2)
     rows = (zero, one, x * y, 1.0 + y * y, x, y, across, along_y, y * r2)
     out = np.stack([np.stack(columns, axis=1), np.stack(rows, axis=1)], axis=1)
-    if cylindrical:
-        sine, cosine, tangent = np.sin(y), np.cos(y), np.tan(x)
-        out[:, 0, 2:5] = np.stack([cosine, zero, -sine], axis=1)
-        out[:, 1, 2:5] = np.stack([tangent * sine, one, tangent * cosine], axis=1)
-    return np.concatenate([out, out[..., 6:8] * r2[:, None, None]], axis=2)
+    out = np.concatenate([out, out[..., 6:8] * r2[:, None, None]], axis=2)
+    if slopes is not None:
+        out = slopes @ out
+        out[..., 2:5] = turns_of_cylinder(rays)
+    return out
 
 
 def prior_information(

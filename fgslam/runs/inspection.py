@@ -8,8 +8,6 @@ from collections.abc import Sequence as Items
 from pathlib import Path
 from typing import TypeAlias
 
-import numpy as np
-
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.checks.motion import (
     check_clock,
@@ -111,7 +109,7 @@ def facts_of(sequence: Sequence) -> Facts:
     rig, stamps = sequence.rig, sequence.timestamps
     duration = float(stamps[-1] - stamps[0])
     rate = f"{(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else "single frame"
-    view = 2.0 * np.degrees(np.arctan(0.5 * np.array([rig.width / rig.fx, rig.height / rig.fy])))
+    view = rig.angles_deg
     vertical = "" if rig.vertical_baseline is None else f", {rig.vertical_baseline:.4g} m vertical"
     place = ", ".join(f"{x + 0.0:.3g}" for x in rig.bTc[:3, 3])
     return (

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.cylindrical import as_perspective
 from fgslam.core.errors import FrameError
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.recordings import Sequence
@@ -228,6 +229,8 @@ def match_facts(
         all_three = np.array([len(look.stereo) for look in looks])
         facts.append(("three-camera matches", f"{_spread(all_three)} a frame"))
     measurement = np.concatenate([look.stereo.measurement for look in looks])
+    if rig.cylindrical:  # depth by what a perspective view would measure
+        measurement = as_perspective(rig, measurement)[0]
     return (*facts, *_depth_facts(measurement[:, 2], len(looks), rig, settings))
 
 

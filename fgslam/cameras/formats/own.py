@@ -12,6 +12,7 @@ from fgslam.cameras.formats.trees import Tree, Values, intrinsic_matrix
 from fgslam.cameras.lenses import LENSES
 from fgslam.cameras.raw_cameras import Calibration, RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose
 from fgslam.core.sensors import CameraRig
 
@@ -79,7 +80,16 @@ def raw_values(calibration: Calibration) -> Mapping[str, Any]:
 
 
 def calibration_of(rig: CameraRig, path: Path) -> Calibration:
-    """Rectified cameras as calibrated ones without distortion: left, right[, top]."""
+    """Rectified cameras as calibrated ones without distortion: left, right[, top].
+
+    Raises:
+        CalibrationError: their view is cylindrical, and no lens is like that.
+    """
+    if rig.cylindrical:
+        raise CalibrationError(
+            f"{path}: is of cylindrical images, which no camera model makes; give the calibration "
+            "of the raw cameras"
+        )
     offsets: list[tuple[str, FloatArray]] = [
         ("left", np.array([-rig.baseline, 0.0, 0.0])),
         ("right", np.zeros(3)),
