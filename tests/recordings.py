@@ -10,6 +10,7 @@ import itertools
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -25,13 +26,18 @@ FOCAL = 130.0
 BASELINE = 0.10
 PERIOD_S = 0.25
 _CELL_M = 0.01
-# x and y of the centre, depth, width, height: metres in the first camera's frame.
-_BOARDS = (
+Boards: TypeAlias = Sequence[tuple[float, float, float, float, float]]
+"""x and y of the centre, depth, width, height: metres in the first camera's frame."""
+_BOARDS: Boards = (
     (0.0, 0.0, 4.0, 9.0, 7.0),
     (-0.9, 0.3, 2.8, 1.1, 1.4),
     (0.8, -0.4, 2.2, 0.9, 1.0),
     (0.1, 0.6, 1.8, 0.7, 0.5),
 )
+
+
+_WIDE = (180.0, 600, 480)
+"""Focal length and size of the plane that lenses look at: 118 x 106 degrees."""
 
 
 def write_recording(root: Path, frames: int = 12, top: bool = True, seed: int = 0) -> Path:
@@ -58,31 +64,34 @@ def write_recording(root: Path, frames: int = 12, top: bool = True, seed: int = 
 
 
 def views(
-    cameras: Sequence[RawCamera], frames: int = 12, seed: int = 0
+    cameras: Sequence[RawCamera],
+    frames: int = 12,
+    seed: int = 0,
+    boards: Boards = _BOARDS,
+    plane: tuple[float, int, int] = _WIDE,
 ) -> Iterator[tuple[Image, ...]]:
-    """What cameras with lenses see of the same boards, frame by frame.
+    """What cameras with lenses see of the same boards, or of others, frame by frame.
 
-    The first one's body moves as :func:`camera_path`; ``bTc`` of each is its place in it.
+    The first one's body moves as :func:`camera_path`; ``bTc`` of each is its place in it. Lenses
+    look at a ``plane``: focal length, width and height, pixels.
     """
     rng = np.random.default_rng(seed)
-    textures = [_texture(rng, width, height) for *_, width, height in _BOARDS]
-    maps = [_map_of(camera) for camera in cameras]
+    textures = [_texture(rng, width, height) for *_, width, height in boards]
+    maps = [_map_of(camera, plane) for camera in cameras]
     for wTb in camera_path(frames):
         seen = []
         for camera, (columns, rows) in zip(cameras, maps, strict=True):
             wTc = wTb @ camera.bTc
-            wide = _render(textures, wTc[:3, :3], wTc[:3, 3], rng, _WIDE)
+            wide = _render(textures, wTc[:3, :3], wTc[:3, 3], rng, plane, boards)
             seen.append(np.asarray(cv2.remap(wide, columns, rows, cv2.INTER_LINEAR), np.uint8))
         yield tuple(seen)
 
 
-_WIDE = (180.0, 600, 480)
-"""Focal length and size of the plane that lenses look at: 118 x 106 degrees."""
-
-
-def _map_of(camera: RawCamera) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def _map_of(
+    camera: RawCamera, plane_at: tuple[float, int, int]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Columns and rows of the wide plane at which each pixel of a camera looks."""
-    focal, width, height = _WIDE
+    focal, width, height = plane_at
     grid = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
     rays = camera.unproject(np.column_stack([axis.ravel() for axis in grid]))
     plane = np.where(rays[:, 2:] > 0.1, rays[:, :2] / rays[:, 2:], np.nan)
@@ -161,12 +170,13 @@ def _render(
     centre: FloatArray,
     rng: np.random.Generator,
     plane: tuple[float, int, int] = (FOCAL, WIDTH, HEIGHT),
+    boards: Boards = _BOARDS,
 ) -> Image:
     """Boards painted from far to near; camera noise of one grey level."""
     focal, *size = plane
     camera = np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1.0]])
     canvas = np.zeros(size[::-1], np.float32)
-    for texture, (x, y, depth, width, height) in zip(textures, _BOARDS, strict=True):
+    for texture, (x, y, depth, width, height) in zip(textures, boards, strict=True):
         corner = np.array([x - width / 2, y - height / 2, depth]) - centre
         axes = np.diag([_CELL_M, _CELL_M, 0.0])
         axes[:, 2] = corner

@@ -62,11 +62,7 @@ class CalibratedSettings(RecordingSettings):
         ),
     ] = None
     view: Annotated[
-        RigView,
-        Field(
-            description="rectified view; `cylindrical`, of two cameras: angles instead of "
-            "tangents, for lenses that see more than 120 degrees"
-        ),
+        RigView, Field(description="`cylindrical`, of two cameras: angles, for wide fisheyes")
     ] = "perspective"
     unit_m: Annotated[
         float,

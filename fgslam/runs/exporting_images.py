@@ -52,7 +52,7 @@ def export_images(
     Raises:
         FgslamError: the run has no images, its recording is gone, or a file cannot be written.
     """
-    if folder is not None and isinstance(log.sensor, CameraRig) and log.sensor.cylindrical:
+    if folder is not None and isinstance(log.rig, CameraRig) and log.rig.cylindrical:
         raise DatasetError(
             f"{folder}: the run's images are cylindrical, and COLMAP and nerfstudio know "
             "perspective ones; run the recording with --view perspective"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
@@ -12,12 +14,15 @@ import pytest
 from fgslam.cameras.assembly import ViewAsked, at_size
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.cameras.rig import StereoRig, asked_view, load_rig, rig_of
 from fgslam.core.arrays import FloatArray
+from fgslam.core.cylindrical import view_rays
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import pose, project, so3_exp, transform_to_camera
+from fgslam.core.geometry import pose, project, so3_exp, transform_to_camera, triangulate
+from fgslam.core.sensors import RigView
 
 SIZE = (160, 120)
+CYLINDER = ViewAsked(kind="cylindrical")
 LENSES = {
     "radtan": (120.0, [-0.28, 0.07, 2e-4, 2e-5]),
     "equidistant": (60.0, [-0.0138, 0.0217, -0.02, 0.0094]),
@@ -71,19 +76,22 @@ def disagreement(rig: StereoRig, cameras: tuple[RawCamera, ...], points: FloatAr
 TURNS = ((0.02, -0.03, 0.01), (-0.03, 0.02, -0.02), (0.01, 0.03, 0.03))
 
 
+@pytest.mark.parametrize("asked", [ViewAsked(), CYLINDER], ids=lambda asked: asked.kind)
 @pytest.mark.parametrize("lens", LENSES)
-def test_points_fall_where_the_rectified_pair_says(lens: str) -> None:
+def test_points_fall_where_the_rectified_pair_says(lens: str, asked: ViewAsked) -> None:
     cameras = (
         camera((0.0, 0.0, 0.0), TURNS[0], lens, "a"),
         camera((0.12, 0.003, -0.004), TURNS[1], lens, "b"),
     )
-    rig = rig_of(Calibration("made", "made", cameras))
-    assert rig.sources == (1, 0)
+    rig = rig_of(Calibration("made", "made", cameras), asked)
+    assert (rig.sources, rig.view) == ((1, 0), asked.kind)
     assert rig.baseline == pytest.approx(np.linalg.norm([0.12, 0.003, -0.004]), abs=1e-12)
     # The maps are sampled between their pixels, which at a fisheye's rim are far apart.
     assert disagreement(rig, cameras, scene()).max() < 0.02
     assert rig.rectifier is not None
-    assert all(mask.all() for mask in rig.rectifier.masks)
+    # All that both see along its axes: corners of a cylinder may be black.
+    full = 1.0 if asked.kind == "perspective" else 0.97
+    assert min(mask.mean() for mask in rig.rectifier.masks) >= full
 
 
 ARRANGEMENTS = {
@@ -138,21 +146,58 @@ def test_of_three_in_a_line_the_outer_two_are_used() -> None:
     assert disagreement(rig, cameras, scene()).max() < 0.02
 
 
-def test_a_wide_fisheye_is_cut_off_and_that_is_said() -> None:
-    """190 degrees: 60 px a radian over 199 px."""
-    wide = tuple(
+def fisheyes() -> tuple[RawCamera, ...]:
+    """Of 190 degrees: 60 px a radian over 199 px."""
+    return tuple(
         RawCamera(
             200, 200, np.array([[60.0, 0, 99.5], [0, 60.0, 99.5], [0, 0, 1.0]]), np.zeros(4),
             pose(np.eye(3), np.array([0.1 * k, 0.0, 0.0])), f"cam{k}", "equidistant",
         )
         for k in (0, 1)
     )  # fmt: skip
+
+
+def test_a_wide_fisheye_is_cut_off_and_that_is_said() -> None:
+    wide = fisheyes()
     rig = rig_of(Calibration("made", "made", wide))
     assert "of 191 x 191 degrees the rectified view shows 120 x 120" in rig.remarks[0]
+    assert rig.remarks[1].startswith("both cameras see 160 degrees; a cylindrical view shows them")
     assert rig.fx == pytest.approx(100.0 / np.tan(np.radians(60.0)))
     assert disagreement(rig, wide, scene()).max() < 0.05
     narrow = rig_of(Calibration("made", "made", wide), ViewAsked(90.0))
     assert narrow.fx == pytest.approx(100.0)
+
+
+def test_a_cylinder_shows_160_degrees_and_says_what_is_beyond() -> None:
+    wide = fisheyes()
+    rig = rig_of(Calibration("made", "made", wide), CYLINDER)
+    assert rig.angles_deg == pytest.approx((160.0, 160.0), abs=1.5)
+    assert rig.width * rig.height == pytest.approx(200 * 200, rel=0.01)
+    assert rig.image_size == (200, 200)
+    (told,) = rig.remarks
+    assert told.startswith("of 191 x 191 degrees the rectified view shows 160 x 160; what lies")
+    angles = np.radians(np.random.default_rng(1).uniform(-78.0, 78.0, (2, 2000)))
+    assert disagreement(rig, wide, 3.0 * view_rays(*angles)).max() < 0.02
+    narrow = rig_of(Calibration("made", "made", wide), ViewAsked(100.0, "cylindrical"))
+    assert narrow.angles_deg == pytest.approx((100.0, 160.0), abs=1.5)
+
+
+def test_views_that_there_are_not_are_refused() -> None:
+    with pytest.raises(CalibrationError, match="view is 'round'; give perspective or cylindrical"):
+        asked_view(None, "round")
+    with pytest.raises(CalibrationError, match="170; a cylindrical view takes 0 to 160 degrees"):
+        asked_view(170, "cylindrical")
+    assert asked_view(160, "cylindrical") == ViewAsked(160.0, "cylindrical")
+
+
+def test_a_cylinder_of_three_cameras_is_refused() -> None:
+    places = ((-0.12, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, -0.1, 0.0))
+    cameras = tuple(
+        camera(at, turn, "equidistant", name)
+        for at, turn, name in zip(places, TURNS, "abc", strict=True)
+    )
+    with pytest.raises(CalibrationError, match=r"made: a cylindrical view is of two .*choose two"):
+        rig_of(Calibration("made", "made", cameras), CYLINDER)
 
 
 def test_swapped_names_are_taken_by_geometry() -> None:
@@ -200,6 +245,7 @@ BOARDS = {
 }  # fmt: skip
 
 
+@cache
 def corners(path: Path, board: tuple[int, int]) -> FloatArray:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     assert image is not None
@@ -211,15 +257,18 @@ def corners(path: Path, board: tuple[int, int]) -> FloatArray:
 
 
 @pytest.mark.data
+@pytest.mark.parametrize("view", get_args(RigView))
 @pytest.mark.parametrize("kind", BOARDS)
-def test_corners_lie_on_one_row_and_squares_have_their_size(shared_data: Path, kind: str) -> None:
+def test_corners_lie_on_one_row_and_squares_have_their_size(
+    shared_data: Path, kind: str, view: RigView
+) -> None:
     """As OpenCV's own rectification of the same files and images: 0.28, 0.23 px rms, 0.38 px."""
     file, images, numbers, size, board, square, (statistic, most) = BOARDS[kind]
     folder = shared_data / "cameras"
     if not folder.is_dir():
         pytest.skip(f"no calibrations at {folder}")
     cameras = at_size(read_calibration_file(folder / file), size, False).cameras
-    rig = load_rig(folder / file, size=size)
+    rig = load_rig(folder / file, size=size, view=view)
     rows, sides = [], []
     for number in numbers:
         seen = [corners(folder / images.format(s, number), board) for s in ("left", "right")]
@@ -229,9 +278,8 @@ def test_corners_lie_on_one_row_and_squares_have_their_size(shared_data: Path, k
         disparity = left[:, 0] - right[:, 0]
         assert (disparity > 0.0).all()
         rows.append(left[:, 1] - right[:, 1])
-        depth = rig.fx * rig.baseline / disparity
-        points = np.column_stack([(right - [rig.cx, rig.cy]) / rig.fx, np.ones(len(depth))])
-        grid = (points * depth[:, None]).reshape(board[1], board[0], 3)
+        points = triangulate(rig, np.column_stack([right, disparity]))
+        grid = points.reshape(board[1], board[0], 3)
         sides += [np.linalg.norm(np.diff(grid, axis=a), axis=2).ravel() for a in (0, 1)]
     away = np.concatenate(rows)
     value = np.sqrt((away**2).mean()) if statistic == "rms" else np.median(np.abs(away))
@@ -242,7 +290,7 @@ def test_corners_lie_on_one_row_and_squares_have_their_size(shared_data: Path, k
 def rectified_pixels(rig: StereoRig, one: RawCamera, pixels: FloatArray) -> FloatArray:
     """Raw pixels (n, 2) of a camera in the rectified view."""
     rays = one.unproject(pixels) @ one.bTc[:3, :3].T @ rig.bTc[:3, :3]
-    return np.asarray(rays[:, :2] / rays[:, 2:] * [rig.fx, rig.fy] + [rig.cx, rig.cy])
+    return project(rig.plain(), rays)[:, :2]
 
 
 # --------------------------------------------------------------------------------------------

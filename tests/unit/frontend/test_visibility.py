@@ -17,6 +17,7 @@ from fgslam.frontend.tracking.map_matching import _CONE_DEG, FieldOfView, direct
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
+CYLINDER = dataclasses.replace(TWO_CAMERAS, fx=180.0, fy=180.0, view="cylindrical")
 SETTINGS = {
     "image": DatabaseSettings(border_px=8.0),
     "no border": DatabaseSettings(border_px=0.0),
@@ -50,7 +51,9 @@ def full_scan(
     return possible, certain
 
 
-@pytest.mark.parametrize("rig", [RIG, TWO_CAMERAS], ids=["three cameras", "two"])
+@pytest.mark.parametrize(
+    "rig", [RIG, TWO_CAMERAS, CYLINDER], ids=["three cameras", "two", "cylindrical"]
+)
 @pytest.mark.parametrize("how", SETTINGS)
 def test_the_selection_is_that_of_a_full_scan(how: str, rig: CameraRig) -> None:
     rng = np.random.default_rng(4)
