@@ -57,13 +57,10 @@ class CalibratedSettings(RecordingSettings):
         Field(
             gt=0.0,
             lt=170.0,
-            description="horizontal angle of the rectified view; null: as wide as all cameras "
-            "fill, at most 120, of a cylindrical one 160",
+            description="horizontal angle of the rectified view; null: as wide as cameras fill",
         ),
     ] = None
-    view: Annotated[
-        RigView, Field(description="`cylindrical`, of two cameras: angles, for wide fisheyes")
-    ] = "perspective"
+    view: Annotated[RigView, Field(description="`cylindrical` for two fisheyes")] = "perspective"
     unit_m: Annotated[
         float,
         Field(
