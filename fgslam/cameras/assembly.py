@@ -22,7 +22,8 @@ from fgslam.cameras.rectification import (
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose
-from fgslam.core.sensors import CameraRig, RigView
+from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigView
 
 _LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
 # Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.

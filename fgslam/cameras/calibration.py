@@ -15,7 +15,8 @@ from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
-from fgslam.core.sensors import CameraRig, RigView
+from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigView
 
 # 'baseline' is close to 'baseline_m' (0.89); 'fy' to 'fx' (0.5) and 'baseline_m' to
 # 'vertical_baseline_m' (0.69), which are keys of their own, are not.

@@ -20,7 +20,8 @@ from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import Brief, FloatArray, Image
 from fgslam.core.cylindrical import view_rays
 from fgslam.core.geometry import pose
-from fgslam.core.sensors import CameraRig, RigView
+from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigView
 
 MapArray: TypeAlias = npt.NDArray[np.float32]
 

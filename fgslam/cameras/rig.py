@@ -31,7 +31,8 @@ from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose
 from fgslam.core.rig_checks import rig_fault
-from fgslam.core.sensors import CAMERA_NAMES, CameraRig, RigView
+from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.settings import RigView
 
 
 def _identity() -> FloatArray:

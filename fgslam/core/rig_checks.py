@@ -8,7 +8,8 @@ import numpy as np
 
 from fgslam.core.checks import is_finite_number
 from fgslam.core.geometry import is_rigid
-from fgslam.core.sensors import CameraRig, RigView
+from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigView
 
 _FOCAL_RANGE = 1000.0
 """Of focal length and image size: at one end a telescope, at the other no picture."""

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
-
-RigView: TypeAlias = Literal["perspective", "cylindrical"]
-"""How images are laid out when they are rectified."""
+from fgslam.core.settings import RigView
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

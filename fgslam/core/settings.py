@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 from difflib import get_close_matches
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -16,6 +16,9 @@ S = TypeVar("S")
 
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Unknown keys, NaN and infinity are refused."""
+
+RigView: TypeAlias = Literal["perspective", "cylindrical"]
+"""How images are laid out when they are rectified."""
 
 
 def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:

@@ -10,8 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.sensors import RigView
-from fgslam.core.settings import STRICT, FrameSelection
+from fgslam.core.settings import STRICT, FrameSelection, RigView
 from fgslam.worlds.lab_settings import RenderedLabSettings as RenderedLabSettings
 from fgslam.worlds.simulated.settings import Correlation
 from fgslam.worlds.simulated.settings import (

@@ -19,7 +19,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.cylindrical import view_rays
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose, project, so3_exp, transform_to_camera, triangulate
-from fgslam.core.sensors import RigView
+from fgslam.core.settings import RigView
 
 SIZE = (160, 120)
 CYLINDER = ViewAsked(kind="cylindrical")
