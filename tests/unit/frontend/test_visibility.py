@@ -77,7 +77,7 @@ def test_the_selection_is_that_of_a_full_scan(how: str, rig: CameraRig) -> None:
         np.testing.assert_array_equal(found.certain, certain[possible])
         np.testing.assert_array_equal(found.points, seen_from_there[possible])
         np.testing.assert_array_equal(found.measurement, g.project(rig, found.points))
-        assert 20 < len(found.rows) < 700
+        assert 10 < len(found.rows) < 700  # a cone is a small part of a cylinder
 
 
 def test_an_edge_of_the_image_is_inside() -> None:
