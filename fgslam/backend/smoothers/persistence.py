@@ -17,6 +17,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import (
     in_front,
     inverse,
+    inverse_spd3,
     measurement_difference,
     project,
     projection_jacobian,
@@ -33,6 +34,7 @@ _EVERY = 5  # frames between judgements
 _ITERATIONS = 5
 _BENDS = 4.0  # deviations at which the weight of a residual falls while the place is fitted
 _ASTRAY = 4.0  # times the track's own median residual: it holds a wrong match
+_SINGULAR = 1e12  # of a condition number: what is beyond has hardly a digit
 _LEAST_PART = 0.1  # of a leaning, that no other place of the landmark explains
 STATED = np.array([30.0, 0.3])
 """Samples that the stated noise counts for: numbers of single residuals, longest tracks."""
@@ -167,6 +169,17 @@ def _ratio(sums: FloatArray) -> float:
     return float(np.clip(sums[0] / sums[1], *_BOUNDS))
 
 
+def _inverses(normal: FloatArray) -> FloatArray:
+    """(m, 3, 3); of one that is singular the pseudo-inverse, which takes six times as long."""
+    with np.errstate(all="ignore"):
+        found = inverse_spd3(normal)
+        condition = np.trace(normal, axis1=1, axis2=2) * np.trace(found, axis1=1, axis2=2)
+    odd = ~((condition > 0.0) & (condition < _SINGULAR))
+    if odd.any():
+        found[odd] = np.linalg.pinv(normal[odd])
+    return found
+
+
 def _over(track: _Track, frame: int) -> bool:
     return len(track.frames) >= LONGEST or frame - track.frames[-1] > ENDED_AFTER
 
@@ -269,7 +282,7 @@ class _Sightings:
         start = self.tracks.start
         normal = np.add.reduceat(np.swapaxes(weighed, 1, 2) @ jacobian, start)
         gradient = np.add.reduceat(np.einsum("nci,nc->ni", weighed, residual), start)
-        return np.asarray(np.einsum("mij,mj->mi", np.linalg.pinv(normal), gradient))
+        return np.asarray(np.einsum("mij,mj->mi", _inverses(normal), gradient))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,8 +305,8 @@ class Fitted:
         """
         length = np.linalg.norm(residual, axis=1)
         start, counts = tracks.start, tracks.counts
-        ends = start + counts
-        median = np.array([np.median(length[a:b]) for a, b in zip(start, ends, strict=True)])
+        ranked = length[np.lexsort((length, tracks.track))]
+        median = 0.5 * (ranked[start + (counts - 1) // 2] + ranked[start + counts // 2])
         good = np.maximum.reduceat(length, start) <= _ASTRAY * median
         if not good.any():
             return None
@@ -301,7 +314,7 @@ class Fitted:
         kept = tracks.select(good)
         residual, jacobian = residual[rows], jacobian[rows]
         turned = np.swapaxes(jacobian, 1, 2)
-        normal = np.linalg.pinv(np.add.reduceat(turned @ jacobian, kept.start))
+        normal = _inverses(np.add.reduceat(turned @ jacobian, kept.start))
         gradient = np.add.reduceat(np.einsum("nci,nc->ni", jacobian, residual), kept.start)
         step = np.einsum("mij,mj->mi", normal, gradient)
         residual = residual - np.einsum("nci,ni->nc", jacobian, step[kept.track])

@@ -49,6 +49,7 @@ from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 
 _PLACE = 20  # frames: what they saw last comes back as one
+_SECOND = 2  # frame of the second solution: every fifth, the builder judges the noise
 _STIFF = 1e-4  # radians and metres: the least deviation between two places
 
 
@@ -92,13 +93,19 @@ class SlidingWindowSolver(WholeGraphSolver):
             self._held.enter(new.values.atPoint3(landmark_key(variable)))
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
-        """Solves the window where the last solution lies `update_every` frames back."""
+        """Solves the window where the last solution lies `update_every` frames back.
+
+        What a solution leaves to do is done in the frames between, as what they bring.
+        """
         if closes_loop:
             return None
         if frame and frame - self._solved_at < self._settings.update_every:
             self._let_go()
+            self._take_in()
             return None
         self._leaving = solved = self._solve()
+        if not frame:
+            self._solved_at = min(_SECOND - self._settings.update_every, 0)
         last = self._measured(solved, len(solved.frames) - 1)
         return Smoothed(self._window.values(), last, self._window.frames[0])
 

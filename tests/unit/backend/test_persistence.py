@@ -16,7 +16,7 @@ from fgslam.backend.settings import (
     Isam2Settings,
 )
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
-from fgslam.backend.smoothers.persistence import Persistence, StatedNoise
+from fgslam.backend.smoothers.persistence import Persistence, StatedNoise, _inverses
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
@@ -195,3 +195,18 @@ def test_steps_together_are_measured_if_each_is() -> None:
     wheels, guess = Odometry(STEP, np.eye(6)), Odometry(STEP, np.eye(6), measured=False)
     assert g.compose_odometry([wheels, wheels]).measured
     assert not g.compose_odometry([wheels, guess, wheels]).measured
+
+
+def test_what_no_sighting_determines_of_a_place_is_left_as_it_is(rng: np.random.Generator) -> None:
+    """Beside places that are determined, whatever their distance."""
+    root = rng.standard_normal((9, 3, 3)) * np.array([1.0, 1e-2, 1e-4])
+    root[3, :, 2] = 0.0
+    root[7] = 0.0
+    normal = np.swapaxes(root, 1, 2) @ root
+    found = _inverses(normal)
+    expected = np.linalg.pinv(normal)
+    np.testing.assert_array_equal(found[[3, 7]], expected[[3, 7]])
+    size = np.sqrt(np.einsum("mii->mi", expected))
+    size[[3, 7]] = 1.0
+    off = (found - expected) / (size[:, :, None] * size[:, None, :])
+    np.testing.assert_allclose(off, 0.0, atol=1e-6, rtol=0.0)
