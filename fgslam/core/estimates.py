@@ -192,6 +192,28 @@ class UpdateStats(Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
+class GyroscopeBias(Brief):
+    """Bias of the gyroscope that measured the turns, at the end of the drive.
+
+    Attributes:
+        rates: (3,) rad/s about the axes of the body, x forward, y left, z up.
+        covariance: (3, 3) of it.
+    """
+
+    rates: FloatArray
+    covariance: FloatArray
+
+    @property
+    def words(self) -> str:
+        """In degrees/s, with its standard deviations."""
+        rates = np.degrees(self.rates)
+        sigmas = np.degrees(np.sqrt(np.diagonal(self.covariance)))
+        pairs = zip("xyz", rates, sigmas, strict=True)
+        axes = ", ".join(f"{axis} {rate:+.3f} +- {sigma:.3f}" for axis, rate, sigma in pairs)
+        return f"bias of the gyroscope at the end, degrees/s: {axes}"
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Estimate(Brief):
     """An estimator's whole answer.
 
@@ -202,6 +224,7 @@ class Estimate(Brief):
         remarks: what the estimator had to correct or leave out, in words.
         noise_factor: what the stated deviations of landmark measurements were multiplied by when
             they were weighed; None where none was.
+        gyroscope: bias of the gyroscope; None where none is estimated.
     """
 
     trajectory: Trajectory
@@ -209,3 +232,4 @@ class Estimate(Brief):
     landmarks: LandmarkMap
     remarks: tuple[str, ...] = ()
     noise_factor: float | None = None
+    gyroscope: GyroscopeBias | None = None

@@ -1,8 +1,8 @@
 """Frames of a measurement log as plain arrays, and back: the layout of its file.
 
 A log without loop closures and relocalised frames is written as version 2, to the same bytes as
-before there were any; one that has them is version 3, one with turns of a gyroscope or of a rig
-that calibrated itself version 6. All are read.
+before there were any; one that has them is version 3, one with turns or of a rig that calibrated
+itself version 6, one with the bias of a gyroscope version 7. All are read.
 """
 
 from __future__ import annotations
@@ -26,7 +26,14 @@ from fgslam.core.array_files import (
 from fgslam.core.array_values import require_covariances, require_finite, require_single
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry, SettledRig
+from fgslam.core.measurements import (
+    BiasEffect,
+    Increment,
+    LoopClosure,
+    Observations,
+    Odometry,
+    SettledRig,
+)
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.rig_correction import FIRST_TERMS, term_names, with_all_terms
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
@@ -34,13 +41,13 @@ from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 LOG = ArrayFile(
     name="fgslam measurement log",
     # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope, 5 no
-    # correction for all frames alike, and fewer terms.
-    versions=(1, 2, 3, 4, 5, 6),
+    # correction for all frames alike, and fewer terms, 6 no bias.
+    versions=(1, 2, 3, 4, 5, 6, 7),
     error=MeasurementLogError,
     give="give a run folder's measurements.npz",
     again="run again",
 )
-_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, WITH_EVERYTHING = 2, 3, 4, 6
+_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, _WITH_SETTLED, WITH_EVERYTHING = 2, 3, 4, 6, 7
 CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
 _UPPER = np.triu_indices(3)
 _UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig
@@ -65,6 +72,12 @@ _PER_LOOP: Items = {
     "loop_frame": ("i", ()),
     "loop_oTc": ("f", (4, 4)),
     "loop_covariance": ("f", (6, 6)),
+}
+_PER_TURN: Items = {
+    "gyroscope_jacobian": ("f", (3, 3)),
+    "gyroscope_bias": ("f", (3,)),
+    "gyroscope_bias_covariance": ("f", (3, 3)),
+    "gyroscope_stability": ("f", (2,)),
 }
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
@@ -97,15 +110,18 @@ def arrays_of(
         out |= _loop_arrays(frames)
     if version >= _WITH_CORRECTIONS and isinstance(sensor, CameraRig):
         out |= _correction_arrays(frames, len(term_names(sensor)))
+    if version >= WITH_EVERYTHING:
+        out |= _bias_arrays(frames)
     return out
 
 
 def version_of(frames: Sequence[Increment]) -> int:
     """The first version that has a place for all that is there."""
-    if any(s.odometry is not None and s.odometry.turned for s in frames):
+    steps = [s.odometry for s in frames if s.odometry is not None]
+    if any(step.bias is not None for step in steps):
         return WITH_EVERYTHING
-    if any(s.rig_correction is not None for s in frames):
-        return WITH_EVERYTHING
+    if any(step.turned for step in steps) or any(s.rig_correction is not None for s in frames):
+        return _WITH_SETTLED
     return _WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else _BEFORE_LOOPS
 
 
@@ -129,6 +145,7 @@ def frames_of(
     sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
     corrections = _corrections(arrays, header["version"], sensor, where)
     settled = _settled(arrays, header["version"], corrections, where)
+    biases = _biases(arrays, header["version"], where)
     observed = _split_observations(arrays, "")
     missed, pruned = _split(arrays, "missed"), _split(arrays, "pruned")
     start = arrays["observation_start"]
@@ -136,7 +153,7 @@ def frames_of(
         Increment(
             index=int(index),
             timestamp=float(arrays["timestamp"][k]),
-            odometry=_odometry(arrays, k),
+            odometry=_odometry(arrays, k, biases[k]),
             observations=observed[k],
             rejected=arrays["rejected"][start[k] : start[k + 1]],
             missed_ids=missed[k],
@@ -175,6 +192,18 @@ def _correction_arrays(frames: Sequence[Increment], terms: int) -> StateArrays:
             [unknown if s.values is None else s.values for s in settled], (terms,)
         ),
         "rig_knocks": np.array([s.knocks for s in settled], np.int64),
+    }
+
+
+def _bias_arrays(frames: Sequence[Increment]) -> StateArrays:
+    matrix = np.full((3, 3), np.nan)
+    none = BiasEffect(matrix, np.nan, np.nan, matrix[0], matrix)
+    known = [none if s.odometry is None else s.odometry.bias or none for s in frames]
+    return {
+        "gyroscope_jacobian": _stack([bias.jacobian for bias in known], (3, 3)),
+        "gyroscope_bias": _stack([bias.applied for bias in known], (3,)),
+        "gyroscope_bias_covariance": _stack([bias.left for bias in known], (3, 3)),
+        "gyroscope_stability": np.array([(b.start_variance, b.walk) for b in known]).reshape(-1, 2),
     }
 
 
@@ -293,7 +322,7 @@ def _corrections(
     frames = len(arrays["frame_index"])
     if version < _WITH_CORRECTIONS or not isinstance(rig, CameraRig):
         return [None] * frames
-    older = version < WITH_EVERYTHING
+    older = version < _WITH_SETTLED
     terms = FIRST_TERMS * (rig.cameras - 1) if older else len(term_names(rig))
     LOG.require(arrays, {CORRECTIONS: ("f", (frames, terms))}, where)
     rows = with_all_terms(rig, arrays[CORRECTIONS]) if older else arrays[CORRECTIONS]
@@ -309,13 +338,37 @@ def _settled(
     """
     frames = len(arrays["frame_index"])
     terms = next((len(row) for row in corrections if row is not None), 0)
-    if version < WITH_EVERYTHING or not terms:
+    if version < _WITH_SETTLED or not terms:
         return [None] * frames
     expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
     LOG.require(arrays, expected, where)
     rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), strict=True)
     found = [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
     return [None if one.knocks == _UNSETTLED else one for one in found]
+
+
+def _biases(arrays: StateArrays, version: int, where: str) -> list[BiasEffect | None]:
+    """What the gyroscope's bias does to each step; None before version 7, and where unknown.
+
+    Raises MeasurementLogError where its arrays are not there, or hold what no run measures.
+    """
+    frames = len(arrays["frame_index"])
+    if version < WITH_EVERYTHING:
+        return [None] * frames
+    LOG.require(arrays, of_rows(frames, _PER_TURN), where)
+    known = ~np.isnan(arrays["gyroscope_jacobian"][:, 0, 0])
+    given = {name: arrays[name][known] for name in _PER_TURN}
+    require_finite(LOG, given, tuple(given), where)
+    name = "gyroscope_bias_covariance"
+    require_covariances(LOG, name, given[name], where, definite=False)
+    variances = given["gyroscope_stability"][:, :, None, None]
+    require_covariances(LOG, "gyroscope_stability", variances[:, 0], where)
+    require_covariances(LOG, "gyroscope_stability", variances[:, 1], where, definite=False)
+    rows = zip(*(arrays[name] for name in _PER_TURN), known, strict=True)
+    return [
+        BiasEffect(jacobian, float(start), float(walk), applied, left) if ok else None
+        for jacobian, applied, left, (start, walk), ok in rows
+    ]
 
 
 def _motion(increment: Increment) -> FloatArray:
@@ -343,12 +396,12 @@ def _motion_covariance(increment: Increment) -> FloatArray:
     return increment.odometry.covariance
 
 
-def _odometry(arrays: StateArrays, k: int) -> Odometry | None:
+def _odometry(arrays: StateArrays, k: int, bias: BiasEffect | None) -> Odometry | None:
     motion, covariance = arrays["odometry_motion"][k], arrays["odometry_covariance"][k]
     if np.isnan(motion[0, 0]):
         return None
     if np.isnan(motion[0, 3]):
-        return Odometry.turn(motion[:3, :3], covariance[:3, :3])
+        return Odometry.turn(motion[:3, :3], covariance[:3, :3], bias)
     return Odometry(motion, covariance)
 
 

@@ -152,5 +152,6 @@ def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
     if odometry is None or odometry.measured:
         return odometry
     if odometry.turned:
-        return Odometry.turn(odometry.motion[:3, :3], odometry.covariance[:3, :3])
+        turn = odometry.motion[:3, :3], odometry.covariance[:3, :3]
+        return Odometry.turn(*turn, odometry.bias)
     return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
@@ -24,17 +24,22 @@ class MeasurementType(str, Enum):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class BiasEffect(Brief):
-    """What the unknown bias of a gyroscope does to a step that it measured.
+    """What the bias of a gyroscope does to a step that it measured.
 
     Attributes:
         jacobian: (3, 3) of the step's rotation vector, at its end, by the bias: rad by rad/s.
         start_variance: of the bias per axis before the drive, (rad/s)^2.
         walk: by how much that variance grows in the step, (rad/s)^2.
+        applied: (3,) bias that the step's motion is corrected for, rad/s; zero as measured.
+        left: (3, 3) covariance of what is unknown of it, which the step's covariance contains;
+            zero as measured.
     """
 
     jacobian: FloatArray
     start_variance: float
     walk: float
+    applied: FloatArray = field(default_factory=lambda: np.zeros(3))
+    left: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -48,7 +53,7 @@ class Odometry(Brief):
             velocity, which belongs in no log.
         turned: its rotation alone was measured, by a gyroscope; the translation is a stand-in's, or
             free (:meth:`turn`), and ``measured`` is false.
-        bias: of that gyroscope, where the rotation is not corrected for it; None where it is.
+        bias: of that gyroscope; None where nothing is known of it.
     """
 
     motion: FloatArray

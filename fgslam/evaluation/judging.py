@@ -199,6 +199,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "last_pose_sigma": _last_pose_sigma(answer.estimate),
             "end_against_start": _end_against_start(final),
             "noise_factor": answer.estimate.noise_factor,
+            **_gyroscope(answer.estimate),
             "remarks": list(answer.estimate.remarks),
         },
     )
@@ -349,6 +350,20 @@ def _last_pose_sigma(estimate: Estimate) -> JsonValue:
     return {
         "rotation_deg": float(np.degrees(np.sqrt(variances[:3].sum()))),
         "position_m": float(np.sqrt(variances[3:].sum())),
+    }
+
+
+def _gyroscope(estimate: Estimate) -> dict[str, JsonValue]:
+    """Bias of the gyroscope at the end, about the axes of the body; nothing where there is none."""
+    found = estimate.gyroscope
+    if found is None:
+        return {}
+    sigmas = np.sqrt(np.diagonal(found.covariance))
+    return {
+        "gyroscope_bias_dps": {
+            "rates": np.degrees(found.rates).tolist(),
+            "sigmas": np.degrees(sigmas).tolist(),
+        }
     }
 
 

@@ -5,14 +5,14 @@ Derivation: docs/derivations/factors.md.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.cylindrical import as_perspective
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.noise import Whitening
 
 FROM_MEASUREMENT: FloatArray = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -170,3 +170,20 @@ def _may_be_mixed_up(bearing: FloatArray, spread: FloatArray) -> bool:
         return False
     smallest, second, _ = np.sort(np.abs(bearing))
     return bool(second - smallest < np.sqrt(2.0 * largest) * _REACH_SIGMAS)
+
+
+class LandmarkFactors(Protocol):
+    """Makes the factor of one landmark observation."""
+
+    def factor(
+        self, pose: int, landmark: int, measurement: FloatArray, covariance: FloatArray
+    ) -> Any:
+        """Factor between a pose and a landmark, by key."""
+        ...
+
+
+def landmark_factors(sensor: Sensor, whitening: Whitening) -> LandmarkFactors:
+    """The factors of a sensor."""
+    if isinstance(sensor, CameraRig):
+        return StereoFactors(sensor, whitening)
+    return RangeBearingFactors(whitening)

@@ -35,7 +35,7 @@ def turned_by(guess: Odometry, turn: Odometry) -> Odometry:
     covariance[:3, :3] = turn.covariance[:3, :3]
     covariance[3:, 3:] = guess.covariance[3:, 3:]
     motion = se3_exp(np.append(rotation, se3_log(guess.motion)[3:]))
-    return Odometry(motion, covariance, measured=False, turned=True)
+    return Odometry(motion, covariance, measured=False, turned=True, bias=turn.bias)
 
 
 class GyroscopeError:
@@ -78,7 +78,8 @@ class GyroscopeError:
         jacobian = self._jacobian = turn.bias.jacobian
         rotation = turn.motion[:3, :3] @ so3_exp(jacobian @ self._bias)
         unknown = jacobian @ self._covariance @ jacobian.T
-        return Odometry.turn(rotation, covariance + unknown)
+        known = dataclasses.replace(turn.bias, applied=self._bias, left=self._covariance)
+        return Odometry.turn(rotation, covariance + unknown, known)
 
     def handed(self, step: Odometry | None) -> Odometry | None:
         """The step itself; it is what the next pose is predicted with."""

@@ -37,11 +37,12 @@ class DenseFactor:
         self._inverted = False
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """(n,) the matrix' inverse times (n,)."""
+        """The matrix' inverse times (n,) or (n, c)."""
         if self._inverted:
             return np.asarray(self._held @ right)
-        found = cho_solve((self._held, True), right / self._size, check_finite=False)
-        return np.asarray(found / self._size)
+        scale = self._size if right.ndim == 1 else self._size[:, None]
+        found = cho_solve((self._held, True), right / scale, check_finite=False)
+        return np.asarray(found / scale)
 
     @property
     def inverse(self) -> FloatArray:

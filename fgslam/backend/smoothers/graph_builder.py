@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from array import array
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,6 +14,7 @@ from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.persistence import MeasurementNoise, Persistence, StatedNoise
+from fgslam.backend.smoothers.turns import Turn, TurnedStep
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
@@ -23,7 +24,7 @@ from fgslam.core.measurements import Observations, Odometry
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
-from fgslam.factors.landmark import RangeBearingFactors, StereoFactors
+from fgslam.factors.landmark import landmark_factors
 from fgslam.factors.motion import (
     floor_factors,
     odometry_factor,
@@ -37,23 +38,6 @@ WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a we
 _WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
 
 
-class LandmarkFactors(Protocol):
-    """Makes the factor of one landmark observation."""
-
-    def factor(
-        self, pose: int, landmark: int, measurement: FloatArray, covariance: FloatArray
-    ) -> Any:
-        """Factor between a pose and a landmark, by key."""
-        ...
-
-
-def landmark_factors(sensor: Sensor, whitening: Whitening) -> LandmarkFactors:
-    """The factors of a sensor."""
-    if isinstance(sensor, CameraRig):
-        return StereoFactors(sensor, whitening)
-    return RangeBearingFactors(whitening)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedFrame:
     """A frame as the tracker has it.
@@ -63,12 +47,14 @@ class TrackedFrame:
         wTc: (4, 4) its pose.
         motion: from the frame before; None for the first.
         accepted: observations that fit.
+        turn: what the bias of a gyroscope does to the motion.
     """
 
     frame: int
     wTc: FloatArray
     motion: Odometry | None
     accepted: Observations
+    turn: Turn | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -124,6 +110,7 @@ class GraphBuilder:
         self.noise: MeasurementNoise = Persistence(sensor) if given is None else StatedNoise(given)
         self.corrections = KnownCorrections()
         self._variance_of: dict[int, float] = {}
+        self._turned: dict[int, TurnedStep] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
         self._id_of = array("q")  # eight bytes a variable, which is all a bounded lag keeps of it
@@ -267,7 +254,9 @@ class GraphBuilder:
 
     def kept_factors(self) -> Any:
         """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
-        out = self._other_factors()
+        return self._with_observations(self._other_factors())
+
+    def _with_observations(self, out: Any) -> Any:
         seen = self.kept_observed()
         for frame, variable, measurement, covariance in zip(*seen, strict=True):
             sighting = Sighting(int(frame), measurement, covariance)
@@ -288,14 +277,21 @@ class GraphBuilder:
 
         With ``settled`` all measurements are corrected by what was known last of the rig.
         """
-        kernel = kernel or self.kernel
+        graph, state = self._whole_graph(values, kernel or self.kernel, settled)
+        return graph.with_turns(list(self._turned.values()), state, self._persistence)
+
+    def _whole_graph(
+        self, values: Any, kernel: KernelSettings, settled: bool
+    ) -> tuple[WholeGraph, State]:
+        """Without turns of a gyroscope."""
+        others = self._other_factors(turned=False)
         if not isinstance(self._sensor, CameraRig):
-            return WholeGraph.of(self.kept_factors(), values, kernel)
+            return WholeGraph.of(self._with_observations(others), values, kernel)
         frames, variables, measured, covariances = self.kept_observed()
         if settled:
             measured = self.corrections.settle(self._sensor, frames, measured)
         return WholeGraph.of_rig(
-            self._other_factors(),
+            others,
             values,
             kernel,
             (pose_key(0) + frames, landmark_key(0) + variables),
@@ -313,12 +309,15 @@ class GraphBuilder:
             seen["covariance"][kept],
         )
 
-    def _other_factors(self) -> Any:
-        """Those that are no observations, without empty slots, weighed as is known now."""
+    def _other_factors(self, turned: bool = True) -> Any:
+        """Those that are no observations, without empty slots, weighed as is known now.
+
+        Steps of a gyroscope whose bias is of account are among them where ``turned``.
+        """
         self._weigh()
         out = gtsam.NonlinearFactorGraph()
         for row in range(self.graph.size()):
-            if self.graph.exists(row):
+            if self.graph.exists(row) and (turned or row not in self._turned):
                 factor, then = self.graph.at(row), self._variance_of.get(row)
                 out.add(factor if then is None else self._weighed(factor, then))
         return out
@@ -346,15 +345,16 @@ class GraphBuilder:
         elif tracked.motion is None:
             raise ValueError(f"frame {new.frame}: no motion from the frame before")
         else:
-            self._add_step(new, tracked.motion)
+            self._add_step(new, tracked.motion, tracked.turn)
         for factor in floor_factors(key, self._floor, tracked.wTc):
             self._push(new, factor)
 
-    def _add_step(self, new: NewFactors, motion: Odometry) -> None:
+    def _add_step(self, new: NewFactors, motion: Odometry, turn: Turn | None) -> None:
         """From the frame before; the errors of one that goes on as before persist like images'.
 
         Its velocity comes from nothing but matches, and its noise from how far they scatter.
         """
+        stated = motion
         if not motion.measured:
             covariance = self._persistence * motion.covariance
             motion = dataclasses.replace(motion, covariance=covariance)
@@ -363,6 +363,8 @@ class GraphBuilder:
         )
         if not motion.measured:
             self._variance_of[row] = self._persistence
+        if turn is not None and self._remember:
+            self._turned[row] = TurnedStep(self.frames[-1], new.frame, stated, turn)
 
     def _add_observations(
         self, new: NewFactors, tracked: TrackedFrame, landmarks: LandmarkMap

@@ -24,6 +24,7 @@ import numpy as np
 from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
 from fgslam.backend.smoothers.graph_builder import TrackedFrame
 from fgslam.backend.smoothers.solver import Solution, allowed_parts
+from fgslam.backend.smoothers.turns import Turn
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
@@ -192,7 +193,7 @@ class Segments:
         here = len(self._motions) - later
         since, self._motions = self._motions[:here], self._motions[here:]
         motion = compose_odometry(since) if since else None
-        return TrackedFrame(frame.frame, frame.wTc, motion, accepted)
+        return TrackedFrame(frame.frame, frame.wTc, motion, accepted, Turn.of(since))
 
 
 def _corrected(frame: TrackedFrame, change: RigChange) -> TrackedFrame:

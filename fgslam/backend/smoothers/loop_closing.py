@@ -98,7 +98,7 @@ class GraphLoops:
         loops = [*self.accepted, known]
         guess = first_guess(self._builder, graph.values(state), drive.chain, loops)
         closed = graph.plus(constraint_factor(known))
-        solution = solved(closed, State.of(guess))
+        solution = solved(closed, dataclasses.replace(State.of(guess), bias=state.bias))
         refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
         competing = self._competing(closed.squared(solution))
         if refused and 0 < competing.sum() < known.matches:

@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.sparse import block_array, bsr_matrix, csr_matrix, diags_array
 
 from fgslam.backend.smoothers.block_cholesky import BlockCholesky, order
-from fgslam.backend.smoothers.dense_cholesky import UNDETERMINED, DenseFactor
+from fgslam.backend.smoothers.border import Border, Bordered
+from fgslam.backend.smoothers.dense_cholesky import DenseFactor
+from fgslam.backend.smoothers.stretches import Stretch
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
@@ -39,6 +40,7 @@ class LinearSystem:
         landmarks: (m, 3, 3) each landmark's own block.
         links: (3m, 3m) of landmarks and each other, empty but for odd graphs.
         pose_gradient, landmark_gradient: (6n,) and (3m,).
+        border: a few numbers that all poses may depend on; None: there are none.
     """
 
     pose_keys: IntArray
@@ -49,6 +51,7 @@ class LinearSystem:
     links: csr_matrix
     pose_gradient: FloatArray
     landmark_gradient: FloatArray
+    border: Border | None = None
 
     @property
     def columns(self) -> int:
@@ -69,19 +72,36 @@ class LinearSystem:
         own[:, every, every] *= 1.0 + by
         own[~own.any(axis=(1, 2))] = np.eye(3)
         poses = self.poses + diags_array(by * self.poses.diagonal()) if by else self.poses
-        return replace(self, landmarks=own, poses=poses)
+        border = None if self.border is None else self.border.damped(by)
+        return replace(self, landmarks=own, poses=poses, border=border)
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(3m + 6n,) landmarks before poses."""
+        return np.concatenate([self.landmark_gradient, self.pose_gradient])
 
 
-def reduced(system: LinearSystem) -> GraphMarginals | ChainMarginals:
+def reduced(system: LinearSystem) -> GraphMarginals | ChainMarginals | Bordered:
     """The system with one group of variables eliminated, whichever leaves less to do.
 
     Raises:
         EstimatorError: the measurements do not determine all variables.
     """
     band = 12 * order(_seen_together(system))[1]
-    if system.links.nnz or min(band, 6 * len(system.pose_keys)) > system.columns:
-        return ChainMarginals.of(system)
-    return GraphMarginals.of(system)
+    chain = system.links.nnz or min(band, 6 * len(system.pose_keys)) > system.columns
+    return with_border(ChainMarginals.of(system) if chain else GraphMarginals.of(system))
+
+
+def with_border(
+    held: GraphMarginals | ChainMarginals,
+) -> GraphMarginals | ChainMarginals | Bordered:
+    """The system with its border, where it has one.
+
+    Raises:
+        EstimatorError: the border is not determined.
+    """
+    border = held.system.border
+    return held if border is None else Bordered.of(held, held.system.gradient, border)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +143,16 @@ class GraphMarginals:
         return GraphMarginals(system, inverse, BlockCholesky(information))
 
     def step(self) -> FloatArray:
-        """(3m + 6n,) from where the graph was linearised to its minimum."""
-        s = self.system
-        pull = np.einsum("mij,mj->mi", self.inverse, s.landmark_gradient.reshape(-1, 3)).ravel()
-        poses = -self.factor.solve((s.pose_gradient - s.coupling @ pull)[:, None])[:, 0]
-        follows = (s.coupling.T @ poses).reshape(-1, 3)
-        landmarks = -pull - np.einsum("mij,mj->mi", self.inverse, follows).ravel()
+        """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
+        return self.solve(self.system.gradient[:, None])[:, 0]
+
+    def solve(self, gradients: FloatArray) -> FloatArray:
+        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
+        s, m, c = self.system, self.system.columns, gradients.shape[1]
+        pull = (self.inverse @ gradients[:m].reshape(-1, 3, c)).reshape(m, c)
+        poses = -self.factor.solve(gradients[m:] - s.coupling @ pull)
+        follows = (s.coupling.T @ poses).reshape(-1, 3, c)
+        landmarks = -pull - (self.inverse @ follows).reshape(m, c)
         return np.concatenate([landmarks, poses])
 
     def poses(self) -> FloatArray:
@@ -197,50 +221,6 @@ def _pairs(group: IntArray, groups: int) -> Iterator[tuple[IntArray, IntArray]]:
         low = high
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
-    """Neighbouring poses, eliminated together: they hang on what they see and on their ends.
-
-    Attributes:
-        rows: (6k,) of the system's poses.
-        columns: (c,) of what is kept that they hang on.
-        own: (k, 6, 6) their covariances if those are held.
-        gain: (6k, c) how their mean follows those, negated.
-        alone: (6k,) their step if those are held.
-    """
-
-    rows: IntArray
-    columns: IntArray
-    own: FloatArray
-    gain: FloatArray
-    alone: FloatArray
-
-    @staticmethod
-    def of(
-        rows: IntArray, chain: csr_matrix, coupling: csr_matrix, gradient: FloatArray
-    ) -> tuple[Stretch, FloatArray]:
-        """Of rows of the poses' block, their coupling with all that is kept, and their gradient.
-
-        Returns:
-            The stretch, and the information (c, c) that it takes from its columns.
-
-        Raises:
-            EstimatorError: the poses are not determined.
-        """
-        band, size = _scaled_band(chain)
-        try:
-            factor = cholesky_banded(band, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            raise EstimatorError(UNDETERMINED) from None
-        columns = np.unique(coupling.indices).astype(np.int64)
-        scaled = coupling[:, columns].toarray() / size[:, None]
-        gain = cho_solve_banded((factor, True), scaled, check_finite=False)
-        alone = -cho_solve_banded((factor, True), gradient / size, check_finite=False) / size
-        blocks = size.reshape(-1, 6)
-        own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
-        return Stretch(rows, columns, own, gain / size[:, None], alone), scaled.T @ gain
-
-
 @dataclass(frozen=True, eq=False)
 class ChainMarginals:
     """The same where poses are many and landmarks few: the poses are eliminated first.
@@ -284,25 +264,26 @@ class ChainMarginals:
             if not len(chosen):
                 continue
             own = rows[chosen].ravel()
-            stretch, taken = Stretch.of(
-                own, among[own][:, own], coupling[own], system.pose_gradient[own]
-            )
+            stretch, taken = Stretch.of(own, among[own][:, own], coupling[own])
             border[np.ix_(stretch.columns, stretch.columns)] -= taken
             stretches.append(stretch)
         return ChainMarginals(system, stretches, kept, DenseFactor(border))
 
     def step(self) -> FloatArray:
-        """(3m + 6n,) from where the graph was linearised to its minimum."""
-        s = self.system
-        gradient = np.concatenate([s.landmark_gradient, s.pose_gradient])
-        pull = gradient[self.kept]
+        """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
+        return self.solve(self.system.gradient[:, None])[:, 0]
+
+    def solve(self, gradients: FloatArray) -> FloatArray:
+        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
+        of_poses, pull = gradients[self.system.columns :], gradients[self.kept]
         for stretch in self.stretches:
-            pull[stretch.columns] -= stretch.gain.T @ s.pose_gradient[stretch.rows]
+            pull[stretch.columns] -= stretch.gain.T @ of_poses[stretch.rows]
         moved = -self.border.solve(pull)
-        out = np.empty_like(gradient)
+        out = np.empty_like(gradients)
         out[self.kept] = moved
         for stretch in self.stretches:
-            out[s.columns + stretch.rows] = stretch.alone - stretch.gain @ moved[stretch.columns]
+            alone = stretch.alone(of_poses[stretch.rows])
+            out[self.system.columns + stretch.rows] = alone - stretch.gain @ moved[stretch.columns]
         return out
 
     def poses(self) -> FloatArray:
@@ -353,37 +334,6 @@ def _led_back_to(matrix: csr_matrix) -> IntArray:
     entries = matrix.tocoo()
     one, other = entries.row // 6, entries.col // 6
     return np.unique(np.minimum(one, other)[np.abs(one - other) > 1]).astype(np.int64)
-
-
-def _scaled_band(matrix: csr_matrix) -> tuple[FloatArray, FloatArray]:
-    """Lower band (12, 6n) of a chain's information, scaled to a unit diagonal, and the scale."""
-    entries = matrix.tocoo()
-    distance = entries.row - entries.col
-    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
-    if not (size > 0.0).all():
-        raise EstimatorError(UNDETERMINED)
-    band = np.zeros((12, len(size)))
-    lower = distance >= 0
-    row, column = entries.row[lower], entries.col[lower]
-    band[distance[lower], column] = entries.data[lower] / (size[row] * size[column])
-    return band, size
-
-
-def _inverse_blocks(factor: FloatArray) -> FloatArray:
-    """(n, 6, 6) diagonal blocks of the inverse of a matrix with banded Cholesky factor (12, 6n)."""
-    n = factor.shape[1] // 6
-    row, column = np.tril_indices(6)
-    below, beside = np.indices((6, 6)).reshape(2, -1)
-    starts = 6 * np.arange(n)[:, None]
-    own, next_to = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
-    own[:, row, column] = factor[row - column, starts + column]
-    next_to[:, below, beside] = factor[6 + below - beside, starts + beside]
-    inverse = np.linalg.inv(own)
-    carried = next_to @ inverse
-    out = np.swapaxes(inverse, 1, 2) @ inverse
-    for k in range(n - 2, -1, -1):
-        out[k] += carried[k].T @ out[k + 1] @ carried[k]
-    return out
 
 
 def block_diagonal(blocks: FloatArray) -> csr_matrix:

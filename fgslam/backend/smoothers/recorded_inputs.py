@@ -91,7 +91,8 @@ class RecordedInputs:
             turned = measured is not None and measured.turned
             if (measured is None or turned) and state["motion_known"][k]:
                 motion, covariance = state["motion"][row[k]], state["motion_covariance"][row[k]]
-                stand_in = Odometry(motion, covariance, measured=False, turned=turned)
+                bias = None if measured is None else measured.bias
+                stand_in = Odometry(motion, covariance, False, turned, bias)
                 increment = dataclasses.replace(increment, odometry=stand_in)
             out.append(increment, tracking)
         return out

@@ -20,10 +20,11 @@ import numpy as np
 from fgslam.backend.filters.loop_correction import Constraint
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import KernelSettings
+from fgslam.backend.smoothers.border import Bordered, Eliminated
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.loop_closing import Acceptance, GraphLoops, Minimum
-from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
-from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals
+from fgslam.backend.smoothers.marginals import reduced
+from fgslam.backend.smoothers.rig_doubt import doubted
 from fgslam.backend.smoothers.solved_noise import power_ratio
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
@@ -37,7 +38,7 @@ from fgslam.backend.smoothers.solver import (
 from fgslam.backend.smoothers.whole_graph import Descent, State, WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import GyroscopeBias, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.quantiles import chi_square_quantile
@@ -202,15 +203,23 @@ class Refined:
         return out
 
     @cached_property
-    def marginals(self) -> GraphMarginals | ChainMarginals | DoubtedMarginals:
+    def marginals(self) -> Eliminated:
         """Of all variables.
 
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
         if self.doubted is not None and self.graph.kinds:
-            return DoubtedMarginals.of(self.graph, self.state, self.doubted)
+            return doubted(self.graph, self.state, self.doubted)
         return reduced(self.graph.linear(self.state))
+
+    @property
+    def gyroscope(self) -> GyroscopeBias | None:
+        """Its bias at the end; None where it is no variable, raises as :meth:`marginals`."""
+        found = self.marginals
+        if self.graph.rest.turns is None or not isinstance(found, Bordered):
+            return None
+        return GyroscopeBias(self.state.bias[-3:], found.estimated[-3:, -3:])
 
 
 def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
@@ -336,7 +345,9 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
         remarks = (*refined.remarks, str(error))
         return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio)
-    return Solution(poses, kept, points, covariances, refined.remarks, True, ratio)
+    bias = refined.gyroscope
+    remarks = refined.remarks if bias is None else (*refined.remarks, bias.words)
+    return Solution(poses, kept, points, covariances, remarks, True, ratio, bias)
 
 
 def _lost(builder: GraphBuilder, found: Refined) -> dict[int, str]:

@@ -13,21 +13,14 @@ docs/derivations/measurement_noise.md.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import block_diag
 
 from fgslam.backend.filters.online_doubt import fused, pixels_of, shared_covariance
-from fgslam.backend.smoothers.marginals import (
-    ChainMarginals,
-    GraphMarginals,
-    LinearSystem,
-    reduced,
-)
+from fgslam.backend.smoothers.border import Bordered
+from fgslam.backend.smoothers.marginals import reduced
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray
 from fgslam.core.cylindrical import as_perspective, from_perspective
 from fgslam.core.rig_correction import (
     RigCorrection,
@@ -38,56 +31,31 @@ from fgslam.core.rig_correction import (
 from fgslam.core.sensors import CameraRig
 
 
-@dataclass(frozen=True, eq=False)
-class DoubtedMarginals:
-    """Marginals of a graph, as :class:`GraphMarginals`, with the doubt about its rig.
+def doubted(graph: WholeGraph, state: State, rig: RigCorrection) -> Bordered:
+    """Marginals at a solution, with the doubt about its rig.
 
-    Attributes:
-        held: the same with the correction held as it is.
-        gain: (3m + 6n, p + q) how landmarks and poses follow the correction's p terms and the q
-            that all cameras share.
-        correction: (p + q, p + q) their covariance.
+    Its border are the correction's terms, then those that all cameras share.
+
+    Args:
+        graph: the factors.
+        state: its minimum.
+        rig: with the correction that was applied to it.
+
+    Raises:
+        EstimatorError: the measurements do not determine all variables.
     """
-
-    held: GraphMarginals | ChainMarginals
-    gain: FloatArray
-    correction: FloatArray
-
-    @staticmethod
-    def of(graph: WholeGraph, state: State, rig: RigCorrection) -> DoubtedMarginals:
-        """At a solution; ``rig`` with the correction that was applied to it.
-
-        Raises:
-            EstimatorError: the measurements do not determine all variables.
-        """
-        system = graph.linear(state)
-        held, prior, shared = reduced(system), prior_information(rig.rig), shared_covariance(rig)
-        p, terms = len(prior), slice(len(prior) + len(shared))
-        pull, own = graph.pulled(state, lambda measured: shifts(rig.rig, measured)[..., terms])
-        gain = np.column_stack([_step(held, system, one) for one in pull.T])
-        information = (own + pull.T @ gain)[:p, :p] + prior
-        correction = np.linalg.inv(0.5 * (information + information.T))
-        return DoubtedMarginals(held, gain, np.asarray(block_diag(correction, shared)))
-
-    def poses(self) -> FloatArray:
-        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
-        columns = self.held.system.columns
-        gain = self.gain[columns:].reshape(-1, 6, len(self.correction))
-        return np.asarray(self.held.poses() + gain @ self.correction @ np.swapaxes(gain, 1, 2))
-
-    def landmarks(self) -> FloatArray:
-        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
-        columns = self.held.system.columns
-        gain = self.gain[:columns].reshape(-1, 3, len(self.correction))
-        by_rig = gain @ self.correction @ np.swapaxes(gain, 1, 2)
-        return np.asarray(self.held.landmarks() + by_rig)
-
-    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
-        at = self.held.system.columns + 6 * pose + np.arange(6)
-        rows = np.concatenate([at, (3 * landmarks[:, None] + np.arange(3)).ravel()])
-        gain = self.gain[rows]
-        return np.asarray(self.held.joint(pose, landmarks) + gain @ self.correction @ gain.T)
+    held, prior, shared = (
+        reduced(graph.linear(state)),
+        prior_information(rig.rig),
+        shared_covariance(rig),
+    )
+    p, terms = len(prior), slice(len(prior) + len(shared))
+    pull, own = graph.pulled(state, lambda measured: shifts(rig.rig, measured)[..., terms])
+    gain = held.solve(pull)
+    information = (own + pull.T @ gain[: len(pull)])[:p, :p] + prior
+    correction = np.linalg.inv(0.5 * (information + information.T))
+    covariance = np.asarray(block_diag(correction, shared))
+    return Bordered(held, gain, covariance, np.zeros(len(covariance)))
 
 
 def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
@@ -101,16 +69,3 @@ def shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
     of_pixels = [displacements(rig, pixels), shared_displacements(rig, pixels)]
     moved = fused(rig, np.concatenate(of_pixels, axis=2))
     return as_perspective(rig, measured)[1] @ moved if rig.cylindrical else moved
-
-
-def _step(
-    held: GraphMarginals | ChainMarginals, system: LinearSystem, gradient: FloatArray
-) -> FloatArray:
-    """(3m + 6n,) the graph's step for another gradient."""
-    columns = system.columns
-    other = dataclasses.replace(
-        system, landmark_gradient=gradient[:columns], pose_gradient=gradient[columns:]
-    )
-    if isinstance(held, GraphMarginals):
-        return dataclasses.replace(held, system=other).step()
-    return ChainMarginals.of(other).step()

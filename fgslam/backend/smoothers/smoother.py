@@ -35,6 +35,7 @@ from fgslam.backend.smoothers.loop_closing import carried_to
 from fgslam.backend.smoothers.recorded_inputs import RecordedInputs
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
+from fgslam.backend.smoothers.turns import Turn
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import (
@@ -193,6 +194,7 @@ class Smoother:
             landmarks,
             (*self._solver.remarks, *self._builder.admission.remarks, *answer.remarks),
             noise_factor=float(np.sqrt(self._builder.noise.power * answer.noise_ratio)),
+            gyroscope=answer.gyroscope,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
@@ -237,10 +239,11 @@ class Smoother:
         """
         before, turn = self._tracker.predict(None).wTc, increment.odometry
         motion, covariance = inverse(before) @ tracking.wTc, FREE
-        if turn is not None and turn.turned:
-            motion[:3, :3], covariance = turn.motion[:3, :3], FREE.copy()
-            covariance[:3, :3] = turn.covariance[:3, :3]
-        return Odometry(motion, covariance, measured=False)
+        if turn is None or not turn.turned:
+            return Odometry(motion, covariance, measured=False)
+        motion[:3, :3], covariance = turn.motion[:3, :3], FREE.copy()
+        covariance[:3, :3] = turn.covariance[:3, :3]
+        return Odometry(motion, covariance, measured=False, turned=True, bias=turn.bias)
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)
@@ -270,7 +273,8 @@ class Smoother:
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
         frame = len(self._inputs.increments) - 1
-        return TrackedFrame(frame, tracking.wTc, increment.odometry, self._held(accepted))
+        step = increment.odometry
+        return TrackedFrame(frame, tracking.wTc, step, self._held(accepted), Turn.of((step,)))
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""

@@ -16,7 +16,7 @@ from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.estimates import GyroscopeBias, LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import congruence
 from fgslam.factors.graphs import landmark_key, pose_key
@@ -35,6 +35,7 @@ class Solution:
         considers_rig: covariances contain what is open of the rig's calibration; else what was
             open when each frame came is added.
         noise_ratio: variance of the measurements over what the builder takes it to be.
+        gyroscope: its bias, where it is a variable of the graph.
     """
 
     poses: FloatArray
@@ -44,6 +45,7 @@ class Solution:
     remarks: tuple[str, ...] = ()
     considers_rig: bool = False
     noise_ratio: float = 1.0
+    gyroscope: GyroscopeBias | None = None
 
 
 def poses_of(values: Any, frames: list[int]) -> FloatArray:

@@ -18,24 +18,27 @@ from scipy.sparse import bsr_matrix, csr_matrix
 
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.block_cholesky import BlockCholesky
+from fgslam.backend.smoothers.border import Bordered, Eliminated
 from fgslam.backend.smoothers.marginals import (
-    ChainMarginals,
     GraphMarginals,
     LinearSystem,
     block_diagonal,
     reduced,
+    with_border,
 )
+from fgslam.backend.smoothers.other_factors import OtherFactors
 from fgslam.backend.smoothers.sightings import (
     FactorSightings,
     Sightings,
     StereoSightings,
     values_of,
 )
+from fgslam.backend.smoothers.turns import TurnedStep, Turns
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.levenberg import Damping
 from fgslam.core.sensors import CameraRig
-from fgslam.factors.graphs import is_pose
+from fgslam.factors.graphs import is_pose, number
 from fgslam.factors.noise import kernel_losses, kernel_weights
 from fgslam.factors.stacked import LinearRows
 
@@ -46,25 +49,30 @@ _AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Poses ``wTc`` (n, 4, 4) and landmarks (m, 3), by the keys' order."""
+    """Poses ``wTc`` (n, 4, 4) and landmarks (m, 3), by the keys' order; a gyroscope's biases (3q,).
+
+    The biases are in rad/s, about the axes of the body.
+    """
 
     poses: FloatArray
     points: FloatArray
+    bias: FloatArray = dataclasses.field(default_factory=lambda: np.empty(0))
 
     @staticmethod
     def of(values: Any) -> State:
-        """Those of GTSAM values."""
+        """Those of GTSAM values, without biases."""
         flat = gtsam.utilities.extractPose3(values)
         poses = np.tile(np.eye(4), (len(flat), 1, 1))
         poses[:, :3, :3], poses[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
         return State(poses, np.array(gtsam.utilities.extractPoint3(values)).reshape(-1, 3))
 
     def moved(self, step: FloatArray) -> State:
-        """After a step (3m + 6n,) of the landmarks and in the poses' tangent spaces."""
+        """After a step (3m + 6n + 3q,) of landmarks, in the poses' tangent spaces, of biases."""
         points = 3 * len(self.points)
-        pairs = zip(self.poses, step[points:].reshape(-1, 6), strict=True)
+        end = points + 6 * len(self.poses)
+        pairs = zip(self.poses, step[points:end].reshape(-1, 6), strict=True)
         poses = np.array([gtsam.Pose3(pose).retract(by).matrix() for pose, by in pairs])
-        return State(poses, self.points + step[:points].reshape(-1, 3))
+        return State(poses, self.points + step[:points].reshape(-1, 3), self.bias + step[end:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +91,7 @@ class WholeGraph:
     landmark_keys: list[int]
     kinds: list[Sightings]
     weights: FloatArray
-    rest: Any
+    rest: OtherFactors
     kernel: KernelSettings
 
     @staticmethod
@@ -109,7 +117,8 @@ class WholeGraph:
             factors, *which = zip(*each, strict=True)
             kinds.append(kind.of(list(factors), *(np.array(w, np.int64) for w in which)))
         weights = np.ones(sum(len(kind.rows) for kind in kinds))
-        return WholeGraph(poses, landmarks, kinds, weights, rest, kernel), State.of(values)
+        others = OtherFactors(rest, poses, landmarks)
+        return WholeGraph(poses, landmarks, kinds, weights, others, kernel), State.of(values)
 
     @staticmethod
     def of_rig(
@@ -139,8 +148,21 @@ class WholeGraph:
         kinds: list[Sightings] = []
         if len(rows):
             kinds.append(StereoSightings(rows, of_pose, of_landmark, *measured, rig))
-        weights = np.ones(len(rows))
-        return WholeGraph(poses, landmarks, kinds, weights, others, kernel), State.of(values)
+        rest = OtherFactors(others, poses, landmarks)
+        return WholeGraph(poses, landmarks, kinds, np.ones(len(rows)), rest, kernel), State.of(
+            values
+        )
+
+    def with_turns(
+        self, steps: list[TurnedStep], state: State, persistence: float
+    ) -> tuple[WholeGraph, State]:
+        """With steps that a gyroscope measured, and the state with a bias for its poses."""
+        turns = Turns.of(steps, [number(key) for key in self.pose_keys], persistence)
+        if turns is None:
+            return self, state
+        rest = dataclasses.replace(self.rest, turns=turns)
+        start = dataclasses.replace(state, bias=turns.start(state.poses))
+        return dataclasses.replace(self, rest=rest), start
 
     # -- other graphs --------------------------------------------------------------------------
 
@@ -158,24 +180,18 @@ class WholeGraph:
         kept = np.ones(len(self.landmark_keys), np.bool_)
         kept[rows] = False
         gone = {self.landmark_keys[row] for row in rows.tolist()}
-        rest = gtsam.NonlinearFactorGraph()
-        for row in range(self.rest.size()):
-            if gone.isdisjoint(self.rest.at(row).keys()):
-                rest.add(self.rest.at(row))
         left = dataclasses.replace(
             self,
             landmark_keys=[key for key in self.landmark_keys if key not in gone],
             kinds=[kind.of_points(kept) for kind in self.kinds],
             weights=self.weights[kept[self._points]],
-            rest=rest,
+            rest=self.rest.without(gone),
         )
-        return left, State(state.poses, state.points[kept])
+        return left, dataclasses.replace(state, points=state.points[kept])
 
     def plus(self, factor: Any) -> WholeGraph:
         """With one factor more, of poses alone."""
-        rest = self.rest.clone()
-        rest.add(factor)
-        return dataclasses.replace(self, rest=rest)
+        return dataclasses.replace(self, rest=self.rest.plus(factor))
 
     def unseen(self) -> IntArray:
         """Rows of the landmarks of which no observation counts."""
@@ -199,11 +215,11 @@ class WholeGraph:
         """Half the robust sum of squares of all that counts."""
         squared = self.weights * self.squared(state)
         losses = kernel_losses(self.kernel.name, self.kernel.width, squared)
-        return float(losses.sum()) + float(self.rest.error(self._of_rest(state)))
+        return float(losses.sum()) + self.rest.cost(state.poses, state.points, state.bias)
 
     def linear(self, state: State) -> LinearSystem:
         """Normal equations at a state, robust weights as they are there."""
-        rest = self._linear_rest(state)
+        rest = self.rest.linear(state.poses, state.points, state.bias)
         looks = [kind.look(state.poses, state.points) for kind in self.kinds]
         if not looks:
             return rest
@@ -311,46 +327,6 @@ class WholeGraph:
         start = np.searchsorted(self._poses[order], np.arange(n + 1))
         return bsr_matrix((blocks[order], self._points[order], start), (6 * n, 3 * m))
 
-    @cached_property
-    def _rest_rows(self) -> dict[int, int]:
-        """Rows of the variables of the other factors, by key, ascending."""
-        rows = {key: row for row, key in enumerate(self.landmark_keys)}
-        rows |= {key: row for row, key in enumerate(self.pose_keys)}
-        return {key: rows[key] for key in sorted(self.rest.keyVector())}
-
-    def _linear_rest(self, state: State) -> LinearSystem:
-        """Normal equations of the other factors alone, by GTSAM."""
-        n, m = len(self.pose_keys), len(self.landmark_keys)
-        linear = self.rest.linearize(values_of(self._rest_rows, state.poses, state.points))
-        row, column, value = linear.sparseJacobian_()
-        places = [
-            3 * m + 6 * row + np.arange(6) if is_pose(key) else 3 * row + np.arange(3)
-            for key, row in self._rest_rows.items()
-        ]
-        # GTSAM counts from 1 and puts the right-hand side in the last column.
-        place = np.concatenate([*places, [3 * m + 6 * n]])
-        at = row.astype(np.int64) - 1, place[column.astype(np.int64) - 1]
-        rows = int(row.max(initial=0))
-        whole = csr_matrix((value, at), (rows, 3 * m + 6 * n + 1))
-        jacobian, right = whole[:, :-1], whole[:, [-1]].toarray()[:, 0]
-        information = (jacobian.T @ jacobian).tocsr()
-        gradient = -(jacobian.T @ right)
-        own, links = _apart(information[: 3 * m, : 3 * m])
-        coupling = information[3 * m :, : 3 * m]
-        return LinearSystem(
-            np.array(self.pose_keys, np.int64),
-            np.array(self.landmark_keys, np.int64),
-            information[3 * m :, 3 * m :],
-            coupling.tobsr((6, 3)) if n and m else bsr_matrix((6 * n, 3 * m), blocksize=(6, 3)),
-            own,
-            links,
-            gradient[3 * m :],
-            gradient[: 3 * m],
-        )
-
-    def _of_rest(self, state: State) -> Any:
-        return values_of(self._rest_rows, state.poses, state.points)
-
 
 class Descent:
     """Steps towards the minimum, Gauss and Newton's or damped.
@@ -390,7 +366,8 @@ class Descent:
     ) -> tuple[float, State] | None:
         """The step by a kept system; None where a landmark has become undetermined."""
         try:
-            return _after(graph, state, GraphMarginals.of(system.damped(0.0), factor))
+            kept = GraphMarginals.of(system.damped(0.0), factor)
+            return _after(graph, state, with_border(kept))
         except EstimatorError:
             return None
 
@@ -398,14 +375,13 @@ class Descent:
         self, graph: WholeGraph, state: State, system: LinearSystem, damping: float
     ) -> tuple[float, State]:
         solved = reduced(system.damped(damping))
-        if self._keeps and damping == 0.0 and isinstance(solved, GraphMarginals):
-            self._factor = solved.factor
+        held = solved.held if isinstance(solved, Bordered) else solved
+        if self._keeps and damping == 0.0 and isinstance(held, GraphMarginals):
+            self._factor = held.factor
         return _after(graph, state, solved)
 
 
-def _after(
-    graph: WholeGraph, state: State, solved: GraphMarginals | ChainMarginals
-) -> tuple[float, State]:
+def _after(graph: WholeGraph, state: State, solved: Eliminated) -> tuple[float, State]:
     ahead = state.moved(solved.step())
     return graph.cost(ahead), ahead
 
@@ -437,14 +413,3 @@ def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:
     """Sums (g, ...) of what each observation (k, ...) adds to its group, one after another."""
     found = incidence @ each.reshape(len(each), -1)
     return np.asarray(found.reshape(-1, *each.shape[1:]))
-
-
-def _apart(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
-    """The (m, 3, 3) diagonal blocks of a sparse matrix (3m, 3m), and what is beside them."""
-    entries = matrix.tocoo()
-    own = np.zeros((matrix.shape[0] // 3, 3, 3))
-    inside = entries.row // 3 == entries.col // 3
-    row, column = entries.row[inside], entries.col[inside]
-    own[row // 3, row % 3, column % 3] = entries.data[inside]
-    beside = entries.data[~inside], (entries.row[~inside], entries.col[~inside])
-    return own, csr_matrix(beside, matrix.shape)

@@ -25,8 +25,9 @@ from fgslam.backend.settings import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
+from fgslam.backend.smoothers.border import Bordered
 from fgslam.backend.smoothers.refinement import Refined
-from fgslam.backend.smoothers.rig_doubt import DoubtedMarginals, shifts
+from fgslam.backend.smoothers.rig_doubt import doubted, shifts
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction, UpdateStats
@@ -79,14 +80,14 @@ def displaced(increment: Any, by: FloatArray) -> Any:
 
 def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() -> None:
     refined = solved()
-    found = DoubtedMarginals.of(refined.graph, refined.state, EXACT)
+    found = doubted(refined.graph, refined.state, EXACT)
     system = refined.graph.linear(refined.state)
     information = system.information.toarray()
     p = len(EXACT.values)
     pull, own = refined.graph.pulled(refined.state, lambda measured: shifts(RIG, measured)[..., :p])
     whole = np.block([[information, pull], [pull.T, own + prior_information(RIG)]])
     covariance = np.linalg.inv(whole)
-    columns, k = system.columns, len(found.correction)
+    columns, k = system.columns, len(found.covariance)
     scale = np.abs(covariance).max()
     last = columns + 6 * 11 + np.arange(6)
     np.testing.assert_allclose(
@@ -99,7 +100,7 @@ def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() ->
     np.testing.assert_allclose(
         found.joint(11, np.array([0])), covariance[np.ix_(rows, rows)], rtol=1e-5, atol=1e-9 * scale
     )
-    np.testing.assert_allclose(found.correction, covariance[-k:, -k:], rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(found.covariance, covariance[-k:, -k:], rtol=1e-5, atol=1e-12)
 
 
 @pytest.mark.parametrize("term", ["left.yaw", "row", "focal", "all.radial", "radial", "baseline"])
@@ -107,7 +108,7 @@ def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     """By some tenth of a pixel; to first order."""
     by = 0.1 / RIG.fx * (np.array(ALL) == term)
     refined, moved = solved(), solved(3, tuple(by))
-    found = DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
+    found = doubted(refined.graph, refined.state, CALIBRATED)
     before, after = refined.state.poses, moved.state.poses
     steps = np.array([g.se3_log(step) for step in g.inverse(before) @ after])
     gain = (found.gain[found.held.system.columns :] @ by).reshape(-1, 6)
@@ -123,8 +124,8 @@ def test_images_far_off_against_each_other_are_taken_to_be_off_as_far() -> None:
     def of(left_px: float) -> FloatArray:
         """Covariance of what is shared, the left image so far to the right."""
         moved = dataclasses.replace(CALIBRATED, values=left_px / RIG.fx * column)
-        found = DoubtedMarginals.of(refined.graph, refined.state, moved)
-        return found.correction[shared, shared]
+        found = doubted(refined.graph, refined.state, moved)
+        return found.covariance[shared, shared]
 
     np.testing.assert_allclose(of(0.3), of(0.0))
     # 2 pixels in each of three images
@@ -161,12 +162,12 @@ def test_rigs_that_are_off_as_assumed_leave_consistent_poses() -> None:
     found, held = [], []
     for seed in range(12):
         exact, truth = solved(seed), drawn(seed, frames=12).poses[1:]
-        assumed = DoubtedMarginals.of(exact.graph, exact.state, CALIBRATED).correction
+        assumed = doubted(exact.graph, exact.state, CALIBRATED).covariance
         refined = solved(seed, tuple(rng.multivariate_normal(np.zeros(len(ALL)), assumed)))
         poses = refined.poses()[1:]
-        doubted = DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
-        found.append(per_dof(poses, doubted.poses()[1:], truth))
-        held.append(per_dof(poses, doubted.held.poses()[1:], truth))
+        both = doubted(refined.graph, refined.state, CALIBRATED)
+        found.append(per_dof(poses, both.poses()[1:], truth))
+        held.append(per_dof(poses, both.held.poses()[1:], truth))
     assert np.mean(held) > 2.0
     assert 0.75 < np.mean(found) < 1.25
 
@@ -200,16 +201,16 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
     np.testing.assert_allclose(gain, turned, rtol=1e-3, atol=1e-4 * np.abs(turned).max())
 
 
-def whole() -> DoubtedMarginals:
+def whole() -> Bordered:
     refined = solved()
-    return DoubtedMarginals.of(refined.graph, refined.state, CALIBRATED)
+    return doubted(refined.graph, refined.state, CALIBRATED)
 
 
 def test_the_newest_pose_is_as_uncertain_as_the_whole_graph_has_it() -> None:
     """Within a factor of two: a filter does not go back to earlier poses."""
     shared = slice(len(EXACT.values), None)
     gain = whole().gain[-6:, shared]
-    known = np.diagonal(gain @ whole().correction[shared, shared] @ gain.T)
+    known = np.diagonal(gain @ whole().covariance[shared, shared] @ gain.T)
     ratio = np.sqrt(np.diagonal(driven(12).of_pose()) / known)
     assert (ratio > 0.5).all()
     assert (ratio < 2.0).all(), ratio
