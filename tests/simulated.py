@@ -73,15 +73,19 @@ class Simulation:
     increments: list[Increment]
 
 
-def simulate(drive: Drive, rng: np.random.Generator) -> Simulation:
-    """Drives with a constant twist past points that are spread over all its views."""
-    step = g.se3_exp(np.array(drive.twist))
+def simulate(
+    drive: Drive, rng: np.random.Generator, twists: FloatArray | None = None
+) -> Simulation:
+    """Drives with a constant twist, or twists (frames - 1, 6), past points over all its views."""
+    constant = np.tile(np.array(drive.twist), (drive.frames - 1, 1))
+    steps = [g.se3_exp(twist) for twist in (constant if twists is None else twists)]
     poses = [np.eye(4)]
-    for _ in range(drive.frames - 1):
+    for step in steps:
         poses.append(g.reorthonormalise(poses[-1] @ step))
     points = points_in_views(drive, poses, rng)
     book = _Identities(drive, points)
-    increments = [book.increment(k, wTc, step, rng) for k, wTc in enumerate(poses)]
+    to = [np.eye(4), *steps]
+    increments = [book.increment(k, wTc, to[k], rng) for k, wTc in enumerate(poses)]
     return Simulation(drive, np.array(poses), points[book.book.point_of_id], increments)
 
 

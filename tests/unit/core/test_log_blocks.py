@@ -14,11 +14,11 @@ from fgslam.core.array_files import Pieces, write_arrays, write_pieces
 from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.log_blocks import LogBlocks
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.measurements import BiasEffect, Increment, Odometry
 from fgslam.core.rig_correction import term_names
 
 FRAMES, BLOCK = 23, 4
-PLAIN, LOOPS, CORRECTED, TURNED = "plain", "loops", "corrected", "turned"
+PLAIN, LOOPS, CORRECTED, TURNED, BIASED = "plain", "loops", "corrected", "turned", "biased"
 
 
 @pytest.fixture(autouse=True)
@@ -33,11 +33,14 @@ def frames(kind: str, rng: np.random.Generator) -> list[Increment]:
         closures = (loop(2, rng, 5, 2), loop(9, rng, 0, 0))
         out[10] = replace(out[10], loops=closures, relocalised=True)
         out[21] = replace(out[21], loops=(loop(17, rng, 3, 1),))
-    if kind in (CORRECTED, TURNED):
+    if kind in (CORRECTED, TURNED, BIASED):
         for k in range(6, 14):
             out[k] = replace(out[k], rig_correction=rng.standard_normal(len(term_names(RIG))))
     if kind == TURNED:
         out[12] = replace(out[12], odometry=Odometry.turn(np.eye(3), 0.01 * np.eye(3)))
+    if kind == BIASED:
+        effect = BiasEffect(-0.1 * np.eye(3), 1e-3, 1e-9, rng.standard_normal(3), 1e-4 * np.eye(3))
+        out[12] = replace(out[12], odometry=Odometry.turn(np.eye(3), 0.01 * np.eye(3), effect))
     return out
 
 
@@ -54,7 +57,7 @@ def logs(kind: str, rng: np.random.Generator, folder: Path) -> tuple[Measurement
     return memory, disk
 
 
-@pytest.mark.parametrize("kind", [PLAIN, LOOPS, CORRECTED, TURNED])
+@pytest.mark.parametrize("kind", [PLAIN, LOOPS, CORRECTED, TURNED, BIASED])
 def test_the_file_of_the_whole_log_has_the_same_bytes(
     kind: str, rng: np.random.Generator, tmp_path: Path
 ) -> None:

@@ -10,12 +10,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from simulated import assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry, SettledRig
+from fgslam.core.measurements import (
+    BiasEffect,
+    Increment,
+    LoopClosure,
+    Observations,
+    Odometry,
+    SettledRig,
+)
 from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
 
@@ -187,13 +195,13 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-@pytest.mark.parametrize("version", [7, 99, "1", None])
+@pytest.mark.parametrize("version", [8, 99, "1", None])
 def test_another_version_is_refused(file: Path, version: object) -> None:
     arrays = load_arrays(file)
     header = json.loads(str(arrays["header"])) | {"version": version}
     arrays["header"] = np.array(json.dumps(header))
     with pytest.raises(
-        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 6"
+        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 7"
     ):
         MeasurementLog.from_arrays(arrays, "x.npz")
 
@@ -364,6 +372,28 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
     write_arrays(tmp_path / "log.npz", arrays | {"rig_correction": arrays["rig_correction"][:, 1:]})
     with pytest.raises(MeasurementLogError, match="rig_correction"):
         MeasurementLog.load(tmp_path / "log.npz")
+
+
+def test_the_bias_of_a_gyroscope_makes_version_7(log: MeasurementLog, tmp_path: Path) -> None:
+    applied, left = np.array([0.01, -0.02, 0.03]), np.diag([1e-6, 2e-6, 3e-6])
+    effect = BiasEffect(-0.05 * np.eye(3), 0.003, 1e-11, applied, left)
+    turn = Odometry.turn(np.eye(3), 1e-6 * np.eye(3), effect)
+    log.increments[1] = replace(log.increments[1], odometry=turn)
+    log.save(tmp_path / "log.npz")
+    arrays = load_arrays(tmp_path / "log.npz")
+    assert json.loads(str(arrays["header"]))["version"] == 7
+    back = [increment.odometry for increment in MeasurementLog.load(tmp_path / "log.npz")]
+    assert back[1] is not None
+    assert_same_bits(back[1], turn)
+    assert [step is None or step.bias is None for step in (back[0], back[2])] == [True, True]
+    for name, wrong, words in (
+        ("gyroscope_bias", np.full((len(back), 3), np.nan), "is not finite"),
+        ("gyroscope_bias_covariance", -np.tile(left, (len(back), 1, 1)), "no covariance"),
+        ("gyroscope_stability", np.zeros((len(back), 2)), "no covariance"),
+        ("gyroscope_jacobian", np.zeros((len(back), 3)), "absent or damaged"),
+    ):
+        with pytest.raises(MeasurementLogError, match=f"array {name}.* {words}"):
+            MeasurementLog.from_arrays(arrays | {name: wrong}, "x.npz")
 
 
 def test_a_correction_of_fewer_terms_has_none_of_the_others(log: MeasurementLog) -> None:
