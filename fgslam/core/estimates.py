@@ -196,7 +196,7 @@ class GyroscopeBias(Brief):
     """Bias of the gyroscope that measured the turns, at the end of the drive.
 
     Attributes:
-        rates: (3,) rad/s about the axes of the body, x forward, y left, z up.
+        rates: (3,) rad/s about the axes of the body.
         covariance: (3, 3) of it.
     """
 

@@ -100,12 +100,18 @@ def test_tum_vi_is_mapped_by_the_bare_command(
     root = write_tum_vi(tmp_path / "dataset-boards_512_16")
     quiet = ("--set", "output.pictures=false", "--set", "output.report=false")
     assert main(monkeypatch, "run", root, "--out", tmp_path / "run", *quiet) == 0
-    first = capfd.readouterr().out.splitlines()[0]
+    said = capfd.readouterr().out
+    first = said.splitlines()[0]
     assert "EuRoC native, 2 cameras 192x192, unrectified; 8 frames at 20 Hz" in first
     assert "a gyroscope, no odometry; truth, for evaluation only" in first
     result = metrics_of(tmp_path / "run")["estimators"]["isam2"]
     assert result["ate_rmse_m"] < 0.003  # of 0.28 m
     assert result["ate_first_pose_m"] < 0.006  # 0.018 by a camera that is rolled by 0.6 degrees
+    bias = result["gyroscope_bias_dps"]
+    off, sigmas = np.abs(bias["rates"] - np.degrees(BIAS)), np.array(bias["sigmas"])
+    assert (off < 4.0 * sigmas).all()
+    assert sigmas.max() < 1.0, "of 3 beforehand"
+    assert "gyroscope bias, x y z" in said
 
 
 def test_tum_vi_without_its_calibration_says_where_that_is(tmp_path: Path) -> None:

@@ -224,10 +224,20 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
         ("drift", "unknown" if metrics.drift_percent is None else f"{metrics.drift_percent:.2f} %"),
         ("pose NEES per dof", _nees(metrics)),
         ("loop without SIFT, median", _milliseconds(numbers["loop_ms"])),
+        *_gyroscope(metrics.more.get("gyroscope_bias_dps")),
     ]
     heading = f"{outputs.config.name}: {outputs.title}{remark}"
     cells = tuple((name, (str(value),)) for name, value in rows)
     return TextTable("summary", heading, "", (Column("", "of the run"),), cells)
+
+
+def _gyroscope(bias: object) -> list[tuple[str, object]]:
+    """Its bias in degrees/s; nothing where none was estimated."""
+    if not isinstance(bias, dict):
+        return []
+    pairs = zip(bias["rates"], bias["sigmas"], strict=True)
+    words = ", ".join(f"{rate:.3f} +- {sigma:.3f}" for rate, sigma in pairs)
+    return [("gyroscope bias, x y z", f"{words} deg/s")]
 
 
 def _located(outputs: RunOutputs) -> str:
