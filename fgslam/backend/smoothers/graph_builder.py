@@ -259,8 +259,7 @@ class GraphBuilder:
     def _with_observations(self, out: Any) -> Any:
         seen = self.kept_observed()
         for frame, variable, measurement, covariance in zip(*seen, strict=True):
-            sighting = Sighting(int(frame), measurement, covariance)
-            out.add(self._observation(int(variable), sighting))
+            out.add(self._observation(int(variable), Sighting(int(frame), measurement, covariance)))
         return out
 
     def observation_factors(self, sightings: list[tuple[int, Sighting]]) -> Any:
@@ -358,9 +357,8 @@ class GraphBuilder:
         if not motion.measured:
             covariance = self._persistence * motion.covariance
             motion = dataclasses.replace(motion, covariance=covariance)
-        row = self._push(
-            new, odometry_factor(pose_key(self.frames[-1]), pose_key(new.frame), motion)
-        )
+        before, after = pose_key(self.frames[-1]), pose_key(new.frame)
+        row = self._push(new, odometry_factor(before, after, motion))
         if not motion.measured:
             self._variance_of[row] = self._persistence
         if turn is not None and self._remember:
