@@ -9,7 +9,9 @@ docs/derivations/self_calibration.md.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -54,6 +56,7 @@ _CAMERAS = ("left", "top")
 _CHANGES = ("yaw_deg", "pitch_deg", "roll_deg", "focal_percent")
 _CHANGE_UNITS = np.array([180.0 / np.pi] * 3 + [100.0])
 _COMMON = [TERMS.index(name) for name in COMMON]
+_Shift: TypeAlias = tuple[FloatArray | float, FloatArray | float]
 _GRID = 7  # points along each axis of the image at which the prior is stated
 
 
@@ -84,41 +87,95 @@ def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
         rig: as calibrated.
         pixels: (k, cameras, 2) raw (column, row) in right, left[, top].
     """
-    of_cameras = [camera_displacements(rig, k, pixels[:, k]) for k in range(rig.cameras)]
-    return np.concatenate(of_cameras, axis=1)
+    out = np.zeros((2 * rig.cameras, _count(rig), len(pixels)))
+    for camera in range(rig.cameras):
+        _fill(out[2 * camera : 2 * camera + 2], rig, camera, pixels[:, camera])
+    return np.ascontiguousarray(out.transpose(2, 0, 1))
 
 
 def camera_displacements(rig: CameraRig, camera: int, pixels: FloatArray) -> FloatArray:
     """Displacements (k, 2, p) of pixels (k, 2) of one camera (0: right) by a unit of each term."""
-    focal = np.array([rig.fx, rig.fy])
-    own = focal[:, None] * _terms((pixels - [rig.cx, rig.cy]) / focal, rig.cylindrical)
-    count = len(TERMS)
-    out = np.zeros((len(pixels), 2, count * (rig.cameras - 1) + len(COMMON)))
+    out = np.zeros((2, _count(rig), len(pixels)))
+    _fill(out, rig, camera, pixels)
+    return np.ascontiguousarray(out.transpose(2, 0, 1))
+
+
+def _count(rig: CameraRig) -> int:
+    return len(TERMS) * (rig.cameras - 1) + len(COMMON)
+
+
+def _fill(out: FloatArray, rig: CameraRig, camera: int, pixels: FloatArray) -> None:
+    """Writes one camera's displacements (2, p, k), which are zero but for its own and the common.
+
+    Term by term over all pixels, for speed.
+    """
+    rays = _rays(rig, pixels)
     if camera:
-        out[..., count * (camera - 1) : count * camera] = own
-    out[..., -len(COMMON) :] = own[..., _COMMON]
-    return out
+        own = slice(len(TERMS) * (camera - 1), len(TERMS) * camera)
+        _scale(out[:, own], rig, _terms(rig, *rays))
+        out[:, -len(COMMON) :] = out[:, own][:, _COMMON]
+    elif rig.cylindrical:
+        terms = _terms(rig, *rays)
+        _scale(out[:, -len(COMMON) :], rig, [terms[term] for term in _COMMON])
+    else:
+        _scale(out[:, -len(COMMON) :], rig, [_radial(*rays)])
 
 
-def _terms(rays: FloatArray, cylindrical: bool) -> FloatArray:
-    """Displacements (k, 2, 11) of normalised image points (k, 2) in the order of TERMS.
+def _rays(rig: CameraRig, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normalised image points (k,), (k,)."""
+    return (pixels[:, 0] - rig.cx) / rig.fx, (pixels[:, 1] - rig.cy) / rig.fy
+
+
+def _scale(out: FloatArray, rig: CameraRig, terms: Iterable[_Shift]) -> None:
+    """Writes displacements of normalised points, term by term, as such of pixels (2, n, k)."""
+    for at, (column, row) in enumerate(terms):
+        np.multiply(rig.fx, column, out=out[0, at])
+        np.multiply(rig.fy, row, out=out[1, at])
+
+
+def _terms(rig: CameraRig, x: FloatArray, y: FloatArray) -> list[_Shift]:
+    """Displacements in column and row of normalised image points (k,), in the order of TERMS.
 
     In a cylindrical view the points are angles, and the lens an equidistant fisheye, whose own
     image the terms other than turns displace.
     """
-    on_lens, slopes = on_fisheye(rays) if cylindrical else (rays, None)
-    x, y = on_lens.T
-    r2 = x * x + y * y
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    along_x, across, along_y = r2 + 2.0 * x * x, 2.0 * x * y, r2 + 2.0 * y * y
-    columns = (one, zero, 1.0 + x * x, x * y, -y, x, along_x, across, x * r2)
-    rows = (zero, one, x * y, 1.0 + y * y, x, y, across, along_y, y * r2)
-    out = np.stack([np.stack(columns, axis=1), np.stack(rows, axis=1)], axis=1)
-    out = np.concatenate([out, out[..., 6:8] * r2[:, None, None]], axis=2)
-    if slopes is not None:
-        out = slopes @ out
-        out[..., 2:5] = turns_of_cylinder(rays)
+    if not rig.cylindrical:
+        return _of_plane(x, y)
+    rays = np.column_stack([x, y])
+    on_lens, slopes = on_fisheye(rays)
+    (by_column, across), (along, by_row) = slopes.transpose(1, 2, 0)
+    out: list[_Shift] = [
+        (by_column * column + across * row, along * column + by_row * row)
+        for column, row in _of_plane(*on_lens.T)
+    ]
+    turns = turns_of_cylinder(rays).transpose(2, 1, 0)
+    out[2:5] = [(column, row) for column, row in turns]
     return out
+
+
+def _radial(x: FloatArray, y: FloatArray) -> _Shift:
+    r2 = x * x + y * y
+    return x * r2, y * r2
+
+
+def _of_plane(x: FloatArray, y: FloatArray) -> list[_Shift]:
+    """The same of a perspective view."""
+    xx, xy, yy = x * x, x * y, y * y
+    r2, across = xx + yy, 2.0 * xy
+    along_x, along_y, outer = r2 + 2.0 * xx, r2 + 2.0 * yy, across * r2
+    return [
+        (1.0, 0.0),
+        (0.0, 1.0),
+        (1.0 + xx, xy),
+        (xy, 1.0 + yy),
+        (-y, x),
+        (x, y),
+        (along_x, across),
+        (across, along_y),
+        (x * r2, y * r2),
+        (along_x * r2, outer),
+        (outer, along_y * r2),
+    ]
 
 
 def prior_information(
@@ -148,14 +205,11 @@ def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
 
     Arguments as for :func:`displacements`. A longer baseline is one with larger disparities.
     """
-    focal = np.array([rig.fx, rig.fy])
-    rays = (pixels.reshape(-1, 2) - [rig.cx, rig.cy]) / focal
-    of_lens = (
-        focal[:, None]
-        * _terms(rays, rig.cylindrical)[..., [TERMS.index(name) for name in SHARED[:-1]]]
-    )
-    out = np.zeros((len(pixels), 2 * rig.cameras, len(SHARED)))
-    out[..., :-1] = of_lens.reshape(len(pixels), 2 * rig.cameras, len(SHARED) - 1)
+    terms = _terms(rig, *_rays(rig, pixels.reshape(-1, 2)))
+    of_lens = np.zeros((2, len(SHARED), rig.cameras * len(pixels)))
+    _scale(of_lens, rig, [terms[TERMS.index(name)] for name in SHARED[:-1]])
+    out = np.ascontiguousarray(of_lens.transpose(2, 0, 1))
+    out = out.reshape(len(pixels), 2 * rig.cameras, len(SHARED))
     out[:, 2, -1] = pixels[:, 1, 0] - pixels[:, 0, 0]
     if rig.cameras == 3:
         out[:, 5, -1] = pixels[:, 2, 1] - pixels[:, 0, 1]

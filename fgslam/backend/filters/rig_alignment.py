@@ -64,6 +64,22 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Prediction:
+    """What is measured at a state.
+
+    Attributes:
+        local: (m, 3) points in the cameras that see them.
+        residual: (m, 2 * cameras) predicted less raw pixels, in sigmas.
+        unit: (m, 2 * cameras, p) displacements of the predicted pixels.
+    """
+
+    state: _State
+    local: FloatArray
+    residual: FloatArray
+    unit: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _Normal:
     """Normal equations with the points eliminated; poses 1.. first, then the correction."""
 
@@ -89,6 +105,7 @@ class RigAlignment:
         Of the correction's terms (p,) those that are not ``free`` are held at zero.
         """
         self._rig, self._sigma, self._free = rig, pixel_sigma, free
+        self._last: _Prediction | None = None
         self._poses = np.array([wTc for wTc, _ in frames])
         ids = np.concatenate([seen.ids for _, seen in frames])
         frame = np.repeat(np.arange(len(frames)), [len(seen) for _, seen in frames])
@@ -147,8 +164,8 @@ class RigAlignment:
         turn, place = self._poses[:, :3, :3], self._poses[:, :3, 3]
         at = self._frame[self._first]
         points = np.einsum("lij,lj->li", turn[at], local) + place[at]
-        residual, depth, _ = self._residuals(_State(self._poses, points, correction))
-        wild = (np.abs(residual).max(axis=1) > _GROSS) | (depth < _NEAREST_M)
+        found = self._predicted(_State(self._poses, points, correction))
+        wild = (np.abs(found.residual).max(axis=1) > _GROSS) | (found.local[:, 2] < _NEAREST_M)
         usable = ~np.logical_or.reduceat(wild, self._first)
         self._keep(usable[self._landmark])
         if usable.sum() < len(correction):
@@ -169,25 +186,29 @@ class RigAlignment:
         off = state.points[self._landmark] - place[self._frame]
         return np.asarray((off[:, None] @ turn[self._frame])[:, 0])
 
-    def _residuals(self, state: _State) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predicted less raw pixels (m, 2 * cameras) in sigmas, depths (m,), and displacements.
+    def _predicted(self, state: _State) -> _Prediction:
+        """What is measured at a state; of the last one it is known.
 
-        These are taken at the prediction: a measured pixel's noise would correlate with them, and
-        windows without end would agree on a wrong lens.
+        Displacements are taken at the prediction: a measured pixel's noise would correlate with
+        them, and windows without end would agree on a wrong lens.
         """
+        if self._last is not None and self._last.state is state:
+            return self._last
         local = self._local(state)
         safe = np.where(local[:, 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
         exact = project(self._rig, safe) @ self._model.T
-        unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2)) * self._free
+        unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2))
+        unit *= self._free
         residual = (exact + unit @ state.correction - self._raw()) / self._sigma
-        return residual, local[:, 2], unit
+        self._last = _Prediction(state, local, residual, unit)
+        return self._last
 
     def _cost(self, state: _State, around: FloatArray, prior: FloatArray) -> float:
-        residual, depth, _ = self._residuals(state)
-        if (depth < _NEAREST_M).any():
+        found = self._predicted(state)
+        if (found.local[:, 2] < _NEAREST_M).any():
             return np.inf
         off = state.correction - around
-        squared = (residual**2).sum(axis=1) / _KERNEL_WIDTH**2
+        squared = (found.residual**2).sum(axis=1) / _KERNEL_WIDTH**2
         return float(_KERNEL_WIDTH**2 * np.log1p(squared).sum() + off @ prior @ off)
 
     def _minimise(
@@ -210,10 +231,10 @@ class RigAlignment:
         return state, self._linearise(state)
 
     def _linearise(self, state: _State) -> _Normal:
-        residual, _, unit = self._residuals(state)
+        found = self._predicted(state)
+        local, residual, unit = found.local, found.residual, found.unit
         squared = (residual**2).sum(axis=1)
         root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))
-        local = self._local(state)
         by_local = root[:, None, None] * (self._model @ projection_jacobian(self._rig, local))
         by_pose = by_local @ point_pose_jacobian(local)
         by_point = by_local @ np.swapaxes(state.poses[:, :3, :3], 1, 2)[self._frame]
