@@ -12,10 +12,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, Image, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, Image, StateArrays
+from fgslam.core.quantiles import middle
 from fgslam.core.rig_correction import EXPECTED_PX
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
-from fgslam.frontend.image_lag import Lag, LagModel, LineRows, Shrunk, followed, spread_of
+from fgslam.frontend.image_lag import (
+    Followed,
+    Lag,
+    LagModel,
+    LineRows,
+    Shrunk,
+    followed,
+    spread_of,
+)
 
 _WIDE_PX = 400  # wider images are made smaller
 _SURE = 5.0  # deviations: by chance once in three million frames
@@ -65,8 +74,10 @@ class CameraWatch:
         repeated = self._repeated(images)
         swapped = ""
         points = now.corners()
-        for camera, pair in enumerate(self._pairs, 1):
-            found, kept = followed(now.images[0], now.images[camera], points)
+        across = [followed(now.images[0], other, points) for other in now.images[1:]]
+        shown = np.logical_or.reduce([kept for _, kept in across])
+        moved: Followed | None = None
+        for camera, (pair, (found, kept)) in enumerate(zip(self._pairs, across, strict=True), 1):
             here, there = points[kept], found[kept]
             self._order(pair, self._factor * (there - here)[:, camera - 1])
             if pair.swapped and not swapped:
@@ -75,7 +86,8 @@ class CameraWatch:
                 )
             self._weigh(pair, now.grey[0], now.grey[camera], here, there)
             if self._before and not repeated and not swapped:
-                self._judge(camera, now, here, there)
+                moved = moved or _followed_of(now.images[0], self._before[0], points, shown)
+                self._judge(camera, now, (here, there), (moved[0][kept], moved[1][kept]))
         self._before, self._frames = now.images, self._frames + 1
         return repeated or swapped or self._old()
 
@@ -106,11 +118,11 @@ class CameraWatch:
         """Whether disparities (n,) have the wrong sign, beyond what a calibration explains."""
         if len(disparity) < _FEWEST:
             return
-        middle = float(np.median(disparity))
-        spread = 1.4826 * float(np.median(np.abs(disparity - middle)))
+        centre = middle(disparity)
+        spread = 1.4826 * middle(np.abs(disparity - centre))
         allowed = _SURE * 1.2533 * spread / math.sqrt(len(disparity))  # 1.25: of a median
-        if abs(middle) > allowed + _CALIBRATED * EXPECTED_PX:
-            pair.swapped = middle < 0.0
+        if abs(centre) > allowed + _CALIBRATED * EXPECTED_PX:
+            pair.swapped = centre < 0.0
 
     def _weigh(
         self, pair: _Pair, right: Image, other: Image, here: FloatArray, there: FloatArray
@@ -119,35 +131,40 @@ class CameraWatch:
         a, b = _grey(right, here), _grey(other, there)
         bright = np.minimum(a, b) >= _DARKEST
         if bright.sum() >= _FEWEST:
-            ratio = float(np.median(np.log(b[bright] / a[bright])))
+            ratio = middle(np.log(b[bright] / a[bright]))
             pair.ratios = [*pair.ratios, ratio][-_WINDOW:]
         settled = len(pair.ratios) == _WINDOW
-        pair.unequal += settled and abs(float(np.median(pair.ratios))) > math.log(_STOP)
+        pair.unequal += settled and abs(middle(np.array(pair.ratios))) > math.log(_STOP)
 
-    def _judge(self, camera: int, now: Shrunk, here: FloatArray, there: FloatArray) -> None:
-        """Whether the other camera, or the reference, shows an earlier moment than the other."""
-        pair = self._pairs[camera - 1]
+    def _judge(
+        self, camera: int, now: Shrunk, places: tuple[FloatArray, FloatArray], moved: Followed
+    ) -> None:
+        """Whether the other camera, or the reference, shows an earlier moment than the other.
+
+        Of points in the reference and the other image; and where the reference saw them before.
+        """
+        pair, (here, there) = self._pairs[camera - 1], places
         offset = (there - here)[:, pair.model.across]
-        rows = self._shifted(now, 0, here, offset, there, pair)
+        rows = self._shifted(moved, here, offset, there, pair)
         newest = self._take(pair, camera, 0, rows)
         sure = newest.sigma < _KNOWN and abs(newest.frames) < _ALIKE
         if not sure or any(self._late):
-            rows = self._shifted(now, camera, there, -offset, there, pair)
+            moved = followed(now.images[camera], self._before[camera], there)
+            rows = self._shifted(moved, there, -offset, there, pair)
             self._take(pair, 0, 1, rows)
         else:
             pair.rows[1].clear()
 
     def _shifted(
         self,
-        now: Shrunk,
-        camera: int,
+        moved: Followed,
         points: FloatArray,
         offset: FloatArray,
         place: FloatArray,
         pair: _Pair,
     ) -> LineRows:
         """Offsets of the points that one camera's last image shows, too, and their shift since."""
-        then, kept = followed(now.images[camera], self._before[camera], points)
+        then, kept = moved
         shift = (then - points)[:, pair.model.across]
         size = float(self._factor)
         return LineRows(size * offset[kept], size * shift[kept], size * place[kept])
@@ -220,6 +237,13 @@ def _named(which: list[bool]) -> str:
     names = [CAMERA_NAMES[k] for k, one in enumerate(which) if one]
     verb = "camera delivers" if len(names) == 1 else "cameras deliver"
     return f"the {' and '.join(names)} {verb}"
+
+
+def _followed_of(a: Image, b: Image, points: FloatArray, which: BoolArray) -> Followed:
+    """As :func:`followed`, of some points (n,); the others come back nowhere."""
+    found, kept = points.copy(), np.zeros(len(points), np.bool_)
+    found[which], kept[which] = followed(a, b, points[which])
+    return found, kept
 
 
 def _grey(image: Image, points: FloatArray) -> FloatArray:

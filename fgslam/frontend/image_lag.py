@@ -14,11 +14,13 @@ calibration leaves is a free smooth displacement with the prior of
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, Rows
+from fgslam.core.quantiles import middle
 from fgslam.core.rig_correction import TERMS, camera_displacements, prior_information
 from fgslam.core.sensors import CameraRig
 
@@ -100,10 +102,10 @@ class LagModel:
         found = np.zeros(design.shape[1])
         for _ in range(_ROUNDS):
             residual = rows.offset - design @ found
-            spread = max(spread_px, 1.4826 * float(np.median(np.abs(residual))))
-            weight = 1.0 / (1.0 + (residual / (_KERNEL * spread)) ** 2)
-            information = (design.T * weight) @ design + spread**2 * prior
-            found = np.linalg.solve(information, (design.T * weight) @ rows.offset)
+            spread = max(spread_px, 1.4826 * middle(np.abs(residual)))
+            weighted = design.T * (1.0 / (1.0 + (residual / (_KERNEL * spread)) ** 2))
+            information = weighted @ design + spread**2 * prior
+            found = np.linalg.solve(information, weighted @ rows.offset)
         if np.sqrt(np.mean(rows.shift**2)) < _SIGNAL * spread:
             return Lag(np.nan, np.nan)
         residual = rows.offset - design @ found
@@ -129,7 +131,7 @@ class Shrunk:
         """Shrinks by a whole ``factor``."""
         self.factor = factor
         self.grey = [_shrunk(image, factor) for image in images]
-        spread = [max(float(image.std()), 1.0) for image in self.grey]
+        spread = [max(float(cv2.meanStdDev(image)[1][0, 0]), 1.0) for image in self.grey]
         self.images: list[Image] = [
             np.asarray(cv2.convertScaleAbs(image, alpha=min(spread[0] / own, 4.0)), np.uint8)
             for image, own in zip(self.grey, spread, strict=True)
@@ -148,7 +150,11 @@ def _shrunk(image: Image, factor: int) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def followed(a: Image, b: Image, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+Followed: TypeAlias = tuple[FloatArray, BoolArray]
+"""Where points (n, 2) are in another image, and which (n,) of them are there."""
+
+
+def followed(a: Image, b: Image, points: FloatArray) -> Followed:
     """Where points (n, 2) of image ``a`` are in ``b``, and which (n,) come back when followed back.
 
     Pyramidal Lucas-Kanade (Bouguet 2000).
