@@ -28,6 +28,7 @@ from fgslam.core.sensors import (
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
+_EYE3, _EYE4, _EYE6 = np.eye(3), np.eye(4), np.eye(6)  # made once: six of them a step
 _RIGID_TOLERANCE = 1e-4  # of hand-written rotation matrices, four digits each
 
 BODY_FORWARD_LEFT_UP_FROM_CAMERA: FloatArray = np.array(
@@ -42,6 +43,9 @@ BODY_FORWARD_LEFT_UP_FROM_CAMERA: FloatArray = np.array(
 
 def skew(v: FloatArray) -> FloatArray:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): ``skew(a) @ b == cross(a, b)``."""
+    if v.ndim == 1:  # one of them, four times as fast
+        x, y, z = v.tolist()
+        return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
     out = np.zeros((*v.shape[:-1], 3, 3))
     out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
     out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
@@ -63,7 +67,7 @@ def so3_exp(omega: FloatArray) -> FloatArray:
     else:
         a, b = np.sin(theta) / theta, _one_minus_cos(theta) / theta2
     k = skew(omega)
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+    return np.asarray(_EYE3 + a * k + b * (k @ k))
 
 
 def so3_log(rotation: FloatArray) -> FloatArray:
@@ -125,7 +129,7 @@ def rotation_from_quaternion(quaternion: FloatArray) -> FloatArray:
 
 def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
     """Homogeneous (4, 4) matrix of a rotation (3, 3) and a translation (3,)."""
-    out = np.eye(4)
+    out = _EYE4.copy()
     out[:3, :3] = rotation
     out[:3, 3] = translation
     return out
@@ -161,7 +165,7 @@ def _so3_left_jacobian_inverse(omega: FloatArray) -> FloatArray:
         half = 0.5 * theta
         c = (1.0 - half * math.cos(half) / math.sin(half)) / theta2
     k = skew(omega)
-    return np.asarray(np.eye(3) - 0.5 * k + c * (k @ k))
+    return np.asarray(_EYE3 - 0.5 * k + c * (k @ k))
 
 
 def se3_exp(xi: FloatArray) -> FloatArray:
@@ -203,7 +207,7 @@ def se3_log_jacobian(xi: FloatArray) -> FloatArray:
     ad[3:, :3] = skew(xi[3:])
     ad2 = ad @ ad
     ad4 = ad2 @ ad2
-    return np.asarray(np.eye(6) + ad / 2 + ad2 / 12 - ad4 / 720 + (ad4 @ ad2) / 30240)
+    return np.asarray(_EYE6 + ad / 2 + ad2 / 12 - ad4 / 720 + (ad4 @ ad2) / 30240)
 
 
 def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray) -> FloatArray:
@@ -347,7 +351,7 @@ def point_pose_jacobian(points: FloatArray) -> FloatArray:
     """d(point in camera)/d(tangent of wTc) (n, 3, 6) for points (n, 3) in the camera's frame."""
     out = np.empty((len(points), 3, 6))
     out[:, :, :3] = skew(points)
-    out[:, :, 3:] = -np.eye(3)
+    out[:, :, 3:] = -_EYE3
     return out
 
 

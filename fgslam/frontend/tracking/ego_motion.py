@@ -109,16 +109,19 @@ class EgoMotionSolver:
         used = inliers = in_front(self.sensor, transform_to_camera(start, problem.points))
         iterations = 0
         wTc, robust = start, self._settings.kernel != "none"
+        weights = self._information(wTc, problem)
         for _ in range(_REPEATS):
             if inliers.sum() < self._settings.min_matches:
                 return self._fall_back(prediction, problem, EgoMotionStatus.TOO_FEW_MATCHES)
             weighted_at = wTc
-            minimum = self._minimise(wTc, prediction, problem.select(inliers), robust)
+            chosen = problem.select(inliers)
+            minimum = self._minimise(wTc, prediction, chosen, weights[inliers], robust)
             iterations += minimum.iterations
             if not minimum.converged:
                 return self._fall_back(prediction, problem, EgoMotionStatus.DIVERGED)
             wTc = minimum.wTc
-            kept = self._inliers(wTc, problem)
+            weights = self._information(wTc, problem)
+            kept = self._inliers(wTc, problem, weights)
             if not robust and np.array_equal(kept, inliers):
                 break
             used, inliers, robust = inliers, kept, False
@@ -130,9 +133,14 @@ class EgoMotionSolver:
     # ----------------------------------------------------------------------------------------
 
     def _minimise(
-        self, start: FloatArray, prediction: Prediction, problem: PoseProblem, robust: bool
+        self,
+        start: FloatArray,
+        prediction: Prediction,
+        problem: PoseProblem,
+        information: FloatArray,
+        robust: bool,
     ) -> _Minimum:
-        information = self._information(start, problem)
+        from_predicted = inverse(prediction.wTc)
         prior = _prior_information(prediction.covariance) if self._settings.prior else None
         best_cost, damping = np.inf, 0.0
         tolerance = _ROBUST_TOLERANCE if robust else _STEP_TOLERANCE
@@ -141,7 +149,7 @@ class EgoMotionSolver:
         for iteration in range(1, MAX_ITERATIONS + 1):
             cost, h, g = self._linearise(wTc, problem, information, robust)
             if prior is not None:
-                cost, h, g = _add_prior(wTc, prediction.wTc, prior, (cost, h, g))
+                cost, h, g = _add_prior(from_predicted @ wTc, prior, (cost, h, g))
             if cost <= best_cost * (1.0 + 1e-12):
                 best, best_cost, hessian, gradient = wTc, cost, h, g
                 damping *= 0.1
@@ -175,6 +183,7 @@ class EgoMotionSolver:
             covariance = problem.measurement_covariance
         if settings.weighting == "landmark":
             points = transform_to_camera(wTc, problem.points)
+            points[~in_front(self.sensor, points)] = (0.0, 0.0, 1.0)  # of no use
             jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
             covariance = covariance + congruence(jacobian, problem.point_covariances)
         if settings.residuals == "image_disparity":
@@ -233,13 +242,11 @@ class EgoMotionSolver:
         """Predicted less measured (k, 3)."""
         return measurement_difference(self.sensor, project(self.sensor, points), measurement)
 
-    def _inliers(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
-        near = self.image_residuals(wTc, problem) <= self.farthest  # so in front, too
+    def _inliers(self, wTc: FloatArray, problem: PoseProblem, information: FloatArray) -> BoolArray:
+        residual, distance = self._measured(wTc, problem)
+        near = distance <= self.farthest  # so in front, too
         if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
-            candidates = problem.select(near)
-            points = transform_to_camera(wTc, candidates.points)
-            residual = self._residual(points, candidates.measurement)
-            information = self._information(wTc, candidates)
+            residual, information = residual[near], information[near]
             squared = np.einsum("ki,kij,kj->k", residual, information, residual)
             near[near] = squared <= self._settings.outlier_sigmas**2
         return near
@@ -260,7 +267,7 @@ class EgoMotionSolver:
             status = EgoMotionStatus.CAPPED
             wTc = self.floor.constrain(prediction.wTc @ se3_exp(allowed * correction))
             # The matches belong to another pose; what of it was cut off is the least we may err.
-            inliers = inliers & self._inliers(wTc, problem)
+            inliers = inliers & self._inliers(wTc, problem, self._information(wTc, problem))
             cut_off = (1.0 - allowed) * correction
             covariance = self.floor.allowed_part(
                 wTc, prediction.covariance + np.outer(cut_off, cut_off)
@@ -310,11 +317,16 @@ class EgoMotionSolver:
 
         Pixels; of a range-bearing sensor the angle in radians, range aside.
         """
+        return self._measured(wTc, problem)[1]
+
+    def _measured(self, wTc: FloatArray, problem: PoseProblem) -> tuple[FloatArray, FloatArray]:
+        """Residuals (k, 3), and distances (k,) in the image; inf if behind."""
         points = transform_to_camera(wTc, problem.points)
         behind = ~in_front(self.sensor, points)
         points[behind] = (0.0, 0.0, 1.0)
-        error = np.linalg.norm(self._residual(points, problem.measurement)[:, :2], axis=1)
-        return np.where(behind, np.inf, error)
+        residual = self._residual(points, problem.measurement)
+        distance = np.linalg.norm(residual[:, :2], axis=1)
+        return residual, np.where(behind, np.inf, distance)
 
 
 def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
@@ -338,14 +350,13 @@ def _inverse_spd(matrix: FloatArray) -> FloatArray:
 
 
 def _add_prior(
-    wTc: FloatArray,
-    predicted: FloatArray,
+    correction: FloatArray,
     information: FloatArray,
     system: tuple[float, FloatArray, FloatArray],
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Adds ``|Log(predicted^-1 wTc)|^2`` in the prediction's metric (Lowe 1991)."""
+    """Adds ``|Log(correction)|^2`` of ``predicted^-1 wTc`` in its metric (Lowe 1991)."""
     cost, hessian, gradient = system
-    deviation = se3_log(inverse(predicted) @ wTc)
+    deviation = se3_log(correction)
     jacobian = se3_log_jacobian(deviation)
     weighted = jacobian.T @ information
     return (
