@@ -149,10 +149,11 @@ class GraphMarginals:
     def solve(self, gradients: FloatArray) -> FloatArray:
         """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
         s, m, c = self.system, self.system.columns, gradients.shape[1]
-        pull = (self.inverse @ gradients[:m].reshape(-1, 3, c)).reshape(m, c)
+        own = "mij,mjc->mic", self.inverse
+        pull = np.einsum(*own, gradients[:m].reshape(-1, 3, c)).reshape(m, c)
         poses = -self.factor.solve(gradients[m:] - s.coupling @ pull)
         follows = (s.coupling.T @ poses).reshape(-1, 3, c)
-        landmarks = -pull - (self.inverse @ follows).reshape(m, c)
+        landmarks = -pull - np.einsum(*own, follows).reshape(m, c)
         return np.concatenate([landmarks, poses])
 
     def poses(self) -> FloatArray:
