@@ -17,6 +17,7 @@ from benchmarks.runs import EXPERIMENTS, say
 from benchmarks.tables import Cell, Table
 from fgslam.backend.filters.online_doubt import shared_covariance, shared_shifts
 from fgslam.backend.settings import (
+    BatchSettings,
     EkfSettings,
     EstimatorSettings,
     FixedLagSettings,
@@ -49,7 +50,7 @@ MOTION = {
 }
 """Accelerations over those of the paper's drive: frames that its way takes, within which limits."""
 FRAMES = 80
-SMOOTHERS: dict[str, EstimatorSettings] = {"isam2": Isam2Settings()}
+SMOOTHERS: dict[str, EstimatorSettings] = {"isam2": Isam2Settings(), "batch": BatchSettings()}
 EVERY: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),
     "ekf": EkfSettings(),
