@@ -82,6 +82,7 @@ _RESULT_FILES = (
     "logs/*.npz",
     "units/*.npz",
     f"{SUBMAPS_FOLDER}/*.fgmap",
+    f"{SUBMAPS_FOLDER}/*.npz",
     f"{BLOCKS_FOLDER}/*.npz",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),

@@ -34,7 +34,7 @@ from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.backend.filters.set_aside import SetAside
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -152,6 +152,10 @@ class LandmarkKalman:
     def poses_of(self, frames: IntArray) -> FloatArray:
         """Poses (k, 4, 4) of earlier frames as known now."""
         return np.array([self._past.poses[frame] for frame in frames.tolist()]).reshape(-1, 4, 4)
+
+    def settled(self, ids: IntArray) -> BoolArray:
+        """(k,) all: each is filtered by itself."""
+        return np.ones(len(ids), np.bool_)
 
     def held_aside(self, ids: IntArray) -> SetAside:
         """Copies of landmarks, with what it takes to give them back; nothing changes."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from fgslam.backend.filters.loop_correction import changes, home_changes, rotated, transported
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import LandmarkMap
 
 
@@ -28,6 +29,7 @@ class SetAside:
         doubt_gain: (n, 3, q) derivatives by the rig's shared terms
             (:mod:`fgslam.backend.filters.online_doubt`), world axes; zero where there is no doubt.
         doubt_information: (n, 3, 3) given the poses; zero where there is no doubt.
+        tracks: what else their estimator knows of them.
     """
 
     landmarks: LandmarkMap
@@ -39,6 +41,7 @@ class SetAside:
     poses: FloatArray
     doubt_gain: FloatArray
     doubt_information: FloatArray
+    tracks: StateArrays = dataclasses.field(default_factory=dict)
 
     def moved(self, poses: FloatArray) -> SetAside:
         """The landmarks beside their homes' poses (k, 4, 4) as known now; to the bit if unmoved."""
@@ -78,6 +81,10 @@ class SetsAside(Protocol):
         """Poses (k, 4, 4) of earlier frames as known now."""
         ...
 
+    def settled(self, ids: IntArray) -> BoolArray:
+        """(k,) which landmarks may leave now."""
+        ...
+
     def held_aside(self, ids: IntArray) -> SetAside:
         """Copies of landmarks (ascending), with what it takes to give them back."""
         ...
@@ -92,4 +99,20 @@ class SetsAside(Protocol):
 
     def take_back(self, aside: SetAside) -> None:
         """Landmarks come back, moved by what closures have corrected their homes since."""
+        ...
+
+
+INPUTS = "[0-9]" * 6 + ".npz"
+"""Files of what an estimator was given, in the folder of sub-maps."""
+
+
+@runtime_checkable
+class KeepsRecord(Protocol):
+    """An estimator whose state is all that it was given; optional."""
+
+    def keep_record_in(self, folder: Path) -> None:
+        """From now on what it was given is in files (INPUTS) of the folder, but the last frames.
+
+        Called before the first frame, and before it is restored from a state of such a run.
+        """
         ...

@@ -21,7 +21,8 @@ from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.drift_undone import drift_undone
 from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
+from fgslam.backend.smoothers.lag_smoother import LagSmoother
+from fgslam.backend.smoothers.smoother import GraphProblem
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
@@ -51,7 +52,7 @@ from fgslam.factors.motion import pose_prior
 
 def fixed_lag_smoother(
     sensor: Sensor, settings: FixedLagSettings, floor: Floor, prior: Prediction
-) -> Smoother:
+) -> LagSmoother:
     """Estimator of kind ``fixed_lag``, at the prior pose with an empty map.
 
     Raises:
@@ -60,7 +61,7 @@ def fixed_lag_smoother(
     if settings.lag_frames is None and settings.lag_s is None:
         raise EstimatorError("fixed_lag: no lag; set estimator.lag_frames or estimator.lag_s")
     problem = GraphProblem.of(sensor, settings, floor, prior, remember=False)
-    return Smoother(problem, FixedLagSolver(problem, settings))
+    return LagSmoother(problem, FixedLagSolver(problem, settings))
 
 
 class FixedLagSolver:
@@ -80,6 +81,15 @@ class FixedLagSolver:
         self._covariances: list[FloatArray] = []
         self._clock: list[float] = []
         self.remarks: list[str] = []
+
+    @property
+    def oldest(self) -> int:
+        """The first frame within the lag."""
+        return self._oldest
+
+    def pose(self, frame: int) -> Prediction:
+        """A frame's pose; final before the lag."""
+        return Prediction(self._poses[frame], self._covariances[frame])
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Takes in a frame, and lets go what is older than the lag."""

@@ -29,7 +29,7 @@ from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import EgoMotion
+from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.measurements import LoopClosure
 from fgslam.core.quantiles import chi_square_quantile
@@ -154,19 +154,21 @@ def misfit(factor: Any, values: Any) -> float:
     return 2.0 * float(factor.error(values))
 
 
-def carried_to(frame: int, loop: LoopClosure, trackings: list[EgoMotion], last: int) -> Constraint:
+def carried_to(
+    frame: int, loop: LoopClosure, tracked: Callable[[int], Prediction], last: int
+) -> Constraint:
     """The closure as one to a neighbour of the earlier frame, by how both were tracked.
 
     Args:
         frame: of the neighbour, tracked against the same map; may be the earlier frame itself.
         loop: the closure.
-        trackings: of all frames.
+        tracked: gives a frame's pose as it was tracked.
         last: the present frame.
     """
     matches = len(loop.observations)
     if frame == loop.frame:
         return Constraint(frame, last, loop.oTc, loop.covariance, matches=matches)
-    neighbour, earlier = trackings[frame], trackings[loop.frame]
+    neighbour, earlier = tracked(frame), tracked(loop.frame)
     kTo = inverse(neighbour.wTc) @ earlier.wTc
     own = earlier.covariance + congruence(adjoint(inverse(kTo)), neighbour.covariance)
     covariance = loop.covariance + congruence(adjoint(inverse(loop.oTc)), own)

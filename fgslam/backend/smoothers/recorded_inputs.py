@@ -1,98 +1,169 @@
 """What an estimator was given, frame by frame: the state of those that cannot show their inside.
 
 Of the tracking only what smoothers use is kept: pose, covariance, inliers, residuals, and whether
-the landmarks determined it.
+the landmarks determined it. On a long drive all but the last frames can be in files.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, StateArrays
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus
+from fgslam.core.array_files import load_arrays, write_arrays
+from fgslam.core.arrays import FloatArray, GrowingColumns, StateArrays
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
+from fgslam.core.files import make_subfolder
+from fgslam.core.log_arrays import frames_of
+from fgslam.core.log_blocks import BLOCK
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.sensors import Sensor
 
+Input: TypeAlias = tuple[Increment, EgoMotion]
+_ON_DISK = "blocks"
 
-@dataclass(slots=True, eq=False)
+
 class RecordedInputs:
     """Arguments of all updates so far."""
 
-    increments: list[Increment] = field(default_factory=list)
-    trackings: list[EgoMotion] = field(default_factory=list)
+    def __init__(self, sensor: Sensor) -> None:
+        """None yet; all are kept in memory."""
+        self._sensor = sensor
+        self._folder: Path | None = None
+        self._blocks = 0
+        self._last: list[Input] = []
+        self._heads = GrowingColumns(
+            timestamp=np.empty(0), wTc=np.empty((0, 4, 4)), covariance=np.empty((0, 6, 6))
+        )
+
+    def __len__(self) -> int:
+        return len(self._heads)
+
+    def keep_in(self, folder: Path) -> None:
+        """From now on only the last few hundred frames are in memory, the others in the folder.
+
+        It is made when needed. Files of a run before are written anew as this one gets there.
+        """
+        self._folder = folder
 
     def append(self, increment: Increment, tracking: EgoMotion) -> None:
-        """Keeps one update's arguments."""
-        self.increments.append(increment)
-        self.trackings.append(tracking)
+        """Keeps one update's arguments.
 
-    def __iter__(self) -> Iterator[tuple[Increment, EgoMotion]]:
-        return zip(self.increments, self.trackings, strict=True)
+        Raises:
+            OutputError: a block of them cannot be written.
+        """
+        if self._folder is not None and len(self._last) >= 2 * BLOCK:
+            make_subfolder(self._folder.parent, self._folder.name)
+            write_arrays(self._file(self._blocks), _arrays(self._sensor, self._last[:BLOCK]))
+            self._blocks += 1
+            del self._last[:BLOCK]
+        head = {
+            "timestamp": np.array(increment.timestamp),
+            "wTc": tracking.wTc,
+            "covariance": tracking.covariance,
+        }
+        self._heads.append({name: value[None] for name, value in head.items()})
+        self._last.append((increment, tracking))
+
+    def __iter__(self) -> Iterator[Input]:
+        """Raises MeasurementLogError for a block that is missing or damaged."""
+        for block in range(self._blocks):
+            yield from self._read(block)
+        yield from self._last
 
     def timestamps(self) -> FloatArray:
         """(n,) seconds."""
-        return np.array([increment.timestamp for increment in self.increments])
+        return self._heads["timestamp"].copy()
+
+    def timestamp(self, frame: int) -> float:
+        """A frame's, seconds."""
+        return float(self._heads["timestamp"][frame])
+
+    def tracked(self, frame: int) -> Prediction:
+        """A frame's pose and covariance as tracked."""
+        return Prediction(self._heads["wTc"][frame], self._heads["covariance"][frame])
 
     def motions(self) -> list[Odometry | None]:
         """The step to each frame, as it was used."""
-        return [increment.odometry for increment in self.increments]
+        return [increment.odometry for increment, _ in self]
 
-    def to_arrays(self, sensor: Sensor) -> StateArrays:
-        """All of it as plain arrays."""
-        log = MeasurementLog(sensor, {})
-        for increment in self.increments:
-            log.append(increment)
-        n, motions = len(self.trackings), self.motions()
-        known = np.array([motion is not None for motion in motions], np.bool_)
-        given = [motion for motion in motions if motion is not None]
-        return {f"log/{name}": array for name, array in log.to_arrays().items()} | {
-            "wTc": np.array([t.wTc for t in self.trackings]).reshape(n, 4, 4),
-            "covariance": np.array([t.covariance for t in self.trackings]).reshape(n, 6, 6),
-            "matches": np.array([len(t.inliers) for t in self.trackings], np.int64),
-            "inliers": np.concatenate(
-                [np.empty(0, np.bool_), *(t.inliers for t in self.trackings)]
-            ),
-            "residuals": np.concatenate([np.empty(0), *(t.residuals for t in self.trackings)]),
-            "measured": np.array([t.status.measured for t in self.trackings], np.bool_),
-            "motion_known": known,
-            "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
-            "motion_covariance": np.array([m.covariance for m in given]).reshape(-1, 6, 6),
-        }
+    def state(self) -> StateArrays:
+        """All of it as plain arrays; without what is in files, but for how many these are."""
+        on_disk = {_ON_DISK: np.array(self._blocks)} if self._folder is not None else {}
+        return _arrays(self._sensor, self._last) | on_disk
 
-    @staticmethod
-    def from_arrays(state: StateArrays) -> RecordedInputs:
-        """Back from :meth:`to_arrays`."""
-        logged = {
-            name.removeprefix("log/"): array
-            for name, array in state.items()
-            if name.startswith("log/")
-        }
-        log = MeasurementLog.from_arrays(logged, "the smoother's saved state")
-        ends = np.cumsum(state["matches"])[:-1]
-        inliers = np.split(state["inliers"], ends)
-        residuals = np.split(state["residuals"], ends)
-        row = np.cumsum(state["motion_known"]) - 1
-        out = RecordedInputs()
-        for k, increment in enumerate(log):
-            tracking = EgoMotion(
-                state["wTc"][k],
-                state["covariance"][k],
-                inliers[k],
-                residuals[k],
-                EgoMotionStatus.OK if state["measured"][k] else EgoMotionStatus.TOO_FEW_MATCHES,
-                0,
-            )
-            measured = increment.odometry
-            turned = measured is not None and measured.turned
-            if (measured is None or turned) and state["motion_known"][k]:
-                motion, covariance = state["motion"][row[k]], state["motion_covariance"][row[k]]
-                bias = None if measured is None else measured.bias
-                stand_in = Odometry(motion, covariance, False, turned, bias)
-                increment = dataclasses.replace(increment, odometry=stand_in)
-            out.append(increment, tracking)
-        return out
+    def recalled(self, state: StateArrays) -> Iterator[Input]:
+        """Everything that :meth:`state` told of, in order, to be put in once more.
+
+        Raises:
+            MeasurementLogError: a file is missing or damaged.
+        """
+        blocks = int(state.get(_ON_DISK, 0))
+        for block in range(blocks):
+            yield from self._read(block)
+        yield from _inputs(state, "the smoother's saved state", blocks * BLOCK)
+
+    def _file(self, block: int) -> Path:
+        if self._folder is None:
+            raise ValueError("the state was kept in files; name their folder first")
+        return self._folder / f"{block:06d}.npz"
+
+    def _read(self, block: int) -> list[Input]:
+        path = self._file(block)
+        return _inputs(load_arrays(path), str(path), block * BLOCK)
+
+
+def _arrays(sensor: Sensor, inputs: Sequence[Input]) -> StateArrays:
+    """Inputs as plain arrays."""
+    log, trackings = MeasurementLog(sensor, {}), [tracking for _, tracking in inputs]
+    for increment, _ in inputs:
+        log.append(increment)
+    motions = [increment.odometry for increment, _ in inputs]
+    n, known = len(trackings), np.array([motion is not None for motion in motions], np.bool_)
+    given = [motion for motion in motions if motion is not None]
+    return {f"log/{name}": array for name, array in log.to_arrays().items()} | {
+        "wTc": np.array([t.wTc for t in trackings]).reshape(n, 4, 4),
+        "covariance": np.array([t.covariance for t in trackings]).reshape(n, 6, 6),
+        "matches": np.array([len(t.inliers) for t in trackings], np.int64),
+        "inliers": np.concatenate([np.empty(0, np.bool_), *(t.inliers for t in trackings)]),
+        "residuals": np.concatenate([np.empty(0), *(t.residuals for t in trackings)]),
+        "measured": np.array([t.status.measured for t in trackings], np.bool_),
+        "motion_known": known,
+        "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
+        "motion_covariance": np.array([m.covariance for m in given]).reshape(-1, 6, 6),
+    }
+
+
+def _inputs(state: StateArrays, where: str, first: int) -> list[Input]:
+    """Inputs back from their arrays, frame ``first`` and those after it."""
+    logged = {
+        name.removeprefix("log/"): array for name, array in state.items() if name.startswith("log/")
+    }
+    frames = frames_of(logged, where, first)[2]
+    ends = np.cumsum(state["matches"])[:-1]
+    inliers = np.split(state["inliers"], ends)
+    residuals = np.split(state["residuals"], ends)
+    row = np.cumsum(state["motion_known"]) - 1
+    out = []
+    for k, increment in enumerate(frames):
+        tracking = EgoMotion(
+            state["wTc"][k],
+            state["covariance"][k],
+            inliers[k],
+            residuals[k],
+            EgoMotionStatus.OK if state["measured"][k] else EgoMotionStatus.TOO_FEW_MATCHES,
+            0,
+        )
+        measured = increment.odometry
+        turned = measured is not None and measured.turned
+        if (measured is None or turned) and state["motion_known"][k]:
+            motion, covariance = state["motion"][row[k]], state["motion_covariance"][row[k]]
+            bias = None if measured is None else measured.bias
+            stand_in = Odometry(motion, covariance, False, turned, bias)
+            increment = dataclasses.replace(increment, odometry=stand_in)
+        out.append((increment, tracking))
+    return out

@@ -113,7 +113,7 @@ class Smoother:
         self._tracker, self._builder = problem.tracker, problem.builder
         self._solver, self._segments = solver, segments
         self._map = TrackerMap(problem.sensor, problem.tracker, problem.builder.admission)
-        self._inputs = RecordedInputs()
+        self._inputs = RecordedInputs(problem.sensor)
         self._smoothed = problem.prior
         self._answer: Solution | None = None
         self._takeovers = 0
@@ -144,7 +144,7 @@ class Smoother:
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
         free = increment.relocalised or founds_anew(increment, tracking)
-        if free and self._inputs.increments:
+        if free and len(self._inputs):
             step = self._unknown_step(increment, tracking)
             increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
@@ -181,7 +181,7 @@ class Smoother:
 
     def estimate(self) -> Estimate:
         """All poses and landmarks as the graph has them now, with their marginals."""
-        if not self._inputs.increments:
+        if not len(self._inputs):
             return self._tracker.estimate()
         answer = self._solved()
         covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
@@ -221,13 +221,13 @@ class Smoother:
 
     def state(self) -> StateArrays:
         """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
-        return self._inputs.to_arrays(self._sensor)
+        return self._inputs.state()
 
     def restore(self, state: StateArrays) -> None:
         """Repeats all updates of :meth:`state`."""
-        if self._inputs.increments:
+        if len(self._inputs):
             raise EstimatorError("only a new estimator can be restored")
-        for increment, tracking in RecordedInputs.from_arrays(state):
+        for increment, tracking in self._inputs.recalled(state):
             self.update(increment, tracking)
 
     # -- its steps -----------------------------------------------------------------------------
@@ -247,7 +247,7 @@ class Smoother:
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)
-        frame = len(self._inputs.increments) - 1
+        frame = len(self._inputs) - 1
         self._builder.corrections.note(frame, increment)
         self._eras.append(self._takeovers)
         self._answer = None
@@ -257,7 +257,7 @@ class Smoother:
         observed = increment.observations
         matched = observed.select(~observed.is_new).select(_fits(tracking))
         fitting = matched.join(observed.select(observed.is_new))
-        frame = len(self._inputs.increments) - 1
+        frame = len(self._inputs) - 1
         step = inverse(before) @ tracking.wTc if tracking.status.measured else None
         self._builder.noise.learn(frame, step, fitting)
 
@@ -272,8 +272,7 @@ class Smoother:
         self._restart(moved)
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
-        frame = len(self._inputs.increments) - 1
-        step = increment.odometry
+        frame, step = len(self._inputs) - 1, increment.odometry
         return TrackedFrame(frame, tracking.wTc, step, self._held(accepted), Turn.of((step,)))
 
     def _held(self, observed: Observations) -> Observations:
@@ -299,7 +298,7 @@ class Smoother:
     def _add(self, frame: TrackedFrame) -> None:
         landmarks = self._tracker.landmarks()
         self._map.entered(frame.frame, frame.wTc)
-        timestamp = float(self._inputs.increments[frame.frame].timestamp)
+        timestamp = self._inputs.timestamp(frame.frame)
         self._solver.add(self._builder.add(frame, landmarks), landmarks, timestamp)
 
     def _solve(self, entered: TrackedFrame, tracked: TrackedFrame, closes_loop: bool) -> None:
@@ -331,7 +330,7 @@ class Smoother:
         An earlier frame that has none gives way to the nearest one that was tracked on the same
         map, since only the tracked poses of such are relative to each other.
         """
-        last = len(self._inputs.increments) - 1
+        last = len(self._inputs) - 1
         if not 0 <= loop.frame < last:
             raise EstimatorError(
                 f"{self.kind}: a loop closure of frame {last} of the log leads to frame "
@@ -342,7 +341,7 @@ class Smoother:
         near = min(fellows, key=lambda frame: abs(frame - loop.frame))
         covariance = CLOSURE_FACTOR**2 * loop.covariance
         loop = dataclasses.replace(loop, covariance=covariance)
-        return carried_to(near, loop, self._inputs.trackings, last)
+        return carried_to(near, loop, self._inputs.tracked, last)
 
     def _current(self, tracking: EgoMotion) -> Prediction:
         """The last pose: the tracker's, whose map is as uncertain as the pose last smoothed."""
@@ -370,7 +369,7 @@ class Smoother:
 
     def _at_last_frame(self, joint: FloatArray) -> FloatArray:
         """A joint covariance with the graph's last pose, carried on to the last frame's."""
-        entered, last = self._builder.frames[-1], len(self._inputs.increments) - 1
+        entered, last = self._builder.frames[-1], len(self._inputs) - 1
         if entered == last:
             return joint
         answer = self._solved()

@@ -78,7 +78,7 @@ class TrackerMap:
                 positions[row], covariances[row] = track.left_at
             else:
                 positions[row], covariances[row] = self._seen_from(answer, track.last)
-        return LandmarkMap(known.ids, positions, covariances)
+        return LandmarkMap(known.ids.copy(), positions, covariances)  # theirs change later
 
     def _in_graph(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
         """Identities and positions of the tracker's landmarks that ``values`` hold."""

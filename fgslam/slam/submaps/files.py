@@ -21,6 +21,7 @@ from fgslam.core.sensors import CameraRig
 
 _OF_ESTIMATOR = ("counts", "homes", "lasts", "frames", "doubt_gain", "doubt_information")
 _OF_DATABASE = ("missed", "seen", "contradicted", "view_counts", "used")
+_TRACK = "track/"
 FILES = "[0-9]" * 6 + ".fgmap"
 
 
@@ -60,6 +61,7 @@ def write_submap(submap: SubMap, rig: CameraRig, path: Path) -> None:
     """
     geometry, held = submap.geometry, submap.entries
     session = {name: getattr(geometry, name) for name in _OF_ESTIMATOR}
+    session |= {_TRACK + name: array for name, array in geometry.tracks.items()}
     saved = SavedMap(
         rig=rig,
         landmarks=geometry.landmarks,
@@ -105,6 +107,7 @@ def _geometry(saved: SavedMap) -> SetAside:
         frames=session["frames"],
         doubt_gain=session["doubt_gain"],
         doubt_information=session["doubt_information"],
+        tracks={n.removeprefix(_TRACK): a for n, a in session.items() if n.startswith(_TRACK)},
         timestamps=saved.trajectory.timestamps,
         poses=saved.trajectory.poses,
     )

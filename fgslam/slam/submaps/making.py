@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fgslam.backend.filters.self_calibration import SETTLING
+from fgslam.backend.filters.set_aside import KeepsRecord
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import FrontendSettings, LoopSettings
 from fgslam.slam.factory import make_relocaliser
@@ -18,11 +19,14 @@ def make_submaps(
     Raises:
         ConfigError: its estimator keeps every landmark in memory.
     """
+    estimator = require_sets_aside(pipeline.estimator)
+    if isinstance(estimator, KeepsRecord):
+        estimator.keep_record_in(area.folder)
     loops = settings.loops or LoopSettings()
     parts = SubMapParts(
         rig=rig,
         database=pipeline.tracker.database,
-        estimator=require_sets_aside(pipeline.estimator),
+        estimator=estimator,
         places=pipeline.places,
         relocaliser=make_relocaliser(rig, settings),
         max_drift_share=loops.max_drift_share,

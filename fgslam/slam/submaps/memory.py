@@ -257,7 +257,7 @@ class SubMaps:
         cube = cube.reshape(-1)
         far = self._far((cubes + 0.5) * side)
         seen = ~self._parts.database.unseen_for(_LATELY)[self._parts.database.rows(ids)]
-        far[cube[seen]] = False
+        far[cube[seen | ~self._parts.estimator.settled(ids)]] = False
         for k in np.flatnonzero(far).tolist():
             self._store(ids[cube == k], places[cube == k])
         if far.any():
@@ -391,7 +391,7 @@ class SubMaps:
         parts = self._parts
         ids = parts.estimator.landmarks().ids.copy()
         active = SubMap(parts.estimator.held_aside(ids), parts.database.held_aside(ids))
-        yield parts.estimator.reported(active.geometry), active
+        yield parts.estimator.estimate().landmarks, active
         for number in self._stored:
             submap = self._read(number)
             yield parts.estimator.reported(submap.geometry), submap
@@ -419,6 +419,6 @@ def require_sets_aside(estimator: Estimator) -> MapEstimator:
     if not isinstance(estimator, SetsAside):
         raise ConfigError(
             f"map.active_radius_m: estimator {estimator.kind} keeps every landmark in memory; use "
-            "landmark_kalman, or leave the radius out"
+            "landmark_kalman, landmark_kalman_graph or fixed_lag, or leave the radius out"
         )
     return cast("MapEstimator", estimator)
