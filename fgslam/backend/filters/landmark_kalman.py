@@ -142,7 +142,8 @@ class LandmarkKalman:
     @property
     def homes(self) -> IntArray:
         """(n,) frame with which each landmark of the map moves; -1 for one that stays."""
-        return self._rows.homes
+        # One that a smoother started anew was seen in the last frame, which was over by then.
+        return np.minimum(self._rows.homes, len(self._past) - 1)
 
     @property
     def chain(self) -> Chain:
@@ -160,7 +161,7 @@ class LandmarkKalman:
     def held_aside(self, ids: IntArray) -> SetAside:
         """Copies of landmarks, with what it takes to give them back; nothing changes."""
         rows = self._rows.rows(ids)
-        homes = self._rows.homes[rows]
+        homes = self.homes[rows]
         frames = np.unique(homes[homes >= 0])
         gain, information = self._doubt.held_aside(ids)
         return SetAside(

@@ -67,3 +67,17 @@ def test_landmarks_move_with_the_frame_that_first_saw_them() -> None:
     np.testing.assert_allclose(moved.doubt_information[1], now.covariances[1], rtol=0, atol=1e-12)
     np.testing.assert_array_equal(moved.doubt_gain[[0, 2]], aside.doubt_gain[[0, 2]])
     assert aside.moved(poses) is aside
+
+
+def test_a_landmark_just_started_anew_is_at_home_in_the_last_frame() -> None:
+    """As a smoother's tracker starts one that has moved, after the frame."""
+    simulation = simulate(Drive(frames=4), np.random.default_rng(1))
+    estimator = make_estimator(RIG, LandmarkKalmanSettings())
+    assert isinstance(estimator, LandmarkKalman)
+    play(estimator, simulation.increments, EgoMotionSettings())
+    moved = simulation.increments[-1].observations
+    estimator.restart(moved)
+    aside = estimator.held_aside(moved.ids)
+    np.testing.assert_array_equal(aside.homes, 3)
+    np.testing.assert_array_equal(aside.frames, [3])
+    assert estimator.homes.max() == 3
