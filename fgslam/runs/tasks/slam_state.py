@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.backend.filters.set_aside import INPUTS
 from fgslam.backend.protocol import Estimator, Resumable
 from fgslam.core import __version__
 from fgslam.core.array_files import load_arrays, write_arrays
@@ -137,6 +136,10 @@ def _part(state: StateArrays, part: str) -> StateArrays:
 def remove_checkpoint(folder: Path) -> None:
     """Drops the state once the run has finished, and what an estimator kept of it in files."""
     (folder / STATE_FILE).unlink(missing_ok=True)
+    if not (folder / SUBMAPS_FOLDER).is_dir():
+        return
+    from fgslam.backend.filters.set_aside import INPUTS  # loads the factors, which take a second
+
     for path in (folder / SUBMAPS_FOLDER).glob(INPUTS):
         path.unlink(missing_ok=True)
 
