@@ -27,10 +27,9 @@ from fgslam.core.homing import (
 )
 from fgslam.core.planar import bearings, compose, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.homing.active_homing import parallax
+from fgslam.homing.active_homing import Sighting
 from fgslam.homing.closed_loop import Driver, follow
 from fgslam.homing.drive_record import DriveRecord
-from fgslam.homing.front_end import Sighting
 from fgslam.homing.path_following import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, ObstacleAvoider, Steering
@@ -147,7 +146,7 @@ class SimulatedFrontEnd:
         if isinstance(begun, Refusal):
             return begun
         start, _ = begun
-        return Sighting(start.vector, parallax(start.matches, start.vector.rotation))
+        return Sighting(start.vector, start.matches)
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """True bearings with noise; what is beyond reach is lost."""

@@ -46,7 +46,21 @@ _FARTHEST = 3.0  # legs; an estimate farther away has diverged
 _FASTEST_TURN = np.deg2rad(120.0)  # a second between two images: no wheelchair turns faster
 _TURN_MARGIN = np.deg2rad(20.0)  # what near features and noise make of a common turn
 _KEPT_SHARE = 0.7  # of the tracks; fewer count as weak even where there were few to begin with
+_BOUND_SIGMAS = 2.0  # of the part of the leg that is surely left at most
 _SIGMAS = 4.0  # between two homing vectors of which one must be wrong
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """A target seen in passing, without tracks of its features.
+
+    Attributes:
+        vector: the homing vector.
+        matches: its inliers.
+    """
+
+    vector: TwoViewVector
+    matches: BearingMatches
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,14 +179,6 @@ class ActiveHoming:
             return Fault(f"target uncertain by {across:.2f} legs across", True)
         return None
 
-    def part_left(self, seen: float) -> float:
-        """Part of the leg that is left, by the target's parallax (radians) over that at the start.
-
-        Rough; 1 at most.
-        """
-        before = parallax(self.start.matches, self.start.vector.rotation)
-        return min(1.0, self.unit * seen / before) if before > 0.0 else 1.0
-
     def contradicts(self, vector: TwoViewVector) -> bool:
         """Whether direction or rotation of a new homing vector contradicts the estimate."""
         return bool(self._contradictions(vector).any())
@@ -244,6 +250,36 @@ def parallax(matches: BearingMatches, rotation: float) -> float:
     It falls to zero at the target, and needs no direction: a measure of how near the target is.
     """
     return float(np.median(np.abs(wrap(matches.bearing_a - matches.bearing_b - rotation))))
+
+
+def surely_left(begun: HomingStart, seen: Sighting) -> float:
+    """Bound of the part of the leg from ``begun`` that is left, by the features common to both.
+
+    A feature's distance from the target, triangulated in units of either leg, gives the ratio of
+    the legs. The bound is that of the ratios' median at two deviations, by their order alone, so
+    that wrong matches, a minority, widen it and do not move it. 1 where too few are common, or
+    where they agree on nothing.
+    """
+    before, now = _common(begun.matches, seen.matches)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = _far_from_target(before, begun.vector) / _far_from_target(now, seen.vector)
+    ratios = np.sort(np.where(ratios > 0.0, ratios, np.inf))
+    count = len(ratios)
+    last = int(np.ceil(0.5 * (count + _BOUND_SIGMAS * np.sqrt(count)))) if count else 0
+    return min(1.0, float(ratios[last])) if last < count else 1.0
+
+
+def _common(a: BearingMatches, b: BearingMatches) -> tuple[BearingMatches, BearingMatches]:
+    """Rows of both with the same feature of the target."""
+    of_target_a, of_target_b = (2 * m.index_b + m.kind for m in (a, b))
+    _, of_a, of_b = np.intersect1d(of_target_a, of_target_b, return_indices=True)
+    return a.select(of_a), b.select(of_b)
+
+
+def _far_from_target(matches: BearingMatches, vector: TwoViewVector) -> FloatArray:
+    """(n,) distances of features from the target, in legs; not positive where rays diverge."""
+    across = np.sin(matches.bearing_b + vector.rotation - matches.bearing_a)
+    return np.asarray(np.sin(matches.bearing_a - vector.direction) / across)
 
 
 def common_turn(before: TrackedBearings, now: TrackedBearings) -> float:

@@ -15,11 +15,18 @@ import numpy as np
 from fgslam.core.arrays import ByteArray
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.homing import HomingStart, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.homing.active_homing import CONTRADICTION_DEG, ActiveHoming, EstimatorMaker, Fault
+from fgslam.homing.active_homing import (
+    CONTRADICTION_DEG,
+    ActiveHoming,
+    EstimatorMaker,
+    Fault,
+    Sighting,
+    surely_left,
+)
 from fgslam.homing.command import Command, HomingState
-from fgslam.homing.front_end import HomingFrontEnd, Sighting
+from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.settings import HomingControlSettings
 
 _BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
@@ -71,6 +78,7 @@ class HomingController:
         self._ended: Command | None = None
         self._heading = 0.0
         self._was_ahead = False
+        self._begun: HomingStart | None = None  # where the leg begins, of which parts are left
         self._progress, self._patience = _Progress(_STALL_S), _WAIT_S
         self._next_try = -np.inf
         self._blind_until = -np.inf
@@ -167,12 +175,12 @@ class HomingController:
     def _seen_elsewhere(self, homing: ActiveHoming, seen: Sighting, time: float) -> Command:
         """The target is seen in another direction than estimated: reached, passed, or an error.
 
-        At the target itself directions mean little, so the parallax decides; rotations that
-        contradict mean that the parallaxes are of another place.
+        At the target itself directions mean little, so its distance decides, as far as it is
+        certain; rotations that contradict mean that another place is seen.
         """
         if homing.turned_otherwise(seen.vector):
             return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
-        left = homing.part_left(seen.parallax)
+        left = surely_left(self._begun or homing.start, seen)
         behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
         if left <= self._settings.switch_fraction or (behind and left <= _PASS_FRACTION):
             self.remaining = left
@@ -268,6 +276,7 @@ class HomingController:
         if self._standing_since is not None or self.initialisations == 0:
             self._progress.pause(time)
         self.active = homing
+        self._begun = self._begun or homing.start
         self._heading = homing.start.vector.direction
         self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
         self._pending = self._standing_since = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -24,23 +24,9 @@ from fgslam.frontend.homing.homing_vector import estimate_homing_vector, paired_
 from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.frontend.homing.two_view_geometry import make_local_map, triangulable
-from fgslam.homing.active_homing import parallax
+from fgslam.homing.active_homing import Sighting
 from fgslam.homing.compact import best_all_around
 from fgslam.homing.settings import FrontEndSettings
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sighting:
-    """A target seen in passing, without tracks of its features.
-
-    Attributes:
-        vector: the homing vector.
-        parallax: median of its inliers, radians; see
-            :func:`fgslam.homing.active_homing.parallax`.
-    """
-
-    vector: TwoViewVector
-    parallax: float
 
 
 class HomingFrontEnd(Protocol):
@@ -112,12 +98,12 @@ class ImageFrontEnd:
         return self._started(image, time, vector, matches, (present, target))
 
     def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
-        """The homing vector alone, and how near the target is."""
+        """The homing vector and its inliers alone."""
         answer = self._matched(image, target)
         if isinstance(answer, Refusal):
             return answer
         _, matches, vector = answer
-        return Sighting(vector, parallax(matches.select(vector.inliers), vector.rotation))
+        return Sighting(vector, matches.select(vector.inliers))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """The features in the next image. Raises as :meth:`BearingTracker.track`."""

@@ -29,7 +29,13 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
-from fgslam.homing.active_homing import _MAX_ACROSS, _MIN_TRACKS, ActiveHoming, parallax
+from fgslam.homing.active_homing import (
+    _MAX_ACROSS,
+    _MIN_TRACKS,
+    ActiveHoming,
+    Sighting,
+    surely_left,
+)
 from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import (
     _BLIND_S,
@@ -40,7 +46,6 @@ from fgslam.homing.controller import (
     _NEAR_FRACTION,
     HomingController,
 )
-from fgslam.homing.front_end import Sighting
 from fgslam.homing.settings import HomingControlSettings
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
@@ -66,6 +71,19 @@ def start_at(time: float, vector: TwoViewVector) -> HomingStart:
     covariance = np.tile(np.eye(2) * 1e-6, (20, 1, 1))
     local_map = LocalMap(np.arange(20), angles[:, 0], distance, covariance)
     return HomingStart(time, vector, local_map, make_matches(angles, 0.01))
+
+
+def sighting_of(vector: TwoViewVector, part: float, wrong: int = 0) -> Sighting:
+    """The target seen by a vector from so many legs; the last ``wrong`` matches are others'."""
+    turned = np.array([part * np.cos(vector.direction), part * np.sin(vector.direction)])
+    heading = -vector.rotation  # the target stands at (1, 0), heading 0
+    c, s = np.cos(heading), np.sin(heading)
+    robot = np.append([1.0, 0.0] - np.array([[c, -s], [s, c]]) @ turned, heading)
+    angles = np.zeros((20, 4))
+    angles[:, 0] = bearings(robot, POINTS)
+    angles[:, 2] = bearings(np.array([1.0, 0.0, 0.0]), POINTS)
+    angles[20 - wrong :, 0] = bearings(robot, -POINTS[20 - wrong :])
+    return Sighting(vector, make_matches(angles, 0.01))
 
 
 class OracleEstimator:
@@ -124,7 +142,7 @@ class ScriptedFrontEnd:
         if self.looks:
             return self.looks.pop(0) if len(self.looks) > 1 else self.looks[0]
         way = between(self.robot, self.home)
-        return Sighting(vector_to(float(np.arctan2(way[1], way[0])), float(way[2])), 0.1)
+        return sighting_of(vector_to(float(np.arctan2(way[1], way[0])), float(way[2])), 0.1)
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
         """Exact bearings."""
@@ -529,7 +547,7 @@ def test_near_the_target_one_look_confirms_it() -> None:
 def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
     """A wrong vector that was sure of itself: two images that agree on another one win."""
     b = bench(vector_to(0.0), vector_to(1.5))
-    b.front_end.looks = [Sighting(vector_to(1.4), 3.0)]
+    b.front_end.looks = [sighting_of(vector_to(1.4), 0.9)]
     b.step()
     b.at(0.8)
     doubt = b.step()
@@ -539,7 +557,7 @@ def test_target_seen_elsewhere_begins_the_leg_anew() -> None:
     anew = b.step()
     assert anew.state is HomingState.DRIVE
     assert anew.heading == pytest.approx(1.5)
-    assert anew.remaining == pytest.approx(1.0)
+    assert anew.remaining == pytest.approx(0.9)
 
 
 @pytest.mark.parametrize(
@@ -558,14 +576,37 @@ def test_how_near_the_target_is_seen_decides(
     """Seen elsewhere than expected: at the target itself that is an arrival, else an error."""
     b = bench(vector_to(0.0))
     b.step()
-    start = b.controller.active
-    assert start is not None
-    before = parallax(start.start.matches, 0.0)
-    b.front_end.looks = [Sighting(vector, part * before)]
+    b.front_end.looks = [sighting_of(vector, part)]
     b.at(0.8)
     command = b.step()
     assert command.state is state
     assert command.remaining == pytest.approx(1.0 if vector.rotation else part)
+
+
+def test_target_that_is_surely_passed_only_by_few_features_is_no_arrival() -> None:
+    """Behind, and a fifth of the leg away by a third of the matches: nothing is certain."""
+    b = bench(vector_to(0.0))
+    b.front_end.looks = [sighting_of(vector_to(np.pi), 0.2, wrong=14)]
+    b.step()
+    b.at(0.8)
+    command = b.step()
+    assert command.state is HomingState.CONFIRM
+    assert command.remaining == 1.0
+
+
+def test_what_is_left_is_bounded_by_common_features() -> None:
+    """Exact without wrong matches; with some at least as much; 1 where too few are common."""
+    begun = start_at(0.0, vector_to(0.0))
+    for part in (0.05, 0.2, 0.6):
+        for direction in (0.3, 1.5, np.pi):
+            exact = surely_left(begun, sighting_of(vector_to(direction), part))
+            assert exact == pytest.approx(part)
+            bound = surely_left(begun, sighting_of(vector_to(direction), part, wrong=5))
+            assert bound >= 0.999 * part
+    seen = sighting_of(vector_to(1.5), 0.2)
+    few = Sighting(seen.vector, seen.matches.select(np.arange(4)))
+    assert surely_left(begun, few) == 1.0
+    assert surely_left(begun, Sighting(seen.vector, seen.matches.select(np.arange(0)))) == 1.0
 
 
 def test_estimate_in_doubt_is_driven_by_no_more_not_even_blind(
