@@ -12,6 +12,7 @@ from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.keyframes import Segments
+from fgslam.backend.smoothers.loop_closing import solved
 from fgslam.backend.smoothers.refinement import (
     MINIMUM,
     Refined,
@@ -108,7 +109,7 @@ class Isam2Solver(WholeGraphSolver):
         """Updates the tree with the loop, or builds it anew where the loop moves the map."""
         self._updated = self._builder.frames[-1]
         self._flush()
-        found = self._accepted(loop, drive, what, lambda graph, state: state)
+        found = self._accepted(loop, drive, what, _without_loop)
         if found is None:
             return None
         self._join(found.values)
@@ -266,3 +267,11 @@ class Isam2Solver(WholeGraphSolver):
             return np.asarray(self._isam.marginalCovariance(pose_key(frame)))
         except RuntimeError as error:
             raise self._failed(error) from None
+
+
+def _without_loop(graph: WholeGraph, state: State) -> State:
+    """The graph's minimum from iSAM2's values: these, but for one with a gyroscope's bias.
+
+    That is no variable of the tree, whose values lie far from the minimum of a graph that has it.
+    """
+    return state if graph.rest.turns is None else solved(graph, state)

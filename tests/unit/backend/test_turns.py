@@ -17,15 +17,17 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
+from fgslam.backend.smoothers import loop_closing
 from fgslam.backend.smoothers.border import Bordered
+from fgslam.backend.smoothers.loop_closing import solved
 from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, with_border
 from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.turns import Turn, TurnedStep, Turns
-from fgslam.backend.smoothers.whole_graph import State
+from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import BiasEffect, Increment, Odometry
+from fgslam.core.measurements import BiasEffect, Increment, LoopClosure, Odometry
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.consistency import judge
 from fgslam.evaluation.consistency import nees as normalised
@@ -331,6 +333,53 @@ def test_a_log_on_disk_and_a_restored_smoother_find_the_same() -> None:
     assert_same_bits(first, again.estimate())
     back = MeasurementLog.from_arrays(log.to_arrays(), "here")
     assert_same_bits(first, replayed(back, Isam2Settings()).estimate)
+
+
+# --------------------------------------------------------------------------------------------
+# Loops
+
+
+def with_loop(one: Driven, off_m: float) -> MeasurementLog:
+    """The last frame recognises frame 5, so far beside where it is (to 1 cm and 0.06 degrees)."""
+    frames, poses = list(one.log), one.simulation.poses
+    true = g.inverse(poses[5]) @ poses[len(frames) - 1]
+    oTc = true @ g.pose(np.eye(3), np.array([off_m, 0.0, 0.0]))
+    seen = frames[-1].observations
+    loop = LoopClosure(
+        frame=5,
+        oTc=oTc,
+        covariance=np.diag(np.repeat([1e-3, 1e-2], 3) ** 2),
+        observations=seen.select(np.zeros(len(seen), np.bool_)),
+        merged=np.empty((0, 2), np.int64),
+    )
+    out = MeasurementLog(one.log.rig, one.log.motion_model)
+    for increment in [*frames[:-1], dataclasses.replace(frames[-1], loops=(loop,))]:
+        out.append(increment)
+    return out
+
+
+@pytest.mark.parametrize("settings", SMOOTHERS)
+def test_a_bias_lets_no_wrong_loop_in(settings: EstimatorSettings) -> None:
+    """What the tree or the window has without the bias as a variable is no minimum to judge by."""
+    one = driven(0)
+    right, wrong = (replayed(with_loop(one, off), settings) for off in (0.15, 1.0))
+    assert any("the camera moved by" in line for line in right.estimate.remarks)
+    assert any("standard deviations off" in line for line in wrong.estimate.remarks)
+    assert rms(errors(right, one.simulation)[:, 3:]) < 0.03
+
+
+def test_a_loop_is_solved_from_the_bias_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    starts: list[State] = []
+
+    def watched(graph: WholeGraph, state: State) -> State:
+        starts.append(state)
+        return solved(graph, state)
+
+    monkeypatch.setattr(loop_closing, "solved", watched)
+    one = driven(0)
+    replayed(with_loop(one, 1.0), Isam2Settings(noise_factor=1.0))
+    nodes = starts[0].bias.reshape(-1, 3)
+    assert np.degrees(np.abs(nodes - one.bias)).max() < 0.2, "the bias is of 1 degree/s"
 
 
 @pytest.mark.slow
