@@ -2,7 +2,8 @@
 
 The bias walks: it is linear in time between nodes, and the nodes are a random walk. A node lies
 wherever the walk would come out of the white noise; a drive of any length has few, so they are the
-graph's border (:mod:`border`). docs/derivations/gyroscope.md.
+graph's border (:mod:`border`). How far the walk is off that line between two nodes is white noise
+more, which says what it is where the drive is long. docs/derivations/gyroscope.md.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ from scipy.sparse import bsr_matrix
 from fgslam.backend.smoothers.border import Border
 from fgslam.backend.smoothers.marginals import LinearSystem
 from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import adjoint, compose_covariance, inverse
 from fgslam.core.measurements import BiasEffect, Odometry
 from fgslam.factors.noise import positive_definite
 from fgslam.factors.stacked import whitening
 
 _MOST_NODES = 17  # a bound for the work: every two minutes in a drive of half an hour
+_NO_WALK = 0.01  # of the time after which the walk counts: less than 1e-4 of the variance is its
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,9 +114,10 @@ class Turns:
         if not steps:
             return None
         scale = np.sqrt(np.repeat([1.0, persistence], 3))
-        noise = [scale[:, None] * (s.step.covariance - s.turn.unknown) * scale for s in steps]
+        white = np.array([s.step.covariance - s.turn.unknown for s in steps])
         jacobians = np.array([s.turn.jacobian for s in steps])
-        nodes, known = _nodes([s.turn for s in steps], np.array([n[:3, :3] for n in noise]))
+        nodes, known, between = _nodes([s.turn for s in steps], jacobians, white)
+        noise = scale[:, None] * white * scale + between
         return Turns(
             np.searchsorted(frames, [s.before for s in steps]).astype(np.int64),
             np.searchsorted(frames, [s.after for s in steps]).astype(np.int64),
@@ -146,11 +150,21 @@ class Turns:
         return np.asarray(np.einsum("kij,kj->ki", self.roots, apart))
 
     def start(self, poses: FloatArray) -> FloatArray:
-        """(3q,) the likeliest bias for these poses."""
+        """(3q,) the likeliest bias for these poses.
+
+        Raises:
+            EstimatorError: the noise that is stated for the gyroscope leaves it open.
+        """
         none = np.zeros(len(self.known))
         by_bias = self._by_bias()
         gradient = by_bias.T @ self.residuals(poses, none).ravel()
-        return np.asarray(-np.linalg.solve(by_bias.T @ by_bias + self.known, gradient))
+        try:
+            return np.asarray(-np.linalg.solve(by_bias.T @ by_bias + self.known, gradient))
+        except np.linalg.LinAlgError:
+            raise EstimatorError(
+                "the gyroscope's bias is not determined by its stated noise; correct "
+                "gyroscope_noise_density and gyroscope_random_walk of its file"
+            ) from None
 
     def joined(self, system: LinearSystem, poses: FloatArray, bias: FloatArray) -> LinearSystem:
         """Normal equations with these steps, at a state; derivatives as of a small residual."""
@@ -179,23 +193,50 @@ class Turns:
         return np.asarray(spread.reshape(6 * len(whitened), -1))
 
 
-def _nodes(turns: Sequence[Turn], noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weights (k, q) of the nodes in each step, and (3q, 3q) what is known of them beforehand.
+def _nodes(
+    turns: Sequence[Turn], jacobians: FloatArray, white: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weights (k, q) of the nodes in each step, what is known of them, what they leave open.
 
     After a time of sqrt(3) times white noise over walk, the random walk is as large as the mean of
     the white noise (where their Allan deviations cross); two nodes lie in each such time.
+
+    Args:
+        turns: k of them, in time order.
+        jacobians: (k, 6, 3) theirs.
+        white: (k, 6, 6) noise of the steps that is no bias.
+
+    Returns:
+        Weights (k, q), information (3q, 3q) of the nodes beforehand, and (k, 6, 6) by how much the
+        walk between two nodes adds to the steps' noise.
     """
-    duration = np.array([np.linalg.norm(turn.jacobian[:3]) for turn in turns]) / np.sqrt(3.0)
+    duration = np.linalg.norm(jacobians[:, :3], axis=(1, 2)) / np.sqrt(3.0)
     end, walk = np.cumsum(duration), sum(turn.walk for turn in turns)
-    white = float(np.trace(noise, axis1=1, axis2=2).sum()) / 3.0
-    crossing = np.sqrt(3.0 * white / walk) if walk > 0.0 else np.inf
+    noise = float(np.trace(white[:, :3, :3], axis1=1, axis2=2).sum()) / 3.0
     first = np.eye(3) / turns[0].start_variance
-    intervals = int(min(np.ceil(2.0 * end[-1] / crossing), _MOST_NODES - 1))
-    if not intervals:
-        return np.ones((len(turns), 1)), first
+    if end[-1] ** 2 * walk <= _NO_WALK**2 * 3.0 * noise:
+        return np.ones((len(turns), 1)), first, np.zeros_like(white)
+    most = end[-1] / (_MOST_NODES - 1)
+    intervals = int(np.ceil(end[-1] / max(0.5 * np.sqrt(3.0 * noise / walk), most)))
     at = intervals * (end - 0.5 * duration) / end[-1]
     nodes = np.maximum(1.0 - np.abs(at[:, None] - np.arange(intervals + 1)), 0.0)
     steps = np.diff(np.eye(intervals + 1), axis=0) * np.sqrt(intervals / walk)
     known = np.kron(steps.T @ steps, np.eye(3))
     known[:3, :3] += first
-    return nodes, known
+    return nodes, known, _between(jacobians, duration, walk * end[-1] / intervals**2)
+
+
+def _between(jacobians: FloatArray, duration: FloatArray, walk: float) -> FloatArray:
+    """(k, 6, 6) what a walk between nodes adds to the noise of steps, as if new in each.
+
+    There it is a Brownian bridge; over an interval L its integral has the variance K^2 L^3 / 12, as
+    white noise of the density K^2 L^2 / 12 has (at most a sixteenth of the gyroscope's own, where
+    the number of nodes is not bounded). Over parts of the interval that is more than the truth.
+
+    Args:
+        jacobians: (k, 6, 3) of the steps by the bias.
+        duration: (k,) of the steps, seconds.
+        walk: K^2 L^2.
+    """
+    each = walk / 12.0 / np.maximum(duration, np.finfo(np.float64).tiny)
+    return np.asarray(each[:, None, None] * (jacobians @ np.swapaxes(jacobians, 1, 2)))

@@ -26,6 +26,7 @@ from fgslam.backend.smoothers.turns import Turn, TurnedStep, Turns
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import EstimatorError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import BiasEffect, Increment, LoopClosure, Odometry
 from fgslam.datasets.settings import ConstantVelocitySettings
@@ -201,18 +202,20 @@ def test_steps_without_a_gyroscope_have_no_turn() -> None:
     assert joined is not None
 
 
-def turns_of(walk: float, steps: int = 40) -> Turns:
+def turns_of(
+    walk: float, steps: int = 40, density: float = DENSITY, persistence: float = 1.0
+) -> Turns:
     rng = np.random.default_rng(2)
     effect = BiasEffect(-DT * np.eye(3), START**2, walk**2 * DT, np.zeros(3), np.zeros((3, 3)))
     out = []
     for k in range(steps):
         motion = g.se3_exp(0.2 * rng.standard_normal(6))
-        covariance = np.diag(np.repeat([DENSITY**2 * DT, 0.01], 3))
+        covariance = np.diag(np.repeat([density**2 * DT, 0.01], 3))
         step = Odometry(motion, covariance, measured=False, turned=True, bias=effect)
         turn = Turn.of((step,))
         assert turn is not None
         out.append(TurnedStep(k, k + 1, step, turn))
-    found = Turns.of(out, range(steps + 1), 1.0)
+    found = Turns.of(out, range(steps + 1), persistence)
     assert found is not None
     return found
 
@@ -229,6 +232,63 @@ def test_a_bias_has_nodes_where_its_walk_comes_out_of_the_noise() -> None:
     np.testing.assert_allclose(before[:3, :3], START**2 * np.eye(3), rtol=1e-9, atol=1e-15)
     grown = START**2 + (10.0 * WALK) ** 2 * 40 * DT
     np.testing.assert_allclose(before[-3:, -3:], grown * np.eye(3), rtol=1e-9, atol=1e-15)
+
+
+def noise_of(turns: Turns) -> FloatArray:
+    """(k, 6, 6) of the steps, beside the bias."""
+    return np.asarray(np.linalg.inv(np.swapaxes(turns.roots, 1, 2) @ turns.roots))
+
+
+@pytest.mark.parametrize(
+    ("walk", "density", "nodes"), [(1e-14, DENSITY, 1), (1e-9, DENSITY, 1), (WALK, 0.0, 17)]
+)
+def test_extremes_of_the_stated_noise_leave_a_bias(walk: float, density: float, nodes: int) -> None:
+    turns = turns_of(walk, density=density)
+    assert turns.nodes.shape == (40, nodes)
+    bias = turns.start(np.tile(np.eye(4), (41, 1, 1)))
+    assert np.isfinite(bias).all()
+
+
+def test_a_bias_that_nothing_determines_is_told() -> None:
+    turns = turns_of(0.0)
+    open_to_all = dataclasses.replace(
+        turns, jacobians=0.0 * turns.jacobians, known=np.zeros((3, 3))
+    )
+    with pytest.raises(EstimatorError, match="correct gyroscope_noise_density"):
+        open_to_all.start(np.tile(np.eye(4), (41, 1, 1)))
+
+
+def test_persistence_is_of_the_translation_alone() -> None:
+    once, twice = (noise_of(turns_of(10.0 * WALK, persistence=by)) for by in (1.0, 2.0))
+    by = np.sqrt(np.repeat([1.0, 2.0], 3))
+    np.testing.assert_allclose(twice, by[:, None] * once * by, rtol=1e-6, atol=1e-12)
+
+
+def test_a_long_drive_is_no_surer_of_its_bias_than_that_walks() -> None:
+    """Its variance at the end over the stated one, of 115 times in which the walk comes out.
+
+    Images tell the heading 33 times, to 0.02 degrees; the solution is linear, so the variance is
+    exact. Where the walk between the 17 nodes is left out it is 2.9 times the stated one.
+    """
+    walk, k, sigma = 20.0 * WALK, 900, np.radians(0.02) * np.sqrt(2.0)
+    turns = turns_of(walk, k)
+    assert turns.nodes.shape == (k, 17)
+    white = noise_of(turns)[:, 0, 0]
+    at = np.linspace(0, k, 33).astype(int)
+    inside = (np.arange(k) >= at[:-1, None]) & (np.arange(k) < at[1:, None])
+    by_node, known = DT * inside @ turns.nodes, turns.known[::3, ::3]
+    weights = by_node.T / (inside @ white + sigma**2)
+    covariance = np.linalg.inv(weights @ by_node + known)
+    gain = (covariance @ weights)[-1]
+    by_step = gain @ inside
+    by_walk = DT * by_step
+    by_walk[-1] -= 1.0
+    variance = (
+        walk**2 * DT * (np.cumsum(by_walk[::-1]) ** 2).sum()
+        + DENSITY**2 * DT * (by_step**2).sum()
+        + sigma**2 * (gain**2).sum()
+    )
+    assert 0.7 < variance / covariance[-1, -1] < 1.1
 
 
 # --------------------------------------------------------------------------------------------
