@@ -53,8 +53,12 @@ class StereoFactors:
             measurement: (3,) column, row, disparity, pixels.
             covariance: (3, 3) of it, pixels squared.
         """
+        if not self._rig.cylindrical:
+            model = self._whitening.model(covariance, FROM_MEASUREMENT)
+            return self.with_model(pose, landmark, measurement, model)
+        # Equal noise in the cylinder is another in the plane at each place.
         planes, slopes = self.in_perspective(measurement[None])
-        model = self._whitening.model(covariance, slopes[0])
+        model = self._whitening.model(slopes[0] @ covariance @ slopes[0].T)
         return self.with_model(pose, landmark, planes[0], model)
 
     def in_perspective(self, measurement: FloatArray) -> tuple[FloatArray, FloatArray]:
