@@ -8,7 +8,7 @@ nothing about poses. One that is contradicted frame after frame has moved, and s
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -173,7 +173,8 @@ class LandmarkAdmission:
             parallax: its range over the range's standard deviation.
         """
         track = self.tracks[identity]
-        track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
+        if track.waiting and track.waiting[0].frame < self._first_frame:
+            track.waiting = [s for s in track.waiting if s.frame >= self._first_frame]
         seldom = len(track.waiting) < LEAST_SIGHTINGS
         return identity in self._saved or not (seldom or parallax < track.least_parallax)
 
@@ -217,16 +218,18 @@ class LandmarkAdmission:
             del self._recent[identity]
         return [(i, track) for i, track in left if track.variable >= 0]
 
-    def waiting(self, since: int = 0) -> Iterator[tuple[int, Track]]:
+    def waiting(self, since: int = 0) -> list[tuple[int, Track]]:
         """Landmarks that are not in the graph, seen in a frame or later, within a bounded lag."""
-        return ((i, track) for i, track in self._seen(since) if track.variable < 0)
+        return [(i, track) for i, track in self._seen(since) if track.variable < 0]
 
-    def in_graph(self, since: int = 0) -> Iterator[tuple[int, Track]]:
+    def in_graph(self, since: int = 0) -> list[tuple[int, Track]]:
         """Landmarks that are in the graph, seen in a frame or later."""
-        return ((i, track) for i, track in self._seen(since) if track.variable >= 0)
+        return [(i, track) for i, track in self._seen(since) if track.variable >= 0]
 
-    def _seen(self, since: int) -> Iterator[tuple[int, Track]]:
+    def _seen(self, since: int) -> Iterable[tuple[int, Track]]:
         latest = reversed(self._recent.items())
+        if since <= 0:
+            return latest
         return itertools.takewhile(lambda each: each[1].last.frame >= since, latest)
 
     def describe(self, identity: int, variable: int) -> str:

@@ -133,7 +133,9 @@ class Persistence:
             accepted.ids.tolist(), accepted.measurement, accepted.covariance, strict=True
         )
         for identity, measurement, covariance in measured:
-            track = self._tracks.setdefault(identity, _Track())
+            track = self._tracks.get(identity)
+            if track is None:
+                track = self._tracks[identity] = _Track()
             track.frames.append(frame)
             track.measurement.append(measurement)
             track.covariance.append(covariance)

@@ -17,6 +17,7 @@ from fgslam.backend.smoothers.solver import (
     Smoothed,
     Solution,
 )
+from fgslam.backend.smoothers.window_parts import WindowValues
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.geometry import (
@@ -24,7 +25,7 @@ from fgslam.core.geometry import (
     transform_to_world,
 )
 from fgslam.core.sensors import Sensor
-from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
+from fgslam.factors.graphs import landmarks_in, pose_key, poses_of_frame
 
 
 class TrackerMap:
@@ -82,15 +83,13 @@ class TrackerMap:
 
     def _in_graph(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
         """Identities and positions of the tracker's landmarks that ``values`` hold."""
-        ids, positions = [], []
-        for identity, track in self._admission.in_graph(since):
-            key = landmark_key(track.variable)
-            if values.exists(key):
-                ids.append(identity)
-                positions.append(values.atPoint3(key))
-        found = np.array(ids, np.int64)
-        known = np.isin(found, self._tracker.landmarks().ids)
-        return found[known], np.array(positions, np.float64).reshape(-1, 3)[known]
+        tracks = self._admission.in_graph(since)
+        ids = np.array([identity for identity, _ in tracks], np.int64)
+        wanted = np.array([track.variable for _, track in tracks], np.int64)
+        inside = isinstance(values, WindowValues)
+        variables, positions = values.landmarks() if inside else landmarks_in(values)
+        known = np.isin(wanted, variables) & np.isin(ids, self._tracker.landmarks().ids)
+        return ids[known], positions[np.searchsorted(variables, wanted[known])]
 
     def _waiting(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
         """Landmarks outside the graph, moved along with the pose that saw them last."""

@@ -11,6 +11,7 @@ import numpy as np
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.landmark_elimination import Eliminated
 from fgslam.core.arrays import FloatArray, IntArray, Rows
+from fgslam.factors.graphs import landmark_key
 from fgslam.factors.stacked import LinearRows
 
 
@@ -97,9 +98,12 @@ class WindowValues:
         """Whether the window holds a variable."""
         return key in self.points or key in self.poses
 
-    def atPoint3(self, key: int) -> FloatArray:
-        """A landmark."""
-        return self.points[key]
+    def landmarks(self) -> tuple[IntArray, FloatArray]:
+        """As :func:`fgslam.factors.graphs.landmarks_in`."""
+        keys = np.fromiter(self.points, np.int64, len(self.points))
+        places = np.array(list(self.points.values())).reshape(-1, 3)
+        order = np.argsort(keys)
+        return keys[order] - landmark_key(0), places[order]
 
     def atPose3(self, key: int) -> Any:
         """A pose."""
