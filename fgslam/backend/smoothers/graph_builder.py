@@ -371,11 +371,8 @@ class GraphBuilder:
         rows = landmarks.rows(accepted.ids)
         positions = landmarks.positions[rows]
         parallax = _parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
-        measured = zip(
-            accepted.ids.tolist(), accepted.measurement, accepted.covariance, strict=True
-        )
-        for i, (identity, measurement, covariance) in enumerate(measured):
-            sighting = Sighting(new.frame, measurement, covariance)
+        for i, identity in enumerate(accepted.ids.tolist()):
+            sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
             track = self.admission.sighted(identity, sighting)
             if track.variable >= 0:
                 new.sightings.append((track.variable, sighting))
