@@ -138,4 +138,5 @@ class GyroscopeError:
         self._covariance = None if np.isnan(covariance[0, 0]) else covariance
         known = not np.isnan(pose[0, 0])
         self._before = Prediction(pose, state["gyroscope_pose_covariance"]) if known else None
+        self._step = self._jacobian = None
         self._found, self._expected = map(float, state["gyroscope_noise"])

@@ -136,7 +136,7 @@ class FixedLagSolver:
         if inside:
             self._window.factors.add(constraint_factor(loop))
             self._solve()
-            self.remarks.append(f"{what}: within the lag, a factor more")
+            self.remarks.append(f"{found.remark}; within the lag, it is a factor more")
         else:
             self.remarks.append(f"{found.remark}, and what lies within the lag")
             self._move_all(found.last)

@@ -124,6 +124,7 @@ def test_a_loop_within_a_lag_so_long_that_it_drifts_is_closed_and_a_wrong_one_re
         first, meant = found.trajectory.poses[0], drive.poses[0]
         np.testing.assert_allclose(first, meant, rtol=0, atol=1e-6)
     assert off[0] < 0.6 * off[1]
+    assert "the camera moved by" in remarks[0]
     assert "within the lag" in remarks[0]
     assert "refused" in remarks[1]
 

@@ -356,6 +356,19 @@ def test_the_initial_bias_is_the_likeliest_for_the_poses() -> None:
 # Estimates
 
 
+def test_a_frame_found_without_a_prior_keeps_its_turn_and_the_bias_of_it() -> None:
+    frames = list(driven(0).log)[:6]
+    frames[3] = dataclasses.replace(frames[3], relocalised=True)
+    log = MeasurementLog(RIG, driven(0).log.motion_model)
+    for increment in frames:
+        log.append(increment)
+    estimator = made_or_given(RIG, BATCH, EgoMotionSettings(), None)
+    replayed(log, estimator)
+    turns = estimator._solver._refined().graph.rest.turns  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(turns.after, [1, 2, 3, 4, 5])
+    assert noise_of(turns)[:, 3, 3].argmax() == 2
+
+
 SMOOTHERS = [BATCH, Isam2Settings(noise_factor=1.0), SlidingWindowSettings(noise_factor=1.0)]
 
 

@@ -165,6 +165,18 @@ def test_it_continues_from_its_state_with_the_same_bits() -> None:
     assert_same_bits(motion.state(), other.state())
 
 
+def test_a_frame_taken_back_leaves_no_step_to_learn_from() -> None:
+    """What follows it has no turn: the camera went on, by no step of the gyroscope's."""
+    motion, other = driven(20, 1)[0], driven(20, 1)[0]
+    before = motion.state()
+    motion.between(DT * 20, measured(g.so3_exp(np.full(3, 0.05)), np.zeros(3), TRUE_BIAS))
+    motion.restore(before)
+    for each in (motion, other):
+        each.between(DT * 20, None)
+        each.observe(DT * 20, Prediction(np.eye(4), 1e-6 * np.eye(6)), measured=True)
+    assert_same_bits(motion.state(), other.state())
+
+
 # --------------------------------------------------------------------------------------------
 # Log and replay
 
