@@ -253,8 +253,9 @@ def _view(
     """Rotation of each camera into the view, the view, and what to tell."""
     if asked.kind == "cylindrical" and len(chosen) > 2:
         raise CalibrationError(
-            f"{calibration.source}: a cylindrical view is of two cameras, not of three; choose two "
-            "(--cameras 0,1, cameras=(0, 1)), or leave the view perspective"
+            f"{calibration.source}: a cylindrical view is of two cameras, not of three; give a "
+            "calibration of two (cameras=(0, 1) of load_rig, --cameras 0,1 of fgslam camera), or "
+            "leave the view perspective"
         )
     if asked.is_default and _is_rectified(chosen):
         return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
@@ -286,10 +287,12 @@ def _cut_off(camera: RawCamera, view: View) -> tuple[str, ...]:
     cylinder = view.kind == "cylindrical"
     if kept[0] > (_TOLD_SHARE_OF_CYLINDER if cylinder else _TOLD_SHARE) * seen[0]:
         return ()
-    most = f", at most {WIDEST_CYLINDER_DEG:.0f}" if cylinder else ""
+    more = "dataset.fov_deg chooses another angle"
+    if cylinder and kept[0] > _TOLD_SHARE_OF_CYLINDER * WIDEST_CYLINDER_DEG:
+        more = "no cylindrical view shows more"
     return (
         f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-        f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle{most})",
+        f"{kept[1]:.0f}; what lies beyond is cut off ({more})",
     )
 
 
@@ -303,7 +306,7 @@ def _wider(
     if high[0] - low[0] <= _WIDE_DEG:
         return ()
     return (
-        f"both cameras see {high[0] - low[0]:.0f} degrees; a cylindrical view shows them all "
+        f"a cylindrical view would show {high[0] - low[0]:.0f} degrees, which both cameras see "
         "(--view cylindrical, dataset.view)",
     )
 

@@ -147,6 +147,11 @@ def require_rig(saved: SavedMap, rig: CameraRig, where: str) -> None:
     Raises:
         MapError: what differs first; ``where`` names the map.
     """
+    if saved.rig.view != rig.view:
+        raise MapError(
+            f"{where}: made with a {saved.rig.view} view, not with a {rig.view} one; sizes in them "
+            f"differ, choose the same view: dataset.view {saved.rig.view}"
+        )
     for name in _RIG:
         theirs, ours = getattr(saved.rig, name), getattr(rig, name)
         if (theirs is None) != (ours is None) or (
@@ -156,11 +161,6 @@ def require_rig(saved: SavedMap, rig: CameraRig, where: str) -> None:
                 f"{where}: made with another rig ({name} {theirs}, the recording's is {ours}); "
                 "give a map of the same cameras"
             )
-    if saved.rig.view != rig.view:
-        raise MapError(
-            f"{where}: made with a {saved.rig.view} view, the recording's is {rig.view}; sizes in "
-            "them differ, choose that one: --view, dataset.view"
-        )
     if not np.allclose(saved.rig.bTc, rig.bTc, rtol=0.0, atol=_SAME_RIG):
         raise MapError(
             f"{where}: made with the cameras mounted otherwise on the robot (bTc differs); give a "

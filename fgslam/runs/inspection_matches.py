@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.cylindrical import as_perspective
 from fgslam.core.errors import FrameError
 from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.datasets.checks.matches import (
@@ -229,26 +229,24 @@ def match_facts(
         all_three = np.array([len(look.stereo) for look in looks])
         facts.append(("three-camera matches", f"{_spread(all_three)} a frame"))
     measurement = np.concatenate([look.stereo.measurement for look in looks])
-    if rig.cylindrical:  # depth by what a perspective view would measure
-        measurement = as_perspective(rig, measurement)[0]
-    return (*facts, *_depth_facts(measurement[:, 2], len(looks), rig, settings))
+    return (*facts, *_depth_facts(measurement, len(looks), rig, settings))
 
 
 def _depth_facts(
-    disparity: FloatArray, frames: int, rig: CameraRig, settings: StereoSettings
+    measurement: FloatArray, frames: int, rig: CameraRig, settings: StereoSettings
 ) -> tuple[tuple[str, str], ...]:
-    if len(disparity) < _FEWEST_FOR_DEPTH * frames:
+    if len(measurement) < _FEWEST_FOR_DEPTH * frames:
         return (("depth", "unknown: too few matches"),)
-    low, middle, high = np.percentile(disparity, [5.0, 50.0, 95.0])
-    scale = rig.fx * rig.baseline
-    # First order: dZ = Z^2 / (f B) * sigma of the disparity, a difference of two positions.
-    blur = (scale / middle) ** 2 / scale * np.sqrt(2.0) * settings.pixel_sigma
+    low, middle, high = np.percentile(measurement[:, 2], [5.0, 50.0, 95.0])
+    near, usual, far = np.percentile(triangulate(rig, measurement)[:, 2], [5.0, 50.0, 95.0])
+    noise = np.zeros((len(measurement), 3, 3))
+    noise[:, 2, 2] = 2.0 * settings.pixel_sigma**2  # a disparity is a difference of two positions
+    blur = np.sqrt(np.median(triangulation_covariance(rig, measurement, noise)[:, 2, 2]))
     return (
         ("disparity", f"{low:.1f} to {high:.1f} px (5 to 95 %), median {middle:.1f} px"),
         (
             "depth",
-            f"{scale / high:.3g} to {scale / low:.3g} m (5 to 95 %), median {scale / middle:.3g} "
-            f"+- {blur:.2g} m",
+            f"{near:.3g} to {far:.3g} m (5 to 95 %), median {usual:.3g} +- {blur:.2g} m",
         ),
     )
 

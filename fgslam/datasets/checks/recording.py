@@ -20,6 +20,7 @@ from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 
 _LISTED = 5
+_WIDEST_DEG = {"perspective": 140.0, "cylindrical": 165.0}  # of usual fields of view
 
 
 class Level(str, Enum):
@@ -204,8 +205,8 @@ def check_calibration(rig: CameraRig) -> tuple[Finding, ...]:
             f"fx and fy differ by more than 5 % ({rig.fx:.1f}, {rig.fy:.1f} px); were the images "
             "stretched after they were calibrated?"
         )
-    view = float(2.0 * np.degrees(np.arctan(0.5 * rig.width / rig.fx)))
-    if not 15.0 < view < 140.0:
+    view = rig.angles_deg[0]
+    if not 15.0 < view < _WIDEST_DEG[rig.view]:
         found.append(
             f"the field of view of {view:.0f} degrees is unusual; is fx in pixels of these images?"
         )

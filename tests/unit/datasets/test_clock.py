@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
-from fgslam.core.geometry import so3_exp, so3_log
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, project, so3_exp, so3_log
+from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigView
 from fgslam.datasets.checks.clock import (
     Judged,
     SeenTurns,
     _Look,
+    _Looks,
     _turn_between,
     judged,
     judged_turns,
@@ -92,6 +97,32 @@ def test_images_whose_matches_lie_in_one_place_say_no_turn() -> None:
     pixels = points @ camera.T
     look = _Look(pixels[:, :2] / pixels[:, 2:], codes, points)
     assert _turn_between(look, look, camera) is None
+
+
+class Found(_Looks):
+    """Features instead of images."""
+
+    def _found(self, image: Any) -> Any:
+        return image
+
+
+@pytest.mark.parametrize("view", ["perspective", "cylindrical"])
+def test_turns_are_seen_in_either_view(view: RigView) -> None:
+    rig = CameraRig(
+        400, 300, 120.0, 120.0, 199.5, 149.5, 0.1, None, BODY_FORWARD_LEFT_UP_FROM_CAMERA, view=view
+    )
+    rng = np.random.default_rng(2)
+    points = rng.uniform([-4.0, -2.0, 1.0], [4.0, 2.0, 5.0], (200, 3))
+    looks = np.eye(200, 32, dtype=np.uint8) + rng.integers(0, 255, (200, 32), dtype=np.uint8)
+    turn = np.array([0.01, -0.05, 0.02])
+    frames = []
+    for at in (points, points @ so3_exp(turn)):
+        measured = project(rig, at)
+        left = np.column_stack([measured[:, 0] + measured[:, 2], measured[:, 1]])
+        frames.append(SimpleNamespace(images=((measured[:, :2], looks), (left, looks))))
+    found = Found(cast(Any, SimpleNamespace(rig=rig, frame=frames.__getitem__)))
+    camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+    assert _turn_between(found.at(0), found.at(1), camera) == pytest.approx(turn, abs=1e-6)
 
 
 @pytest.mark.data
