@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
+from fgslam.cameras.corrected import correction_values
+from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
 from fgslam.cameras.rectification import (
     WIDEST_CYLINDER_DEG,
     Rectifier,
@@ -93,7 +94,8 @@ def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly
     chosen = tuple(cameras[k] for k in sources)
     _require_side_by_side(chosen, turn)
     rotations, view, also = _view(calibration, chosen, sources, turn, asked)
-    found = rectifier(chosen, rotations, view)
+    found = rectifier(chosen, rotations, view, _corrected(calibration))
+    found = replace(found, calibration=_with_view(calibration, sources, rotations, view))
     remarks = (*calibration.notes, *told, *also)
     if calibration.sided and len(sources) == 2:
         found = replace(found, order=(1 - sources[0], 1 - sources[1]))
@@ -101,8 +103,29 @@ def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly
             remarks = (*remarks, _swapped(chosen, found.rig))
     remarks = (*remarks, *implausible(calibration.source, found.rig))
     straight = found.order[:2] == (0, 1) and asked.is_default and _is_rectified(chosen)
-    kept = None if straight else found
+    kept = None if straight and found.correction is None else found
     return Assembly(found.rig, kept, sources, remarks)
+
+
+def _corrected(calibration: Calibration) -> Callable[[CameraRig], FloatArray] | None:
+    values = calibration.corrections
+    if values is None:
+        return None
+    return lambda rig: correction_values(calibration.source, values, rig)
+
+
+def _with_view(
+    calibration: Calibration,
+    sources: tuple[int, ...],
+    rotations: Sequence[FloatArray],
+    view: View,
+) -> Calibration:
+    """The calibration with the view that was chosen, without corrections."""
+    turns = [np.eye(3)] * len(calibration.cameras)
+    for source, rotation in zip(sources, rotations, strict=True):
+        turns[source] = rotation
+    stated = StatedView(tuple(turns), view.matrix, view.size, view.kind)
+    return replace(calibration, view=stated, corrections=None)
 
 
 def _usable(calibration: Calibration) -> tuple[RawCamera, ...]:
@@ -257,9 +280,14 @@ def _view(
             "calibration of two (cameras=(0, 1) of load_rig, --cameras 0,1 of fgslam camera), or "
             "leave the view perspective"
         )
+    stated = calibration.view
+    own = stated is not None and asked in (ANY_VIEW, ViewAsked(None, stated.kind))
+    if stated is not None and own and calibration.corrections is not None:
+        rotations = tuple(stated.rotations[k] for k in sources)
+        return rotations, View(stated.matrix, stated.size, stated.kind), ()
+    calibration.require_uncorrected("another view (fov_deg, view) is asked for")
     if asked.is_default and _is_rectified(chosen):
         return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
-    stated = calibration.view
     told: tuple[str, ...] = ()
     natural = float(np.mean([camera.focal_px for camera in chosen]))
     if stated is not None and asked.is_default:
@@ -372,6 +400,8 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
     if size is None:
         return calibration
     other = [c for c in calibration.cameras if c.size != size and c.width]
+    if other:
+        calibration.require_uncorrected(f"images of {size[0]}x{size[1]} pixels are given")
     if other and not scale:
         _require_one_size(calibration.cameras)
         raise CalibrationError(

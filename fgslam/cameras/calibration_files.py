@@ -30,7 +30,8 @@ def _without_size(read: Callable[[Path, Tree], Calibration]) -> Reader:
 
 def _rectified(path: Path, tree: Tree, _: Size | None) -> Calibration:
     found = read_own_format(path, "vertical_baseline_m" in tree)
-    return own.calibration_of(found.rig if isinstance(found, Rectifier) else found, path)
+    rig = found.rig if isinstance(found, Rectifier) else found
+    return own.calibration_of(rig, path, own.stated_corrections(path, tree))
 
 
 _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from fgslam.cameras.lenses import LENSES, Lens
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse, is_rigid
+from fgslam.core.settings import RigView
 
 _WALK = 400  # places between the centre and the border at which a ray is asked for
 
@@ -145,19 +147,21 @@ def _either(sizes: tuple[int, ...]) -> str:
     return " or ".join(map(str, sizes))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StatedView:
-    """The rectification that a file states, of its first and its second camera.
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class StatedView(Brief):
+    """The rectification that a file states.
 
     Attributes:
-        rotations: (3, 3) each, from raw to rectified axes.
-        matrix: (3, 3) intrinsics of both rectified images, pixels.
+        rotations: (3, 3) each, from raw to rectified axes, in the order of the file's cameras.
+        matrix: (3, 3) intrinsics of all rectified images, pixels; of a cylinder a radian.
         size: width and height of the rectified images, pixels.
+        kind: perspective or cylindrical.
     """
 
-    rotations: tuple[FloatArray, FloatArray]
+    rotations: tuple[FloatArray, ...]
     matrix: FloatArray
     size: tuple[int, int]
+    kind: RigView = "perspective"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -170,6 +174,8 @@ class Calibration(Brief):
         cameras: in the file's order.
         sided: whether the file calls its first camera the left one and the second the right one.
         view: the rectification that it states; None where there is none.
+        corrections: of images rectified like that, what a drive found, by the names of its terms
+            (:func:`fgslam.core.rig_correction.term_names`); None where there are none.
         notes: what a user should know, a line each.
     """
 
@@ -179,6 +185,15 @@ class Calibration(Brief):
     sided: bool = False
     view: StatedView | None = None
     notes: tuple[str, ...] = field(default=())
+    corrections: Mapping[str, float] | None = None
+
+    def require_uncorrected(self, what: str) -> None:
+        """Raises CalibrationError where it has corrections, which ``what`` would lose."""
+        if self.corrections is not None:
+            raise CalibrationError(
+                f"{self.source} has corrections, which hold for its own images and view: {what}; "
+                "leave that out, or use the calibration without corrections"
+            )
 
     def offset(self, camera: int, other: int) -> FloatArray:
         """Pose (4, 4) of one camera in another's axes."""

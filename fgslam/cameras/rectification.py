@@ -7,8 +7,8 @@ cameras in an L the image plane holds both baselines.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
 
@@ -16,10 +16,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.arrays import Brief, FloatArray, Image
 from fgslam.core.cylindrical import view_rays
 from fgslam.core.geometry import pose
+from fgslam.core.rig_correction import camera_displacements
 from fgslam.core.sensors import CameraRig
 from fgslam.core.settings import RigView
 
@@ -49,6 +50,10 @@ class Rectifier(Brief):
         size: width and height of the raw images, pixels; None: those of the rig.
         shown: per camera, what of its raw image may be used (h, w), nonzero where it may; None:
             all of it. Empty: all of every image.
+        correction: (p,) displacements of the rectified images
+            (:mod:`fgslam.core.rig_correction`) that the maps undo; None: none.
+        calibration: of the raw cameras, with this view, without the correction; None where the
+            images are rectified as they are stored.
 
     Without maps the images are rectified as they are.
     """
@@ -58,6 +63,8 @@ class Rectifier(Brief):
     order: tuple[int, ...] = (0, 1, 2)
     size: tuple[int, int] | None = None
     shown: tuple[Image | None, ...] = ()
+    correction: FloatArray | None = None
+    calibration: Calibration | None = field(default=None, repr=False)
 
     def rectify(self, camera: int, image: Image) -> Image:
         """Rectified image (h, w) of camera 0 (right), 1 (left) or 2 (top), bilinear."""
@@ -258,19 +265,28 @@ def _on_plane(camera: RawCamera, rotation: FloatArray, pixels: FloatArray) -> Fl
     return np.asarray(rays[:, :2] / rays[:, 2:])
 
 
-def sampling_maps(camera: RawCamera, rotation: FloatArray, view: View) -> tuple[MapArray, MapArray]:
-    """Columns and rows (h, w) of the raw image at which each pixel of the view looks."""
+def pixel_grid(size: tuple[int, int]) -> FloatArray:
+    """(width * height, 2) column and row of every pixel, row by row."""
+    columns, rows = np.meshgrid(*(np.arange(length, dtype=float) for length in size))
+    return np.column_stack([columns.ravel(), rows.ravel()])
+
+
+def sampling_maps(
+    camera: RawCamera, rotation: FloatArray, view: View, seen: FloatArray
+) -> tuple[MapArray, MapArray]:
+    """Columns and rows (h, w) of the raw image where each of the view's pixels is ``seen``."""
     width, height = view.size
-    columns, rows = np.meshgrid(np.arange(width, dtype=float), np.arange(height, dtype=float))
-    rays = view.rays(np.column_stack([columns.ravel(), rows.ravel()])) @ rotation
-    pixels = camera.project(rays)
+    pixels = camera.project(view.rays(seen) @ rotation)
     pixels = np.where(np.isfinite(pixels), pixels, _OUTSIDE).clip(_OUTSIDE, -_OUTSIDE)
     found = pixels.reshape(height, width, 2).astype(np.float32)
     return np.ascontiguousarray(found[..., 0]), np.ascontiguousarray(found[..., 1])
 
 
 def rectifier(
-    cameras: Sequence[RawCamera], rotations: Sequence[FloatArray], view: View
+    cameras: Sequence[RawCamera],
+    rotations: Sequence[FloatArray],
+    view: View,
+    corrected: Callable[[CameraRig], FloatArray] | None = None,
 ) -> Rectifier:
     """What rectifies images of right, left[, top] camera into one view.
 
@@ -278,6 +294,7 @@ def rectifier(
         cameras: right, left[, top].
         rotations: (3, 3) of each, from raw to the view's axes.
         view: the common image plane.
+        corrected: displacements (p,) of the rig's images, which are undone as well.
     """
     right = cameras[0]
     focal = np.diag(view.matrix)[:2]
@@ -296,8 +313,17 @@ def rectifier(
         bTc=pose(axes, right.bTc[:3, 3]),
         view=view.kind,
     )
+    correction = None if corrected is None else corrected(rig)
     maps = tuple(
-        sampling_maps(camera, rotation, view)
-        for camera, rotation in zip(cameras, rotations, strict=True)
+        sampling_maps(camera, rotation, view, displaced_grid(rig, k, correction))
+        for k, (camera, rotation) in enumerate(zip(cameras, rotations, strict=True))
     )
-    return Rectifier(rig, maps, (0, 1, 2), right.size)
+    return Rectifier(rig, maps, (0, 1, 2), right.size, correction=correction)
+
+
+def displaced_grid(rig: CameraRig, camera: int, correction: FloatArray | None) -> FloatArray:
+    """(n, 2) where a camera sees what an exact one has in each of its pixels, row by row."""
+    exact = pixel_grid((rig.width, rig.height))
+    if correction is None:
+        return exact
+    return np.asarray(exact + camera_displacements(rig, camera, exact) @ correction)

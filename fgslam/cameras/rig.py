@@ -161,7 +161,8 @@ def load_rig(
     asked = asked_view(fov_deg, view)
     require_options(size, unit_m)
     own = _own_rectified(Path(path), cameras, unit_m) if path2 is None else None
-    if own is not None and asked.is_default and size in (None, (own.width, own.height)):
+    same_size = own is not None and size in (None, (own.width, own.height))
+    if own is not None and same_size and asked in (ANY_VIEW, ViewAsked(None, own.view)):
         return with_masks(own, Path(path))
     found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
@@ -236,7 +237,9 @@ def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> 
     rig = _rig_in_metres(found.rig if isinstance(found, Rectifier) else found, unit_m)
     raw = replace(found, rig=rig) if isinstance(found, Rectifier) else None
     if unit_m != 1.0:
-        assembled(calibration_of(rig, path))  # refuses a unit that makes one camera of two
+        assembled(
+            calibration_of(replace(rig, view="perspective"), path)
+        )  # refuses a unit that makes one camera of two
     return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
 
 
@@ -265,6 +268,7 @@ def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> C
         raise CalibrationError(
             f"{calibration.source}: cameras is {cameras!r}; give two or three of 0 to {count - 1}"
         )
+    calibration.require_uncorrected("some of its cameras are chosen")
     chosen = tuple(calibration.cameras[k] for k in cameras)
     return replace(calibration, cameras=chosen, view=None)
 

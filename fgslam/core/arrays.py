@@ -33,7 +33,11 @@ class Brief:
 
     def __repr__(self) -> str:
         owner: Any = self
-        parts = (f"{f.name}={_brief(getattr(owner, f.name))}" for f in dataclasses.fields(owner))
+        parts = (
+            f"{f.name}={_brief(getattr(owner, f.name))}"
+            for f in dataclasses.fields(owner)
+            if f.repr
+        )
         return f"{type(self).__name__}({', '.join(parts)})"
 
 

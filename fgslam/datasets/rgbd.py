@@ -18,7 +18,7 @@ from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.trees import read_tree
 from fgslam.cameras.raw_cameras import RawCamera
-from fgslam.cameras.rectification import MapArray, View, sampling_maps
+from fgslam.cameras.rectification import MapArray, View, pixel_grid, sampling_maps
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
@@ -243,7 +243,7 @@ class _Undistorted:
         if camera.model == "radtan" and not np.any(camera.distortion):
             return None
         view = View(camera.matrix, (camera.width, camera.height))
-        return _Undistorted(*sampling_maps(camera, np.eye(3), view))
+        return _Undistorted(*sampling_maps(camera, np.eye(3), view, pixel_grid(view.size)))
 
     def apply(self, image: Image, nearest: bool) -> Image:
         """The image, with its pixels between others blended, or, of depth, the nearest."""

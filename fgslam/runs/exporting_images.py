@@ -55,7 +55,7 @@ def export_images(
     if folder is not None and isinstance(log.rig, CameraRig) and log.rig.cylindrical:
         raise DatasetError(
             f"{folder}: the run's images are cylindrical, and COLMAP and nerfstudio know "
-            "perspective ones; run the recording with --view perspective"
+            "perspective ones; run the raw recording in the perspective view (dataset.view)"
         )
     rows, pictures = frames_of(config, trajectory)
     model = build_model(log, trajectory, points)

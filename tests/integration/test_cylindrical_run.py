@@ -57,8 +57,9 @@ def test_fisheyes_are_mapped_in_the_cylindrical_view(
     recording: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     run = tmp_path / "run"
+    better = tmp_path / "better.json"
     given = ("run", recording, "--view", "cylindrical", "--out", run, *QUIET)
-    assert main(monkeypatch, *given) == 0
+    assert main(monkeypatch, *given, "--camera-out", better) == 0
     assert "of 191 x 143 degrees the rectified view shows 160 x 143" in capfd.readouterr().out
     result = metrics_of(run)["estimators"]["isam2"]
     assert result["ate_first_pose_m"] < 0.006  # of 0.2 m
@@ -69,3 +70,7 @@ def test_fisheyes_are_mapped_in_the_cylindrical_view(
     assert beyond.sum() > 20  # beyond what the perspective view shows
     assert main(monkeypatch, "export", run, "--images", tmp_path / "model") == 2
     assert "images are cylindrical" in capfd.readouterr().err
+    again = ("run", recording, "--camera", better, "--out", tmp_path / "again", *QUIET)
+    assert main(monkeypatch, *again) == 0  # the file is of the raw cameras, and says the view
+    assert "unrectified" in capfd.readouterr().out
+    assert metrics_of(tmp_path / "again")["estimators"]["isam2"]["ate_first_pose_m"] < 0.006

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 
 from fgslam.cameras.formats.trees import Tree, Values, intrinsic_matrix
 from fgslam.cameras.lenses import LENSES
-from fgslam.cameras.raw_cameras import Calibration, RawCamera, checked_camera
+from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView, checked_camera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import pose
+from fgslam.core.geometry import is_rigid, pose
 from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigView
 
 FORMAT = "calib.json of fgslam"
-
+CORRECTIONS = "corrections"
 
 _OWN = {"baseline_m", "baseline", "rectified", "fx"}
 
@@ -43,7 +44,50 @@ def read_raw(path: Path, tree: Tree) -> Calibration:
     cameras = tuple(
         _camera(Values(path, values, f"cameras[{k}].")) for k, values in enumerate(tree["cameras"])
     )
-    return Calibration(str(path), FORMAT, cameras, sided=tree.get("sided") is True)
+    return Calibration(
+        str(path),
+        FORMAT,
+        cameras,
+        sided=tree.get("sided") is True,
+        view=_stated_view(Values(path, tree).inside("rectified_view"), len(cameras)),
+        corrections=_of_its_view(path, tree),
+    )
+
+
+def stated_corrections(path: Path, tree: Tree) -> Mapping[str, float] | None:
+    """Its corrections by name; None where it has none. Raises CalibrationError: no object."""
+    values = tree.get(CORRECTIONS)
+    if values is not None and not isinstance(values, dict):
+        raise CalibrationError(
+            f"{path}: {CORRECTIONS} must be an object with a number for each term; correct or "
+            "remove it"
+        )
+    return values
+
+
+def _of_its_view(path: Path, tree: Tree) -> Mapping[str, float] | None:
+    found = stated_corrections(path, tree)
+    if found is not None and "rectified_view" not in tree:
+        raise CalibrationError(
+            f"{path}: {CORRECTIONS} are of rectified images, but rectified_view is missing; "
+            f"restore it, or remove {CORRECTIONS}"
+        )
+    return found
+
+
+def _stated_view(part: Values, cameras: int) -> StatedView | None:
+    if not part.tree:
+        return None
+    kind = part.text("kind", "perspective")
+    if kind not in get_args(RigView):
+        raise part.refuse(f"kind is {kind!r}; it is {' or '.join(get_args(RigView))}")
+    rotations = part.numbers("rotations", 9 * cameras).reshape(cameras, 3, 3)
+    if not all(is_rigid(pose(rotation, np.zeros(3))) for rotation in rotations):
+        raise part.refuse("rotations has one that is no rotation; correct the file")
+    size = part.size("width", "height")
+    if min(size) <= 0:
+        raise part.refuse(f"width and height are {size[0]} and {size[1]}; correct the file")
+    return StatedView(tuple(rotations), part.matrix("matrix", 3, 3), size, cast(RigView, kind))
 
 
 def _camera(part: Values) -> RawCamera:
@@ -76,10 +120,24 @@ def raw_values(calibration: Calibration) -> Mapping[str, Any]:
         }
         for camera in calibration.cameras
     ]
-    return {"sided": calibration.sided, "cameras": cameras}
+    values: dict[str, Any] = {"sided": calibration.sided, "cameras": cameras}
+    view = calibration.view
+    if view is not None:
+        values["rectified_view"] = {
+            "kind": view.kind,
+            "width": view.size[0],
+            "height": view.size[1],
+            "matrix": view.matrix.tolist(),
+            "rotations": [rotation.tolist() for rotation in view.rotations],
+        }
+    if calibration.corrections is not None:
+        values[CORRECTIONS] = dict(calibration.corrections)
+    return values
 
 
-def calibration_of(rig: CameraRig, path: Path) -> Calibration:
+def calibration_of(
+    rig: CameraRig, path: Path, corrections: Mapping[str, float] | None = None
+) -> Calibration:
     """Rectified cameras as calibrated ones without distortion: left, right[, top].
 
     Raises:
@@ -87,8 +145,9 @@ def calibration_of(rig: CameraRig, path: Path) -> Calibration:
     """
     if rig.cylindrical:
         raise CalibrationError(
-            f"{path}: is of cylindrical images, which no camera model makes; give the calibration "
-            "of the raw cameras"
+            f"{path}: is of cylindrical images of {rig.width}x{rig.height} pixels, which no camera "
+            "model makes; give images of that size and ask for no other view, or give the "
+            "calibration of the raw cameras"
         )
     offsets: list[tuple[str, FloatArray]] = [
         ("left", np.array([-rig.baseline, 0.0, 0.0])),
@@ -101,4 +160,7 @@ def calibration_of(rig: CameraRig, path: Path) -> Calibration:
         RawCamera(rig.width, rig.height, matrix, np.zeros(4), rig.bTc @ pose(np.eye(3), at), name)
         for name, at in offsets
     )
-    return Calibration(str(path), FORMAT, cameras, sided=True)
+    view = None
+    if corrections is not None:
+        view = StatedView((np.eye(3),) * len(cameras), matrix, (rig.width, rig.height))
+    return Calibration(str(path), FORMAT, cameras, True, view, corrections=corrections)

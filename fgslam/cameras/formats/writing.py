@@ -46,6 +46,8 @@ def write_calibration(calibration: Calibration, path: Path, view: StatedView | N
             f"{path}: no format ends like that; known: {known}, and no ending (a folder for ROS)"
         )
     name, write = _WRITERS[path.suffix.lower()]
+    if write is not _own:
+        calibration.require_uncorrected(f"{name} cannot hold them")
     write(calibration, path, view)
     return name
 

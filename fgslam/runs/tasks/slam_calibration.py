@@ -9,6 +9,7 @@ import numpy as np
 
 from fgslam.backend.filters.self_calibration import SelfCalibration
 from fgslam.cameras.corrected import write_corrected
+from fgslam.cameras.rectification import Rectifier
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.files import read_text, require_writable, write_text
 from fgslam.core.rig_correction import RigCorrection, term_names
@@ -29,12 +30,15 @@ _WORDS = {
 }
 
 
-def write_calibration(folder: Path, calibration: SelfCalibration) -> None:
-    """camera.json and calibration.csv: the rig, corrected, and what was known after each window.
+def write_calibration(
+    folder: Path, calibration: SelfCalibration, rectifier: Rectifier | None
+) -> None:
+    """camera.json and calibration.csv: the cameras, corrected, and what each window knew.
 
-    Raises OutputError.
+    ``rectifier`` is what rectified the images; the file then is of the raw cameras. Raises
+    OutputError.
     """
-    write_corrected(folder / CAMERA_FILE, calibration.found.best)
+    write_corrected(folder / CAMERA_FILE, calibration.found.best, rectifier)
     known = calibration.found.estimated
     terms = term_names(known.rig)
     changes = list(known.changes())

@@ -106,7 +106,8 @@ class RunOutputs:
         self.write_metrics({self.title: metrics}, status)
         self._write_timing(estimate.trajectory)
         if self.pipeline.calibration is not None:
-            write_calibration(self.folder, self.pipeline.calibration)
+            rectifier = getattr(self.sequence, "rectifier", None)  # recordings of files have one
+            write_calibration(self.folder, self.pipeline.calibration, rectifier)
         return metrics
 
     def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.corrected import rectifier_of, write_corrected
+from fgslam.cameras.formats.own import raw_values
+from fgslam.cameras.formats.writing import write_calibration
+from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp
 from fgslam.core.rig_correction import (
     SHARED,
     RigCorrection,
@@ -128,3 +136,122 @@ def test_what_is_no_correction_is_refused(
 def test_a_frame_that_shows_nothing_is_displaced_by_nothing(rig: CameraRig) -> None:
     found = shared_displacements(rig, np.empty((0, rig.cameras, 2)))
     assert found.shape == (0, 2 * rig.cameras, len(SHARED))
+
+
+# --------------------------------------------------------------------------------------------
+# Of cameras that are not rectified
+
+
+def raw_pair(tmp_path: Path) -> Path:
+    """A calibration of two cameras with lenses, turned against each other."""
+    matrix = np.array([[130.0, 0.0, 79.5], [0.0, 130.0, 59.5], [0.0, 0.0, 1.0]])
+    bends = (np.array([-0.2, 0.05, 1e-3, -1e-3]), np.array([-0.18, 0.04, 0.0, 5e-4]))
+    places = (np.eye(4), se3_exp(np.array([0.01, -0.02, 0.005, 0.1, 0.001, 0.0])))
+    cameras = tuple(
+        RawCamera(160, 120, matrix, bend, place, name)
+        for bend, place, name in zip(bends, places, ("left", "right"), strict=True)
+    )
+    path = tmp_path / "raw.json"
+    path.write_text(json.dumps(raw_values(Calibration("made", "made", cameras, sided=True))))
+    return path
+
+
+@pytest.mark.parametrize("asked", [{}, {"fov_deg": 50.0}, {"view": "cylindrical"}], ids=str)
+def test_a_correction_of_raw_cameras_is_undone_in_their_raw_images(
+    asked: dict[str, Any], tmp_path: Path
+) -> None:
+    before = load_rig(raw_pair(tmp_path), **asked)
+    wrong = knocked(before.plain())
+    assert before.rectifier is not None
+    write_corrected(tmp_path / "better.json", wrong, before.rectifier)
+    after = load_rig(tmp_path / "better.json")
+    assert after.rectifier is not None
+    for name in CameraRig.__dataclass_fields__:
+        found, expected = getattr(after, name), getattr(before, name)
+        if isinstance(expected, float | int | np.ndarray):
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert after.view == before.view
+    exact = np.array([[40.0, 30.0], [75.0, 60.0], [110.0, 50.0]])
+    seen = (exact + camera_displacements(before, 1, exact) @ wrong.values).astype(np.float32)
+    columns, rows = exact.astype(int).T
+    for of_before, of_after in zip(before.rectifier.maps[1], after.rectifier.maps[1], strict=True):
+        expected = cv2.remap(of_before, seen[None], None, cv2.INTER_LINEAR)[0]
+        np.testing.assert_allclose(of_after[rows, columns], expected, atol=0.02)
+    np.testing.assert_allclose(after.rectifier.maps[0], before.rectifier.maps[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("raw", [True, False], ids=["raw", "rectified"])
+def test_a_second_correction_is_added_to_the_first(raw: bool, tmp_path: Path) -> None:
+    rig = load_rig(raw_pair(tmp_path))
+    path, rectifier = tmp_path / "better.json", rig.rectifier if raw else None
+    for times in (1, 2):
+        write_corrected(path, knocked(rig.plain()), rectifier)
+        values = json.loads(path.read_text())["corrections"]
+        assert values["left.yaw"] == pytest.approx(0.01 * times)
+        rectifier = load_rig(path).rectifier
+
+
+def test_raw_cameras_are_written_as_they_were_mounted(tmp_path: Path) -> None:
+    rig = load_rig(raw_pair(tmp_path))
+    mounted = replace(rig.plain(), bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+    write_corrected(tmp_path / "better.json", knocked(mounted), rig.rectifier)
+    back = load_rig(tmp_path / "better.json")
+    np.testing.assert_allclose(back.bTc, mounted.bTc, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"fov_deg": 60.0}, "has corrections, .*another view"),
+        ({"view": "cylindrical"}, "has corrections, .*another view"),
+        ({"size": (320, 240), "scale": True}, "has corrections, .*320x240"),
+        ({"cameras": (1, 0)}, "has corrections, .*some of its cameras"),
+    ],
+)
+@pytest.mark.parametrize("raw", [True, False], ids=["raw", "rectified"])
+def test_what_would_lose_a_correction_is_refused(
+    raw: bool, given: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    rig = load_rig(raw_pair(tmp_path))
+    path = tmp_path / "better.json"
+    write_corrected(path, knocked(rig.plain()), rig.rectifier if raw else None)
+    if not raw and "cameras" in given:
+        return  # they are left and right by name
+    with pytest.raises(CalibrationError, match=words):
+        load_rig(path, **given)
+    with pytest.raises(CalibrationError, match="Kalibr cannot hold them"):
+        write_calibration(read_calibration_file(path), tmp_path / "chain.yaml")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "round"}, "kind is 'round'"),
+        ({"rotations": [np.ones((3, 3)).tolist()] * 2}, "no rotation"),
+        ({"rotations": [np.eye(3).tolist()]}, "expected 18 finite numbers"),
+        ({"width": 0}, "width and height are 0"),
+    ],
+)
+def test_a_stated_view_that_is_none_is_refused(
+    change: dict[str, Any], words: str, tmp_path: Path
+) -> None:
+    rig = load_rig(raw_pair(tmp_path))
+    path = tmp_path / "better.json"
+    write_corrected(path, knocked(rig.plain()), rig.rectifier)
+    values = json.loads(path.read_text())
+    path.write_text(json.dumps(values | {"rectified_view": values["rectified_view"] | change}))
+    with pytest.raises(CalibrationError, match=words):
+        load_rig(path)
+    del values["rectified_view"]
+    path.write_text(json.dumps(values))
+    with pytest.raises(CalibrationError, match="rectified_view is missing"):
+        load_rig(path)
+
+
+def test_a_file_of_cylindrical_images_may_be_asked_for_that_view(tmp_path: Path) -> None:
+    rolled = replace(PAIR, view="cylindrical")
+    write_corrected(tmp_path / "rolled.json", RigCorrection.none(rolled))
+    assert load_rig(tmp_path / "rolled.json", view="cylindrical").view == "cylindrical"
+    assert load_rig(tmp_path / "rolled.json", unit_m=0.5).baseline == 0.5 * PAIR.baseline
+    with pytest.raises(CalibrationError, match="of cylindrical images of 160x120 pixels"):
+        load_rig(tmp_path / "rolled.json", size=(320, 240))
