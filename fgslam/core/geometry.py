@@ -214,13 +214,17 @@ def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray
 
 
 def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
-    """Consecutive independent steps as one, with its covariance; measured if all of them are."""
-    motion, covariance, measured = np.eye(4), np.zeros((6, 6)), True
+    """Consecutive independent steps as one, with its covariance; measured if all of them are.
+
+    Turned if every rotation was measured, but not every translation.
+    """
+    motion, covariance, measured, turned = np.eye(4), np.zeros((6, 6)), True, True
     for step in steps:
         covariance = compose_covariance(step.motion, covariance, step.covariance)
         motion = motion @ step.motion
-        measured = measured and step.measured
-    return Odometry(motion, covariance, measured)
+        measured &= step.measured
+        turned &= step.measured or step.turned
+    return Odometry(motion, covariance, measured, turned and not measured)
 
 
 def is_rigid(matrix: FloatArray) -> bool:

@@ -56,6 +56,17 @@ def plain(factor: Any) -> Any:
     return factor
 
 
+def scaled(factor: Any, variance: float) -> Any:
+    """A GTSAM factor whose covariance is multiplied by a number, with the kernel that it has."""
+    model = factor.noiseModel()
+    kernel = model.robust() if isinstance(model, gtsam.noiseModel.Robust) else None
+    covariance = variance * plain(factor).noiseModel().covariance()
+    model = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    if kernel is not None:
+        model = gtsam.noiseModel.Robust.Create(kernel, model)
+    return factor.cloneWithNewNoiseModel(model)
+
+
 def kernel_weights(name: KernelName, width: float, squared: FloatArray) -> FloatArray:
     """Weights of squared whitened residuals, any shape, of iteratively reweighted least squares.
 

@@ -25,13 +25,8 @@ from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import landmark_factors
-from fgslam.factors.motion import (
-    floor_factors,
-    odometry_factor,
-    point_prior,
-    pose_prior,
-)
-from fgslam.factors.noise import Whitening
+from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
+from fgslam.factors.noise import Whitening, scaled
 from fgslam.factors.stacked import whitening
 
 WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a weak prior
@@ -331,10 +326,7 @@ class GraphBuilder:
 
     def _weighed(self, step: Any, then: float) -> Any:
         """A guessed step as is known now; ``then`` multiplied its variance when it was made."""
-        if self._persistence == then:
-            return step
-        covariance = self._persistence / then * step.noiseModel().covariance()
-        return step.cloneWithNewNoiseModel(gtsam.noiseModel.Gaussian.Covariance(covariance))
+        return step if self._persistence == then else scaled(step, self._persistence / then)
 
     def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
         key = pose_key(new.frame)
@@ -358,7 +350,7 @@ class GraphBuilder:
             covariance = self._persistence * motion.covariance
             motion = dataclasses.replace(motion, covariance=covariance)
         before, after = pose_key(self.frames[-1]), pose_key(new.frame)
-        row = self._push(new, odometry_factor(before, after, motion))
+        row = self._push(new, step_factor(before, after, motion))
         if not motion.measured:
             self._variance_of[row] = self._persistence
         if turn is not None and self._remember:

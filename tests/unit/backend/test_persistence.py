@@ -193,8 +193,11 @@ def test_a_graph_is_weighed_anew_by_what_is_known_at_its_end(measured: bool) -> 
 
 def test_steps_together_are_measured_if_each_is() -> None:
     wheels, guess = Odometry(STEP, np.eye(6)), Odometry(STEP, np.eye(6), measured=False)
+    turn = Odometry.turn(STEP[:3, :3], np.eye(3))
     assert g.compose_odometry([wheels, wheels]).measured
     assert not g.compose_odometry([wheels, guess, wheels]).measured
+    turned = [g.compose_odometry([wheels, other]).turned for other in (wheels, guess, turn)]
+    assert turned == [False, False, True]
 
 
 def test_what_no_sighting_determines_of_a_place_is_left_as_it_is(rng: np.random.Generator) -> None:

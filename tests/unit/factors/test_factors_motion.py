@@ -23,8 +23,14 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import Odometry
-from fgslam.factors.motion import floor_factors, odometry_factor, point_prior, pose_prior
-from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite
+from fgslam.factors.motion import (
+    floor_factors,
+    odometry_factor,
+    point_prior,
+    pose_prior,
+    step_factor,
+)
+from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite, scaled
 
 TILTED = g.so3_exp(np.array([0.31, 0.1, -0.24])) @ np.array([0.0, 1.0, 0.0])
 """The vertical of a camera that is pitched and rolled on the robot: no axis of anything."""
@@ -59,6 +65,28 @@ def test_odometry_is_as_specified(off: float, rng: np.random.Generator) -> None:
         residual = partial(residuals.odometry, pTn=motion)
         after = before @ motion @ gentle(rng, off)
         assert_as_specified(factor, residual, [before, after], covariance)
+
+
+@pytest.mark.parametrize("deviations", [0.1, 3.0, 30.0])
+def test_a_foretold_step_pulls_like_student_with_ten_samples(deviations: float) -> None:
+    """Half of what a measured one does where it is off by the root of ten, less beyond."""
+    step = Odometry(g.se3_exp(np.full(6, 0.1)), 0.01 * np.eye(6), measured=False)
+    off = np.array([0.0, 0.0, 0.0, 0.1 * deviations, 0.0, 0.0])
+    values = values_of(np.eye(4), step.motion @ g.se3_exp(off))
+    loss = 5.0 * np.log1p(deviations**2 / 10.0)
+    assert step_factor(0, 1, step).error(values) == pytest.approx(loss, rel=1e-9)
+    twice = scaled(step_factor(0, 1, step), 4.0)
+    assert twice.error(values) == pytest.approx(5.0 * np.log1p(deviations**2 / 40.0), rel=1e-9)
+    pull = step_factor(0, 1, step).linearize(values).jacobian()[1]
+    bounded = deviations / np.sqrt(1.0 + deviations**2 / 10.0)
+    assert np.linalg.norm(pull) == pytest.approx(bounded, rel=1e-9)
+
+
+@pytest.mark.parametrize("by", [{"measured": True}, {"measured": False, "turned": True}])
+def test_a_measured_step_has_no_kernel(by: dict[str, bool]) -> None:
+    step = Odometry(np.eye(4), 0.01 * np.eye(6), **by)
+    values = values_of(np.eye(4), g.se3_exp(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0])))
+    assert step_factor(0, 1, step).error(values) == pytest.approx(450.0, rel=1e-9)
 
 
 @pytest.mark.parametrize("angle", [np.pi - 1e-3, np.pi - 1e-9, np.pi])
