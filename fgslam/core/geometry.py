@@ -214,16 +214,12 @@ def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray
 
 
 def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
-    """Consecutive independent steps as one, with its covariance; measured if all of them are.
-
-    Turned if every rotation was measured, but not every translation.
-    """
+    """Consecutive independent steps as one; measured, or else turned, if all of them are so."""
     motion, covariance, measured, turned = np.eye(4), np.zeros((6, 6)), True, True
     for step in steps:
         covariance = compose_covariance(step.motion, covariance, step.covariance)
         motion = motion @ step.motion
-        measured &= step.measured
-        turned &= step.measured or step.turned
+        measured, turned = measured and step.measured, turned and (step.measured or step.turned)
     return Odometry(motion, covariance, measured, turned and not measured)
 
 
