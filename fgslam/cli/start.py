@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import resource
 import sys
@@ -10,12 +11,16 @@ from fgslam.cli import signals
 
 _LEAST_MEMORY = 700_000_000  # bytes of address space: below it libraries crash or hang at import
 
+_ended_with: list[int] = []
+"""Status of the command, once it has one."""
+
 
 def main() -> None:
     """The command line; as :func:`fgslam.cli.main.main`."""
-    signals.watch()
-    _require_memory()
+    atexit.register(_leave)  # the first to be registered is the last to be called
     try:
+        signals.watch()
+        _require_memory()
         from fgslam.cli.main import main as command
 
         command()
@@ -26,7 +31,26 @@ def main() -> None:
         if signals.was_asked() and ended.code == signals.status():
             signals.end()
         _flush()
+        if ended.code is None or isinstance(ended.code, int):
+            _ended_with.append(ended.code or 0)
         raise
+    except Exception:
+        if not signals.was_asked():
+            raise
+        # Some library made another error of the signal while the command was imported.
+        print("fgslam: interrupted", file=sys.stderr)
+        signals.end()
+
+
+def _leave() -> None:
+    """Ends the process when all that was to be cleared up has been.
+
+    The interpreter would free every object that it holds, for half a second in which no signal is
+    answered.
+    """
+    if _ended_with:
+        _flush()
+        os._exit(_ended_with[0])
 
 
 def _require_memory() -> None:

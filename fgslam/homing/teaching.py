@@ -160,6 +160,11 @@ class Teacher:
         self._seen = 0
         self.next = 0
 
+    @property
+    def begun(self) -> bool:
+        """Whether an image could be used so far: the path has a beginning."""
+        return self._leg is not None
+
     def take(self, number: int, name: str, image: Image) -> None:
         """Looks at one more image (height, width, 3). Raises FrameError if not the camera's."""
         features = self._extractor.extract(image)

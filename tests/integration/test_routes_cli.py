@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 from pathlib import Path
 
@@ -15,7 +16,9 @@ from running import main
 import fgslam as fg
 from fgslam.core.trajectories import write_covariances
 from fgslam.homing.path_memory import PathMemory
+from fgslam.runs.bare_routes import teaching
 from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.run import run_experiment
 from tests import textured_room
 
 Capture = pytest.CaptureFixture[str]
@@ -89,6 +92,20 @@ def test_a_route_is_taught_with_the_reason_of_each_path_image(taught: Path, data
     assert (data / "taught" / "pictures" / "path_images.png").stat().st_size > 10_000
     assert (data / "taught" / "report.html").is_file()
     assert (data / "taught" / "route.fgpath").read_bytes() == taught.read_bytes()
+
+
+@pytest.mark.parametrize(("images", "said"), [(0, "There is no route yet."), (3, "path images")])
+def test_teaching_that_is_stopped_leaves_the_route_so_far_or_none(
+    data: Path, tmp_path: Path, images: int, said: str
+) -> None:
+    asked = itertools.count()
+    config = teaching(data / "drive", str(data / "camera.yaml"), tmp_path / "route.fgpath")
+    result = run_experiment(config, tmp_path / "run", stopped=lambda: next(asked) >= images)
+    assert result.status == "interrupted"
+    assert said in result.lines[0]
+    assert (tmp_path / "route.fgpath").exists() == bool(images)
+    if images:
+        assert len(PathMemory.load(tmp_path / "route.fgpath")) >= 1
 
 
 def textured_room_camera() -> object:

@@ -69,7 +69,13 @@ def _run(
 ) -> RunResult:
     """Stopped early, the route ends where the recording was read to."""
     folder = context.folder
-    taught, whole = _teach(config, recording, context)
+    teacher = Teacher(recording.camera, DRIVING, config.seed)
+    whole = _teach(teacher, recording, context)
+    if not whole and not teacher.begun:
+        result = RunResult(config, folder, "interrupted", ("There is no route yet.",))
+        write_document(result, {})
+        return result
+    taught = teacher.finish()
     if drive is not None:
         numbers = [row.number for row in taught.rows]
         metric = drive.at(recording.timestamps[numbers])
@@ -97,17 +103,16 @@ def _run(
     return result
 
 
-def _teach(config: TeachConfig, recording: OmniRecording, context: Context) -> tuple[Taught, bool]:
-    """The route, and whether the whole recording was read."""
-    teacher = Teacher(recording.camera, DRIVING, config.seed)
+def _teach(teacher: Teacher, recording: OmniRecording, context: Context) -> bool:
+    """Whether the whole recording was read."""
     last = len(recording) - 1
     for i in range(len(recording)):
         if context.stopped():
-            return teacher.finish(), False
+            return False
         if i >= teacher.next or i == last:
             teacher.take(i, recording.names[i], recording.image(i))
         context.progress("teaching", i + 1, len(recording))
-    return teacher.finish(), True
+    return True
 
 
 class _Row(NamedTuple):

@@ -52,6 +52,28 @@ def test_while_a_command_imports_a_signal_ends_it_with_one_line(
     assert (status, said) == (128 + number, "fgslam: interrupted\n")
 
 
+_WHILE_IT_STARTS_TO_WATCH = """
+import os, sys, threading
+from fgslam.cli.start import main
+start = threading.Thread.start
+
+def signalled(thread):
+    os.kill(os.getpid(), int(sys.argv[1]))
+    start(thread)
+
+threading.Thread.start = signalled
+main()
+"""
+
+
+@pytest.mark.parametrize("number", _SIGNALS)
+def test_a_signal_in_the_moment_in_which_it_starts_to_be_answered_is_one_line(
+    number: signal.Signals,
+) -> None:
+    status, said = ended(_WHILE_IT_STARTS_TO_WATCH, int(number))
+    assert (status, said) == (128 + number, "fgslam: interrupted\n")
+
+
 @pytest.mark.parametrize("number", _SIGNALS)
 def test_a_command_that_does_not_end_by_itself_is_ended(number: signal.Signals) -> None:
     status, said = ended(_STUCK, int(number))
@@ -76,3 +98,48 @@ def test_an_output_that_is_full_is_said_in_one_line() -> None:
     assert done.returncode
     assert done.stderr.startswith("fgslam: standard output: No space left on device")
     assert done.stderr.count("\n") == 1
+
+
+_SLOW_TO_FREE = """
+import time
+from fgslam.cli.start import main
+
+class Large:
+    def __del__(self, sleep=time.sleep):
+        sleep(600.0)
+
+large = Large()
+main()
+"""
+
+
+def test_a_command_that_is_done_does_not_free_all_that_it_holds_before_it_ends() -> None:
+    status, said = ended(_SLOW_TO_FREE, "--version")
+    assert (status, said) == (0, "")
+    status, said = ended(_SLOW_TO_FREE, "--no-such-option")
+    assert status == 2
+    assert "No such option" in said
+
+
+_ANOTHER_ERROR = """
+import os, sys
+from fgslam.cli.start import main
+
+class Library:
+    def find_spec(self, name, *rest):
+        if name == sys.argv[1]:
+            try:
+                os.kill(os.getpid(), 2)
+            except KeyboardInterrupt as error:
+                raise ValueError(f"schema: {error!r}")
+
+sys.meta_path.insert(0, Library())
+main()
+"""
+
+
+@pytest.mark.parametrize("module", ["typer", "pydantic"])
+def test_an_error_that_a_library_makes_of_ctrl_c_is_an_interruption(module: str) -> None:
+    code = _ANOTHER_ERROR.replace("sys.argv[1]", repr(module))
+    status, said = ended(code, "run", "lab_loop")
+    assert (status, said) == (130, "fgslam: interrupted\n")
