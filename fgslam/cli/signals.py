@@ -63,6 +63,27 @@ def _end_now(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
+def nothing_to_end() -> None:
+    """The command has ended: a signal changes nothing, but for who does not end by himself."""
+    for number in _SIGNALS:
+        signal.signal(number, _pass_over)
+
+
+def _pass_over(number: int, frame: FrameType | None) -> None:
+    """A handler, so that the watching thread still hears of the signal."""
+
+
+class OtherErrors:
+    """What a library makes of an interruption is one: pydantic a wrong schema of the settings."""
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        if kind is not None and issubclass(kind, Exception) and was_asked():
+            raise KeyboardInterrupt from None
+
+
 def _ignore_further() -> None:
     """A further signal would cut short the end of the threads, which aborts the process."""
     for each in _SIGNALS:

@@ -19,27 +19,23 @@ def main() -> None:
     """The command line; as :func:`fgslam.cli.main.main`."""
     atexit.register(_leave)  # the first to be registered is the last to be called
     try:
-        signals.watch()
-        _require_memory()
-        from fgslam.cli.main import main as command
+        with signals.OtherErrors():
+            signals.watch()
+            _require_memory()
+            from fgslam.cli.main import main as command
 
-        command()
+            command()
     except KeyboardInterrupt:
         print("fgslam: interrupted", file=sys.stderr)
         signals.end()
     except SystemExit as ended:
         if signals.was_asked() and ended.code == signals.status():
             signals.end()
+        signals.nothing_to_end()
         _flush()
         if ended.code is None or isinstance(ended.code, int):
             _ended_with.append(ended.code or 0)
         raise
-    except Exception:
-        if not signals.was_asked():
-            raise
-        # Some library made another error of the signal while the command was imported.
-        print("fgslam: interrupted", file=sys.stderr)
-        signals.end()
 
 
 def _leave() -> None:

@@ -25,7 +25,7 @@ from fgslam.core.files import replacing, require_file
 Items: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
 """Arrays by name: their kind (of ``numpy.dtype.kind``) and the shape of one row."""
 
-_UNREADABLE = (
+UNREADABLE = (
     OSError,
     ValueError,
     EOFError,
@@ -93,7 +93,7 @@ class ArrayFile:
             with np.load(path, allow_pickle=False) as file:
                 _require_plain(file)
                 return {name: file[name] for name in (file.files if names is None else names)}
-        except _UNREADABLE as error:
+        except UNREADABLE as error:
             cause = " ".join(str(error).split()) or type(error).__name__
             if "pickle" in cause:  # NumPy advises to unpickle, which would run what the file says
                 cause = "neither arrays nor an archive of them"
@@ -219,9 +219,12 @@ def write_pieces(path: Path, arrays: Mapping[str, Pieces]) -> None:
                     member.write(np.ascontiguousarray(part).tobytes())
 
 
-def load_arrays(path: Path) -> StateArrays:
-    """Arrays of a file of a run folder. Raises MeasurementLogError for what cannot be read."""
-    return _OF_RUNS.load(path)
+def load_arrays(path: Path, names: Sequence[str] | None = None) -> StateArrays:
+    """All arrays of a file of a run folder, or those of the names.
+
+    Raises MeasurementLogError for what cannot be read.
+    """
+    return _OF_RUNS.load(path, names)
 
 
 _OF_RUNS = ArrayFile(

@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.array_files import (
-    ArrayFile,
-    Items,
     from_upper,
     joined,
     of_rows,
@@ -26,6 +24,21 @@ from fgslam.core.array_files import (
 from fgslam.core.array_values import require_covariances, require_finite, require_single
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
+from fgslam.core.log_layout import (
+    BEFORE_LOOPS,
+    CORRECTIONS,
+    LOG,
+    LOOPS,
+    PER_FRAME,
+    PER_LOOP,
+    PER_OBSERVATION,
+    PER_TURN,
+    SENSOR_POSE,
+    WITH_CORRECTIONS,
+    WITH_EVERYTHING,
+    WITH_LOOPS,
+    WITH_SETTLED,
+)
 from fgslam.core.measurements import (
     BiasEffect,
     Increment,
@@ -38,47 +51,8 @@ from fgslam.core.rig_checks import rig_fault
 from fgslam.core.rig_correction import FIRST_TERMS, term_names, with_all_terms
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
-LOG = ArrayFile(
-    name="fgslam measurement log",
-    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope, 5 no
-    # correction for all frames alike, and fewer terms, 6 no bias.
-    versions=(1, 2, 3, 4, 5, 6, 7),
-    error=MeasurementLogError,
-    give="give a run folder's measurements.npz",
-    again="run again",
-)
-_BEFORE_LOOPS, _WITH_LOOPS, _WITH_CORRECTIONS, _WITH_SETTLED, WITH_EVERYTHING = 2, 3, 4, 6, 7
-CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
 _UPPER = np.triu_indices(3)
 _UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig
-
-# Arrays by the count that their first axis has, with type and the shape of an item.
-_PER_FRAME: Items = {
-    "frame_index": ("i", ()),
-    "timestamp": ("f", ()),
-    "odometry_motion": ("f", (4, 4)),
-    "odometry_covariance": ("f", (6, 6)),
-}
-_PER_OBSERVATION: Items = {
-    "observation_id": ("i", ()),
-    "measurement": ("f", (3,)),
-    "measurement_covariance": ("f", (6,)),
-    "pixels": ("f", (3, 2)),
-    "is_new": ("b", ()),
-    "rejected": ("b", ()),
-}
-_LOOPS = "loop_"  # before the names of the arrays of the loops' own observations
-_PER_LOOP: Items = {
-    "loop_frame": ("i", ()),
-    "loop_oTc": ("f", (4, 4)),
-    "loop_covariance": ("f", (6, 6)),
-}
-_PER_TURN: Items = {
-    "gyroscope_jacobian": ("f", (3, 3)),
-    "gyroscope_bias": ("f", (3,)),
-    "gyroscope_bias_covariance": ("f", (3, 3)),
-    "gyroscope_stability": ("f", (2,)),
-}
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
 _EXACT = "exact"  # of a rig: written where it is
@@ -106,9 +80,9 @@ def arrays_of(
     out |= _ragged("pruned", [s.pruned_ids for s in frames])
     out |= _observation_arrays([s.observations for s in frames], "")
     out["rejected"] = joined([s.rejected for s in frames], (), np.bool_)
-    if version >= _WITH_LOOPS:
+    if version >= WITH_LOOPS:
         out |= _loop_arrays(frames)
-    if version >= _WITH_CORRECTIONS and isinstance(sensor, CameraRig):
+    if version >= WITH_CORRECTIONS and isinstance(sensor, CameraRig):
         out |= _correction_arrays(frames, len(term_names(sensor)))
     if version >= WITH_EVERYTHING:
         out |= _bias_arrays(frames)
@@ -121,8 +95,8 @@ def version_of(frames: Sequence[Increment]) -> int:
     if any(step.bias is not None for step in steps):
         return WITH_EVERYTHING
     if any(step.turned for step in steps) or any(s.rig_correction is not None for s in frames):
-        return _WITH_SETTLED
-    return _WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else _BEFORE_LOOPS
+        return WITH_SETTLED
+    return WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else BEFORE_LOOPS
 
 
 def frames_of(
@@ -178,7 +152,7 @@ def _loop_arrays(frames: Sequence[Increment]) -> StateArrays:
         "loop_covariance": _stack([loop.covariance for loop in loops], (6, 6)),
         "loop_merged_start": offsets([len(loop.merged) for loop in loops]),
         "loop_merged": joined([loop.merged for loop in loops], (2,), np.int64),
-    } | _observation_arrays([loop.observations for loop in loops], _LOOPS)
+    } | _observation_arrays([loop.observations for loop in loops], LOOPS)
 
 
 def _correction_arrays(frames: Sequence[Increment], terms: int) -> StateArrays:
@@ -260,11 +234,11 @@ def _require_sound(arrays: StateArrays, where: str) -> None:
 def _require_consistent(arrays: StateArrays, where: str) -> None:
     """Raises MeasurementLogError unless all arrays are there, of the right type and size."""
     frames = rows_of(arrays, "frame_index")
-    expected = {SENSOR_POSE: ("f", (4, 4))} | of_rows(frames, _PER_FRAME)
+    expected = {SENSOR_POSE: ("f", (4, 4))} | of_rows(frames, PER_FRAME)
     for name in ("observation", "missed", "pruned"):
         rows = LOG.require_offsets(arrays, f"{name}_start", frames, where)
         expected |= of_rows(
-            rows, _PER_OBSERVATION if name == "observation" else {f"{name}_id": ("i", ())}
+            rows, PER_OBSERVATION if name == "observation" else {f"{name}_id": ("i", ())}
         )
     LOG.require(arrays, expected, where)
 
@@ -277,10 +251,10 @@ def _loops(
     Raises MeasurementLogError where their arrays do not fit together, or a loop leads nowhere.
     """
     frames = len(arrays["frame_index"])
-    if version < _WITH_LOOPS:
+    if version < WITH_LOOPS:
         return [()] * frames, np.zeros(frames, np.bool_)
     _require_consistent_loops(arrays, where)
-    observed = _split_observations(arrays, _LOOPS)
+    observed = _split_observations(arrays, LOOPS)
     merged = split(arrays["loop_merged"], arrays["loop_merged_start"])
     of_all = [
         LoopClosure(int(frame), arrays["loop_oTc"][i], arrays["loop_covariance"][i], seen, pairs)
@@ -305,11 +279,9 @@ def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
     count = LOG.require_offsets(arrays, "loop_start", frames, where)
     seen = LOG.require_offsets(arrays, "loop_observation_start", count, where)
     merged = LOG.require_offsets(arrays, "loop_merged_start", count, where)
-    of_loops = {
-        _LOOPS + name: item for name, item in _PER_OBSERVATION.items() if name != "rejected"
-    }
+    of_loops = {LOOPS + name: item for name, item in PER_OBSERVATION.items() if name != "rejected"}
     expected = {"relocalised": ("b", (frames,)), "loop_merged": ("i", (merged, 2))}
-    LOG.require(arrays, expected | of_rows(count, _PER_LOOP) | of_rows(seen, of_loops), where)
+    LOG.require(arrays, expected | of_rows(count, PER_LOOP) | of_rows(seen, of_loops), where)
 
 
 def _corrections(
@@ -320,9 +292,9 @@ def _corrections(
     Raises MeasurementLogError where they are not there, or of another rig.
     """
     frames = len(arrays["frame_index"])
-    if version < _WITH_CORRECTIONS or not isinstance(rig, CameraRig):
+    if version < WITH_CORRECTIONS or not isinstance(rig, CameraRig):
         return [None] * frames
-    older = version < _WITH_SETTLED
+    older = version < WITH_SETTLED
     terms = FIRST_TERMS * (rig.cameras - 1) if older else len(term_names(rig))
     LOG.require(arrays, {CORRECTIONS: ("f", (frames, terms))}, where)
     rows = with_all_terms(rig, arrays[CORRECTIONS]) if older else arrays[CORRECTIONS]
@@ -338,7 +310,7 @@ def _settled(
     """
     frames = len(arrays["frame_index"])
     terms = next((len(row) for row in corrections if row is not None), 0)
-    if version < _WITH_SETTLED or not terms:
+    if version < WITH_SETTLED or not terms:
         return [None] * frames
     expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
     LOG.require(arrays, expected, where)
@@ -355,16 +327,16 @@ def _biases(arrays: StateArrays, version: int, where: str) -> list[BiasEffect | 
     frames = len(arrays["frame_index"])
     if version < WITH_EVERYTHING:
         return [None] * frames
-    LOG.require(arrays, of_rows(frames, _PER_TURN), where)
+    LOG.require(arrays, of_rows(frames, PER_TURN), where)
     known = ~np.isnan(arrays["gyroscope_jacobian"][:, 0, 0])
-    given = {name: arrays[name][known] for name in _PER_TURN}
+    given = {name: arrays[name][known] for name in PER_TURN}
     require_finite(LOG, given, tuple(given), where)
     name = "gyroscope_bias_covariance"
     require_covariances(LOG, name, given[name], where, definite=False)
     variances = given["gyroscope_stability"][:, :, None, None]
     require_covariances(LOG, "gyroscope_stability", variances[:, 0], where)
     require_covariances(LOG, "gyroscope_stability", variances[:, 1], where, definite=False)
-    rows = zip(*(arrays[name] for name in _PER_TURN), known, strict=True)
+    rows = zip(*(arrays[name] for name in PER_TURN), known, strict=True)
     return [
         BiasEffect(jacobian, float(start), float(walk), applied, left) if ok else None
         for jacobian, applied, left, (start, walk), ok in rows

@@ -7,32 +7,25 @@ by array, to the same bytes as from frames in memory.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 
 from fgslam.core.array_files import OFFSETS, Pieces, continued, write_arrays, write_pieces
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.files import clear_output_errors, make_subfolder
-from fgslam.core.log_arrays import (
-    CORRECTIONS,
-    LOG,
-    SENSOR_POSE,
-    WITH_EVERYTHING,
-    arrays_of,
-    frames_of,
-    version_of,
-)
+from fgslam.core.log_arrays import arrays_of, frames_of, version_of
+from fgslam.core.log_file import BLOCK, FramesOnDisk, LogFile
+from fgslam.core.log_layout import CORRECTIONS, LOG, SENSOR_POSE, WITH_EVERYTHING
 from fgslam.core.measurements import Increment, LoopClosure
 from fgslam.core.sensors import Sensor
 
-BLOCK = 256  # frames
 FILES = "[0-9]" * 6 + ".npz"
 
 
-class LogBlocks(Sequence[Increment]):
+class LogBlocks(FramesOnDisk):
     """Frames in order; only the last one or two blocks of them are in memory.
 
     A frame that is read back has what its file keeps: a loaded log's.
@@ -61,25 +54,18 @@ class LogBlocks(Sequence[Increment]):
         self._version, self._calibrated = version_of(()), False
         self._read: tuple[int, list[Increment]] = (-1, [])
         self._whole: Path | None = None
+        self._resting: LogFile | None = None
         self._remove()
 
     def __len__(self) -> int:
         return len(self._heads)
 
-    @overload
-    def __getitem__(self, at: int) -> Increment: ...
-    @overload
-    def __getitem__(self, at: slice) -> list[Increment]: ...
-    def __getitem__(self, at: int | slice) -> Increment | list[Increment]:
-        """A frame, or those of a slice.
-
-        Raises:
-            MeasurementLogError: a file is missing or damaged.
-        """
-        if isinstance(at, slice):
-            return [self[k] for k in range(*at.indices(len(self)))]
-        self._recall()
-        k = range(len(self))[at]
+    def _frame(self, k: int) -> Increment:
+        if self._whole is not None and not self._last:
+            self._resting = self._resting or LogFile.of(self._whole)
+            if self._resting is not None:
+                return self._resting[k]
+            self._recall()
         block, within = divmod(k, BLOCK)
         if block < len(self._blocks):
             return self._frames(block)[within]
@@ -143,7 +129,7 @@ class LogBlocks(Sequence[Increment]):
 
     def rest_in(self, path: Path) -> None:
         """Frames are read from the file that :meth:`save` wrote from now on; the blocks go."""
-        self._whole, self._read = path, (-1, [])
+        self._whole, self._resting, self._read = path, None, (-1, [])
         self._blocks, self._rows, self._last = [], [], []
         self._remove()
 
@@ -167,6 +153,7 @@ class LogBlocks(Sequence[Increment]):
         """All frames, once more in memory, where they rest in the file of the whole log."""
         if self._whole is not None and not self._last:
             self._last = frames_of(LOG.load(self._whole), str(self._whole))[2]
+            self._resting = None
 
     def _joined(self, name: str, last: np.ndarray[Any, Any]) -> Pieces:
         """One array of all frames, ``last`` being that of the last ones."""

@@ -6,7 +6,7 @@ One uncompressed ``.npz`` (:mod:`fgslam.core.log_arrays`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,15 +16,10 @@ import numpy as np
 from fgslam.core.array_files import write_arrays
 from fgslam.core.arrays import Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.log_arrays import (
-    LOG,
-    SENSOR_ARRAYS,
-    arrays_of,
-    frames_of,
-    sensor_of,
-    version_of,
-)
+from fgslam.core.log_arrays import SENSOR_ARRAYS, arrays_of, frames_of, sensor_of, version_of
 from fgslam.core.log_blocks import LogBlocks
+from fgslam.core.log_file import FramesOnDisk, LogFile
+from fgslam.core.log_layout import LOG
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.sensors import Sensor
 
@@ -42,7 +37,7 @@ class MeasurementLog(Brief):
 
     rig: Sensor
     motion_model: dict[str, Any]
-    increments: list[Increment] | LogBlocks = field(default_factory=list)
+    increments: list[Increment] | LogBlocks | LogFile = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.increments)
@@ -61,6 +56,8 @@ class MeasurementLog(Brief):
                 f"after {self.increments[-1].timestamp:.9f} s; sort the measurements by time"
             )
         increment = dataclasses.replace(increment, odometry=_without_stand_in(increment.odometry))
+        if isinstance(self.increments, LogFile):
+            self.increments = list(self.increments)
         self.increments.append(increment)
 
     def keep_in(self, folder: Path) -> None:
@@ -80,38 +77,40 @@ class MeasurementLog(Brief):
         if isinstance(self.increments, LogBlocks):
             self.increments.rest_in(path)
 
-    def continue_with(self, frames: Sequence[Increment]) -> None:
+    def continue_with(self, frames: Iterable[Increment]) -> None:
         """Makes these the frames so far: a loaded log's."""
-        on_disk = self.increments if isinstance(self.increments, LogBlocks) else None
-        self.increments = list(frames)
-        if on_disk is not None:
-            self.keep_in(on_disk.folder)
+        if isinstance(self.increments, LogBlocks):
+            self.increments = LogBlocks(self.rig, self.motion_model, self.increments.folder)
+            for increment in frames:
+                self.increments.append(increment)
+        else:
+            self.increments = list(frames)
 
     @property
     def timestamps(self) -> FloatArray:
         """(n,) seconds."""
-        if isinstance(self.increments, LogBlocks):
+        if isinstance(self.increments, FramesOnDisk):
             return self.increments.timestamps
         return np.array([s.timestamp for s in self], np.float64)
 
     @property
     def numbers(self) -> IntArray:
         """(n,) the frames' numbers in their recording."""
-        if isinstance(self.increments, LogBlocks):
+        if isinstance(self.increments, FramesOnDisk):
             return self.increments.numbers
         return np.array([s.index for s in self], np.int64)
 
     @property
     def relocalised(self) -> int:
         """How many frames were placed without a prior."""
-        if isinstance(self.increments, LogBlocks):
+        if isinstance(self.increments, FramesOnDisk):
             return self.increments.relocalised
         return sum(s.relocalised for s in self)
 
     @property
     def closures(self) -> list[tuple[int, LoopClosure]]:
         """All loop closures, with the position of the frame that offered each."""
-        if isinstance(self.increments, LogBlocks):
+        if isinstance(self.increments, FramesOnDisk):
             return self.increments.closures
         return [(k, loop) for k, step in enumerate(self) for loop in step.loops]
 
@@ -140,6 +139,20 @@ class MeasurementLog(Brief):
     def load_sensor(path: Path) -> Sensor:
         """What a log's file was measured with. Raises MeasurementLogError as :meth:`load` does."""
         return sensor_of(LOG.load(path, SENSOR_ARRAYS), str(path))
+
+    @staticmethod
+    def read_from(path: Path) -> MeasurementLog:
+        """A log whose frames are read as they are asked for, best in their order.
+
+        Of a long one some hundred are in memory at a time.
+
+        Raises:
+            MeasurementLogError: as of :meth:`load`; all frames are checked at once.
+        """
+        frames = LogFile.of(path)
+        if frames is None:
+            return MeasurementLog.load(path)
+        return MeasurementLog(frames.sensor, frames.motion_model, frames)
 
     @staticmethod
     def load(path: str | Path) -> MeasurementLog:

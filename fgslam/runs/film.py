@@ -45,7 +45,7 @@ def film_of_run(run: Path, out: Path, estimator: str | None, progress: Progress)
     require_film_suffix(out)
     folder = run / results_folder(run, estimator)
     trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
-    log = MeasurementLog.load(log_of(run))
+    log = MeasurementLog.read_from(log_of(run))
     if not isinstance(log.rig, CameraRig):
         raise DatasetError(f"{run}: its sensor has no images, so that there is nothing to film")
     if len(trajectory) < 2:
@@ -80,13 +80,14 @@ def _moments(
     """Pose, what is seen there, and the rows of the map that are known by then."""
     seen = np.zeros(len(points), np.bool_)
     last: Increment | None = None
+    began = log.timestamps[0] if len(log) else 0.0
     for increment, row in zip(log, pose_of.tolist(), strict=True):
         if row < 0:
             continue
         now = increment.kept
         seen |= np.isin(points.ids, now.ids)
         before, after = moved_pixels(last, increment)
-        title = f"{increment.timestamp - log.increments[0].timestamp:.1f} s: {len(after)} matched"
+        title = f"{increment.timestamp - began:.1f} s: {len(after)} matched"
         new = now.measurement[now.is_new, :2]
         yield (
             row,

@@ -293,8 +293,8 @@ class _Replaying:
     def result(self, estimator: Estimator | None, before_mb: float | None, failure: str) -> Replay:
         """The answer; of an estimator that cannot give one any more, its online poses."""
         start = time.perf_counter()
-        stamps = [increment.timestamp for increment in self._log.increments[: len(self._rows)]]
-        online = Trajectory(np.array(stamps), np.array(self._poses).reshape(-1, 4, 4))
+        stamps = self._log.timestamps[: len(self._rows)]
+        online = Trajectory(stamps, np.array(self._poses).reshape(-1, 4, 4))
         covariances = np.array(self._covariances).reshape(-1, 6, 6)
         final_ms = math.nan
         if estimator is not None and self._rows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -108,7 +109,7 @@ class RunRecorder:
         self.online_covariances = list(state["online_covariances"])
         self.stage_ms = list(state["stage_ms"])
         self.frame_digests = state["frame_digests"].tolist()
-        self.log.continue_with(log.increments[: len(self.rows)])
+        self.log.continue_with(itertools.islice(log, len(self.rows)))
 
 
 def _row(report: FrameReport, stereo_precision: float) -> FrameRow:

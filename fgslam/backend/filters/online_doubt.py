@@ -43,6 +43,7 @@ from fgslam.core.sensors import (
 _LEAST_MATCHES = 6  # of a frame; with fewer, its pose follows the one before
 _LEAST_DISPARITY_PX = 0.5  # farther points are known no better than their noise
 _LEAST_INFORMATION = 1e-9  # of the mean, in directions that the matches leave open
+_NONE = np.zeros((6, 6))
 
 
 class OnlineDoubt:
@@ -131,7 +132,7 @@ class OnlineDoubt:
     def of_pose(self) -> FloatArray:
         """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
         if self._covariance is None:
-            return np.zeros((6, 6))
+            return _NONE  # one for all frames: a smoother keeps what it is told of each
         return self._gain @ self._covariance @ self._gain.T
 
     def pose(self, newest: Prediction) -> Prediction:

@@ -7,6 +7,7 @@ the landmarks determined it. On a long drive all but the last frames can be in f
 from __future__ import annotations
 
 import dataclasses
+from array import array
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
@@ -14,11 +15,11 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.array_files import load_arrays, write_arrays
-from fgslam.core.arrays import FloatArray, GrowingColumns, StateArrays
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.files import make_subfolder
 from fgslam.core.log_arrays import frames_of
-from fgslam.core.log_blocks import BLOCK
+from fgslam.core.log_file import BLOCK
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.sensors import Sensor
@@ -36,12 +37,10 @@ class RecordedInputs:
         self._folder: Path | None = None
         self._blocks = 0
         self._last: list[Input] = []
-        self._heads = GrowingColumns(
-            timestamp=np.empty(0), wTc=np.empty((0, 4, 4)), covariance=np.empty((0, 6, 6))
-        )
+        self._timestamps = array("d")
 
     def __len__(self) -> int:
-        return len(self._heads)
+        return len(self._timestamps)
 
     def keep_in(self, folder: Path) -> None:
         """From now on only the last few hundred frames are in memory, the others in the folder.
@@ -61,12 +60,7 @@ class RecordedInputs:
             write_arrays(self._file(self._blocks), _arrays(self._sensor, self._last[:BLOCK]))
             self._blocks += 1
             del self._last[:BLOCK]
-        head = {
-            "timestamp": np.array(increment.timestamp),
-            "wTc": tracking.wTc,
-            "covariance": tracking.covariance,
-        }
-        self._heads.append({name: value[None] for name, value in head.items()})
+        self._timestamps.append(increment.timestamp)
         self._last.append((increment, tracking))
 
     def __iter__(self) -> Iterator[Input]:
@@ -77,15 +71,24 @@ class RecordedInputs:
 
     def timestamps(self) -> FloatArray:
         """(n,) seconds."""
-        return self._heads["timestamp"].copy()
+        return np.array(self._timestamps)
 
     def timestamp(self, frame: int) -> float:
         """A frame's, seconds."""
-        return float(self._heads["timestamp"][frame])
+        return self._timestamps[frame]
 
     def tracked(self, frame: int) -> Prediction:
-        """A frame's pose and covariance as tracked."""
-        return Prediction(self._heads["wTc"][frame], self._heads["covariance"][frame])
+        """A frame's pose and covariance as tracked.
+
+        Raises:
+            MeasurementLogError: the file that they are in is missing or damaged.
+        """
+        block, row = divmod(frame, BLOCK)
+        if block < self._blocks:
+            kept = load_arrays(self._file(block), ("wTc", "covariance"))
+            return Prediction(kept["wTc"][row], kept["covariance"][row])
+        tracking = self._last[frame - BLOCK * self._blocks][1]
+        return Prediction(tracking.wTc, tracking.covariance)
 
     def motions(self) -> list[Odometry | None]:
         """The step to each frame, as it was used."""

@@ -99,7 +99,7 @@ def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
         MeasurementLogError: one of the two files cannot be read.
     """
     state = load_arrays(folder / STATE_FILE)
-    log = MeasurementLog.load(folder / LOG_FILE)
+    log = MeasurementLog.read_from(folder / LOG_FILE)
     try:
         restore(state, log, pipeline, recorder)
     except (KeyError, ValueError, IndexError) as error:

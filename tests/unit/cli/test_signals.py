@@ -143,3 +143,23 @@ def test_an_error_that_a_library_makes_of_ctrl_c_is_an_interruption(module: str)
     code = _ANOTHER_ERROR.replace("sys.argv[1]", repr(module))
     status, said = ended(code, "run", "lab_loop")
     assert (status, said) == (130, "fgslam: interrupted\n")
+
+
+_WHILE_IT_CLEARS_UP = """
+import atexit, os, sys
+from fgslam.cli.start import main
+number = int(sys.argv.pop(1))
+main_ = main
+
+def run():
+    import threading
+    threading._register_atexit(os.kill, os.getpid(), number)
+    main_()
+
+run()
+"""
+
+
+@pytest.mark.parametrize("number", _SIGNALS)
+def test_a_signal_after_the_command_has_ended_changes_nothing(number: signal.Signals) -> None:
+    assert ended(_WHILE_IT_CLEARS_UP, int(number), "--version") == (0, "")
