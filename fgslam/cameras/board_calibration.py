@@ -38,6 +38,11 @@ _MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation 
 _TRIMMINGS = 4
 _LEAST_CORNERS = 6  # of an image, for its board's pose to follow with something left
 
+_UNDETERMINED = (
+    "the board's images do not determine the cameras: take more of them, tilted in different "
+    "directions, some in each corner of the image"
+)
+
 View = tuple[Corners | None, ...]
 """What the cameras see of the board at one moment, in their order; None where it was not found."""
 
@@ -209,16 +214,15 @@ def _fit(
 ) -> BoardCalibration:
     problem = _Problem(board, views, model)
     start = problem.start(size)
+    if not np.isfinite(start).all() or not np.isfinite(problem.residuals(start)).all():
+        raise CalibrationError(_UNDETERMINED)
     fit = least_squares(problem.residuals, start, problem.jacobian, method="lm", x_scale="jac")
     jacobian = problem.jacobian(fit.x)
     rows = len(fit.fun)
     scale = np.linalg.norm(jacobian, axis=0)
     information = (jacobian / scale).T @ (jacobian / scale)
-    if rows <= len(fit.x) or np.linalg.cond(information) > 1e14:
-        raise CalibrationError(
-            "the board's images do not determine the cameras: take more of them, tilted in "
-            "different directions, some in each corner of the image"
-        )
+    if rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
+        raise CalibrationError(_UNDETERMINED)
     variance = 2.0 * fit.cost / (rows - len(fit.x))
     sigmas = np.sqrt(variance * np.diag(np.linalg.inv(information))) / scale
     found = problem.result(size, fit.x, sigmas)

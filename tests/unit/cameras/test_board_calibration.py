@@ -147,6 +147,21 @@ def chessboard(columns: int, rows: int) -> np.ndarray:
     return np.pad(drawn, 40, constant_values=220.0).astype(np.uint8)
 
 
+@pytest.mark.parametrize("seed", [2, 6, 11])
+def test_boards_that_no_camera_saw_are_refused_in_one_line(seed: int) -> None:
+    """Corners at perspectives of which no two have the same focal length."""
+    rng = np.random.default_rng(seed)
+    flat = (BOARD.points[None, :, :2] * 1000.0 + 100.0).astype(np.float32)
+    edge = np.array([[0, 0], [400, 0], [400, 320], [0, 320]], np.float32)
+    views: list[View] = []
+    for _ in range(8):
+        there = edge + rng.uniform(-40.0, 40.0, (4, 2)).astype(np.float32)
+        pixels = cv2.perspectiveTransform(flat, cv2.getPerspectiveTransform(edge, there))
+        views.append((Corners(np.arange(len(BOARD.points)), pixels[0].astype(np.float64)),))
+    with pytest.raises(CalibrationError, match="do not determine the cameras: take more"):
+        calibrate(BOARD, views, SIZE, "radtan")
+
+
 def test_a_chessboard_is_found_and_another_size_is_named() -> None:
     image = chessboard(7, 5)
     found = find_corners(Board("chessboard", 7, 5, 0.02), image)
