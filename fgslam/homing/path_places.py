@@ -309,7 +309,12 @@ class PathPlaces:
         return far, far * float(np.cos(_across(answer) - across))
 
     def _vector(self, aim: _Aim) -> tuple[TwoViewVector | None, str]:
-        """The homing vector to the target, unless it contradicts those before it for once."""
+        """The homing vector to the target, unless it contradicts those before it for once.
+
+        At little parallax, or with a camera that is tilted, another direction may fit nearly as
+        well. Where earlier images tell which is right that does no harm; the first vector to a
+        target must be clear by itself, or be seen alike in several images.
+        """
         answer = self._localiser.answers.get(aim.target)
         if answer is None:
             return None, "not matched"
@@ -319,8 +324,11 @@ class PathPlaces:
         across = _across(answer)
         sigma = float(np.sqrt(answer.covariance[0, 0] + answer.covariance[1, 1]))
         limit = max(_CONTRADICTION, _SIGMAS * sigma)
-        if _away(across, aim.across) > limit and not self._confirmed(aim, across, limit):
-            return None, "contradicts the images before, needs others that agree"
+        first = not np.isfinite(aim.across)
+        open_ = answer.doubt > 1.0 - SURE if first else _away(across, aim.across) > limit
+        if open_ and not self._confirmed(aim, across, limit):
+            why = "fits another direction nearly as well" if first else "contradicts those before"
+            return None, f"{why}, needs other images that agree"
         aim.across, aim.agreeing = across, 0
         return answer, ""
 

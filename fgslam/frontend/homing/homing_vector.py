@@ -9,6 +9,7 @@ chance and no different solution comes near it.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtr
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import BearingMatches, Refusal, RefusalReason, TwoViewVector
@@ -35,6 +36,7 @@ _SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
 _TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
 _CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views count as one inlier
 _TURNED = 3.0  # times the median's limit: what is explained by the turn alone
+_SECTORS = 8  # of 45 degrees: what is seen in one has its errors in common, see `doubt`
 _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 
 
@@ -103,7 +105,10 @@ class HomingSearch:
         theta, psi = (float(v) for v in best.parameters[:2])
         support = max((self.independent_inliers(r.inliers) for r in competitors), default=0)
         floor = np.deg2rad([s.direction_floor_deg, s.rotation_floor_deg])
-        return TwoViewVector(theta, psi, covariance + np.diag(floor**2), best.inliers, support)
+        return TwoViewVector(
+            theta, psi, covariance + np.diag(floor**2), best.inliers, support,
+            self.doubt(best, competitors),
+        )  # fmt: skip
 
     # ----------------------------------------------------------------------------------------
     # Sampling
@@ -158,9 +163,13 @@ class HomingSearch:
 
     def _score(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
         """(c,) log-likelihoods of hypotheses, up to a constant, of (n, c) residuals."""
+        return np.asarray(np.sum(self._scores(inliers, residuals), axis=0))
+
+    def _scores(self, inliers: BoolArray, residuals: FloatArray) -> FloatArray:
+        """(n, c) what each match adds to the score of each hypothesis."""
         gains = gain(residuals, INLIER_SIGMAS, COMMON_CHANCE)
         odds = (self._right / (1.0 - self._right))[:, None]
-        return np.asarray(np.sum(np.where(inliers, np.log1p(odds * gains), 0.0), axis=0))
+        return np.where(inliers, np.log1p(odds * gains), 0.0)
 
     def different(self, most: int) -> FloatArray:
         """(c, 2) direction and rotation of the best supported, different hypotheses, best first."""
@@ -243,6 +252,27 @@ class HomingSearch:
             f"median parallax {np.rad2deg(parallax):.2f} deg: both views are from one place",
             psi,
         )
+
+    def doubt(self, best: Refined, competitors: list[Refined]) -> float:
+        """Largest probability that a different solution is the better one, at most 0.5.
+
+        Vuong's test (1989) of two models that both are wrong a little: what the matches add to the
+        lead of one solution over the other is summed by sectors of the present view, and the lead
+        is held against the scatter of these sums. Errors that are common to a sector, of a tilt or
+        a calibration, so count once, not once a match.
+        """
+        if not competitors:
+            return 0.0
+        every = [best, *competitors]
+        inliers = np.column_stack([r.inliers for r in every])
+        scores = self._scores(inliers, np.column_stack([r.residuals for r in every]))
+        part = np.mod(self._matches.bearing_a, 2.0 * np.pi) * (_SECTORS / (2.0 * np.pi))
+        within = np.minimum(part.astype(np.int64), _SECTORS - 1) == np.arange(_SECTORS)[:, None]
+        leads = within @ (scores[:, :1] - scores[:, 1:])
+        spread = np.sqrt(np.sum(leads**2, axis=0))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sigmas = np.where(spread > 0.0, np.sum(leads, axis=0) / spread, 0.0)
+        return float(np.max(ndtr(-np.maximum(sigmas, 0.0))))
 
     def _undecided(self, best: Refined, competitor: Refined) -> bool:
         return self._score_of(best) - self._score_of(competitor) < self._settings.rival_log_odds

@@ -49,12 +49,16 @@ class World:
     """What images show: told by numbers, in place of comparing their features.
 
     A stand-in for ``compare_views``: it knows images and path images by their identity.
+
+    Attributes:
+        direction, doubt: of all homing vectors.
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, some: OmniFeatures) -> None:
         self._some = some
         self.path = PathMemory.of([replace(self._some) for _ in ALONG[0]])
         self._seen: tuple[Sequence[int], Mapping[int, int]] = ((), {})
+        self.direction, self.doubt = 0.3, 0.0
         self._step = 0
         monkeypatch.setattr(path_places, "compare_views", self._compare)
 
@@ -82,7 +86,8 @@ class World:
             count = 0 if node is None else matched.get(node, 0)
             return Refusal(RefusalReason.TOO_FEW_INLIERS, "few"), matches_of(count)
         found = np.ones(common, np.bool_)
-        return TwoViewVector(0.3, 0.1, np.eye(2) * 1e-4, found, 0), matches_of(common)
+        vector = TwoViewVector(self.direction, 0.1, np.eye(2) * 1e-4, found, 0, self.doubt)
+        return vector, matches_of(common)
 
 
 @pytest.fixture(scope="module")
@@ -137,3 +142,17 @@ def test_on_the_route_matches_tell_the_place_between_homing_vectors(world: World
     assert world.look(places, [0] * 6, 200, matched=[12, 9, 15, 60, 14, 11]).nearest == 3
     assert world.look(places, [0] * 6, 200, matched=[12, 9, 15, 10, 60, 11]).nearest >= 3
     assert world.look(places, [0] * 6, 200, matched=[12, 9, 15, 10, 60, 11]).nearest == 4
+
+
+def test_the_first_direction_to_a_path_image_must_be_clear_or_be_seen_again(world: World) -> None:
+    """Another one fits nearly as well; what agrees with clear ones before is taken at once."""
+    clear, open_ = PathPlaces(world.path, DRIVING), PathPlaces(world.path, DRIVING)
+    assert world.look(clear, ALONG[3], 0).vector is not None
+    world.doubt = 0.3
+    assert world.look(clear, ALONG[3], 200).vector is not None
+    given = []
+    for direction in (0.3, 2.0, 2.0, 2.0, 2.0):
+        world.direction = direction
+        place = world.look(open_, ALONG[3], 200)
+        given.append(place.vector is not None)
+    assert given == [False, False, False, True, True]

@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import BearingMatches, LocalMap, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.homing_vector import _cells, estimate_homing_vector
-from fgslam.frontend.homing.refinement import HomingRefinement
+from fgslam.frontend.homing.homing_vector import HomingSearch, _cells, estimate_homing_vector
+from fgslam.frontend.homing.refinement import HomingRefinement, Refined
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import (
     EpipolarTest,
@@ -88,6 +88,23 @@ def test_tilted_cameras_are_estimated() -> None:
             found.append(np.pi if isinstance(vector, Refusal) else abs(error(views, vector)[0]))
     assert np.rad2deg(np.median(free)) < 0.5
     assert np.median(free) < 0.3 * np.median(level)
+
+
+def test_a_lead_in_one_sector_leaves_doubt_and_the_same_lead_all_around_does_not() -> None:
+    """Eight equal matches fewer for the other solution: 8 of 1 sigma each, or one of 8."""
+    bearing = np.repeat(np.deg2rad(22.5 + 45.0 * np.arange(8)), 8)
+    angles = np.column_stack([bearing, np.full(64, 0.2)] * 2)
+    search = HomingSearch(make_matches(angles, HALF_DEGREE), SETTINGS, np.random.default_rng(0))
+
+    def solution(lost: list[int]) -> Refined:
+        return Refined(np.zeros(7), np.eye(7), np.zeros(64), ~np.isin(np.arange(64), lost))
+
+    best = solution([])
+    everywhere, at_one_side = solution([*range(0, 64, 8)]), solution([*range(8)])
+    assert search.doubt(best, [everywhere]) == pytest.approx(norm.sf(np.sqrt(8.0)))
+    assert search.doubt(best, [everywhere, at_one_side]) == pytest.approx(norm.sf(1.0))
+    assert search.doubt(best, [solution([])]) == 0.5
+    assert search.doubt(best, []) == 0.0
 
 
 def test_random_matches_are_refused() -> None:
