@@ -126,7 +126,7 @@ class LandmarkKalman:
         used = matched.select(tracking.inliers)
         nis, dof = self._update_matched(used)
         self._grow(increment.missed_ids)
-        self._add(increment.observations.select(increment.observations.is_new))
+        self._add(increment.observations.select(increment.observations.is_new), len(self._past))
         self._record(increment, tracking, before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
@@ -142,8 +142,7 @@ class LandmarkKalman:
     @property
     def homes(self) -> IntArray:
         """(n,) frame with which each landmark of the map moves; -1 for one that stays."""
-        # One that a smoother started anew was seen in the last frame, which was over by then.
-        return np.minimum(self._rows.homes, len(self._past) - 1)
+        return self._rows.homes
 
     @property
     def chain(self) -> Chain:
@@ -202,10 +201,10 @@ class LandmarkKalman:
         self._rows.positions[self._rows.rows(ids)] = positions
 
     def restart(self, observed: Observations) -> None:
-        """Starts known landmarks anew from one observation each: they have moved."""
+        """Starts known landmarks anew from one observation each in the last frame: they moved."""
         if len(observed):
             self._rows.remove(observed.ids)
-            self._add(observed)
+            self._add(observed, len(self._past) - 1)
 
     def recalibrate(self, correction: FloatArray) -> RigChange | None:
         """Moves the landmarks of this drive where the change of the correction contradicts them.
@@ -220,9 +219,7 @@ class LandmarkKalman:
         if not (early and before.size and len(known) and isinstance(self._rig, CameraRig)):
             return None
         change = RigChange(self._rig, correction - before)
-        # One that a smoother started anew was seen in the last frame, which was over by then.
-        lasts = np.minimum(self._rows.lasts[known], len(self._past) - 1)
-        poses = np.array([*self._past.poses[:-1], self._current.wTc])[lasts]
+        poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
         moved, off_px = change.moved(poses, self._rows.positions[known])
         if not off_px > _CONTRADICTED * self._disparity_sigma:
             return None
@@ -389,9 +386,9 @@ class LandmarkKalman:
             rows = self._rows.rows(ids)
             self._rows.covariances[rows] += _MISS_GROWTH_M**2 * np.eye(3)
 
-    def _add(self, observed: Observations) -> None:
+    def _add(self, observed: Observations, frame: int) -> None:
         """Adds new landmarks (type IV) where this frame sees them."""
         if not len(observed):
             return
         positions, covariances = self._observed_positions(observed)
-        self._rows.add(observed.ids, positions, covariances, len(self._past))
+        self._rows.add(observed.ids, positions, covariances, frame)

@@ -69,15 +69,18 @@ def test_landmarks_move_with_the_frame_that_first_saw_them() -> None:
     assert aside.moved(poses) is aside
 
 
-def test_a_landmark_just_started_anew_is_at_home_in_the_last_frame() -> None:
-    """As a smoother's tracker starts one that has moved, after the frame."""
-    simulation = simulate(Drive(frames=4), np.random.default_rng(1))
+def test_a_landmark_started_anew_is_at_home_in_the_last_frame() -> None:
+    """As a smoother's tracker starts one that has moved, after the frame; and it stays so."""
+    simulation = simulate(Drive(frames=6), np.random.default_rng(1))
     estimator = make_estimator(RIG, LandmarkKalmanSettings())
     assert isinstance(estimator, LandmarkKalman)
-    play(estimator, simulation.increments, EgoMotionSettings())
-    moved = simulation.increments[-1].observations
+    play(estimator, simulation.increments[:4], EgoMotionSettings())
+    moved = simulation.increments[3].observations
     estimator.restart(moved)
     aside = estimator.held_aside(moved.ids)
     np.testing.assert_array_equal(aside.homes, 3)
+    np.testing.assert_array_equal(aside.lasts, 3)
     np.testing.assert_array_equal(aside.frames, [3])
-    assert estimator.homes.max() == 3
+    play(estimator, simulation.increments[4:], EgoMotionSettings())
+    left = np.intersect1d(moved.ids, estimator.landmarks().ids)
+    np.testing.assert_array_equal(estimator.held_aside(left).homes, 3)
