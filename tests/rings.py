@@ -10,7 +10,7 @@ from simulated import RIG, FeatureWorld, assert_same_bits
 
 from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.estimates import Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Odometry
@@ -74,6 +74,12 @@ class RingMotion(OdometryMotion):
         pass
 
     def regained(self, timestamp: float, wTc: FloatArray) -> None:
+        pass
+
+    def state(self) -> StateArrays:
+        return {}
+
+    def restore(self, state: StateArrays) -> None:
         pass
 
 

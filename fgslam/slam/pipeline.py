@@ -88,7 +88,8 @@ class SlamPipeline:
             those of its reference image alone: patches tell the rest.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
-        rewound: the last frame's features could not be found, and it left no trace.
+        rewound: the last frame's features could not be found, and it left no trace; but what a
+            closure before it ended has ended, and sub-maps that came back are in memory.
     """
 
     stereo: StereoMatcher
@@ -161,11 +162,21 @@ class SlamPipeline:
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
 
     def estimate(self) -> Estimate:
-        """The estimator's, with the landmarks that are on disk."""
+        """The estimator's, with the landmarks that are on disk, without those that have ended."""
         found = self.estimator.estimate()
-        if self.submaps is None:
-            return found
-        return dataclasses.replace(found, landmarks=self.submaps.whole().landmarks)
+        if self.submaps is not None:
+            return dataclasses.replace(found, landmarks=self.submaps.whole().landmarks)
+        if len(self._ended):
+            return dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
+        return found
+
+    def state(self) -> StateArrays:
+        """What the loop itself keeps between frames."""
+        return {"ended": self._ended}
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`; the parts have states of their own."""
+        self._ended = state["ended"]
 
     @property
     def book(self) -> LandmarkBook:

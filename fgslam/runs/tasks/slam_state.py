@@ -43,6 +43,7 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         "estimator": _resumable(pipeline.estimator).state(),
         "motion": _resumable(pipeline.motion).state(),
         "parts": pipeline.tracker.parts.state(),
+        "pipeline": pipeline.state(),
         "recorder": recorder.state(),
     }
     if pipeline.places is not None:
@@ -72,6 +73,7 @@ def restore(
     _resumable(pipeline.estimator).restore(_part(state, "estimator"))
     _resumable(pipeline.motion).restore(_part(state, "motion"))
     pipeline.tracker.parts.restore(_part(state, "parts"))
+    pipeline.restore(_part(state, "pipeline"))
     recorder.restore(_part(state, "recorder"), log)
     if pipeline.places is not None:
         pipeline.places.restore(_part(state, "places"), recorder.log)

@@ -387,11 +387,12 @@ class SubMaps:
         return submap.geometry.moved(poses).landmarks
 
     def _pieces(self) -> Iterator[tuple[LandmarkMap, SubMap]]:
-        """What is in memory, then each sub-map."""
+        """What is in memory and has not ended, then each sub-map."""
         parts = self._parts
-        ids = parts.estimator.landmarks().ids.copy()
-        active = SubMap(parts.estimator.held_aside(ids), parts.database.held_aside(ids))
-        yield parts.estimator.estimate().landmarks, active
+        landmarks = parts.estimator.estimate().landmarks
+        landmarks = landmarks.select(np.isin(landmarks.ids, parts.database.ids))
+        ids = landmarks.ids
+        yield landmarks, SubMap(parts.estimator.held_aside(ids), parts.database.held_aside(ids))
         for number in self._stored:
             submap = self._read(number)
             yield parts.estimator.reported(submap.geometry), submap
