@@ -139,8 +139,7 @@ def make_estimator(
         case LandmarkKalmanSettings():
             from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 
-            floor = Floor.under(rig, ego_motion.dof)
-            estimator = LandmarkKalman(rig, settings, prior, floor)
+            estimator = LandmarkKalman(rig, settings, prior, ego_motion)
         case LandmarkKalmanGraphSettings():
             from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
 

@@ -2,12 +2,14 @@
 
 Se, Lowe and Little (2001), Sections 4.1 (averaging) and 6.4 (Kalman filters). The pose is that of
 the least squares against the landmarks (3.3). Correlations between landmarks, and between
-landmarks and pose, are dropped: that is what makes the filter cheap, and overconfident.
+landmarks and pose, are dropped: that is what makes the filter cheap, and its own covariances far
+too small. It goes on with them, and reports those of its errors
+(:mod:`fgslam.backend.filters.sampled_errors`).
 
 Past poses are revised by loop closures alone (backward correction by submaps): the
 drive and the landmarks, each with the frame that it was made in, move to where a pose graph has
-them. The covariances of poses and landmarks stay what they are in this filter: how well a pose is
-known beside the map around it, and how well a landmark beside the poses that saw it.
+them. The filter's own covariances stay: how well a pose is known beside the map around it, and how
+well a landmark beside the poses that saw it.
 """
 
 from __future__ import annotations
@@ -28,17 +30,15 @@ from fgslam.backend.filters.loop_correction import (
     rotated,
     transported,
 )
-from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.filters.sampled_errors import Moved, SampledErrors, Step, shares
 from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.backend.filters.set_aside import SetAside
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
-from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
-    block_diagonal,
     congruence,
     inverse,
     inverse_spd3,
@@ -50,6 +50,8 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 _CONTRADICTED = 2.0
 """Sigmas of a measured disparity by which landmarks are off, rms, where a change of the rig's
@@ -68,7 +70,7 @@ class LandmarkKalman:
         rig: Sensor,
         settings: LandmarkKalmanSettings,
         prior: Prediction,
-        floor: Floor | None = None,
+        ego_motion: EgoMotionSettings | None = None,
     ) -> None:
         """Starts at the prior pose with an empty map.
 
@@ -76,7 +78,8 @@ class LandmarkKalman:
             rig: the cameras, or the range-bearing sensor.
             settings: which update, and its noise.
             prior: pose of the first frame and its covariance.
-            floor: to which the ego-motion keeps; None: to none.
+            ego_motion: of the least squares that finds the poses, for the covariances reported;
+                None reports the filter's own, as a smoother's tracker may.
         """
         self._rig = rig
         self._settings = settings
@@ -85,7 +88,8 @@ class LandmarkKalman:
         self._past = FilteredTrajectory()
         self._rows = LandmarkRows()
         self._drive = DriveRecord()
-        self._doubt = OnlineDoubt(rig, floor or Floor.under(rig, 6))
+        solver = EgoMotionSolver(rig, ego_motion or EgoMotionSettings())
+        self._errors = SampledErrors(solver, off=ego_motion is None)
         self._fixed = False
         self._applied = np.empty(0)  # correction of the rig in the last frame
         self._disparity_sigma = np.inf  # of a measurement of the last frame that had any, pixels
@@ -101,7 +105,7 @@ class LandmarkKalman:
         self._rows.load(landmarks, hits, unseen, unseen)
         self._fixed = fixed
         if fixed:
-            self._doubt.hold_map()
+            self._errors.hold_map()
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
@@ -119,23 +123,25 @@ class LandmarkKalman:
         """
         self._past.require_later(increment)
         recalibrated(self, increment.rig_correction)
-        before, self._current = self._current, Prediction(tracking.wTc, tracking.covariance)
+        step = self._step(increment, tracking)
+        self._current = Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)
         self._by_pose = tracking.covariance if shared else None
         matched = increment.observations.select(~increment.observations.is_new)
         used = matched.select(tracking.inliers)
+        self._errors.track(step, used, self._rows.map())
         nis, dof = self._update_matched(used)
         self._grow(increment.missed_ids)
         self._add(increment.observations.select(increment.observations.is_new), len(self._past))
-        self._record(increment, tracking, before, used.ids)
+        self._record(increment, tracking, step.before, used.ids)
         self._rows.remove(increment.pruned_ids)
+        self._errors.forget(increment.pruned_ids)
         self._past.append(increment.timestamp, self._current)
         if len(increment.observations):
             variances = increment.observations.covariance[:, 2, 2]
             self._disparity_sigma = float(np.sqrt(np.median(variances)))
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
-        self._doubt.observe(increment, self._current.wTc)
-        current = self._doubt.pose(self._current)
+        current = self._errors.pose(self._current)
         self._past.covariances[-1] = current.covariance
         return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof, closed)
 
@@ -162,7 +168,6 @@ class LandmarkKalman:
         rows = self._rows.rows(ids)
         homes = self.homes[rows]
         frames = np.unique(homes[homes >= 0])
-        gain, information = self._doubt.held_aside(ids)
         return SetAside(
             landmarks=self._rows.map().select(rows),
             counts=self._rows.counts[rows],
@@ -171,25 +176,25 @@ class LandmarkKalman:
             frames=frames,
             timestamps=np.array(self._past.timestamps)[frames],
             poses=self.poses_of(frames),
-            doubt_gain=gain,
-            doubt_information=information,
+            doubt_gain=self._errors.held_aside(ids),
+            doubt_information=np.zeros((len(ids), 3, 3)),
         )
 
     def give_up(self, ids: IntArray) -> None:
         """Forgets landmarks that somebody else holds now."""
         self._rows.remove(ids)
-        self._doubt.forget(ids)
+        self._errors.forget(ids)
 
     def take_back(self, aside: SetAside) -> None:
         """Landmarks come back, moved by what closures have corrected their homes since."""
         now = aside.moved(self.poses_of(aside.frames))
         self._rows.bring(now.landmarks, now.counts, now.homes, now.lasts)
-        self._doubt.take_back(now.landmarks.ids, now.doubt_gain, now.doubt_information)
+        self._errors.take_back(now.landmarks.ids, now.doubt_gain)
 
     def reported(self, aside: SetAside) -> LandmarkMap:
-        """Landmarks where closures have put them by now, with what the rig's doubt adds."""
+        """Landmarks where closures have put them by now, with the covariances reported."""
         now = aside.moved(self.poses_of(aside.frames))
-        return self._doubt.added(now.landmarks, now.doubt_gain)
+        return self._errors.reported(now.landmarks, now.doubt_gain)
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
         """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.
@@ -204,6 +209,7 @@ class LandmarkKalman:
         """Starts known landmarks anew from one observation each in the last frame: they moved."""
         if len(observed):
             self._rows.remove(observed.ids)
+            self._errors.forget(observed.ids)
             self._add(observed, len(self._past) - 1)
 
     def recalibrate(self, correction: FloatArray) -> RigChange | None:
@@ -233,19 +239,19 @@ class LandmarkKalman:
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
-            self._doubt.landmarks(held),
+            self._errors.landmarks(held),
             tuple(self._drive.remarks),
             noise_factor=1.0,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of the named landmarks."""
-        return self._doubt.landmarks(self._rows.map().select(self._rows.rows(ids))).covariances
+        return self._errors.landmarks(self._rows.map().select(self._rows.rows(ids))).covariances
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Pose and landmarks as the filter sees them: independent (6.4) but for the rig's doubt."""
-        own = self._rows.covariances[self._rows.rows(ids)]
-        return self._doubt.joint(ids, block_diagonal(self._current.covariance, own))
+        """Pose and landmarks, as reported; those that stay as they are are independent."""
+        known = self._errors.landmarks(self._rows.map().select(self._rows.rows(ids)))
+        return self._errors.joint(self._errors.pose(self._current).covariance, known)
 
     def state(self) -> StateArrays:
         """Everything needed to continue; a snapshot, which later updates leave alone."""
@@ -257,7 +263,7 @@ class LandmarkKalman:
             "rig_correction": self._applied,
             "disparity_sigma": np.array(self._disparity_sigma),
         }
-        return self._past.state() | current | held | self._drive.state() | self._doubt.state()
+        return self._past.state() | current | held | self._drive.state() | self._errors.state()
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
@@ -268,13 +274,20 @@ class LandmarkKalman:
         self._applied = state["rig_correction"]
         self._disparity_sigma = float(state["disparity_sigma"])
         self._drive.restore(state)
-        self._doubt.restore(state)
+        self._errors.restore(state)
 
     # ----------------------------------------------------------------------------------------
 
     def _arrays(self) -> tuple[IntArray | FloatArray, ...]:
         rows = self._rows
         return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes, rows.lasts
+
+    def _step(self, increment: Increment, tracking: EgoMotion) -> Step:
+        """The step to a frame, before it is taken."""
+        frame, before = len(self._past), self._current
+        if not frame:
+            before = Prediction(before.wTc, np.zeros((6, 6)))
+        return Step(frame, increment, tracking, before, self.predict(increment.odometry))
 
     def _record(
         self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray
@@ -298,7 +311,9 @@ class LandmarkKalman:
         by_landmark = home_changes(self._rows.homes, moved_by)
         self._rows.positions[:] = transported(by_landmark, self._rows.positions)
         self._rows.covariances[:] = rotated(by_landmark, self._rows.covariances)
-        self._doubt.turn(self._rows.ids, by_landmark[:, :3, :3])
+        taken = shares(self._drive.chain, loop)
+        moved = Moved(by_landmark[:, :3, :3], self._rows.homes, taken)
+        self._errors.close(loop, self._rows.map(), poses[-1], moved)
         return True
 
     def _update_matched(self, observed: Observations) -> tuple[float, int]:
@@ -317,6 +332,7 @@ class LandmarkKalman:
         if self._fixed:
             self._rows.positions[rows], self._rows.covariances[rows] = before
         else:
+            self._errors.filter(self._share(rows, before[1]))
             self._rows.counts[rows] += 1
         return nis, 3 * len(rows)
 
@@ -365,15 +381,27 @@ class LandmarkKalman:
         before = self._rows.positions[rows]
         innovation = positions - before
         precision = inverse_spd3(self._rows.covariances[rows] + noise)
-        if self._settings.update == "half":
-            weight = np.full((len(rows), 1), 0.5)
-        else:
-            weight = 1.0 / (self._rows.counts[rows, None] + 1.0)
+        weight = self._weight(rows)
         self._rows.positions[rows] = before + weight * innovation
         squared = (weight**2)[:, :, None]
         kept = ((1.0 - weight) ** 2)[:, :, None]
         self._rows.covariances[rows] = kept * self._rows.covariances[rows] + squared * noise
         return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
+
+    def _weight(self, rows: IntArray) -> FloatArray:
+        """(k, 1) of a sighting in the averages of 4.1."""
+        if self._settings.update == "half":
+            return np.full((len(rows), 1), 0.5)
+        return np.asarray(1.0 / (self._rows.counts[rows, None] + 1.0))
+
+    def _share(self, rows: IntArray, before: FloatArray) -> FloatArray:
+        """(k, 3, 3) of the way to where the frame has them that landmarks have moved.
+
+        Of a Kalman filter's K H, from the covariances (k, 3, 3) before and after: (I - K H) S.
+        """
+        if self._settings.update in ("running_mean", "half"):
+            return self._weight(rows)[:, :, None] * np.eye(3)
+        return np.asarray(np.eye(3) - self._rows.covariances[rows] @ inverse_spd3(before))
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """World positions (k, 3) of single observations, and covariances (k, 3, 3)."""
@@ -392,3 +420,5 @@ class LandmarkKalman:
             return
         positions, covariances = self._observed_positions(observed)
         self._rows.add(observed.ids, positions, covariances, frame)
+        placed = PoseProblem(positions, covariances, observed.measurement, observed.covariance)
+        self._errors.add(observed.ids, placed, self._current.wTc)

@@ -314,7 +314,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
             update=settings.update,
             pose_covariance=settings.pose_covariance,
         )
-        super().__init__(rig, closed_form, prior, Floor.under(rig, ego_motion.dof))
+        super().__init__(rig, closed_form, prior, ego_motion)
         self._pose_graph = FixedMapPose(rig, ego_motion)
         self._cameras = rig
 

@@ -122,7 +122,7 @@ class Chain:
         if not self.constraints:
             return 0.0
         poses = np.array(self.poses)
-        errors = _as_motions_of_the_world(poses, np.array(self.steps))
+        errors = as_motions_of_the_world(poses, np.array(self.steps))
         return _minimum(poses, errors, self.constraints, SUBMAP_FRAMES)[1]
 
     def solve(self, constraints: list[Constraint]) -> tuple[FloatArray, float]:
@@ -132,7 +132,7 @@ class Chain:
     def steps_between(self, frames: IntArray) -> FloatArray:
         """(m, 6, 6) covariances of the steps to some frames, ascending, from the one before."""
         poses = np.array(self.poses)
-        errors = _as_motions_of_the_world(poses, np.array(self.steps))
+        errors = as_motions_of_the_world(poses, np.array(self.steps))
         sums = [errors[a + 1 : b + 1].sum(axis=0) for a, b in itertools.pairwise([-1, *frames])]
         return congruence(adjoint(_inverses(poses[frames])), np.array(sums))
 
@@ -183,7 +183,7 @@ def corrected(
         Poses (n, 4, 4), and the cost: squared residuals, each in its own deviations, of all
         changes together.
     """
-    errors = _as_motions_of_the_world(poses, steps)
+    errors = as_motions_of_the_world(poses, steps)
     at, cost = _minimum(poses, errors, constraints, every)
     out = poses.copy()
     for a, b in itertools.pairwise(sorted(at)):
@@ -278,7 +278,7 @@ def _beginnings(count: int, constraints: list[Constraint], every: int) -> list[i
     return sorted({*range(0, count, every), count - 1, *ends})
 
 
-def _as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray:
+def as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray:
     """Covariances (n, 6, 6) of each step's error as a motion of the world.
 
     The error ``xi`` of the step to pose T moves all that follows by ``Ad(T) xi``: to first order

@@ -13,12 +13,12 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, StateArrays
+from fgslam.backend.filters.error_columns import ErrorColumns
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
-    congruence,
     inverse,
     projection_jacobian,
     skew,
@@ -46,7 +46,34 @@ _LEAST_INFORMATION = 1e-9  # of the mean, in directions that the matches leave o
 _NONE = np.zeros((6, 6))
 
 
-class OnlineDoubt:
+class RigTerms:
+    """The terms in SHARED of a rig that calibrates itself: unknown, with a covariance.
+
+    Of a rig that is exact, or that is taken as stated, there are none.
+    """
+
+    def __init__(self, sensor: Sensor) -> None:
+        """``sensor``: that measures; only a rig of cameras is ever in doubt."""
+        self.rig = sensor if isinstance(sensor, CameraRig) and not sensor.exact else None
+        self.applied: FloatArray = np.empty(0)
+        """Correction of the rig, as last heard."""
+        self.covariance: FloatArray | None = None
+        """(q, q) of the terms; None: no doubt."""
+
+    def hear(self, correction: FloatArray | None) -> None:
+        """Of the correction that a frame's measurements contain; it changes seldom."""
+        if self.rig is None or correction is None or np.array_equal(correction, self.applied):
+            return
+        self.applied = correction
+        none = RigCorrection.none(self.rig)
+        self.covariance = shared_covariance(dataclasses.replace(none, values=correction))
+
+    def restore(self, applied: FloatArray) -> None:
+        """Continues from what was last applied."""
+        self.hear(applied if applied.size else None)
+
+
+class OnlineDoubt(ErrorColumns):
     """Derivatives of the newest pose and of the landmarks by the terms in SHARED.
 
     Of a rig that is exact, or that is taken as stated, there is no doubt: nothing is added.
@@ -56,38 +83,31 @@ class OnlineDoubt:
         """The first pose is known, the map empty.
 
         Args:
-            sensor: that measures; only a rig of cameras is ever in doubt.
+            sensor: that measures.
             floor: a hard one leaves the pose these directions alone.
         """
-        self._rig = sensor if isinstance(sensor, CameraRig) and not sensor.exact else None
+        # By landmark: derivative in world axes, information given the poses.
+        super().__init__(len(SHARED), information=np.empty((0, 3, 3)))
+        self._terms = RigTerms(sensor)
         self._floor = floor
-        self._applied: FloatArray = np.empty(0)  # correction of the rig, as last heard
-        self._covariance: FloatArray | None = None  # (q, q) of the terms; None: no doubt
         self._wTc: FloatArray | None = None
-        self._gain = np.zeros((6, len(SHARED)))
-        self._held = False
-        # By landmark: identity, derivative in world axes, information given the poses.
-        self._map = GrowingColumns(
-            ids=np.empty(0, np.int64),
-            gain=np.empty((0, 3, len(SHARED))),
-            information=np.empty((0, 3, 3)),
-        )
 
     @property
     def present(self) -> bool:
         """Whether there is any doubt."""
-        return self._covariance is not None
+        return self._terms.covariance is not None
 
     def observe(self, increment: Increment, wTc: FloatArray) -> None:
         """Takes in a frame: its accepted measurements and its pose as estimated."""
-        self._hear(increment.rig_correction)
-        if self._rig is None or self._covariance is None:
+        self._terms.hear(increment.rig_correction)
+        rig = self._terms.rig
+        if rig is None or not self.present:
             return
         if self._wTc is not None:
             self._gain = adjoint(inverse(inverse(self._wTc) @ wTc)) @ self._gain
         seen = increment.observations.select(~increment.rejected)
         near = seen.measurement[:, 2] > _LEAST_DISPARITY_PX
-        look = _Look(self._rig, seen.select(near), wTc)
+        look = _Look(rig, seen.select(near), wTc)
         rows, known = self._rows(look.ids)
         if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
             basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
@@ -97,107 +117,57 @@ class OnlineDoubt:
         self.forget(increment.pruned_ids)
         self._wTc = wTc
 
-    def hold_map(self) -> None:
-        """The map is a saved one that nothing changes: it is as well known as it was then."""
-        self._held = True
-
-    def forget(self, ids: IntArray) -> None:
-        """Landmarks that somebody else holds now, or nobody."""
-        self._map.drop(np.isin(self._map["ids"], ids))
-
     def held_aside(self, ids: IntArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives (k, 3, q) of landmarks and information (k, 3, 3); zero of unknown ones."""
-        gain, information = np.zeros((len(ids), 3, len(SHARED))), np.zeros((len(ids), 3, 3))
-        rows, known = self._rows(ids)
-        gain[known], information[known] = self._at(rows[known])
-        return gain, information
+        return self._of("gain", ids), self._of("information", ids)
 
     def take_back(self, ids: IntArray, gain: FloatArray, information: FloatArray) -> None:
         """Landmarks come back with what :meth:`held_aside` gave of them."""
         known = np.any(information, axis=(1, 2))
-        if known.any():
-            before = len(self._map)
-            back = {"ids": ids[known], "gain": gain[known], "information": information[known]}
-            self._map.append(back)
-            self._map.keep_ascending("ids", before)
-
-    def turn(self, ids: IntArray, rotations: FloatArray) -> None:
-        """A closure has turned landmarks, each by its rotation (k, 3, 3)."""
-        rows, known = self._rows(ids)
-        by, rows = rotations[known], rows[known]
-        gain, information = self._at(rows)
-        self._map["gain"][rows] = by @ gain
-        self._map["information"][rows] = congruence(by, information)
+        self._append({"ids": ids[known], "gain": gain[known], "information": information[known]})
 
     def of_pose(self) -> FloatArray:
         """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
-        if self._covariance is None:
+        if self._terms.covariance is None:
             return _NONE  # one for all frames: a smoother keeps what it is told of each
-        return self._gain @ self._covariance @ self._gain.T
+        return self._gain @ self._terms.covariance @ self._gain.T
 
     def pose(self, newest: Prediction) -> Prediction:
         """The newest pose with what the doubt adds to its covariance."""
-        if self._covariance is None:
+        if not self.present:
             return newest
         return Prediction(newest.wTc, newest.covariance + self.of_pose())
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with what the doubt adds to their covariances."""
-        return known if self._covariance is None else self.added(known, self._gains(known.ids))
+        return self.added(known, self._of("gain", known.ids)) if self.present else known
 
     def added(self, known: LandmarkMap, gain: FloatArray) -> LandmarkMap:
         """The same of landmarks with these derivatives (k, 3, q), which may have been forgotten."""
-        if self._covariance is None or self._held:
+        covariance = self._terms.covariance
+        if covariance is None or self._held:
             return known
-        more = gain @ self._covariance @ np.swapaxes(gain, 1, 2)
+        more = gain @ covariance @ np.swapaxes(gain, 1, 2)
         return dataclasses.replace(known, covariances=known.covariances + more)
 
     def joint(self, ids: IntArray, covariance: FloatArray) -> FloatArray:
         """A joint covariance (6 + 3k, 6 + 3k) of newest pose and landmarks with what it adds."""
-        if self._covariance is None:
+        terms = self._terms.covariance
+        if terms is None:
             return covariance
-        gain = np.concatenate([self._gain, self._gains(ids).reshape(-1, len(SHARED))])
-        return np.asarray(covariance + gain @ self._covariance @ gain.T)
-
-    def state(self) -> StateArrays:
-        """Everything needed to continue."""
-        pose = np.empty((0, 4, 4)) if self._wTc is None else self._wTc[None]
-        own = {"applied": self._applied, "pose": pose, "pose_gain": self._gain}
-        return {f"doubt_{name}": array for name, array in (own | self._map.state()).items()}
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        applied = state["doubt_applied"]
-        self._hear(applied if applied.size else None)
-        self._wTc = next(iter(state["doubt_pose"]), None)
-        self._gain = state["doubt_pose_gain"]
-        self._map.restore({name: state[f"doubt_{name}"] for name in ("ids", "gain", "information")})
+        gain = np.concatenate([self._gain, self._of_map(ids).reshape(-1, len(SHARED))])
+        return np.asarray(covariance + gain @ terms @ gain.T)
 
     # ----------------------------------------------------------------------------------------
 
-    def _hear(self, correction: FloatArray | None) -> None:
-        """Of the correction that a frame's measurements contain; it changes seldom."""
-        if self._rig is None or correction is None or np.array_equal(correction, self._applied):
-            return
-        self._applied = correction
-        none = RigCorrection.none(self._rig)
-        self._covariance = shared_covariance(dataclasses.replace(none, values=correction))
+    def _state(self) -> StateArrays:
+        pose = np.empty((0, 4, 4)) if self._wTc is None else self._wTc[None]
+        return {"applied": self._terms.applied, "pose": pose, **super()._state()}
 
-    def _gains(self, ids: IntArray) -> FloatArray:
-        """(k, 3, q) of landmarks; zero of those too far away to be known, or of a map held."""
-        gain = np.zeros((len(ids), 3, len(SHARED)))
-        if not self._held:
-            rows, known = self._rows(ids)
-            gain[known] = self._map["gain"][rows[known]]
-        return gain
-
-    def _rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
-        """(k,) rows of landmarks in the map, and which of them are there."""
-        have = self._map["ids"]
-        if not len(have):
-            return np.zeros(len(ids), np.int64), np.zeros(len(ids), np.bool_)
-        rows = np.minimum(np.searchsorted(have, ids), len(have) - 1)
-        return rows, np.asarray(have[rows] == ids)
+    def _restore(self, state: StateArrays) -> None:
+        self._terms.restore(state["applied"])
+        self._wTc = next(iter(state["pose"]), None)
+        super()._restore(state)
 
     def _at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         return self._map["gain"][rows], self._map["information"][rows]
@@ -212,13 +182,9 @@ class OnlineDoubt:
 
     def _add(self, look: _Look) -> None:
         """Landmarks where their first measurement has them; identities ascend."""
-        if not len(look.ids):
-            return
-        gain = np.linalg.solve(look.by_point, look.off(self._gain))
-        new = {"ids": look.ids, "gain": gain, "information": look.landmarks()[1]}
-        before = len(self._map)
-        self._map.append(new)
-        self._map.keep_ascending("ids", before)
+        if len(look.ids):
+            gain = np.linalg.solve(look.by_point, look.off(self._gain))
+            self._append({"ids": look.ids, "gain": gain, "information": look.landmarks()[1]})
 
 
 class _Look:

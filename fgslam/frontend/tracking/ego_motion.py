@@ -130,6 +130,30 @@ class EgoMotionSolver:
         found = self._finish(prediction, problem, minimum, inliers, iterations)
         return dataclasses.replace(found, weighted_at=weighted_at)
 
+    def gain(
+        self, wTc: FloatArray, prediction: Prediction, problem: PoseProblem
+    ) -> tuple[FloatArray, FloatArray]:
+        """How the solution follows what it is found from, to first order.
+
+        Args:
+            wTc: (4, 4) the solution.
+            prediction: that it was stabilised towards.
+            problem: the inliers.
+
+        Returns:
+            Derivatives of the pose's tangent vector by the prediction's (6, 6), and by the
+            measurements (k, 6, 3): ``(sum J^T W J + P^-1)^-1`` times ``P^-1`` and ``J^T W``.
+        """
+        points = transform_to_camera(wTc, problem.points)
+        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
+        pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem)
+        known = np.zeros((6, 6))
+        if self._settings.prior:
+            known = _prior_information(prediction.covariance)
+        hessian = (pull @ jacobian).sum(axis=0) + known
+        covariance = self._covariance(wTc, hessian)
+        return covariance @ known, covariance @ pull
+
     # ----------------------------------------------------------------------------------------
 
     def _minimise(

@@ -359,7 +359,7 @@ def test_sigmas_of_landmarks_set_aside_hold_their_errors() -> None:
             dataclasses.replace(displaced(each, terms), rig_correction=UNCORRECTED)
             for each in drive.increments
         ]
-        estimator = LandmarkKalman(CALIBRATED.rig, LandmarkKalmanSettings(), FIRST, NO_FLOOR)
+        estimator = LandmarkKalman(CALIBRATED.rig, LandmarkKalmanSettings(), FIRST, FREE)
         found, gone = played_with_some_set_aside(estimator, increments)
         found = found.select(found.rows(gone))
         off = drive.points_by_id[gone] - found.positions

@@ -6,9 +6,10 @@ import itertools
 
 import numpy as np
 import pytest
-from simulated import assert_same_bits
+from simulated import assert_same_bits, observations
 
 from fgslam.backend.filters.loop_correction import (
+    CLOSURE_FACTOR,
     FREE,
     Chain,
     Constraint,
@@ -20,14 +21,17 @@ from fgslam.backend.filters.loop_correction import (
     rotated,
     transported,
 )
+from fgslam.backend.filters.sampled_errors import shares
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
+from fgslam.core.measurements import LoopClosure
 
 COUNT = 41
 STEP = g.se3_exp(np.array([0.0, 2.0 * np.pi / 40, 0.0, 0.0, 0.0, 0.3]))
 """Forty of them are a round."""
 SIGMA = np.array([1e-3, 4e-3, 1e-3, 5e-3, 5e-3, 1e-2])
 TIGHT = 1e-8 * np.eye(6)
+NOBODY = observations(np.empty(0, np.int64), np.empty((0, 3)), np.ones(3), np.empty(0, np.bool_))
 
 
 def chained(steps: list[FloatArray]) -> FloatArray:
@@ -108,6 +112,25 @@ def test_the_cost_of_true_loops_is_chi_square(rng: np.random.Generator) -> None:
     """With six degrees of freedom: the drift's covariance is the steps' sum."""
     costs = [corrected(drifted(rng, 0.2), 0.04 * uncertain(), [home()])[1] for _ in range(60)]
     assert 6.0 - 4.0 * np.sqrt(12.0 / 60.0) < np.mean(costs) < 6.0 + 4.0 * np.sqrt(12.0 / 60.0)
+
+
+def test_frames_take_the_share_of_a_closure_that_the_whole_solution_gives(
+    rng: np.random.Generator,
+) -> None:
+    """As a motion of the world, to first order; what is before the loop's earlier end stays."""
+    poses, steps = drifted(rng), uncertain()
+    chain = Chain(list(poses), list(steps))
+    covariance = np.diag(SIGMA**2)
+    off = g.se3_exp(1e-4 * rng.standard_normal(6))
+    motion = g.inverse(poses[7]) @ poses[-1] @ off
+    loop = Constraint(7, COUNT - 1, motion, CLOSURE_FACTOR**2 * covariance)
+    found, _ = corrected(poses, steps, [loop], every=1)
+    moved = np.array([g.se3_log(each) for each in changes(poses, found)])
+    whole = g.se3_log(poses[7] @ motion @ g.inverse(poses[-1]))
+    closed = LoopClosure(7, motion, covariance, NOBODY, np.empty((0, 2), np.int64))
+    taken = shares(chain, closed)
+    np.testing.assert_allclose(taken @ whole, moved, rtol=0.0, atol=1e-2 * np.abs(moved).max())
+    assert np.abs(moved[:8]).max() < 1e-9 < np.abs(moved[8:]).max()
 
 
 def test_corrected_drive_has_no_jumps(rng: np.random.Generator) -> None:

@@ -39,9 +39,10 @@ def faulty(monkeypatch: pytest.MonkeyPatch, **methods: Any) -> None:
     """Estimators of the kind, with some of their methods replaced."""
     kind = type("Faulty", (LandmarkKalman,), methods)
 
-    def make(rig: Any, settings: Any, dof: Any, prior: Any) -> Any:
+    def make(rig: Any, settings: Any, ego_motion: Any, prior: Any) -> Any:
         assert prior is None  # no saved map here
-        return kind(rig, settings, factory.Prediction(np.eye(4), np.zeros((6, 6))))
+        start = factory.Prediction(np.eye(4), np.zeros((6, 6)))
+        return kind(rig, settings, start, ego_motion)
 
     monkeypatch.setattr(module, "made_or_given", make)
 

@@ -1,0 +1,170 @@
+"""Covariances that the per-landmark filter reports, against its errors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+from simulated import RIG, Simulation, play
+from smoothing import FREE, drawn
+
+from fgslam.backend.filters import sampled_errors
+from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.sampled_errors import SAMPLES, SampledErrors
+from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction
+from fgslam.core.measurements import Increment
+from fgslam.evaluation.consistency import landmark_nees, nees, pose_errors, pose_nees, within
+from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.frontend.tracking.ego_motion import PoseProblem
+
+FIRST = Prediction(np.eye(4), np.zeros((6, 6)))
+UPDATES = ("pixel", "world", "running_mean", "half")
+
+
+def played(
+    increments: list[Increment], ego_motion: EgoMotionSettings | None = FREE, **settings: object
+) -> LandmarkKalman:
+    """The filter after a drive; with ``ego_motion`` None it reports its own covariances."""
+    estimator = LandmarkKalman(RIG, LandmarkKalmanSettings(**settings), FIRST, ego_motion)
+    play(estimator, increments, FREE)
+    return estimator
+
+
+def per_dof(drives: list[Simulation], ego_motion: EgoMotionSettings | None) -> FloatArray:
+    """NEES per degree of freedom of the last poses and of the landmarks, and 2 sigma coverage."""
+    poses, landmarks, inside = [], [], []
+    for drive in drives:
+        found = played(drive.increments, ego_motion).estimate()
+        at = found.trajectory.poses, found.covariances
+        poses.append(pose_nees(at[0][-1:], at[1][-1:], drive.poses[-1:]))
+        truth = drive.points_by_id[found.landmarks.ids]
+        landmarks.append(
+            landmark_nees(found.landmarks.positions, found.landmarks.covariances, truth)
+        )
+        inside.append(within(pose_errors(at[0][1:], drive.poses[1:]), at[1][1:]))
+    means = [
+        sum(n.values.sum() for n in of) / sum(n.dof.sum() for n in of) for of in (poses, landmarks)
+    ]
+    return np.array([*means, np.mean(inside)])
+
+
+def test_reported_covariances_are_those_of_the_errors_and_the_filters_own_are_not() -> None:
+    """Three drives; in the slow test fifty, with the band of chi-square."""
+    drives = [drawn(seed, frames=30) for seed in range(3)]
+    pose, landmark, inside = per_dof(drives, FREE)
+    assert 0.4 < pose < 1.9
+    assert 0.5 < landmark < 1.6
+    assert inside > 0.9
+    own = per_dof(drives, None)
+    assert own[0] > 2.5
+    assert own[1] > 2.0
+    assert own[2] < inside
+
+
+@pytest.mark.slow
+def test_fifty_drives_are_within_the_band_of_chi_square() -> None:
+    pose, landmark, inside = per_dof([drawn(seed) for seed in range(50)], FREE)
+    low, high = stats.chi2.ppf([0.025, 0.975], 6 * 50) / (6 * 50)
+    assert low < pose < high
+    # Landmarks of one drive share its errors: 50 drives, not 50 times 60 landmarks.
+    assert 0.85 < landmark < 1.15
+    assert 0.93 < inside < 0.98
+
+
+def pattern(measurement: FloatArray) -> FloatArray:
+    """(k, 3) an error in pixels that differs from place to place of the image."""
+    return np.stack(
+        [
+            np.sin(0.05 * measurement[:, 1]),
+            np.cos(0.03 * measurement[:, 0]),
+            np.sin(0.07 * measurement[:, 0] + 1.0),
+        ],
+        axis=1,
+    )
+
+
+def with_pattern(increment: Increment, size: float) -> Increment:
+    seen = increment.observations
+    moved = seen.measurement + size * pattern(seen.measurement)
+    return dataclasses.replace(increment, observations=dataclasses.replace(seen, measurement=moved))
+
+
+@pytest.mark.parametrize("update", UPDATES)
+def test_a_column_is_what_the_filter_makes_of_an_error(
+    update: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All samples are one known error of all measurements, none of the odometry."""
+    original = SampledErrors._sights
+
+    def known(self: SampledErrors, wTc: FloatArray, seen: PoseProblem) -> sampled_errors.Sights:
+        sights = original(self, wTc, seen)
+        sights.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
+        return sights
+
+    monkeypatch.setattr(SampledErrors, "_sights", known)
+    monkeypatch.setattr(sampled_errors, "_root", lambda covariance: np.zeros((6, 6)))
+    increments = drawn(2, noise=0.0).increments
+    size = 1e-4
+    plain = played(increments, update=update)
+    moved = played([with_pattern(each, size) for each in increments], update=update)
+    step = g.se3_log(g.inverse(plain._current.wTc) @ moved._current.wTc) / size
+    column = plain._errors._gain[:, -1]
+    np.testing.assert_allclose(column, step, rtol=0.0, atol=1e-2 * np.abs(step).max())
+    before, after = plain.landmarks(), moved.landmarks()
+    shift = (after.positions - before.positions) / size
+    columns = plain._errors._of("gain", before.ids)[:, :, -1]
+    np.testing.assert_allclose(columns, shift, rtol=0.0, atol=1e-2 * np.abs(shift).max())
+
+
+def test_covariances_of_few_samples_are_stated_larger_so_that_the_nees_is_right(
+    rng: np.random.Generator,
+) -> None:
+    errors = SampledErrors(
+        LandmarkKalman(RIG, LandmarkKalmanSettings(), FIRST, FREE)._errors._solver
+    )
+    found = []
+    for _ in range(400):
+        columns = np.zeros((6, errors._gain.shape[1]))
+        columns[:, -SAMPLES:] = rng.standard_normal((6, SAMPLES))
+        error = rng.standard_normal((1, 6))
+        found.append(nees(error, errors._covariances(columns, 6)[None]).values[0])
+    assert np.mean(found) / 6.0 == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_frame_that_nothing_places_is_as_uncertain_as_its_odometry() -> None:
+    """Blind frames: the covariance grows by the noise of each step."""
+    increments = drawn(1).increments
+    blind = [
+        dataclasses.replace(
+            each,
+            observations=each.observations.select(np.zeros(len(each.observations), np.bool_)),
+            rejected=np.empty(0, np.bool_),
+            missed_ids=np.empty(0, np.int64),
+            pruned_ids=np.empty(0, np.int64),
+        )
+        for each in increments[8:]
+    ]
+    estimator = played(increments[:8] + blind)
+    said = estimator.estimate().covariances
+    known = said[7]
+    for each, covariance in zip(blind, said[8:], strict=True):
+        assert each.odometry is not None
+        known = g.compose_covariance(each.odometry.motion, known, each.odometry.covariance)
+        ratio = np.diagonal(covariance) / np.diagonal(known)
+        assert (ratio > 0.5).all()
+        assert (ratio < 2.0).all()
+
+
+@pytest.mark.parametrize("update", ["pixel", "half"])
+def test_estimates_do_not_depend_on_what_is_reported(update: str) -> None:
+    increments = drawn(4).increments
+    sampled, own = played(increments, update=update), played(increments, None, update=update)
+    poses = [one.estimate().trajectory.poses for one in (sampled, own)]
+    np.testing.assert_array_equal(*poses)
+    np.testing.assert_array_equal(sampled.landmarks().positions, own.landmarks().positions)
+    np.testing.assert_array_equal(sampled.landmarks().covariances, own.landmarks().covariances)
