@@ -16,6 +16,7 @@ import numpy as np
 
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.errors import EstimatorError, OutputError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.files import make_subfolder
 from fgslam.core.log_arrays import frames_of
@@ -25,7 +26,7 @@ from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.sensors import Sensor
 
 Input: TypeAlias = tuple[Increment, EgoMotion]
-_ON_DISK = "blocks"
+_ON_DISK, _NUMBER = "blocks", "block"
 
 
 class RecordedInputs:
@@ -57,14 +58,15 @@ class RecordedInputs:
         """
         if self._folder is not None and len(self._last) >= 2 * BLOCK:
             make_subfolder(self._folder.parent, self._folder.name)
-            write_arrays(self._file(self._blocks), _arrays(self._sensor, self._last[:BLOCK]))
+            arrays = _arrays(self._sensor, self._last[:BLOCK])
+            write_arrays(self._file(self._blocks), arrays | {_NUMBER: np.array(self._blocks)})
             self._blocks += 1
             del self._last[:BLOCK]
         self._timestamps.append(increment.timestamp)
         self._last.append((increment, tracking))
 
     def __iter__(self) -> Iterator[Input]:
-        """Raises MeasurementLogError for a block that is missing or damaged."""
+        """Raises OutputError for a block that is missing, MeasurementLogError for a damaged one."""
         for block in range(self._blocks):
             yield from self._read(block)
         yield from self._last
@@ -103,7 +105,9 @@ class RecordedInputs:
         """Everything that :meth:`state` told of, in order, to be put in once more.
 
         Raises:
-            MeasurementLogError: a file is missing or damaged.
+            EstimatorError: its folder has not been named.
+            OutputError: a file is missing or another's.
+            MeasurementLogError: one is damaged.
         """
         blocks = int(state.get(_ON_DISK, 0))
         for block in range(blocks):
@@ -112,12 +116,22 @@ class RecordedInputs:
 
     def _file(self, block: int) -> Path:
         if self._folder is None:
-            raise ValueError("the state was kept in files; name their folder first")
+            raise EstimatorError(
+                "a part of the smoother's state is in files; name their folder with "
+                "keep_record_in before restore"
+            )
         return self._folder / f"{block:06d}.npz"
 
     def _read(self, block: int) -> list[Input]:
         path = self._file(block)
-        return _inputs(load_arrays(path), str(path), block * BLOCK)
+        arrays = load_arrays(path) if path.is_file() else {}
+        if int(arrays.get(_NUMBER, -1)) != block:
+            what = "holds other frames than its name says" if arrays else "is missing"
+            raise OutputError(
+                f"{path}: this file of the run {what}; restore the file, or start again with "
+                "--overwrite"
+            )
+        return _inputs(arrays, str(path), block * BLOCK)
 
 
 def _arrays(sensor: Sensor, inputs: Sequence[Input]) -> StateArrays:

@@ -226,6 +226,8 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Solves; where poses were tracked by the fewer matches, weighs these by what they err now.
 
     Not where only key frames are variables, whose tracks were judged in all frames.
+    The observations alone are weighed anew: guessed steps and the translations of a gyroscope's
+    keep the noise of the way, and which landmarks lie behind a camera is not asked again.
     """
     found = _solved(builder, values, minimise)
     if builder.noise.spread < _BEYOND or len(builder.frames) <= builder.frames[-1]:
