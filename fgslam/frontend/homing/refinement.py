@@ -4,7 +4,8 @@ The planar constraint supposes level cameras at one height. Real ones tilt by a 
 ("estimate or inflate"), which bends elevations alike over whole sides of the view; so each
 view's roll and pitch and the difference of heights are estimated along with theta and psi, held by
 a prior. The residual is the epipolar one with general rotations, a weighted first-order (Sampson)
-distance.
+distance, minimised with its noise's own slope: held, the noise that residual and derivative share
+would pull towards what explains less (Kanatani 1996).
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _SEARCH = GaussNewton(
     longest=0.3,  # radians, legs
     damping=1e-3,  # of the information: a handful of inliers may leave a direction open
 )
+_LEAST_VARIANCE = 1e-24  # of a residual; a ray along the leg fits any of them
+_LEAST_SHARE = 0.1  # of the information that is no noise; less leaves a direction open
 _LEAST_SIGMA = 1e-6  # of a parameter that is not to be estimated; less spoils the conditioning
 
 
@@ -52,6 +55,25 @@ class Refined:
     covariance: FloatArray
     residuals: FloatArray
     inliers: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linearised:
+    """All matches (n) seen from parameters (c, 7).
+
+    Attributes:
+        residuals: (c, n) normalised.
+        jacobian: (c, 7, n) their derivatives, sigma held.
+        derivatives: (c, 7, 9) of E.
+        noise: (c, 4, n) the residual's deviation by each of the four angles, not normalised.
+        variance: (c, n) the sum of their squares.
+    """
+
+    residuals: FloatArray
+    jacobian: FloatArray
+    derivatives: FloatArray
+    noise: FloatArray
+    variance: FloatArray
 
 
 def spread_over(near: list[Refined], scores: FloatArray, temper: float) -> FloatArray:
@@ -116,11 +138,12 @@ class HomingRefinement:
     def _normal(self, parameters: FloatArray, iteration: int) -> Linearised:
         """Information (c, 7, 7) and gradient (c, 7) at parameters (c, 7)."""
         widened = _WIDENED[iteration] if iteration < len(_WIDENED) else 1.0
-        residuals, jacobian = self._linearised(parameters)
-        weights = self._weights(parameters, residuals, widened)
-        gradient = (jacobian @ (weights * residuals)[:, :, None])[:, :, 0]
+        view = self._linearised(parameters)
+        weights = self._weights(parameters, view.residuals, widened)
+        slope = view.jacobian - view.residuals[:, None] * self._noise_slope(view)
+        gradient = (slope @ (weights * view.residuals)[:, :, None])[:, :, 0]
         gradient += self._prior * parameters
-        return self._information(jacobian, weights), gradient
+        return self._information(view.jacobian, weights), gradient
 
     def _information(self, jacobian: FloatArray, weights: FloatArray) -> FloatArray:
         """(c, 7, 7) of Jacobians (c, 7, n) and weights (c, n), with the prior's."""
@@ -128,16 +151,16 @@ class HomingRefinement:
         return np.asarray(weighted @ jacobian.transpose(0, 2, 1) + np.diag(self._prior))
 
     def _finished(self, parameters: FloatArray) -> list[Refined]:
-        residuals, jacobian = self._linearised(parameters)
+        view = self._linearised(parameters)
+        residuals = view.residuals
         inliers = self._inliers(parameters, residuals)
-        information = self._information(jacobian, self._weights(parameters, residuals))
-        covariances = np.linalg.pinv(information, hermitian=True)
-        return [
-            Refined(p, covariance * max(1.0, _scatter(r[kept])) ** 2, r, kept)
-            for p, covariance, r, kept in zip(
-                parameters, covariances, residuals, inliers, strict=True
-            )
-        ]
+        weights = _told(self._weights(parameters, residuals), residuals)
+        scatter = np.array([_scatter(r[kept]) for r, kept in zip(residuals, inliers, strict=True)])
+        variance = scatter[:, None, None] ** 2
+        noise = self._noise_information(view, weights) * variance
+        covariances = _sandwich(self._information(view.jacobian, weights), noise)
+        covariances *= np.maximum(variance, 1.0)
+        return list(map(Refined, parameters, covariances, residuals, inliers))
 
     def _weights(
         self, parameters: FloatArray, residuals: FloatArray, widened: float = 1.0
@@ -155,16 +178,58 @@ class HomingRefinement:
         ahead = in_front(self._bearings, theta, psi, self._least_parallax).T
         return np.asarray((np.abs(residuals) < widened * self._sigmas) & ahead)
 
-    def _linearised(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(c, n) normalised residuals, their (c, 7, n) Jacobians, noise held at the estimate."""
+    def _linearised(self, parameters: FloatArray) -> _Linearised:
+        """All matches at parameters (c, 7)."""
         essential, derivatives = _essential(parameters)
         count = len(parameters)
-        flat = essential.reshape(count, 9)
-        residual = flat @ self._outer.T
-        by = (derivatives.reshape(-1, 9) @ self._outer.T).reshape(count, 7, -1)
+        flat, by_each = essential.reshape(count, 9), derivatives.reshape(count, 7, 9)
         noise = (flat @ self._noisy.T).reshape(count, 4, -1)
-        sigma = np.sqrt(np.maximum(np.einsum("ckn,ckn->cn", noise, noise), 1e-24))
-        return residual / sigma, by / sigma[:, None]
+        variance = np.maximum(np.einsum("ckn,ckn->cn", noise, noise), _LEAST_VARIANCE)
+        sigma = np.sqrt(variance)
+        residuals = flat @ self._outer.T / sigma
+        jacobian = by_each @ self._outer.T / sigma[:, None]
+        return _Linearised(residuals, jacobian, by_each, noise, variance)
+
+    def _noise_slope(self, view: _Linearised) -> FloatArray:
+        """(c, 7, n) derivatives of ln sigma of the residuals."""
+        carried = np.einsum("ckn,kne->cen", view.noise, self._noisy.reshape(4, -1, 9))
+        return np.asarray(view.derivatives @ carried / view.variance[:, None])
+
+    def _noise_information(self, view: _Linearised, weights: FloatArray) -> FloatArray:
+        """(c, 7, 7) what noise alone adds to the information: derivatives are of noisy rays.
+
+        Noise in line with the residual moves it, and not its derivatives.
+        """
+        count = len(weights)
+        by = (view.derivatives @ self._noisy.T).reshape(count, 7, 4, -1)
+        along = np.einsum("ckn,cpkn->cpn", view.noise, by) / view.variance[:, None]
+        by -= along[:, :, None] * view.noise[:, None]
+        by *= np.sqrt(weights / view.variance)[:, None, None]
+        flat = by.reshape(count, 7, -1)
+        return np.asarray(flat @ flat.transpose(0, 2, 1))
+
+
+def _told(weights: FloatArray, residuals: FloatArray) -> FloatArray:
+    """(c, n) information of matches over that of right ones, by how likely they are right.
+
+    Less what is missing as that is not known (Louis 1982).
+    """
+    return np.asarray(np.maximum(weights * (1.0 - (1.0 - weights) * residuals**2), 0.0))
+
+
+def _sandwich(information: FloatArray, noise: FloatArray) -> FloatArray:
+    """Covariances (c, 7, 7) of estimates whose information (c, 7, 7) is partly noise.
+
+    The score's covariance is the information, its slope what is left of it without the noise:
+    slope^-1 information slope^-1 (Godambe).
+    """
+    values, vectors = np.linalg.eigh(information)
+    root = vectors * np.sqrt(np.maximum(values, _LEAST_VARIANCE))[:, None] ** -1.0
+    inverse = root @ vectors.transpose(0, 2, 1)
+    shares, axes = np.linalg.eigh(inverse @ noise @ inverse)
+    left = np.maximum(1.0 - shares, _LEAST_SHARE)
+    carried = inverse @ (axes / left[:, None])
+    return np.asarray(carried @ carried.transpose(0, 2, 1))
 
 
 def _scatter(residuals: FloatArray) -> float:

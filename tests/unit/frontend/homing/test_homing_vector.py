@@ -10,7 +10,7 @@ from scipy.stats import chi2, norm
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import BearingMatches, LocalMap, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import wrap
+from fgslam.core.planar import bearings, wrap
 from fgslam.frontend.homing.homing_vector import HomingSearch, _cells, estimate_homing_vector
 from fgslam.frontend.homing.refinement import HomingRefinement, Refined
 from fgslam.frontend.homing.settings import HomingVectorSettings
@@ -267,3 +267,40 @@ def test_rays_that_diverge_are_not_triangulable() -> None:
     )
     made = make_local_map(backwards, views.matches)
     assert not np.any(triangulable(made, 0.3))
+
+
+def corridor(seed: int, leg_m: float, sigma: float) -> TwoViews:
+    """Matches of points on the walls of a corridor 2.4 m wide, all right; along it."""
+    rng = np.random.default_rng(seed)
+    count, rotation = 120, float(rng.uniform(-np.pi, np.pi))
+    points = np.column_stack([rng.uniform(-12.0, 12.0, count), rng.choice([-1.2, 1.2], count)])
+    height = rng.uniform(-1.3, 1.2, count)
+    poses = (np.zeros(3), np.array([leg_m, 0.1 * leg_m, rotation]))
+    angles = np.column_stack(
+        [
+            by
+            for pose in poses
+            for by in (
+                bearings(pose, points),
+                np.arctan2(height, np.hypot(*(points - pose[:2]).T)),
+            )
+        ]
+    )
+    angles += rng.normal(0.0, sigma, angles.shape)
+    direction = float(np.arctan2(0.1, 1.0))
+    right = np.ones(count, np.bool_)
+    return TwoViews(make_matches(angles, sigma), direction, rotation, leg_m, points, right)
+
+
+@pytest.mark.parametrize("leg_m", [1.2, 2.0])
+def test_links_along_a_corridor_are_as_uncertain_as_they_say(leg_m: float) -> None:
+    """Error over sigma, rms; on short legs much of the derivatives is noise, too."""
+    settings = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0)
+    scaled = []
+    for seed in range(60):
+        truth = corridor(seed, leg_m, np.deg2rad(0.5))
+        found = answer(truth, settings)
+        assert isinstance(found, TwoViewVector)
+        scaled.append(error(truth, found) / np.sqrt(np.diag(found.covariance)))
+    rms = np.sqrt(np.mean(np.square(scaled), axis=0))
+    assert np.all((rms >= 0.8) & (rms <= 1.2))
