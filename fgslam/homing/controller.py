@@ -165,12 +165,22 @@ class HomingController:
         if isinstance(answer, Sighting):
             if homing.contradicts(answer.vector):
                 return self._seen_elsewhere(homing, answer, time)
-            self._recognised = True
+            self._recognised = self._surely_near(homing, answer)
+            if arrival and not self._recognised:
+                return self._doubt(time, "target may not be so near", answer.vector)
         elif answer.reason is RefusalReason.AT_TARGET:
             return self._end(time, HomingState.ARRIVED, answer.details)
         elif arrival:
             return self._doubt(time, f"target not seen where it is believed: {answer.details}")
         return None
+
+    def _surely_near(self, homing: ActiveHoming, seen: Sighting) -> bool:
+        """Whether an estimate that says so is near the target; that of the leg's start is.
+
+        Later ones took the place of one that failed, with its distance or where its tracks ended.
+        """
+        begun = self._begun or homing.start
+        return homing.start is begun or surely_left(begun, seen) <= _NEAR_FRACTION
 
     def _seen_elsewhere(self, homing: ActiveHoming, seen: Sighting, time: float) -> Command:
         """The target is seen in another direction than estimated: reached, passed, or an error.
@@ -280,7 +290,7 @@ class HomingController:
         self._heading = homing.start.vector.direction
         self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
         self._pending = self._standing_since = None
-        self._ambiguous = False
+        self._ambiguous = self._recognised = False  # it was another estimate that was seen right
         self._blind_until = self._search_until = -np.inf
         self.initialisations += 1
         return self._drive(homing, time, why)

@@ -594,6 +594,25 @@ def test_target_that_is_surely_passed_only_by_few_features_is_no_arrival() -> No
     assert command.remaining == 1.0
 
 
+@pytest.mark.parametrize(("common", "state"), [(20, "arrived"), (4, "confirm")])
+def test_arrival_of_an_estimate_matched_anew_is_confirmed_by_common_features(
+    common: int, state: str
+) -> None:
+    """Its unit is that of an estimate that was given up: few common features confirm nothing."""
+    b = bench(vector_to(0.0), vector_to(0.0))
+    b.step()
+    b.at(0.6)
+    b.step()
+    b.front_end.tracks = 9
+    b.step(SETTINGS.retry_s)
+    assert b.controller.initialisations == 2
+    b.front_end.tracks = 20
+    seen = sighting_of(vector_to(0.0), 0.05)
+    b.front_end.looks = [Sighting(seen.vector, seen.matches.select(np.arange(common)))]
+    b.at(0.9)
+    assert b.step().state.value == state
+
+
 def test_what_is_left_is_bounded_by_common_features() -> None:
     """Exact without wrong matches; with some at least as much; 1 where too few are common."""
     begun = start_at(0.0, vector_to(0.0))
