@@ -43,6 +43,7 @@ class TrackedFrame:
         motion: from the frame before; None for the first.
         accepted: observations that fit.
         turn: what the bias of a gyroscope does to the motion.
+        located: (6, 6) covariance with which it was found in the map without a prior; else None.
     """
 
     frame: int
@@ -50,6 +51,7 @@ class TrackedFrame:
     motion: Odometry | None
     accepted: Observations
     turn: Turn | None = None
+    located: FloatArray | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -337,6 +339,9 @@ class GraphBuilder:
             raise ValueError(f"frame {new.frame}: no motion from the frame before")
         else:
             self._add_step(new, tracked.motion, tracked.turn)
+            if tracked.located is not None and not self._remember:
+                # The map that it was found in has left the lag: nothing else holds it there.
+                self._push(new, pose_prior(key, Prediction(tracked.wTc, tracked.located)))
         for factor in floor_factors(key, self._floor, tracked.wTc):
             self._push(new, factor)
 

@@ -15,11 +15,14 @@ import numpy as np
 from fgslam.backend.filters.filtered import placed
 from fgslam.backend.filters.set_aside import SetAside
 from fgslam.backend.smoothers.admission import Track
+from fgslam.backend.smoothers.graph_builder import TrackedFrame
 from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
 from fgslam.backend.smoothers.solver import GraphSolver
 from fgslam.backend.smoothers.tracks_aside import arrays_of, tracks_of
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
-from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction
+from fgslam.core.geometry import adjoint, congruence, inverse
+from fgslam.core.measurements import Increment
 
 
 class LagSolver(GraphSolver, Protocol):
@@ -119,6 +122,28 @@ class LagSmoother(Smoother):
         super().restore(state)
         if "away" in state:
             self.give_up(state["away"])
+
+    def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
+        """The frame; one that was found without a prior is where the map has it."""
+        tracked = super()._admitted(increment, tracking)
+        if not increment.relocalised:
+            return tracked
+        return dataclasses.replace(tracked, located=self._located(increment, tracking))
+
+    def _located(self, increment: Increment, tracking: EgoMotion) -> FloatArray:
+        """(6, 6) of a pose in a map that has left: as tracked, and as the map is known itself.
+
+        Its landmarks are as uncertain as the pose of the frame that began them, in the middle.
+        """
+        observed = increment.observations
+        matched = observed.ids[~observed.is_new][tracking.inliers]
+        known = self._tracker.landmarks()
+        homes = self._tracker.homes[known.rows(matched[np.isin(matched, known.ids)])]
+        if not len(homes):
+            return tracking.covariance
+        home = self._lag.pose(int(np.sort(homes)[len(homes) // 2]))
+        there = adjoint(inverse(tracking.wTc) @ home.wTc)
+        return tracking.covariance + congruence(there, home.covariance)
 
     def _left(self, track: Track) -> tuple[FloatArray, FloatArray]:
         """Place and covariance with which a landmark left, or as its last sighting has it."""
