@@ -271,3 +271,16 @@ def test_restored_smoother_continues_to_the_bit(at: int) -> None:
     held = [i for i, track in second._builder.admission.tracks.items() if track.variable >= 0][:2]
     ids = np.array(held)
     assert_same_bits(second.joint_covariance(ids), straight.joint_covariance(ids))
+
+
+def test_a_frame_located_without_a_prior_is_as_sure_as_the_map_around_it() -> None:
+    """After so long in the dark that nothing it sees is within the lag."""
+    increments = blackout(drawn(3, frames=13).increments, range(6, 12))
+    estimator = build(FixedLagSettings(lag_frames=4))
+    before = play(estimator, increments[:6], FREE)[-1]
+    play(estimator, increments[6:12], FREE)
+    located = dataclasses.replace(increments[12], relocalised=True)
+    after = play(estimator, [located], FREE)[-1]
+    assert located.observations.is_new.mean() < 0.5
+    sigmas = [np.sqrt(np.diag(stats.covariance)) for stats in (before, after)]
+    assert (sigmas[1] < 3.0 * sigmas[0]).all(), "not 3 rad and 30 m"

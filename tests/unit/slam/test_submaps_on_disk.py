@@ -206,11 +206,10 @@ def test_a_resumed_drive_ends_with_the_same_bytes(
     assert all((driven.folder / name).read_bytes() == content for name, content in left.items())
 
 
-@pytest.mark.parametrize("estimator", ESTIMATORS)
-def test_a_robot_carried_off_is_found_by_looks_in_a_sub_map(estimator: str, tmp_path: Path) -> None:
+def test_a_robot_carried_off_is_found_by_looks_in_a_sub_map(tmp_path: Path) -> None:
     away = 48
     poses = [*(on_ring(k) for k in range(away)), *(on_ring(2 + k) for k in range(8))]
-    pipeline = with_submaps(poses, tmp_path / "submaps", estimator)
+    pipeline = with_submaps(poses, tmp_path / "submaps")
     reports = drive(pipeline, frames(poses))
     assert submaps_of(pipeline).recognised > 0
     statuses = [report.tracking.status for report in reports[away:]]
