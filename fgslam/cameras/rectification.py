@@ -198,14 +198,14 @@ def chosen_cylinder(
 ) -> View:
     """The cylindrical view of all that both cameras see along its axes, at most 160 degrees.
 
-    It has as many pixels as the raw images, all equally large. Corners that a fisheye does not see
+    The whole has as many pixels as the raw images, all equally large. Corners that a fisheye does not see
     are black. Arguments as for :func:`chosen_view`.
     """
     low, high = common_reach(cameras, rotations)
+    focal = float(np.sqrt(cameras[0].width * cameras[0].height / np.prod(high - low)))
     if fov_deg is not None:
         half = np.radians(0.5 * fov_deg)
         low[0], high[0] = max(low[0], -half), min(high[0], half)
-    focal = float(np.sqrt(cameras[0].width * cameras[0].height / np.prod(high - low)))
     width, height = np.rint(focal * (high - low)).astype(int).tolist()
     column, row = (-0.5 - focal * low).tolist()
     matrix = np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]])

@@ -180,6 +180,7 @@ def test_a_cylinder_shows_160_degrees_and_says_what_is_beyond() -> None:
     assert disagreement(rig, wide, 3.0 * view_rays(*angles)).max() < 0.02
     narrow = rig_of(Calibration("made", "made", wide), ViewAsked(100.0, "cylindrical"))
     assert narrow.angles_deg == pytest.approx((100.0, 160.0), abs=1.5)
+    assert narrow.fx == rig.fx  # less is shown, nothing is enlarged
 
 
 def test_views_that_there_are_not_are_refused() -> None:
