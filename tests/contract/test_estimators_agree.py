@@ -269,8 +269,21 @@ def test_without_measurements_all_are_dead_reckoning(name: str) -> None:
             )
             expected = Prediction(expected.wTc @ odometry.motion, covariance)
         np.testing.assert_allclose(found.trajectory.poses[k], expected.wTc, rtol=0, atol=1e-8)
-        np.testing.assert_allclose(found.covariances[k], expected.covariance, rtol=0, atol=1e-9)
+        if name in SAMPLED:
+            whiten = np.linalg.inv(np.linalg.cholesky(expected.covariance))
+            variances = np.linalg.eigvalsh(g.congruence(whiten, found.covariances[k]))
+            # Extremes of 48 samples in 6 dimensions, 0.42 and 1.83, stated larger by 48 / 41.
+            assert 0.4 < variances.min() < variances.max() < 2.5
+        else:
+            np.testing.assert_allclose(found.covariances[k], expected.covariance, rtol=0, atol=1e-9)
+    if name in SAMPLED:
+        own = estimator.predict(None).covariance
+        np.testing.assert_allclose(own, expected.covariance, rtol=0, atol=1e-9)
     assert len(found.landmarks) == 0
+
+
+SAMPLED = ("landmark_kalman", "landmark_kalman_graph")
+"""They report covariances of samples, beside their own ones."""
 
 
 ONE_LANDMARK: dict[str, EstimatorSettings] = {
@@ -299,7 +312,7 @@ def test_from_exactly_known_poses_landmarks_are_independent(name: str) -> None:
         matches = int((~increment.observations.is_new).sum())
         here = Prediction(simulation.poses[k], exact)
         estimator.update(increment, tracked_at(here, matches))
-    found = estimator.estimate().landmarks
+    found = estimator.landmarks() if name in SAMPLED else estimator.estimate().landmarks
     position, covariance = by_information(simulation.increments, simulation.poses, found.ids)
     scale = np.linalg.norm(covariance, axis=(1, 2))
     offset = np.linalg.norm(found.positions - position, axis=1) / np.sqrt(scale)
