@@ -14,6 +14,16 @@ from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, 
 _PREFIX = "doubt_"  # of names in a state
 
 
+def under(prefix: str, state: StateArrays) -> StateArrays:
+    """A part's state, its names prefixed so that they differ from those of other parts."""
+    return {prefix + name: array for name, array in state.items()}
+
+
+def found_under(prefix: str, state: StateArrays) -> StateArrays:
+    """The part of a state that :func:`under` has named."""
+    return {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
+
+
 class ErrorColumns:
     """Columns (6, m) of the newest pose and (n, 3, m) of landmarks, by ascending identity."""
 
@@ -44,12 +54,11 @@ class ErrorColumns:
 
     def state(self) -> StateArrays:
         """Everything needed to continue."""
-        return {_PREFIX + name: array for name, array in self._state().items()}
+        return under(_PREFIX, self._state())
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
-        own = {n.removeprefix(_PREFIX): a for n, a in state.items() if n.startswith(_PREFIX)}
-        self._restore(own)
+        self._restore(found_under(_PREFIX, state))
 
     # ----------------------------------------------------------------------------------------
 

@@ -5,7 +5,8 @@ of its errors. That follows the same gains with the true noise (sensitivity of s
 Gelb 1974, 7.2): exactly, it takes a joint matrix whose size and cost grow with the square of the
 map. Here a fixed number of drawn samples stands for it, as in the ensemble of Evensen (1994): a
 landmark costs as much whatever the map. The terms of the rig's calibration go the same way, one
-column each (Schmidt 1966). Estimates stay as they are. docs/derivations/landmark_filter.md.
+column each (Schmidt 1966). The noise is drawn as large as the drive's residuals so far say, as a
+smoother weighs it. Estimates stay as they are. docs/derivations/landmark_filter.md.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgslam.backend.filters.error_columns import ErrorColumns
+from fgslam.backend.filters.error_columns import ErrorColumns, found_under, under
 from fgslam.backend.filters.loop_correction import (
     CLOSURE_FACTOR,
     FREE,
@@ -25,6 +26,7 @@ from fgslam.backend.filters.loop_correction import (
     founds_anew,
 )
 from fgslam.backend.filters.online_doubt import RigTerms, shared_shifts
+from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.geometry import (
@@ -45,6 +47,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 SAMPLES = 48
 """A variance from them is known to the root of 2 / SAMPLES, a deviation to 10 %."""
 _TERMS = len(SHARED)
+_NOISE = "noise_"  # of names in a state
 _STREAM = 17  # of random numbers, beside those of the recording
 _FARTHEST_M = 1e9  # beyond, a point has no derivative; and nothing to tell
 _LEAST_MATCHES = 6  # that place a frame by an old part of the drive
@@ -146,6 +149,7 @@ class SampledErrors(ErrorColumns):
         self._solver = solver
         self._sensor = solver.sensor
         self._terms = RigTerms(solver.sensor)
+        self._noise = Persistence(solver.sensor)
         self._random = np.random.default_rng(_STREAM)
         self._seen: tuple[IntArray, Sights, FloatArray] | None = None
         """Matches of the newest frame: rows of their landmarks, and the columns of these before."""
@@ -158,6 +162,7 @@ class SampledErrors(ErrorColumns):
             return
         self._random = np.random.default_rng((_STREAM, step.frame))
         self._terms.hear(step.increment.rig_correction)
+        learn_from(self._noise, step.frame, step.increment, step.tracking, step.before.wTc)
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
         moved = carried @ self._gain
@@ -261,10 +266,12 @@ class SampledErrors(ErrorColumns):
     # ----------------------------------------------------------------------------------------
 
     def _state(self) -> StateArrays:
-        return {"applied": self._terms.applied, **super()._state()}
+        learned = under(_NOISE, self._noise.state())
+        return {"applied": self._terms.applied, **learned, **super()._state()}
 
     def _restore(self, state: StateArrays) -> None:
         self._terms.restore(state["applied"])
+        self._noise.restore(found_under(_NOISE, state))
         super()._restore(state)
 
     def _sights(self, wTc: FloatArray, seen: PoseProblem) -> Sights:
@@ -273,7 +280,7 @@ class SampledErrors(ErrorColumns):
         shift = np.zeros((len(seen), 3, _TERMS + SAMPLES))
         if self._terms.covariance is not None and self._terms.rig is not None:
             shift[:, :, :_TERMS] = shared_shifts(self._terms.rig, seen.measurement)
-        shift[:, :, _TERMS:] = self._drawn(seen.measurement_covariance)
+        shift[:, :, _TERMS:] = self._drawn(self._noise.power * seen.measurement_covariance)
         by_pose = projection @ point_pose_jacobian(points)
         return Sights(by_pose, projection @ wTc[:3, :3].T, shift)
 

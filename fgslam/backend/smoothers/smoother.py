@@ -27,6 +27,7 @@ from fgslam.backend.filters.loop_correction import (
     founds_anew,
 )
 from fgslam.backend.filters.online_doubt import OnlineDoubt
+from fgslam.backend.persistence import learn_from
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
@@ -36,7 +37,7 @@ from fgslam.backend.smoothers.recorded_inputs import RecordedInputs
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
 from fgslam.backend.smoothers.turns import Turn
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import (
     EgoMotion,
@@ -55,9 +56,6 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import Sensor
-
-_FITS = 3.2
-"""Medians of an image residual within which 99.9 % lie that are normal in column and row."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -154,7 +152,7 @@ class Smoother:
         plain = dataclasses.replace(increment, loops=(), rig_correction=None)
         stats = self._tracker.update(plain, tracking)
         self._record(increment, tracking)
-        self._learn_noise(increment, tracking, before)
+        learn_from(self._builder.noise, len(self._inputs) - 1, increment, tracking, before)
         tracked = self._admitted(increment, tracking)
         entering = self._entering(tracked, at_once=bool(increment.loops))
         for frame in entering:
@@ -251,15 +249,6 @@ class Smoother:
         self._builder.corrections.note(frame, increment)
         self._eras.append(self._takeovers)
         self._answer = None
-
-    def _learn_noise(self, increment: Increment, tracking: EgoMotion, before: FloatArray) -> None:
-        """What fits of a frame teaches how large errors are, and how long they persist."""
-        observed = increment.observations
-        matched = observed.select(~observed.is_new).select(_fits(tracking))
-        fitting = matched.join(observed.select(observed.is_new))
-        frame = len(self._inputs) - 1
-        step = inverse(before) @ tracking.wTc if tracking.status.measured else None
-        self._builder.noise.learn(frame, step, fitting)
 
     def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
         """The frame with those observations that fit; landmarks that moved have started anew."""
@@ -426,18 +415,6 @@ class MapSmoother(Smoother):
         self._prior = self._smoothed = prior
         self._builder.start_at(prior)
         self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
-
-
-def _fits(tracking: EgoMotion) -> BoolArray:
-    """(k,) matches that teach the noise: those that the pose was found by.
-
-    Where these are the fewer, the noise is not what they were judged by: then what is not far off
-    beside the others.
-    """
-    if tracking.coherent:
-        return tracking.inliers
-    off_px = tracking.residuals
-    return np.asarray(off_px <= _FITS * np.median(off_px))
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.backend.smoothers.persistence import (
+from fgslam.backend.persistence import (
     ENDED_AFTER,
     LEAST_SIGHTINGS,
     LONGEST,
@@ -27,7 +27,7 @@ from fgslam.factors.graphs import number
 def power_ratio(graph: WholeGraph, state: State) -> float:
     """By how much tracks lean at a solution, over what the graph takes them to: a variance.
 
-    Tracks are as :class:`~fgslam.backend.smoothers.persistence.Persistence` judges them.
+    Tracks are as :class:`~fgslam.backend.persistence.Persistence` judges them.
     """
     frame_of = np.array([number(key) for key in graph.pose_keys])
     sums, counted = np.full(2, STATED[1]), 0

@@ -16,7 +16,7 @@ from fgslam.backend.settings import (
     Isam2Settings,
 )
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
-from fgslam.backend.smoothers.persistence import Persistence, StatedNoise, _inverses
+from fgslam.backend.persistence import Persistence, StatedNoise, _inverses
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
@@ -43,17 +43,22 @@ def driven(
     frames: int = FRAMES,
     lost: FloatArray | None = STEP,
     smoothed: bool = False,
+    resumed: int = -1,
 ) -> Persistence:
     """Learned on a drive whose errors are ``scale`` of those stated, ``kept`` from frame to frame.
 
     Each landmark is seen for 12 frames; ``wrong`` of the sightings are of something else. Every
     tenth step is said to be ``lost``. Where the path is ``smoothed`` every fifth frame, it is true.
+    At the frame ``resumed`` another continues from the state.
     """
     rng = np.random.default_rng(5)
     noise, wTc, path = Persistence(RIG), np.eye(4), list[FloatArray]()
     points: dict[int, FloatArray] = {}
     errors: dict[int, FloatArray] = {}
     for k in range(frames):
+        if k == resumed:
+            state, noise = noise.state(), Persistence(RIG)
+            noise.restore(state)
         wTc = wTc @ STEP
         for i in range(5 * k, 5 * k + 5):
             at = np.array([*rng.uniform(-0.8, 0.8, 2), rng.uniform(2.0, 5.0)])
@@ -113,6 +118,13 @@ def test_steps_that_a_map_in_doubt_has_leaned_are_put_right_by_the_smoothed_path
     found = driven(1.0, frames=60, lost=aside, smoothed=True)
     assert found.spread == pytest.approx(1.0, rel=0.1)
     assert found.power == pytest.approx(1.0, rel=0.3)
+
+
+def test_a_state_continues_to_the_byte() -> None:
+    whole, resumed = driven(1.0, kept=0.7, frames=60), driven(1.0, kept=0.7, frames=60, resumed=33)
+    assert (whole.spread, whole.power) == (resumed.spread, resumed.power)
+    for name, array in whole.state().items():
+        np.testing.assert_array_equal(array, resumed.state()[name], err_msg=name)
 
 
 @pytest.mark.parametrize("scale", [1.0, 4.0])

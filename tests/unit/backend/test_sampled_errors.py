@@ -13,6 +13,7 @@ from smoothing import FREE, drawn
 from fgslam.backend.filters import sampled_errors
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.sampled_errors import SAMPLES, SampledErrors
+from fgslam.backend.persistence import StatedNoise
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
@@ -74,6 +75,38 @@ def test_fifty_drives_are_within_the_band_of_chi_square() -> None:
     # Landmarks of one drive share its errors: 50 drives, not 50 times 60 landmarks.
     assert 0.85 < landmark < 1.15
     assert 0.93 < inside < 0.98
+
+
+def with_persistent_errors(drive: Simulation, kept: float, seed: int) -> Simulation:
+    """Errors as large as stated, of which each landmark keeps a part from sighting to sighting."""
+    rng, last = np.random.default_rng(seed), dict[int, FloatArray]()
+    increments = []
+    for wTc, increment in zip(drive.poses, drive.increments, strict=True):
+        seen = increment.observations
+        errors = rng.standard_normal((len(seen), 3))
+        for error, i in zip(errors, seen.ids.tolist(), strict=True):
+            if i in last:
+                error[:] = kept * last[i] + np.sqrt(1.0 - kept**2) * error
+            last[i] = error
+        exact = g.project(RIG, g.transform_to_camera(wTc, drive.points_by_id[seen.ids]))
+        measured = exact + errors * np.sqrt(np.diagonal(seen.covariance, axis1=1, axis2=2))
+        moved = dataclasses.replace(seen, measurement=measured)
+        increments.append(dataclasses.replace(increment, observations=moved))
+    return dataclasses.replace(drive, increments=increments)
+
+
+def test_errors_that_persist_are_drawn_as_large_as_the_residuals_so_far_say(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drives = [
+        with_persistent_errors(drawn(seed, frames=45, points=120), kept=0.8, seed=seed)
+        for seed in range(2)
+    ]
+    learned = per_dof(drives, FREE)
+    monkeypatch.setattr(sampled_errors, "Persistence", lambda sensor: StatedNoise(1.0))
+    stated = per_dof(drives, FREE)
+    assert (learned[:2] < 0.75 * stated[:2]).all()
+    assert learned[2] > stated[2]
 
 
 def pattern(measurement: FloatArray) -> FloatArray:

@@ -1,9 +1,9 @@
 """How large the errors of landmark measurements are, and how long they persist, from residuals.
 
-A graph takes the errors of a landmark's measurements to be independent from frame to frame. Those
-of SIFT are not: the appearance changes slowly with the view. What that costs a path is the power of
-the errors in their slowest part, the one that leans a landmark's whole track forwards or backwards
-as a drift of the camera would. docs/derivations/measurement_noise.md.
+A graph, and a filter, takes the errors of a landmark's measurements to be independent from frame to
+frame. Those of SIFT are not: the appearance changes slowly with the view. What that costs a path is
+the power of the errors in their slowest part, the one that leans a landmark's whole track forwards
+or backwards as a drift of the camera would. docs/derivations/measurement_noise.md.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import (
     in_front,
     inverse,
@@ -24,7 +25,7 @@ from fgslam.core.geometry import (
     reorthonormalise,
     triangulate,
 )
-from fgslam.core.measurements import Observations
+from fgslam.core.measurements import Increment, Observations
 from fgslam.core.sensors import Sensor
 
 LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
@@ -39,6 +40,8 @@ _LEAST_PART = 0.1  # of a leaning, that no other place of the landmark explains
 STATED = np.array([30.0, 0.3])
 """Samples that the stated noise counts for: numbers of single residuals, longest tracks."""
 _BOUNDS = (0.05, 400.0)  # of variances over the stated ones
+_FITS = 3.2
+"""Medians of an image residual within which 99.9 % lie that are normal in column and row."""
 
 
 @dataclass(slots=True)
@@ -155,6 +158,37 @@ class Persistence:
                 self._poses[frame] = reorthonormalise(by @ wTc)
             self._pose = self._poses[frames[-1]]
 
+    def state(self) -> StateArrays:
+        """Everything needed to continue; sightings of the open tracks one after the other."""
+        tracks = self._tracks.values()
+        return {
+            "sums": self._sums.copy(),
+            "pose": self._pose,
+            "pose_frames": np.array(list(self._poses), np.int64),
+            "poses": np.array(list(self._poses.values())).reshape(-1, 4, 4),
+            "ids": np.array(list(self._tracks), np.int64),
+            "counts": np.array([len(track.frames) for track in tracks], np.int64),
+            "frames": np.array([k for track in tracks for k in track.frames], np.int64),
+            "measurement": np.array([z for t in tracks for z in t.measurement]).reshape(-1, 3),
+            "covariance": np.array([c for t in tracks for c in t.covariance]).reshape(-1, 3, 3),
+        }
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        self._sums, self._pose = state["sums"].copy(), state["pose"]
+        self._poses = dict(zip(state["pose_frames"].tolist(), state["poses"], strict=True))
+        ends = np.cumsum(state["counts"])
+        self._tracks = {
+            i: _Track(
+                state["frames"][end - count : end].tolist(),
+                list(state["measurement"][end - count : end]),
+                list(state["covariance"][end - count : end]),
+            )
+            for i, count, end in zip(
+                state["ids"].tolist(), state["counts"].tolist(), ends.tolist(), strict=True
+            )
+        }
+
     def _judge(self, frame: int, ended: list[int]) -> None:
         tracks = [self._tracks.pop(i) for i in ended]
         tracks = [track for track in tracks if len(track.frames) >= LEAST_SIGHTINGS]
@@ -165,6 +199,40 @@ class Persistence:
                 self._sums += fitted.powers()
         first = min((track.frames[0] for track in self._tracks.values()), default=frame)
         self._poses = {k: wTc for k, wTc in self._poses.items() if k >= first}
+
+
+def learn_from(
+    noise: MeasurementNoise,
+    frame: int,
+    increment: Increment,
+    tracking: EgoMotion,
+    before: FloatArray,
+) -> None:
+    """Teaches what fits of a frame.
+
+    Args:
+        noise: that learns.
+        frame: its number.
+        increment: its measurements.
+        tracking: its pose, and the matches used.
+        before: wTc (4, 4) of the last frame.
+    """
+    observed = increment.observations
+    matched = observed.select(~observed.is_new).select(_fits(tracking))
+    step = inverse(before) @ tracking.wTc if tracking.status.measured else None
+    noise.learn(frame, step, matched.join(observed.select(observed.is_new)))
+
+
+def _fits(tracking: EgoMotion) -> BoolArray:
+    """(k,) matches that teach the noise: those that the pose was found by.
+
+    Where these are the fewer, the noise is not what they were judged by: then what is not far off
+    beside the others.
+    """
+    if tracking.coherent:
+        return tracking.inliers
+    off_px = tracking.residuals
+    return np.asarray(off_px <= _FITS * np.median(off_px))
 
 
 def _ratio(sums: FloatArray) -> float:
