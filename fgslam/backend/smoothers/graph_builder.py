@@ -11,9 +11,9 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
+from fgslam.backend.persistence import MeasurementNoise, Persistence, StatedNoise
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
-from fgslam.backend.persistence import MeasurementNoise, Persistence, StatedNoise
 from fgslam.backend.smoothers.turns import Turn, TurnedStep
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray

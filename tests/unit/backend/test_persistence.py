@@ -9,6 +9,7 @@ import pytest
 from simulated import RIG
 from smoothing import answer, drawn
 
+from fgslam.backend.persistence import Persistence, StatedNoise, _inverses
 from fgslam.backend.settings import (
     BatchSettings,
     FixedLagSettings,
@@ -16,7 +17,6 @@ from fgslam.backend.settings import (
     Isam2Settings,
 )
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
-from fgslam.backend.persistence import Persistence, StatedNoise, _inverses
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
