@@ -293,7 +293,7 @@ def _view(
     if stated is not None and asked.is_default:
         if stated.matrix[0, 0] > _LEAST_STATED * natural:
             rotations = tuple(stated.rotations[k] for k in sources)
-            return rotations, View(stated.matrix, stated.size), ()
+            return rotations, View(stated.matrix, stated.size, stated.kind), ()
         told = (
             f"the rectified focal length that the file states, {stated.matrix[0, 0]:.0f} px, would "
             f"shrink the images ({natural:.0f} px); another view is chosen",

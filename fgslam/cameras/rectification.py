@@ -198,8 +198,8 @@ def chosen_cylinder(
 ) -> View:
     """The cylindrical view of all that both cameras see along its axes, at most 160 degrees.
 
-    The whole has as many pixels as the raw images, all equally large. Corners that a fisheye does not see
-    are black. Arguments as for :func:`chosen_view`.
+    The whole has as many pixels as the raw images, all equally large. Corners that a fisheye does
+    not see are black. Arguments as for :func:`chosen_view`.
     """
     low, high = common_reach(cameras, rotations)
     focal = float(np.sqrt(cameras[0].width * cameras[0].height / np.prod(high - low)))

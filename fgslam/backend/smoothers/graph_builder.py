@@ -340,7 +340,7 @@ class GraphBuilder:
         else:
             self._add_step(new, tracked.motion, tracked.turn)
             if tracked.located is not None and not self._remember:
-                # The map that it was found in has left the lag: nothing else holds it there.
+                # The map it was found in has left the lag: nothing else holds it there.
                 self._push(new, pose_prior(key, Prediction(tracked.wTc, tracked.located)))
         for factor in floor_factors(key, self._floor, tracked.wTc):
             self._push(new, factor)

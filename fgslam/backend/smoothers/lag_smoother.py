@@ -24,6 +24,9 @@ from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse
 from fgslam.core.measurements import Increment
 
+_HOLD_A_POSE = 6
+"""Landmarks in three dimensions: twice as many as determine a pose."""
+
 
 class LagSolver(GraphSolver, Protocol):
     """A solver that lets go for good what is older than its lag."""
@@ -124,19 +127,24 @@ class LagSmoother(Smoother):
             self.give_up(state["away"])
 
     def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
-        """The frame; one that was found without a prior is where the map has it."""
+        """The frame; one that was found without a prior is where a map that has left has it."""
         tracked = super()._admitted(increment, tracking)
-        if not increment.relocalised:
+        observed = increment.observations
+        matched = observed.ids[~observed.is_new][tracking.inliers]
+        if not increment.relocalised or self._within(matched) >= _HOLD_A_POSE:
             return tracked
-        return dataclasses.replace(tracked, located=self._located(increment, tracking))
+        return dataclasses.replace(tracked, located=self._located(matched, tracking))
 
-    def _located(self, increment: Increment, tracking: EgoMotion) -> FloatArray:
+    def _within(self, ids: IntArray) -> int:
+        """How many of them are variables of the lag: those hold a frame by their factors."""
+        tracks = self._builder.admission.tracks
+        return sum(i in tracks and tracks[i].variable >= 0 for i in ids.tolist())
+
+    def _located(self, matched: IntArray, tracking: EgoMotion) -> FloatArray:
         """(6, 6) of a pose in a map that has left: as tracked, and as the map is known itself.
 
         Its landmarks are as uncertain as the pose of the frame that began them, in the middle.
         """
-        observed = increment.observations
-        matched = observed.ids[~observed.is_new][tracking.inliers]
         known = self._tracker.landmarks()
         homes = self._tracker.homes[known.rows(matched[np.isin(matched, known.ids)])]
         if not len(homes):

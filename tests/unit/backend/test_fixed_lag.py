@@ -284,3 +284,15 @@ def test_a_frame_located_without_a_prior_is_as_sure_as_the_map_around_it() -> No
     assert located.observations.is_new.mean() < 0.5
     sigmas = [np.sqrt(np.diag(stats.covariance)) for stats in (before, after)]
     assert (sigmas[1] < 3.0 * sigmas[0]).all(), "not 3 rad and 30 m"
+
+
+def test_a_frame_located_by_landmarks_of_the_lag_tells_nothing_twice() -> None:
+    """Its factors hold it there; a prior from the same matches would be the same evidence."""
+    increments = drawn(3, frames=14).increments
+    marked = [dataclasses.replace(each, relocalised=each.index % 3 == 2) for each in increments]
+    plain, located = (
+        play(build(FixedLagSettings(lag_frames=6)), given, FREE)[-1]
+        for given in (increments, marked)
+    )
+    sigmas = [np.sqrt(np.diag(stats.covariance)) for stats in (plain, located)]
+    assert (sigmas[1] > 0.9 * sigmas[0]).all()

@@ -156,6 +156,17 @@ def raw_pair(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("asked", [{"fov_deg": 50.0}, {"view": "cylindrical"}], ids=str)
+def test_raw_cameras_without_a_correction_keep_their_view(
+    asked: dict[str, Any], tmp_path: Path
+) -> None:
+    before = load_rig(raw_pair(tmp_path), **asked)
+    write_corrected(tmp_path / "same.json", RigCorrection.none(before.plain()), before.rectifier)
+    after = load_rig(tmp_path / "same.json")
+    assert after.view == before.view
+    assert after.angles_deg == pytest.approx(before.angles_deg)
+
+
 @pytest.mark.parametrize("asked", [{}, {"fov_deg": 50.0}, {"view": "cylindrical"}], ids=str)
 def test_a_correction_of_raw_cameras_is_undone_in_their_raw_images(
     asked: dict[str, Any], tmp_path: Path
