@@ -9,6 +9,7 @@ Planar poses and their covariances are as in :mod:`fgslam.core.planar`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal
@@ -16,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.planar import between, wrap
+from fgslam.core.planar import wrap
 
 
 def among(ids: IntArray, others: IntArray) -> BoolArray:
@@ -28,6 +29,16 @@ def among(ids: IntArray, others: IntArray) -> BoolArray:
         return np.zeros(len(ids), np.bool_)
     places = others.searchsorted(ids)
     return np.asarray(others[np.minimum(places, len(others) - 1, out=places)] == ids)
+
+
+def common_rows(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
+    """(k,) rows of identities (n,) and of others (m,), both ascending, that name the same."""
+    if not len(others):
+        return np.empty((2, 0), np.int64)
+    places = others.searchsorted(ids)
+    np.minimum(places, len(others) - 1, out=places)
+    mine = np.flatnonzero(others[places] == ids)
+    return mine, places[mine]
 
 
 # --------------------------------------------------------------------------------------------
@@ -288,13 +299,13 @@ class HomingEstimate:
 
     def home(self) -> HomeVector:
         """The steering vector with its first-order covariance."""
-        offset = self.target[:2] - self.robot[:2]
-        distance = float(np.hypot(*offset))
+        x, y, heading = (self.target - self.robot).tolist()
+        c, s = math.cos(self.robot[2]), math.sin(self.robot[2])
         jacobian = home_vector_jacobian(self.robot, self.target)
-        relative = between(self.robot, self.target)
-        direction = float(np.arctan2(relative[1], relative[0]))
-        turn = float(wrap(self.target[2] - self.robot[2]))
-        return HomeVector(distance, direction, turn, jacobian @ self.covariance @ jacobian.T)
+        covariance = jacobian @ self.covariance @ jacobian.T
+        turn = float(wrap(np.float64(heading)))
+        direction = math.atan2(c * y - s * x, c * x + s * y)
+        return HomeVector(math.hypot(x, y), direction, turn, covariance)
 
 
 def home_vector_jacobian(robot: FloatArray, target: FloatArray) -> FloatArray:
@@ -302,16 +313,17 @@ def home_vector_jacobian(robot: FloatArray, target: FloatArray) -> FloatArray:
 
     At the target itself the direction has no derivative; its row is then infinite, not an error.
     """
-    offset = target[:2] - robot[:2]
-    distance = float(np.hypot(*offset))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        along = offset / distance
-        across = np.array([-along[1], along[0]]) / distance
-    out = np.zeros((3, 6))
-    out[0, :2], out[0, 3:5] = -along, along
-    out[1, :2], out[1, 2], out[1, 3:5] = -across, -1.0, across
-    out[2, 2], out[2, 5] = -1.0, 1.0
-    return out
+    x, y = (target[:2] - robot[:2]).tolist()
+    distance = math.hypot(x, y)
+    c, s = (x / distance, y / distance) if distance > 0.0 else (math.nan, math.nan)
+    far = distance or math.inf
+    return np.array(
+        [
+            [-c, -s, 0.0, c, s, 0.0],
+            [s / far, -c / far, -1.0, -s / far, c / far, 0.0],
+            [0.0, 0.0, -1.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

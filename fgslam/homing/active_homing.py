@@ -18,9 +18,9 @@ from fgslam.core.homing import (
     HomingStart,
     TrackedBearings,
     TwoViewVector,
-    among,
+    common_rows,
 )
-from fgslam.core.planar import bearings, circular_median, wrap
+from fgslam.core.planar import circular_median, wrap
 from fgslam.homing.settings import HomingControlSettings
 
 _MAX_ACROSS = 0.1
@@ -224,22 +224,23 @@ def tracked_misfit(estimate: HomingEstimate, tracked: TrackedBearings) -> float:
 
     NaN where fewer than three features are both tracked and in the map.
     """
-    mine, other = among(estimate.ids, tracked.ids), among(tracked.ids, estimate.ids)
+    mine, other = common_rows(estimate.ids, tracked.ids)
     return _misfit(estimate.robot, estimate.landmarks[mine], tracked.bearing[other])
 
 
 def target_misfit(estimate: HomingEstimate, start: HomingStart) -> float:
     """Median absolute difference of the target's bearings from their prediction, radians."""
     ids = start.local_map.ids
-    mine, other = among(estimate.ids, ids), among(ids, estimate.ids)
+    mine, other = common_rows(estimate.ids, ids)
     return _misfit(estimate.target, estimate.landmarks[mine], start.matches.bearing_b[other])
 
 
 def _misfit(pose: FloatArray, landmarks: FloatArray, seen: FloatArray) -> float:
-    known = np.isfinite(landmarks).all(axis=1)
-    if np.count_nonzero(known) < _FEWEST:
+    x, y = (landmarks - pose[:2]).T
+    apart = (seen + pose[2] - np.arctan2(y, x))[np.isfinite(x + y)]
+    if len(apart) < _FEWEST:
         return float("nan")
-    ordered = np.sort(np.abs(wrap(seen[known] - bearings(pose, landmarks[known]))))
+    ordered = np.sort(np.abs(wrap(apart)))
     # NumPy's own median takes ten times as long for so few, and this is asked with every image.
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
@@ -288,8 +289,8 @@ def common_turn(before: TrackedBearings, now: TrackedBearings) -> float:
     The circular median of the bearings' changes, the other way round: translation moves bearings,
     too, but to both sides.
     """
-    mine, other = among(before.ids, now.ids), among(now.ids, before.ids)
-    if not mine.any():
+    mine, other = common_rows(before.ids, now.ids)
+    if not len(mine):
         return float("nan")
     change = wrap(before.bearing[mine] - now.bearing[other])
     return circular_median(change)
