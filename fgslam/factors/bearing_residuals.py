@@ -7,6 +7,8 @@ arrays and derivatives are by these three numbers, not in a tangent space.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
@@ -47,14 +49,15 @@ def polar_jacobians(polar: FloatArray) -> FloatArray:
 
 def target_pose(target: FloatArray) -> FloatArray:
     """(3,) pose (x_t, y_t, psi_t) of (D_t, theta_t, psi_t): what eq. 9 leaves unsaid."""
-    return np.append(target[0] * unit(target[1]), target[2])
+    distance, direction, turn = target.tolist()
+    return np.array([distance * math.cos(direction), distance * math.sin(direction), turn])
 
 
 def target_jacobian(target: FloatArray) -> FloatArray:
     """(3, 3) derivative of :func:`target_pose`."""
-    out = np.eye(3)
-    out[:2, :2] = polar_jacobians(target[None, :2])[0]
-    return out
+    distance, direction, _ = target.tolist()
+    c, s = math.cos(direction), math.sin(direction)
+    return np.array([[c, -distance * s, 0.0], [s, distance * c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def elevation(

@@ -6,6 +6,7 @@ the start frame. Derivation: docs/derivations/homing_filters.md.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -17,7 +18,7 @@ from fgslam.backend.homing.settings import FilterMotionSettings, HomingEkfSettin
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
-from fgslam.core.planar import wrapped_pose
+from fgslam.core.planar import unit, wrapped_pose
 from fgslam.factors.bearing_residuals import (
     bearing,
     bearing_jacobians,
@@ -169,13 +170,13 @@ def motion(
         step: seconds.
         noise: densities of the random walks of place, heading and speed.
     """
-    _, _, psi, speed = robot
-    c, s = np.cos(psi), np.sin(psi)
-    moved = robot + speed * step * np.array([c, s, 0.0, 0.0])
+    x, y, psi, speed = robot.tolist()
+    ahead, left = step * math.cos(psi), step * math.sin(psi)
+    moved = np.array([x + speed * ahead, y + speed * left, psi, speed])
     jacobian = np.eye(4)
-    jacobian[:2, 2] = speed * step * np.array([-s, c])
-    jacobian[:2, 3] = step * np.array([c, s])
-    deviations = np.array([noise.slip, noise.slip, np.deg2rad(noise.heading_deg), noise.speed])
+    jacobian[:2, 2] = -speed * left, speed * ahead
+    jacobian[:2, 3] = ahead, left
+    deviations = np.array([noise.slip, noise.slip, math.radians(noise.heading_deg), noise.speed])
     return moved, jacobian, np.diag(step * deviations**2)
 
 
@@ -217,17 +218,19 @@ def _seen(
     state: FilterState, pose: FloatArray, measured: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Derivatives by the pose (n, 3) and by each feature's own (d, delta) (n, 2); innovation."""
-    polar = state.polar
-    points = polar_points(polar)
+    distance, along = state.polar[:, 0], unit(state.polar[:, 1])
+    points = distance[:, None] * along
     by_pose, by_point = bearing_jacobians(pose, points)
-    by_polar = np.einsum("ni,nij->nj", by_point, polar_jacobians(polar))
+    by_polar = np.empty_like(by_point)
+    np.einsum("ni,ni->n", by_point, along, out=by_polar[:, 0])
+    by_polar[:, 1] = distance * (by_point[:, 1] * along[:, 0] - by_point[:, 0] * along[:, 1])
     return by_pose, by_polar, -bearing(pose, points, measured)
 
 
 def _put(jacobian: FloatArray, by_polar: FloatArray) -> None:
-    rows = np.arange(len(jacobian))
-    jacobian[rows, _FIRST + 2 * rows] = by_polar[:, 0]
-    jacobian[rows, _FIRST + 2 * rows + 1] = by_polar[:, 1]
+    """Each row's derivative by its own feature, two columns farther right from row to row."""
+    flat, step = jacobian.reshape(-1), jacobian.shape[1] + 2
+    flat[_FIRST::step], flat[_FIRST + 1 :: step] = by_polar.T
 
 
 # --------------------------------------------------------------------------------------------
@@ -299,14 +302,13 @@ class HomingEkf:
         """The present state; see the protocol."""
         state = self._state
         target = state.mean[TARGET]
-        rows = np.array([0, 1, 2, 4, 5, 6])
-        jacobian = np.eye(6)
-        jacobian[3:, 3:] = target_jacobian(target)
+        jacobian = np.zeros((6, _FIRST))
+        jacobian[:3, :3], jacobian[3:, TARGET] = np.eye(3), target_jacobian(target)
         return HomingEstimate(
             time=self._features.time,
             robot=wrapped_pose(state.mean[:3]),
             target=wrapped_pose(target_pose(target)),
-            covariance=jacobian @ state.covariance[np.ix_(rows, rows)] @ jacobian.T,
+            covariance=jacobian @ state.covariance[:_FIRST, :_FIRST] @ jacobian.T,
             ids=state.ids,
             landmarks=polar_points(state.polar),
             landmark_covariances=_landmark_covariances(state, landmarks),
@@ -333,12 +335,12 @@ def updated(
     expected = jacobian @ crossed + noise
     near = np.asarray(innovation**2 <= gate_sigmas**2 * np.diagonal(expected))
     if gate_sigmas > 0.0 and not near.all():
-        jacobian, innovation, noise = _rows(near, jacobian, innovation, noise)
+        innovation = innovation[near]
         crossed, expected = crossed[:, near], expected[np.ix_(near, near)]
     gain = _solved(expected, crossed.T).T
-    # Joseph's (1 - K H) P (1 - K H)^T + K R K^T without products of two matrices of P's size.
-    left = state.covariance - gain @ crossed.T
-    covariance = left - (left @ jacobian.T - gain @ noise) @ gain.T
+    # Joseph's (1 - K H) P (1 - K H)^T + K R K^T, multiplied out, as a symmetric matrix's half:
+    # P - K C^T - C K^T + K S K^T with C = P H^T and S = H C + R.
+    covariance = state.covariance - (2.0 * crossed - gain @ expected) @ gain.T
     mean = state.mean + gain @ innovation
     return FilterState(state.ids, mean, 0.5 * (covariance + covariance.T))
 
