@@ -10,9 +10,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import bearings, between, unit, wrap
+from fgslam.core.planar import bearings, unit, wrap
+
+ComplexArray = npt.NDArray[np.complex128]
 
 _SMALL = 1e-2  # radians: below it the series of the cotangent is exact to rounding
 
@@ -189,32 +192,68 @@ def triangulated(
 # Motion: constant velocity between many poses at once; GTSAM's factor is WnoaMotionFactorPose2
 
 
-def constant_velocities(
-    poses: FloatArray, speeds: FloatArray, steps: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals and derivatives of a chain.
+class ChainMotion:
+    """Motion along a chain of poses against constant velocity: residuals, and their derivatives.
 
-    Args:
-        poses: (n + 1, 3) in the order of time.
-        speeds: (n + 1, 3) velocities there, in the robot's own axes: forward, left, turning.
-        steps: (n,) seconds between them.
+    Places and velocities are complex numbers here: a rotation and [a, -b; b, a] are products.
 
-    Returns:
-        (n, 6) residuals, and (n, 6, 6) derivatives by (pose, velocity) before and after.
+    Attributes:
+        residual: (n, 6).
     """
-    moved = between(poses[:-1], poses[1:])
-    flat, derivative, curve = _log_terms(moved[:, 2])
-    residual, by_moved, by_speed = _by_motion(moved, speeds[1:], (flat, derivative, curve))
-    residual[:, :3] -= steps[:, None] * speeds[:-1]
-    residual[:, 3:] -= speeds[:-1]
-    by_before, by_after = _by_poses(poses[:-1], moved)
-    before, after = np.zeros((2, len(steps), 6, 6))
-    before[:, :, :3], after[:, :, :3] = by_moved @ by_before, by_moved @ by_after
-    every = np.arange(3)
-    before[:, every, 3 + every] = -steps[:, None]
-    before[:, 3 + every, 3 + every] = -1.0
-    after[:, 3:, 3:] = by_speed
-    return residual, before, after
+
+    def __init__(self, poses: FloatArray, speeds: FloatArray, steps: FloatArray) -> None:
+        """The residuals.
+
+        Args:
+            poses: (n + 1, 3) in the order of time.
+            speeds: (n + 1, 3) velocities there, in the robot's own axes: forward, left, turning.
+            steps: (n,) seconds between them.
+        """
+        place, velocity = poses[:, 0] + 1j * poses[:, 1], speeds[:, 0] + 1j * speeds[:, 1]
+        self._back, turn = np.exp(-1j * poses[:-1, 2]), wrap(np.diff(poses[:, 2]))
+        self._moved, self._rate = self._back * np.diff(place), speeds[1:, 2]
+        self._log = _LogTerms(turn)
+        # Log m = (M(w) t, w) of the motion m = (t, w); its rate J v, J = [M R(w), M' t; 0, 1].
+        self._turn = np.exp(1j * turn)
+        self._ahead = self._turn * velocity[1:]
+        self._bent = self._log.slope * self._moved
+        self._gone = self._log.straight * self._moved
+        self._steps = steps
+        self.residual = np.empty((len(steps), 6))
+        self.residual[:, :2] = _parts(self._gone - steps * velocity[:-1])
+        self.residual[:, 2] = turn - steps * speeds[:-1, 2]
+        changed = self._log.straight * self._ahead + self._bent * self._rate - velocity[:-1]
+        self.residual[:, 3:5] = _parts(changed)
+        self.residual[:, 5] = self._rate - speeds[:-1, 2]
+
+    def derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """(n, 6, 6) by (pose, velocity) before and after each step."""
+        before, after = np.zeros((2, len(self._steps), 6, 6))
+        straight, slope, rate = self._log.straight, self._log.slope, self._rate
+        by_turn = (slope + 1j * straight) * self._ahead + self._log.curve() * self._moved * rate
+        _put_product(after[:, :2, :2], straight * self._back)
+        _put_product(after[:, 3:5, :2], slope * rate * self._back)
+        _put_product(after[:, 3:5, 3:5], straight * self._turn)
+        after[:, :2, 2] = after[:, 3:5, 5] = _parts(self._bent)
+        after[:, 3:5, 2] = _parts(by_turn)
+        after[:, 2, 2] = after[:, 5, 5] = 1.0
+        before[:, :, :3] = -after[:, :, :3]
+        before[:, :2, 2] -= _parts(1j * self._gone)
+        before[:, 3:5, 2] -= _parts(1j * rate * self._bent)
+        every = np.arange(3)
+        before[:, every, 3 + every] = -self._steps[:, None]
+        before[:, 3 + every, 3 + every] = -1.0
+        return before, after
+
+
+def _parts(numbers: ComplexArray) -> FloatArray:
+    """(n, 2) real and imaginary parts of (n,)."""
+    return numbers.view(np.float64).reshape(-1, 2)
+
+
+def _put_product(out: FloatArray, factors: ComplexArray) -> None:
+    """Writes the matrices [a, -b; b, a] of factors a + ib (n,) into (n, 2, 2)."""
+    out[:, :, 0], out[:, :, 1] = _parts(factors), _parts(1j * factors)
 
 
 def motion_informations(steps: FloatArray, density: FloatArray) -> FloatArray:
@@ -224,60 +263,23 @@ def motion_informations(steps: FloatArray, density: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nab,ij->naibj", powers, np.diag(1.0 / density)).reshape(-1, 6, 6))
 
 
-def _by_motion(
-    moved: FloatArray, speed: FloatArray, terms: tuple[FloatArray, FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(Log m, J(m) v) with derivatives (n, 6, 3) by the motion m and J (n, 3, 3), that by v.
+class _LogTerms:
+    """M(w) = k - iw/2, k = w/2 cot(w/2), its derivative M' and k''; each (n,)."""
 
-    Log m = (M(w) t, w) of m = (t, w), and J = [M R(w), M' t; 0, 1].
-    """
-    straight, derivative, curve = terms
-    t, w = moved[:, :2, None], moved[:, 2]
-    c, s = np.cos(w), np.sin(w)
-    turn = np.stack([c, -s, s, c], axis=-1).reshape(-1, 2, 2)
-    ahead = turn @ speed[:, :2, None]
-    aside = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)  # of R' = R rotated by 90 degrees
-    rate = speed[:, 2, None, None]
-    bent = derivative @ t
-    residual, by_moved = np.empty((len(moved), 6)), np.zeros((len(moved), 6, 3))
-    residual[:, :2] = (straight @ t)[..., 0]
-    residual[:, 2], residual[:, 5] = w, speed[:, 2]
-    residual[:, 3:5] = (straight @ ahead + bent * rate)[..., 0]
-    by_moved[:, :2, :2], by_moved[:, :2, 2] = straight, bent[..., 0]
-    by_moved[:, 2, 2] = 1.0
-    by_moved[:, 3:5, :2] = derivative * rate
-    by_turn = derivative @ ahead + straight @ aside + curve * t * rate
-    by_moved[:, 3:5, 2] = by_turn[..., 0]
-    by_speed = np.zeros((len(moved), 3, 3))
-    by_speed[:, :2, :2], by_speed[:, :2, 2], by_speed[:, 2, 2] = straight @ turn, bent[..., 0], 1.0
-    return residual, by_moved, by_speed
+    def __init__(self, w: FloatArray) -> None:
+        self._half = half = 0.5 * w
+        self._small = np.abs(half) < _SMALL
+        self._safe = np.where(self._small, 1.0, half)
+        self._square = square = half**2
+        self._cotangent, self._cosecant = 1.0 / np.tan(self._safe), np.sin(self._safe) ** -2.0
+        k = self._safe * self._cotangent
+        k = np.where(self._small, 1.0 - square / 3.0 - square**2 / 45.0, k)
+        series = -half / 3.0 - 2.0 / 45.0 * half * square
+        slope = 0.5 * (self._cotangent - self._safe * self._cosecant)
+        self.straight = k - 1j * half
+        self.slope = np.where(self._small, series, slope) - 0.5j
 
-
-def _log_terms(w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """M(w) = [k, w/2; -w/2, k], k = w/2 cot(w/2): (n, 2, 2); M'; and k'' (n, 1, 1)."""
-    half = 0.5 * w
-    small = np.abs(half) < _SMALL
-    safe = np.where(small, 1.0, half)
-    tangent, sine = np.tan(safe), np.sin(safe)
-    square = half**2
-    k = np.where(small, 1.0 - square / 3.0 - square**2 / 45.0, safe / tangent)
-    series = -half / 3.0 - 2.0 / 45.0 * half * square
-    slope = np.where(small, series, 0.5 * (1.0 / tangent - safe / sine**2))
-    curve = np.where(small, -1.0 / 6.0 - square / 15.0, 0.5 * (safe / tangent - 1.0) / sine**2)
-    fixed = np.full_like(w, 0.5)
-    straight = np.stack([k, half, -half, k], axis=-1).reshape(-1, 2, 2)
-    derivative = np.stack([slope, fixed, -fixed, slope], axis=-1).reshape(-1, 2, 2)
-    return straight, derivative, curve[:, None, None]
-
-
-def _by_poses(before: FloatArray, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n, 3, 3) derivatives of a motion by both its poses."""
-    c, s = np.cos(before[:, 2]), np.sin(before[:, 2])
-    by_before, by_after = np.zeros((2, len(before), 3, 3))
-    by_after[:, 0, 0], by_after[:, 0, 1] = c, s
-    by_after[:, 1, 0], by_after[:, 1, 1] = -s, c
-    by_after[:, 2, 2] = 1.0
-    by_before[:, :2, :2] = -by_after[:, :2, :2]
-    by_before[:, 0, 2], by_before[:, 1, 2] = moved[:, 1], -moved[:, 0]
-    by_before[:, 2, 2] = -1.0
-    return by_before, by_after
+    def curve(self) -> FloatArray:
+        """K'' (n,)."""
+        curve = 0.5 * (self._safe * self._cotangent - 1.0) * self._cosecant
+        return np.where(self._small, -1.0 / 6.0 - self._square / 15.0, curve)

@@ -15,8 +15,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
 from fgslam.factors.bearing import STIFF
 from fgslam.factors.bearing_residuals import (
+    ChainMotion,
     bearings_from_views,
-    constant_velocities,
     direction_and_turn,
     elevation_pair,
     elevations_from_views,
@@ -63,7 +63,7 @@ class Look:
         cost: half the robust sum of squares.
         sights: residuals (v, m) and weighed informations of bearings, and of elevations, if any.
         pairs: residuals (k,), weighed informations, derivatives by target (k, 3), points (k, 2).
-        motion: residuals (n, 6), derivatives (n, 6, 6) by the image before and after.
+        motion: of the chain, with its residuals.
         initial: residual (2,) of the initialisation, and its derivative (2, 3) by the target.
     """
 
@@ -71,7 +71,7 @@ class Look:
     cost: float
     sights: list[tuple[FloatArray, FloatArray]]
     pairs: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-    motion: tuple[FloatArray, FloatArray, FloatArray]
+    motion: ChainMotion
     initial: tuple[FloatArray, FloatArray]
 
 
@@ -237,9 +237,9 @@ class SchurModel:
         total = self._fixed_cost(state)
         initial = direction_and_turn(state.target, *self._vector)
         total += 0.5 * float(initial[0] @ self._initial @ initial[0])
-        motion = constant_velocities(state.chain[:, :3], state.chain[:, 3:], self._steps)
-        carried = (self._motions @ motion[0][..., None])[..., 0]
-        total += 0.5 * float(np.vdot(motion[0], carried))
+        motion = ChainMotion(state.chain[:, :3], state.chain[:, 3:], self._steps)
+        carried = self._motions @ motion.residual[..., None]
+        total += 0.5 * float(np.vdot(motion.residual, carried))
         sights = []
         for residual, information in self._seen(state):
             weighed, loss = self._robust(residual, information)
@@ -327,7 +327,7 @@ class SchurModel:
         e.border_gradient[:3] += pull + known @ residual
 
     def _add_motion(self, e: NormalEquations, look: Look) -> None:
-        residual, before, after = look.motion
+        residual, (before, after) = look.motion.residual, look.motion.derivatives()
         known_before = before.transpose(0, 2, 1) @ self._motions
         known_after = after.transpose(0, 2, 1) @ self._motions
         e.diagonal[:-1] += known_before @ before

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from factor_specifications import constant_velocity, constant_velocity_covariance
 
-from fgslam.factors.bearing_residuals import constant_velocities, motion_informations
+from fgslam.factors.bearing_residuals import ChainMotion, motion_informations
 from fgslam.factors.noise import KernelName, kernel_losses, kernel_weights
 
 NAMES: list[KernelName] = ["none", "huber", "cauchy", "geman_mcclure", "tukey"]
@@ -34,7 +34,8 @@ def test_chains_of_motions_are_their_specification(size: float) -> None:
     rng = np.random.default_rng(3)
     poses = np.cumsum(size * rng.standard_normal((5, 3)), axis=0)
     speeds, steps = rng.standard_normal((5, 3)), rng.uniform(0.1, 0.4, 4)
-    residual, before, after = constant_velocities(poses, speeds, steps)
+    motion = ChainMotion(poses, speeds, steps)
+    residual, (before, after) = motion.residual, motion.derivatives()
     for k in range(4):
         ends = (poses[k], speeds[k], poses[k + 1], speeds[k + 1])
         np.testing.assert_allclose(residual[k], constant_velocity(*ends, steps[k]), atol=1e-12)
