@@ -49,13 +49,13 @@ class GaussNewton:
         """
         unknowns = np.array(start, dtype=np.float64)
         going = np.arange(len(unknowns))
-        damping = self.damping * np.eye(unknowns.shape[1])
+        damping, bounded = self.damping * np.eye(unknowns.shape[1]), np.isfinite(self.longest)
         for k in range(self.iterations):
             hessian, gradient = linearise(unknowns[going], k)
             step = np.linalg.solve(hessian + damping, -gradient[:, :, None])[:, :, 0]
-            unknowns[going] += np.clip(step, -self.longest, self.longest)
+            unknowns[going] += np.clip(step, -self.longest, self.longest) if bounded else step
             if k >= self.settling:
-                going = going[np.max(np.abs(step), axis=1) >= self.converged]
+                going = going[np.abs(step).max(axis=1) >= self.converged]
             if not len(going):
                 break
         return unknowns

@@ -121,8 +121,8 @@ def direction_and_turn(
     Returns:
         (2,) wrapped residuals and (2, 3) derivative.
     """
-    x, y, psi = target
-    residual = wrap(np.array([np.arctan2(y, x) - direction, psi - turn]))
+    x, y, psi = target.tolist()
+    residual = wrap(np.array([math.atan2(y, x) - direction, psi - turn]))
     squared = x**2 + y**2
     return residual, np.array([[-y / squared, x / squared, 0.0], [0.0, 0.0, 1.0]])
 

@@ -8,6 +8,7 @@ each image adds, with first guesses; :mod:`fgslam.backend.homing.schur_solver` a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import repeat
@@ -22,7 +23,7 @@ from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.gauss_newton import GaussNewton, Linearised
-from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
 from fgslam.core.planar import compose, unit, wrap
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
 
@@ -86,7 +87,7 @@ class HomingProblem:
         """
         rows = np.flatnonzero(self._entered)
         guesses = self._guesses[rows]
-        nearer = np.linalg.norm(points, axis=1) / np.linalg.norm(guesses, axis=1)
+        nearer = np.hypot(*points.T) / np.hypot(*guesses.T)
         fell = np.flatnonzero(~(nearer > _COLLAPSED))
         return {int(rows[k]): guesses[k] for k in fell}
 
@@ -218,16 +219,16 @@ class HomingProblem:
         """
         waiting = np.flatnonzero(candidates)
         entering = np.zeros(len(candidates), np.bool_)
-        reach = float(np.hypot(*before.pose[:2]))
+        reach = math.hypot(*before.pose[:2])
         if len(waiting) == 0 or reach == 0.0:
             return entering
         pose = compose(before.pose, _travelled(before.velocity, tracked.time - before.time))
         matches = self._start.matches
         start = matches.bearing_a[rows[waiting]]
         legs, by = triangulated(
-            (float(np.arctan2(pose[1], pose[0])), float(pose[2])), start, tracked.bearing[waiting]
+            (math.atan2(pose[1], pose[0]), float(pose[2])), start, tracked.bearing[waiting]
         )
-        length = float(np.hypot(*pose[:2]))
+        length = math.hypot(*pose[:2])
         x, y, turn = before.variances().tolist()
         variance = np.column_stack(
             [
@@ -291,11 +292,11 @@ def _drift(motion: GraphMotionSettings, step: float) -> FloatArray:
 
 def _travelled(velocity: FloatArray, step: float) -> FloatArray:
     """Motion (3,) of a constant velocity (3,) in the robot's axes over ``step`` seconds."""
-    forward, left, turn = velocity * step
+    forward, left, turn = (velocity * step).tolist()
     half = 0.5 * turn
-    chord = np.sinc(half / np.pi)
-    c, s = np.cos(half) * chord, np.sin(half) * chord
-    return np.array([c * forward - s * left, s * forward + c * left, wrap(turn)])
+    chord = math.sin(half) / half if half else 1.0
+    c, s = math.cos(half) * chord, math.sin(half) * chord
+    return np.array([c * forward - s * left, s * forward + c * left, wrap(np.float64(turn))])
 
 
 def resected(
@@ -387,7 +388,7 @@ class HomingGraph:
     def _alive(self) -> tuple[Any, list[int]]:
         """Identities of landmarks that are tracked still, and their variables' numbers."""
         ids = self._features.alive
-        ids = ids[np.isin(ids, self._problem.entered)]
+        ids = ids[among(ids, self._problem.entered)]
         return ids, self._problem.variables(ids).tolist()
 
     def _entered(self) -> list[int]:

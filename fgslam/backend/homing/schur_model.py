@@ -5,6 +5,7 @@ The same cost as that of :mod:`fgslam.backend.homing.graph_parts` in GTSAM's fac
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -271,9 +272,10 @@ class SchurModel:
     def _fixed_cost(self, state: State) -> float:
         """Of start, leg, first velocity and weak priors."""
         start, speed = state.chain[0, :3], state.chain[0, 3:]
-        leg = np.hypot(*(state.target[:2] - start[:2])) - 1.0
+        leg = math.dist(state.target[:2], start[:2]) - 1.0
         total = (start @ start + leg**2) / STIFF**2 + speed @ (self._speeds * speed)
-        total += np.sum(self._place_informations * (state.points - self._places) ** 2)
+        off = state.points - self._places
+        total += np.vdot(self._place_informations * off, off)
         return float(0.5 * total)
 
     # ----------------------------------------------------------------------------------------
