@@ -198,11 +198,13 @@ def in_front(
         least_parallax: radians.
     """
     from_start = bearings[0][:, None]
-    turned = wrap(bearings[1][:, None] + rotation)
-    parallax = np.sin(turned - from_start)
+    turned = bearings[1][:, None] + rotation
+    apart = turned - from_start
+    parallax = np.sin(apart)
     from_a = np.sin(turned - direction) * parallax
     from_b = np.sin(from_start - direction) * parallax
-    parallel = np.abs(wrap(turned - from_start)) < least_parallax
+    # What wraps angles takes longer than their cosines.
+    parallel = np.cos(apart) > np.cos(least_parallax)
     return ((from_a > 0.0) & (from_b > 0.0)) | parallel
 
 
