@@ -224,27 +224,22 @@ class HomingProblem:
             return entering
         pose = compose(before.pose, _travelled(before.velocity, tracked.time - before.time))
         matches = self._start.matches
-        start = matches.bearing_a[rows[waiting]]
-        legs, by = triangulated(
-            (math.atan2(pose[1], pose[0]), float(pose[2])), start, tracked.bearing[waiting]
-        )
+        rows, seen = rows[waiting], tracked.bearing[waiting]
+        start = matches.bearing_a[rows]
+        legs, by = triangulated((math.atan2(pose[1], pose[0]), float(pose[2])), start, seen)
         length = math.hypot(*pose[:2])
         x, y, turn = before.variances().tolist()
-        variance = np.column_stack(
-            [
-                np.full(len(waiting), (x + y) / reach**2),
-                np.full(len(waiting), turn),
-                matches.sigma[rows[waiting], 0] ** 2,
-                tracked.sigma_bearing[waiting] ** 2,
-            ]
-        )
+        variance = np.empty_like(by)
+        variance[:, 0], variance[:, 1] = (x + y) / reach**2, turn
+        variance[:, 2] = matches.sigma[rows, 0] ** 2
+        variance[:, 3] = tracked.sigma_bearing[waiting] ** 2
         spread = np.sqrt((by**2 * variance).sum(axis=1))
-        self._compare(rows[waiting], length * legs, length * spread)
-        confirmed = self._good(legs, spread) & (self._agreed[rows[waiting]] >= _CONFIRMED)
-        confirmed &= self._seen_by_target(rows[waiting], length * legs, length * spread)
+        self._compare(rows, length * legs, length * spread)
+        confirmed = self._good(legs, spread) & (self._agreed[rows] >= _CONFIRMED)
+        confirmed &= self._seen_by_target(rows, length * legs, length * spread)
         for k in np.flatnonzero(confirmed).tolist():
             distance = float(length * legs[k])
-            self._enter(new, int(rows[waiting[k]]), distance * unit(start[k]), distance)
+            self._enter(new, int(rows[k]), distance * unit(start[k]), distance)
             entering[waiting[k]] = True
         return entering
 
