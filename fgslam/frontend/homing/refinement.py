@@ -249,7 +249,8 @@ def _essential(p: FloatArray) -> tuple[FloatArray, FloatArray]:
     tilt, exact where the tilt itself vanishes.
     """
     c, s, none = np.cos(p[:, 0]), np.sin(p[:, 0]), np.zeros(len(p))
-    tilt_a, tilt_b = _tilt(p[:, 2:4]).transpose(0, 2, 1), _tilt(p[:, 4:6])
+    tilts = _tilt(p[:, 2:6].reshape(-1, 2))  # those of both views at once
+    tilt_a, tilt_b = tilts[::2].transpose(0, 2, 1), tilts[1::2]
     turn = _turn(p[:, 1])
     leg = skew(np.column_stack([c, s, p[:, 6]]))
     right, left = turn @ tilt_b, tilt_a @ leg
@@ -280,8 +281,15 @@ def _turn(angle: FloatArray) -> FloatArray:
 
 def _tilt(vector: FloatArray) -> FloatArray:
     """(c, 3, 3) rotations by small vectors (roll, pitch, 0), (c, 2): Rodrigues' formula."""
-    angle = np.hypot(vector[:, 0], vector[:, 1])[:, None, None]
-    cross = skew(np.column_stack([vector, np.zeros(len(vector))]))
-    # sin(x) / x and (1 - cos(x)) / x^2, also where x vanishes.
-    first, half = np.sinc(angle / np.pi), np.sinc(0.5 * angle / np.pi)
-    return np.asarray(np.eye(3) + first * cross + 0.5 * half**2 * (cross @ cross))
+    x, y = vector.T
+    half_angle = 0.5 * np.hypot(x, y)
+    # sin(a) / a and (1 - cos(a)) / a^2 by half angles, also where a vanishes.
+    half = np.sinc(half_angle / np.pi)
+    first, second = half * np.cos(half_angle), 0.5 * half**2
+    out = np.empty((len(vector), 3, 3))
+    out[:, 0, 0], out[:, 1, 1] = 1.0 - second * y * y, 1.0 - second * x * x
+    out[:, 0, 1] = out[:, 1, 0] = second * x * y
+    out[:, 2, 2] = 1.0 - second * (x * x + y * y)
+    out[:, 0, 2], out[:, 1, 2] = first * y, -first * x
+    out[:, 2, 0], out[:, 2, 1] = -first * y, first * x
+    return out
