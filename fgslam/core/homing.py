@@ -34,7 +34,7 @@ def among(ids: IntArray, others: IntArray) -> BoolArray:
 def common_rows(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
     """(k,) rows of identities (n,) and of others (m,), both ascending, that name the same."""
     if not len(others):
-        return np.empty((2, 0), np.int64)
+        return np.empty(0, np.int64), np.empty(0, np.int64)
     places = others.searchsorted(ids)
     np.minimum(places, len(others) - 1, out=places)
     mine = np.flatnonzero(others[places] == ids)
@@ -303,7 +303,7 @@ class HomingEstimate:
         c, s = math.cos(self.robot[2]), math.sin(self.robot[2])
         jacobian = home_vector_jacobian(self.robot, self.target)
         covariance = jacobian @ self.covariance @ jacobian.T
-        turn = float(wrap(np.float64(heading)))
+        turn = float(wrap(np.array(heading)))
         direction = math.atan2(c * y - s * x, c * x + s * y)
         return HomeVector(math.hypot(x, y), direction, turn, covariance)
 

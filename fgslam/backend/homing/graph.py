@@ -291,7 +291,7 @@ def _travelled(velocity: FloatArray, step: float) -> FloatArray:
     half = 0.5 * turn
     chord = math.sin(half) / half if half else 1.0
     c, s = math.cos(half) * chord, math.sin(half) * chord
-    return np.array([c * forward - s * left, s * forward + c * left, wrap(np.float64(turn))])
+    return np.array([c * forward - s * left, s * forward + c * left, float(wrap(np.array(turn)))])
 
 
 def resected(

@@ -205,7 +205,7 @@ def in_front(
     from_b = np.sin(from_start - direction) * parallax
     # What wraps angles takes longer than their cosines.
     parallel = np.cos(apart) > np.cos(least_parallax)
-    return ((from_a > 0.0) & (from_b > 0.0)) | parallel
+    return np.asarray(((from_a > 0.0) & (from_b > 0.0)) | parallel)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
