@@ -31,7 +31,7 @@ from fgslam.backend.filters.loop_correction import (
     transported,
 )
 from fgslam.backend.filters.rig_change import RigChange
-from fgslam.backend.filters.sampled_errors import Moved, SampledErrors, Step, shares
+from fgslam.backend.filters.sampled_errors import Moved, SampledErrors, Step, lacking, shares
 from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.backend.filters.set_aside import SetAside
 from fgslam.backend.protocol import recalibrated
@@ -401,7 +401,9 @@ class LandmarkKalman:
         """
         if self._settings.update in ("running_mean", "half"):
             return self._weight(rows)[:, :, None] * np.eye(3)
-        return np.asarray(np.eye(3) - self._rows.covariances[rows] @ inverse_spd3(before))
+        extra = lacking(before)
+        after = self._rows.covariances[rows] + extra
+        return np.asarray(np.eye(3) - after @ inverse_spd3(before + extra))
 
     def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
         """World positions (k, 3) of single observations, and covariances (k, 3, 3)."""

@@ -50,6 +50,7 @@ _TERMS = len(SHARED)
 _NOISE = "noise_"  # of names in a state
 _STREAM = 17  # of random numbers, beside those of the recording
 _FARTHEST_M = 1e9  # beyond, a point has no derivative; and nothing to tell
+_FLAT, _PADDING = 1e-20, 1e-9  # of the variances' sum: far below any landmark's, above rounding
 _LEAST_MATCHES = 6  # that place a frame by an old part of the drive
 
 
@@ -187,8 +188,9 @@ class SampledErrors(ErrorColumns):
         if not self._off:
             points = transform_to_camera(wTc, placed.points)
             near = in_front(self._sensor, points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
-            sights = self._sights(wTc, placed.select(near))
-            self._append({"ids": ids[near], "gain": sights.placed(self._gain)})
+            gain = np.zeros((len(ids), 3, _TERMS + SAMPLES))
+            gain[near] = self._sights(wTc, placed.select(near)).placed(self._gain)
+            self._append({"ids": ids, "gain": gain})
 
     def close(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, moved: Moved
@@ -294,7 +296,8 @@ class SampledErrors(ErrorColumns):
 
     def _drawn(self, covariances: FloatArray) -> FloatArray:
         """Samples (k, 3, SAMPLES) of these covariances (k, 3, 3)."""
-        return np.asarray(np.linalg.cholesky(covariances) @ self._signs(len(covariances), 3))
+        definite = covariances + lacking(covariances)
+        return np.asarray(np.linalg.cholesky(definite) @ self._signs(len(covariances), 3))
 
     def _enter(
         self, ids: IntArray, sights: Sights, covariances: FloatArray, pose: FloatArray
@@ -344,6 +347,16 @@ class SampledErrors(ErrorColumns):
             return drawn
         by_terms = terms @ np.linalg.cholesky(self._terms.covariance)
         return np.concatenate([by_terms, drawn], axis=-1)
+
+
+def lacking(covariances: FloatArray) -> FloatArray:
+    """(k, 3, 3) what makes covariances definite: zero but where a direction has no variance.
+
+    Saved maps may have such landmarks.
+    """
+    trace = np.trace(covariances, axis1=1, axis2=2)
+    flat = np.linalg.det(covariances) <= _FLAT * trace**3
+    return np.asarray(np.where(flat, _PADDING * trace, 0.0)[:, None, None] * np.eye(3))
 
 
 def _root(covariance: FloatArray) -> FloatArray:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from loops import CLOSED, Rounds, drive_rounds
 from scipy import stats
 from simulated import RIG, Simulation, play
 from smoothing import FREE, drawn
@@ -17,7 +18,7 @@ from fgslam.backend.persistence import StatedNoise
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.measurements import Increment
 from fgslam.evaluation.consistency import landmark_nees, nees, pose_errors, pose_nees, within
 from fgslam.frontend.settings import EgoMotionSettings
@@ -201,3 +202,46 @@ def test_estimates_do_not_depend_on_what_is_reported(update: str) -> None:
     np.testing.assert_array_equal(*poses)
     np.testing.assert_array_equal(sampled.landmarks().positions, own.landmarks().positions)
     np.testing.assert_array_equal(sampled.landmarks().covariances, own.landmarks().covariances)
+
+
+@pytest.mark.parametrize("variance", [0.0, -1e-18])
+@pytest.mark.parametrize("fixed", [True, False], ids=["as it is", "going on"])
+def test_landmarks_of_a_saved_map_may_be_known_exactly_in_a_direction(
+    variance: float, fixed: bool
+) -> None:
+    drive = drawn(1, frames=6)
+    covariances = np.tile(np.diag([1e-4, variance, 1e-4]), (len(drive.points_by_id), 1, 1))
+    ids = np.arange(len(covariances))
+    given = LandmarkMap(ids, drive.points_by_id.copy(), covariances)
+    prior = Prediction(np.eye(4), 1e-6 * np.eye(6))
+    estimator = LandmarkKalman(RIG, LandmarkKalmanSettings(), prior, FREE)
+    estimator.begin_in(given, np.ones(len(ids), np.int64), fixed)
+    seen = [each.observations for each in drive.increments]
+    known = [dataclasses.replace(each, is_new=np.zeros(len(each), np.bool_)) for each in seen]
+    increments = [
+        dataclasses.replace(each, observations=now, pruned_ids=np.empty(0, np.int64))
+        for each, now in zip(drive.increments, known, strict=True)
+    ]
+    play(estimator, increments, FREE)
+    found = estimator.estimate()
+    errors = pose_nees(found.trajectory.poses, found.covariances, drive.poses)
+    assert errors.values.sum() < 2.0 * errors.dof.sum()
+
+
+def test_a_loop_leaves_the_covariances_those_of_the_errors() -> None:
+    """At the frame that closes it, at the end, and of the landmarks: four drives."""
+    poses: list[float] = []
+    landmarks: list[float] = []
+    for seed in range(4):
+        drive = drive_rounds(Rounds(), np.random.default_rng(seed))
+        estimator = LandmarkKalman(RIG, LandmarkKalmanSettings(), FIRST, FREE)
+        steps = play(estimator, drive.increments, FREE)
+        for k in (CLOSED, len(steps) - 1):
+            at = steps[k].wTc[None], steps[k].covariance[None]
+            poses.append(float(pose_nees(*at, drive.poses[k][None]).values.sum()) / 6.0)
+        found = estimator.estimate().landmarks
+        truth = drive.points_by_id[found.ids]
+        errors = landmark_nees(found.positions, found.covariances, truth)
+        landmarks.append(float(errors.values.sum() / errors.dof.sum()))
+    assert 0.5 < np.mean(poses) < 2.5
+    assert 0.5 < np.mean(landmarks) < 2.0
