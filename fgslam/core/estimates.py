@@ -94,6 +94,8 @@ class EgoMotion(Brief):
         iterations: Newton steps taken.
         weighted_at: (4, 4) pose at which the last minimisation's weights were evaluated; None
             where nothing was minimised.
+        noise: variance over the stated one that its measurements were taken to have.
+        misfit: the same, as the median of its matches' residuals has it; NaN where none says.
     """
 
     wTc: FloatArray
@@ -103,6 +105,8 @@ class EgoMotion(Brief):
     status: EgoMotionStatus
     iterations: int
     weighted_at: FloatArray | None = None
+    noise: float = 1.0
+    misfit: float = np.nan
 
     @property
     def coherent(self) -> bool:

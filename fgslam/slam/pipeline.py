@@ -151,6 +151,7 @@ class SlamPipeline:
         increment = self._increment(index, timestamp, odometry, seen)
         stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
+        self.tracker.noise.learn(seen.tracking)
         self._remember(increment, seen, stats)
         watch.lap("update")
         if self.calibration is not None:
@@ -172,11 +173,12 @@ class SlamPipeline:
 
     def state(self) -> StateArrays:
         """What the loop itself keeps between frames."""
-        return {"ended": self._ended}
+        return {"ended": self._ended} | self.tracker.noise.state()
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`; the parts have states of their own."""
         self._ended = state["ended"]
+        self.tracker.noise.restore(state)
 
     @property
     def book(self) -> LandmarkBook:

@@ -175,6 +175,7 @@ def replay_frame(
     watch.lap("track")
     stats = updated(estimator, increment, tracking)
     observe(motion, increment, tracking, stats)
+    ego_motion.noise.learn(tracking)
     watch.lap("update")
     return ReplayedFrame(tracking, stats, watch.ms)
 

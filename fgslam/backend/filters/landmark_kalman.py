@@ -126,7 +126,8 @@ class LandmarkKalman:
         step = self._step(increment, tracking)
         self._current = Prediction(tracking.wTc, tracking.covariance)
         shared = self._settings.pose_covariance and not guessed(increment, tracking)
-        self._by_pose = tracking.covariance if shared else None
+        # With the stated noise, like all that landmarks are weighed by.
+        self._by_pose = tracking.covariance / tracking.noise if shared else None
         matched = increment.observations.select(~increment.observations.is_new)
         used = matched.select(tracking.inliers)
         self._errors.track(step, used, self._rows.map())

@@ -152,6 +152,7 @@ class SampledErrors(ErrorColumns):
         self._terms = RigTerms(solver.sensor)
         self._noise = Persistence(solver.sensor)
         self._random = np.random.default_rng(_STREAM)
+        self._taken = 1.0  # variance over the stated one that the newest pose took
         self._seen: tuple[IntArray, Sights, FloatArray] | None = None
         """Matches of the newest frame: rows of their landmarks, and the columns of these before."""
 
@@ -164,6 +165,7 @@ class SampledErrors(ErrorColumns):
         self._random = np.random.default_rng((_STREAM, step.frame))
         self._terms.hear(step.increment.rig_correction)
         learn_from(self._noise, step.frame, step.increment, step.tracking, step.before.wTc)
+        self._taken = step.tracking.noise
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
         moved = carried @ self._gain
@@ -174,7 +176,9 @@ class SampledErrors(ErrorColumns):
         self._seen = rows, sights, self._map["gain"][rows].astype(np.float64)
         self._gain = self._on_floor(wTc, moved)
         if step.measured:
-            by_prediction, by_measurement = self._solver.gain(wTc, step.expected, problem)
+            by_prediction, by_measurement = self._solver.gain(
+                wTc, step.expected, problem, self._taken
+            )
             self._gain = by_prediction @ moved + sights.following(by_measurement, self._seen[2])
 
     def filter(self, share: FloatArray) -> None:
@@ -323,7 +327,7 @@ class SampledErrors(ErrorColumns):
             gain[:, _TERMS:] = _root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
         problem, sights = problem.select(ahead), self._sights(wTc, problem.select(ahead))
-        by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem)[1]
+        by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
         return sights.following(by_measurement, self._of("gain", seen.ids[ahead]))
 
     def _on_floor(self, wTc: FloatArray, columns: FloatArray) -> FloatArray:

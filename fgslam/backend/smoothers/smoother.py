@@ -339,7 +339,8 @@ class Smoother:
             return self._smoothed
         moved = adjoint(inverse(now.wTc) @ self._smoothed.wTc)
         drift = congruence(moved, self._smoothed.covariance)
-        since = self._builder.noise.power * tracking.covariance  # as the graph weighs it
+        weighed = self._builder.noise.power / tracking.noise  # as the graph weighs it
+        since = weighed * tracking.covariance
         return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + since))
 
     def _solved(self) -> Solution:

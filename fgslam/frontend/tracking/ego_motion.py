@@ -33,8 +33,10 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Observations
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.frontend.tracking.match_noise import MatchNoise
 
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
@@ -101,6 +103,11 @@ class EgoMotionSolver:
         self._settings = settings
         self.floor = Floor.under(sensor, settings.dof)
         """Which poses are allowed."""
+        self.noise = MatchNoise()
+        """Of the measurements; whoever drives has it learn each frame."""
+        self._judges = settings.outlier_sigmas > 0.0 and settings.weighting != "uniform"
+        numbers = 3 if settings.residuals == "image_disparity" else 2
+        self._median = float(chi_square_quantile(0.5, numbers))
 
     def solve(self, prediction: Prediction, problem: PoseProblem) -> EgoMotion:
         """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
@@ -128,10 +135,12 @@ class EgoMotionSolver:
         else:
             inliers = used  # the set did not come to rest: the pose is that of the last one used
         found = self._finish(prediction, problem, minimum, inliers, iterations)
-        return dataclasses.replace(found, weighted_at=weighted_at)
+        misfit = self._misfit(wTc, problem, weights)
+        noise = self.noise.variance
+        return dataclasses.replace(found, weighted_at=weighted_at, noise=noise, misfit=misfit)
 
     def gain(
-        self, wTc: FloatArray, prediction: Prediction, problem: PoseProblem
+        self, wTc: FloatArray, prediction: Prediction, problem: PoseProblem, noise: float
     ) -> tuple[FloatArray, FloatArray]:
         """How the solution follows what it is found from, to first order.
 
@@ -139,6 +148,7 @@ class EgoMotionSolver:
             wTc: (4, 4) the solution.
             prediction: that it was stabilised towards.
             problem: the inliers.
+            noise: variance over the stated one that they were taken to have.
 
         Returns:
             Derivatives of the pose's tangent vector by the prediction's (6, 6), and by the
@@ -146,7 +156,7 @@ class EgoMotionSolver:
         """
         points = transform_to_camera(wTc, problem.points)
         jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
-        pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem)
+        pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem, noise)
         known = np.zeros((6, 6))
         if self._settings.prior:
             known = _prior_information(prediction.covariance)
@@ -198,8 +208,14 @@ class EgoMotionSolver:
             return False
         return bool(np.linalg.eigvalsh(reduced / np.outer(size, size))[0] > _LEAST_CURVATURE)
 
-    def _information(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
-        """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused."""
+    def _information(
+        self, wTc: FloatArray, problem: PoseProblem, noise: float | None = None
+    ) -> FloatArray:
+        """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused.
+
+        The stated ones times ``noise``, by default as known now: landmarks are made of such
+        measurements, and theirs are too small by as much.
+        """
         settings = self._settings
         if settings.weighting == "uniform":
             covariance = np.tile(np.eye(3), (len(problem), 1, 1))
@@ -210,6 +226,7 @@ class EgoMotionSolver:
             points[~in_front(self.sensor, points)] = (0.0, 0.0, 1.0)  # of no use
             jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
             covariance = covariance + congruence(jacobian, problem.point_covariances)
+        covariance = covariance * (self.noise.variance if noise is None else noise)
         if settings.residuals == "image_disparity":
             return inverse_spd3(covariance)
         out = np.zeros_like(covariance)
@@ -225,7 +242,7 @@ class EgoMotionSolver:
             return np.inf, np.eye(6), np.zeros(6)
         residual = self._residual(points, problem.measurement)
         jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
-        squared = np.einsum("ki,kij,kj->k", residual, information, residual)
+        squared = _squared(residual, information)
         rho, weight = self._kernel(squared, robust)
         weighted = weight[:, None, None] * (information @ jacobian)
         flat = weighted.reshape(-1, 6)
@@ -269,11 +286,22 @@ class EgoMotionSolver:
     def _inliers(self, wTc: FloatArray, problem: PoseProblem, information: FloatArray) -> BoolArray:
         residual, distance = self._measured(wTc, problem)
         near = distance <= self.farthest  # so in front, too
-        if self._settings.outlier_sigmas > 0.0 and self._settings.weighting != "uniform":
-            residual, information = residual[near], information[near]
-            squared = np.einsum("ki,kij,kj->k", residual, information, residual)
+        if self._judges:
+            squared = _squared(residual[near], information[near])
             near[near] = squared <= self._settings.outlier_sigmas**2
         return near
+
+    def _misfit(self, wTc: FloatArray, problem: PoseProblem, information: FloatArray) -> float:
+        """Variance of the residuals over the stated one, by the median of their squares.
+
+        NaN where matches are not judged by their deviations.
+        """
+        if not self._judges:
+            return math.nan
+        residual, distance = self._measured(wTc, problem)
+        ahead = np.isfinite(distance)
+        squared = _squared(residual[ahead], information[ahead])
+        return self.noise.variance * float(np.median(squared)) / self._median
 
     def _finish(
         self,
@@ -358,6 +386,10 @@ def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
     return EgoMotion(
         prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
     )
+
+
+def _squared(residual: FloatArray, information: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("ki,kij,kj->k", residual, information, residual))
 
 
 def _prior_information(covariance: FloatArray) -> FloatArray:

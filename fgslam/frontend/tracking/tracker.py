@@ -93,6 +93,7 @@ class LandmarkTracker:
         self.database = database
         self._matcher = matcher
         self._ego_motion = ego_motion
+        self.noise = ego_motion.noise
         self.resection = Resection(ego_motion)
         self.parts = MapParts()
         self._regainer = Regainer(rig, database, ego_motion, self.parts)
