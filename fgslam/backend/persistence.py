@@ -64,6 +64,10 @@ class MeasurementNoise(Protocol):
         """Variance over the stated one by which a graph of independent measurements weighs them."""
         ...
 
+    def expect(self, variance: float) -> None:
+        """Takes in what a frame's pose took measurements to have, over the stated variance."""
+        ...
+
     def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
         """Takes in a frame's observations that fit.
 
@@ -92,6 +96,9 @@ class StatedNoise:
         """The factor squared."""
         return self.factor**2
 
+    def expect(self, variance: float) -> None:
+        """Nothing."""
+
     def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
         """Nothing."""
 
@@ -110,16 +117,21 @@ class Persistence:
         self._poses: dict[int, FloatArray] = {}
         # Of single residuals and of leanings (rows) the sum of squares, and its expectation.
         self._sums = np.column_stack([STATED, STATED])
+        self._expected = 1.0
 
     @property
     def spread(self) -> float:
         """From the residuals of tracks that have ended."""
-        return _ratio(self._sums[0])
+        return self._ratio(0)
 
     @property
     def power(self) -> float:
         """What independent measurements would need to lean those tracks as much as they do."""
-        return _ratio(self._sums[1])
+        return self._ratio(1)
+
+    def expect(self, variance: float) -> None:
+        """The samples to begin with are of this variance over the stated one."""
+        self._expected = variance
 
     def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
         """Takes in a frame's observations that fit, and judges tracks that have ended.
@@ -163,6 +175,7 @@ class Persistence:
         tracks = self._tracks.values()
         return {
             "sums": self._sums.copy(),
+            "expected": np.array(self._expected),
             "pose": self._pose,
             "pose_frames": np.array(list(self._poses), np.int64),
             "poses": np.array(list(self._poses.values())).reshape(-1, 4, 4),
@@ -176,6 +189,7 @@ class Persistence:
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
         self._sums, self._pose = state["sums"].copy(), state["pose"]
+        self._expected = float(state["expected"])
         self._poses = dict(zip(state["pose_frames"].tolist(), state["poses"], strict=True))
         ends = np.cumsum(state["counts"])
         self._tracks = {
@@ -188,6 +202,10 @@ class Persistence:
                 state["ids"].tolist(), state["counts"].tolist(), ends.tolist(), strict=True
             )
         }
+    def _ratio(self, which: int) -> float:
+        squares, expectation = self._sums[which]
+        squares += STATED[which] * (self._expected - 1.0)
+        return float(np.clip(squares / expectation, *_BOUNDS))
 
     def _judge(self, frame: int, ended: list[int]) -> None:
         tracks = [self._tracks.pop(i) for i in ended]
@@ -201,6 +219,7 @@ class Persistence:
         self._poses = {k: wTc for k, wTc in self._poses.items() if k >= first}
 
 
+<<<<<<< HEAD:fgslam/backend/persistence.py
 def learn_from(
     noise: MeasurementNoise,
     frame: int,
@@ -220,6 +239,7 @@ def learn_from(
     observed = increment.observations
     matched = observed.select(~observed.is_new).select(_fits(tracking))
     step = inverse(before) @ tracking.wTc if tracking.status.measured else None
+    noise.expect(tracking.noise)
     noise.learn(frame, step, matched.join(observed.select(observed.is_new)))
 
 
@@ -239,6 +259,8 @@ def _ratio(sums: FloatArray) -> float:
     return float(np.clip(sums[0] / sums[1], *_BOUNDS))
 
 
+=======
+>>>>>>> 576d1482 (Graphs begin with the noise that matches have, until tracks have ended):fgslam/backend/smoothers/persistence.py
 def _inverses(normal: FloatArray) -> FloatArray:
     """(m, 3, 3); of one that is singular the pseudo-inverse, which takes six times as long."""
     with np.errstate(all="ignore"):

@@ -148,6 +148,7 @@ def _arrays(sensor: Sensor, inputs: Sequence[Input]) -> StateArrays:
         "matches": np.array([len(t.inliers) for t in trackings], np.int64),
         "inliers": np.concatenate([np.empty(0, np.bool_), *(t.inliers for t in trackings)]),
         "residuals": np.concatenate([np.empty(0), *(t.residuals for t in trackings)]),
+        "noise": np.array([t.noise for t in trackings]),
         "measured": np.array([t.status.measured for t in trackings], np.bool_),
         "motion_known": known,
         "motion": np.array([m.motion for m in given]).reshape(-1, 4, 4),
@@ -174,6 +175,7 @@ def _inputs(state: StateArrays, where: str, first: int) -> list[Input]:
             residuals[k],
             EgoMotionStatus.OK if state["measured"][k] else EgoMotionStatus.TOO_FEW_MATCHES,
             0,
+            noise=float(state["noise"][k]),
         )
         measured = increment.odometry
         turned = measured is not None and measured.turned
