@@ -202,6 +202,7 @@ class Persistence:
                 state["ids"].tolist(), state["counts"].tolist(), ends.tolist(), strict=True
             )
         }
+
     def _ratio(self, which: int) -> float:
         squares, expectation = self._sums[which]
         squares += STATED[which] * (self._expected - 1.0)
@@ -219,7 +220,6 @@ class Persistence:
         self._poses = {k: wTc for k, wTc in self._poses.items() if k >= first}
 
 
-<<<<<<< HEAD:fgslam/backend/persistence.py
 def learn_from(
     noise: MeasurementNoise,
     frame: int,
@@ -255,12 +255,6 @@ def _fits(tracking: EgoMotion) -> BoolArray:
     return np.asarray(off_px <= _FITS * np.median(off_px))
 
 
-def _ratio(sums: FloatArray) -> float:
-    return float(np.clip(sums[0] / sums[1], *_BOUNDS))
-
-
-=======
->>>>>>> 576d1482 (Graphs begin with the noise that matches have, until tracks have ended):fgslam/backend/smoothers/persistence.py
 def _inverses(normal: FloatArray) -> FloatArray:
     """(m, 3, 3); of one that is singular the pseudo-inverse, which takes six times as long."""
     with np.errstate(all="ignore"):
