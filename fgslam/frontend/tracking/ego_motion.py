@@ -294,12 +294,14 @@ class EgoMotionSolver:
     def _misfit(self, wTc: FloatArray, problem: PoseProblem, information: FloatArray) -> float:
         """Variance of the residuals over the stated one, by the median of their squares.
 
-        NaN where matches are not judged by their deviations.
+        NaN where matches are not judged by their deviations, or none is ahead.
         """
         if not self._judges:
             return math.nan
         residual, distance = self._measured(wTc, problem)
         ahead = np.isfinite(distance)
+        if not ahead.any():
+            return math.nan
         squared = _squared(residual[ahead], information[ahead])
         return self.noise.variance * float(np.median(squared)) / self._median
 
