@@ -78,7 +78,8 @@ class HomingController:
         self._ended: Command | None = None
         self._heading = 0.0
         self._was_ahead = False
-        self._begun: HomingStart | None = None  # where the leg begins, of which parts are left
+        # Where the leg begins, and where it went on by a vector that two images agree on.
+        self._begun: list[HomingStart] = []
         self._progress, self._patience = _Progress(_STALL_S), _WAIT_S
         self._next_try = -np.inf
         self._blind_until = -np.inf
@@ -163,9 +164,13 @@ class HomingController:
         self._next_look = time + self._settings.retry_s
         answer = self._front_end.look(image, self._target)
         if isinstance(answer, Sighting):
+            # One of the starts may be wrong itself; by that one no place would ever be near.
+            left = min(surely_left(begun, answer) for begun in self._begun)
             if homing.contradicts(answer.vector):
-                return self._seen_elsewhere(homing, answer, time)
-            self._recognised = self._surely_near(homing, answer)
+                return self._seen_elsewhere(homing, answer.vector, left, time)
+            # The first estimate is near when it says so. Later ones took the place of one that
+            # failed, with its distance or where its tracks ended.
+            self._recognised = self.initialisations == 1 or left <= _NEAR_FRACTION
             if arrival and not self._recognised:
                 return self._doubt(time, "target may not be so near", answer.vector)
         elif answer.reason is RefusalReason.AT_TARGET:
@@ -174,28 +179,21 @@ class HomingController:
             return self._doubt(time, f"target not seen where it is believed: {answer.details}")
         return None
 
-    def _surely_near(self, homing: ActiveHoming, seen: Sighting) -> bool:
-        """Whether an estimate that says so is near the target; that of the leg's start is.
-
-        Later ones took the place of one that failed, with its distance or where its tracks ended.
-        """
-        begun = self._begun or homing.start
-        return homing.start is begun or surely_left(begun, seen) <= _NEAR_FRACTION
-
-    def _seen_elsewhere(self, homing: ActiveHoming, seen: Sighting, time: float) -> Command:
+    def _seen_elsewhere(
+        self, homing: ActiveHoming, vector: TwoViewVector, left: float, time: float
+    ) -> Command:
         """The target is seen in another direction than estimated: reached, passed, or an error.
 
         At the target itself directions mean little, so its distance decides, as far as it is
         certain; rotations that contradict mean that another place is seen.
         """
-        if homing.turned_otherwise(seen.vector):
-            return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
-        left = surely_left(self._begun or homing.start, seen)
-        behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
+        if homing.turned_otherwise(vector):
+            return self._doubt(time, "near the target it is seen elsewhere", vector)
+        behind = abs(vector.direction) > np.pi / 2 and self._was_ahead
         if left <= self._settings.switch_fraction or (behind and left <= _PASS_FRACTION):
             self.remaining = left
             return self._end(time, HomingState.ARRIVED, f"passed: seen at {left:.2f} of the leg")
-        return self._doubt(time, "near the target it is seen elsewhere", seen.vector, left)
+        return self._doubt(time, "near the target it is seen elsewhere", vector, left)
 
     def _doubt(
         self, time: float, why: str, vector: TwoViewVector | None = None, left: float = 1.0
@@ -286,7 +284,8 @@ class HomingController:
         if self._standing_since is not None or self.initialisations == 0:
             self._progress.pause(time)
         self.active = homing
-        self._begun = self._begun or homing.start
+        if self._pending is not None or not self._begun:
+            self._begun.append(homing.start)
         self._heading = homing.start.vector.direction
         self._was_ahead = self._was_ahead or abs(self._heading) <= np.pi / 2
         self._pending = self._standing_since = None

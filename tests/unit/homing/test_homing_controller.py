@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -122,6 +122,8 @@ class ScriptedFrontEnd:
     looks: list[Sighting | Refusal] = field(default_factory=list)
     looked: int = 0
     home: FloatArray = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
+    matched: int = 0
+    """Number of the target's first feature that ``begin`` matches."""
 
     def describe(self, image: ByteArray) -> OmniFeatures:
         """Never asked."""
@@ -134,7 +136,9 @@ class ScriptedFrontEnd:
         if isinstance(answer, Refusal):
             return answer
         self.home = np.array([*unit(np.array(answer.direction)), answer.rotation])
-        return start_at(time, answer)
+        start = start_at(time, answer)
+        of_target = start.matches.index_b + self.matched
+        return replace(start, matches=replace(start.matches, index_b=of_target))
 
     def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
         """From a list, the last one repeated; without one the truth since the last match."""
@@ -611,6 +615,26 @@ def test_arrival_of_an_estimate_matched_anew_is_confirmed_by_common_features(
     b.front_end.looks = [Sighting(seen.vector, seen.matches.select(np.arange(common)))]
     b.at(0.9)
     assert b.step().state.value == state
+
+
+@pytest.mark.parametrize(("near", "state"), [(0.05, "arrived"), (0.6, "confirm")])
+def test_start_that_was_contradicted_bounds_no_later_arrival(near: float, state: str) -> None:
+    """Its features are another place's; homing goes on from where two images agree.
+
+    What begins there is no better by itself: its features and the look's must put it near.
+    """
+    b = bench(vector_to(1.5), vector_to(0.0))
+    b.front_end.matched, b.front_end.looks = 100, [sighting_of(vector_to(0.0), 0.9)]
+    b.step()
+    b.at(*(0.8 * unit(np.array(1.5))))
+    assert b.step().state is HomingState.CONFIRM
+    b.front_end.matched, b.front_end.robot = 0, np.zeros(3)
+    anew = b.step()
+    assert anew.state is HomingState.DRIVE
+    assert anew.remaining == 1.0
+    b.front_end.looks = [sighting_of(vector_to(0.0), near)]
+    b.at(0.95)
+    assert b.step(SETTINGS.retry_s).state.value == state
 
 
 def test_what_is_left_is_bounded_by_common_features() -> None:
