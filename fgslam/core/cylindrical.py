@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.sensors import CameraRig
 
 _NEAR_AXIS = 1e-4  # radians, below which a series is exact
@@ -102,6 +102,16 @@ def size_distances(rig: CameraRig, points: FloatArray) -> FloatArray:
         return points[:, 2]
     away2 = points[:, 1] ** 2 + points[:, 2] ** 2
     return np.asarray((away2 * (away2 + points[:, 0] ** 2)) ** 0.25)
+
+
+def are_beyond(rig: CameraRig, points: FloatArray, nearest_m: float) -> BoolArray:
+    """(n,) which points (n, 3) of the camera's frame are before it, farther than ``nearest_m``.
+
+    In depth; in a cylindrical view, at whose rim all depths are small, in distance.
+    """
+    if not rig.cylindrical:
+        return np.asarray(points[:, 2] > nearest_m)
+    return np.asarray((points[:, 2] > 0.0) & (np.linalg.norm(points, axis=1) > nearest_m))
 
 
 def as_perspective(rig: CameraRig, measurement: FloatArray) -> tuple[FloatArray, FloatArray]:

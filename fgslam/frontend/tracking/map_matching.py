@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.cylindrical import size_distances
+from fgslam.core.cylindrical import are_beyond, size_distances
 from fgslam.core.estimates import Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import (
@@ -30,7 +30,7 @@ Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their distances by which sizes shrink: which to consider at all."""
 _CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
-_NEAREST_DEPTH_M = 0.1
+_NEAREST_M = 0.1
 _SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
 
 
@@ -122,7 +122,7 @@ class FieldOfView:
 
         The reference image with its border, widened by a hair, as planes through the camera.
         """
-        rows = np.flatnonzero(points[:, 2] > _NEAREST_DEPTH_M)
+        rows = np.flatnonzero(are_beyond(self._rig, points, _NEAREST_M))
         rig, reach = self._rig, self._border + _SLACK_PX
         if self._cone or rig.cylindrical:
             return rows

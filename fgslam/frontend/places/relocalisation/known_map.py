@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.cylindrical import size_distances
+from fgslam.core.cylindrical import are_beyond, size_distances
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
@@ -17,7 +17,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.descriptor_index import AppearanceIndex, Neighbours
 from fgslam.frontend.features.matching import pairs_within
 
-_NEAREST_DEPTH_M = 0.3
+_NEAREST_M = 0.3
 _ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare
 
 
@@ -95,12 +95,13 @@ class KnownMap:
     ) -> tuple[IntArray, FloatArray]:
         """Rows (m,) of landmarks in all images from ``wTc``, and their points in the camera.
 
-        Only those no deeper than ``farthest`` (metres; one for all, or one for each).
+        Only those whose sizes shrink by no more than ``farthest`` (metres, the depth in a
+        perspective view; one for all, or one for each).
         """
         rows = self._roughly_in_view(rig, wTc, farthest)
         points = transform_to_camera(wTc, self.landmarks.positions[rows])
         limit = farthest if isinstance(farthest, float) else farthest[rows]
-        near = (points[:, 2] > _NEAREST_DEPTH_M) & (points[:, 2] <= limit)
+        near = are_beyond(rig, points, _NEAREST_M) & (size_distances(rig, points) <= limit)
         rows, points = rows[near], points[near]
         column, row, disparity = project(rig, points).T
         vertical = 0.0
@@ -120,9 +121,10 @@ class KnownMap:
         right, _, forward = wTc[:3, :3].T
         depth = forward @ self.axes - forward @ wTc[:3, 3]
         across = right @ self.axes - right @ wTc[:3, 3]
-        near = (depth > _NEAREST_DEPTH_M - _ROUNDING_M) & (depth <= farthest + _ROUNDING_M)
+        near = depth <= farthest + _ROUNDING_M
         if rig.cylindrical:  # its columns are no planes through the camera
-            return np.flatnonzero(near)
+            return np.flatnonzero(near & (depth > -_ROUNDING_M))
+        near &= depth > _NEAREST_M - _ROUNDING_M
         near &= across >= -rig.cx / rig.fx * depth - _ROUNDING_M
         near &= across <= (rig.width - 1.0 - rig.cx) / rig.fx * depth + _ROUNDING_M
         return np.flatnonzero(near)
@@ -137,7 +139,7 @@ class KnownMap:
         """
         rows, _ = self.in_view(rig, wTc, self.largest / scales[0] + _ROUNDING_M)
         sight = self.landmarks.positions[rows] - wTc[:3, 3]
-        distance = np.maximum(size_distances(rig, sight @ wTc[:3, :3]), _NEAREST_DEPTH_M)
+        distance = np.maximum(size_distances(rig, sight @ wTc[:3, :3]), _NEAREST_M)
         sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         views, at = self.views_of(rows)
         cosine = np.einsum("vi,vi->v", self.views.direction[views], sight[at])

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
+from fgslam.core.cylindrical import are_beyond
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
 from fgslam.core.floor import Floor
@@ -25,7 +26,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import CameraRig
 
-_NEAREST_DEPTH_M = 0.1
+_NEAREST_M = 0.1
 _LOG_TWO_PI = float(np.log(2.0 * np.pi))
 
 
@@ -57,7 +58,7 @@ class SeenPoints(Rows):
         column, row, disparity = features.measurement.T
         inside = (column >= -0.5) & (column <= rig.width - 0.5)
         inside &= (row >= -0.5) & (row <= rig.height - 0.5)
-        inside &= (disparity > 0.0) & (features.position[:, 2] > _NEAREST_DEPTH_M)
+        inside &= (disparity > 0.0) & are_beyond(rig, features.position, _NEAREST_M)
         pick = inside[:, None, None]
         return SeenPoints(
             in_image=inside,
@@ -128,8 +129,9 @@ def residuals(
     offset = pairs.points - wTc[..., :3, 3]
     points = np.einsum("kji,kj->ki", wRc, offset)
     seen = pairs.seen
-    valid = (points[:, 2] > _NEAREST_DEPTH_M) | ~seen.in_image
-    safe = np.where((points[:, 2] > _NEAREST_DEPTH_M)[:, None], points, [0.0, 0.0, 1.0])
+    ahead = are_beyond(rig, points, _NEAREST_M)
+    valid = ahead | ~seen.in_image
+    safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
     pick = seen.in_image[:, None]
     predicted = np.where(pick, project(rig, safe), points)
     jacobian = np.where(pick[:, :, None], projection_jacobian(rig, safe), np.eye(3))
