@@ -420,9 +420,3 @@ def main() -> None:
         where = one_line(str(error.filename or "standard output"))
         print(f"fgslam: {where}: {error.strerror or error}; mend that and repeat", file=sys.stderr)
         raise SystemExit(EXIT_USER) from None
-    except (ImportError, RuntimeError, SystemError, AttributeError, TypeError):
-        if not signals.was_asked():
-            raise
-        # Some library made another error of the signal.
-        print("fgslam: interrupted", file=sys.stderr)
-        raise SystemExit(signals.status()) from None

@@ -74,7 +74,10 @@ def _pass_over(number: int, frame: FrameType | None) -> None:
 
 
 class OtherErrors:
-    """What a library makes of an interruption is one: pydantic a wrong schema of the settings."""
+    """What a library makes of an interruption is one: pydantic a wrong schema of the settings.
+
+    Around the whole command line, which has answered its own errors before.
+    """
 
     def __enter__(self) -> None:
         pass

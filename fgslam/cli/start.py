@@ -17,7 +17,8 @@ _ended_with: list[int] = []
 
 def main() -> None:
     """The command line; as :func:`fgslam.cli.main.main`."""
-    atexit.register(_leave)  # the first to be registered is the last to be called
+    # Registered before any library is imported, it is called after all that these register.
+    atexit.register(_leave)
     try:
         with signals.OtherErrors():
             signals.watch()
