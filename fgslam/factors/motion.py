@@ -14,8 +14,9 @@ from fgslam.core.measurements import Odometry
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite, robust
 
 _GUESSED_WIDTH = float(np.sqrt(10.0))
-"""Kernel of a step that a motion model made: a variance estimated from ten samples, which is what
-its noise remembers, foretells by Student's t with ten degrees of freedom, of Cauchy's shape."""
+"""Kernel of a step that a motion model made: Student's t with ten degrees of freedom, of Cauchy's
+shape. A variance known from as many samples foretells so; the model's fading memory is worth twenty
+equal ones, and ten allow for starts and bends besides."""
 
 
 def pose_prior(pose: int, prior: Prediction) -> Any:
