@@ -223,8 +223,8 @@ class SampledErrors(ErrorColumns):
             self._map["gain"][rows[of_home]] -= motion[3:] - points @ motion[:3]
 
     def held_aside(self, ids: IntArray) -> FloatArray:
-        """(k, 3, m) of landmarks; zero of those that have none yet."""
-        return self._of("gain", ids)
+        """(k, 3, m) of landmarks, as precise as they are kept; zero of those that have none yet."""
+        return self._of("gain", ids).astype(self._map["gain"].dtype)
 
     def take_back(self, ids: IntArray, gain: FloatArray) -> None:
         """Landmarks come back with what :meth:`held_aside` gave of them."""

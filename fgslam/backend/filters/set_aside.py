@@ -26,8 +26,9 @@ class SetAside:
         frames: (k,) the homes, ascending, each once.
         timestamps: (k,) theirs, seconds.
         poses: (k, 4, 4) theirs, as they were then.
-        doubt_gain: (n, 3, q) derivatives by the rig's shared terms
-            (:mod:`fgslam.backend.filters.online_doubt`), world axes; zero where there is no doubt.
+        doubt_gain: (n, 3, q) error columns, world axes; zero where there are none: derivatives by
+            the rig's shared terms (:mod:`fgslam.backend.filters.online_doubt`) and, of the filter
+            of single landmarks, drawn samples (:mod:`fgslam.backend.filters.sampled_errors`).
         doubt_information: (n, 3, 3) given the poses; zero where there is no doubt.
         tracks: what else their estimator knows of them.
     """

@@ -83,11 +83,12 @@ class RecordedInputs:
         """A frame's pose and covariance as tracked.
 
         Raises:
-            MeasurementLogError: the file that they are in is missing or damaged.
+            OutputError: the file that they are in is missing or another's.
+            MeasurementLogError: it is damaged.
         """
         block, row = divmod(frame, BLOCK)
         if block < self._blocks:
-            kept = load_arrays(self._file(block), ("wTc", "covariance"))
+            kept = self._arrays_of(block, ("wTc", "covariance"))
             return Prediction(kept["wTc"][row], kept["covariance"][row])
         tracking = self._last[frame - BLOCK * self._blocks][1]
         return Prediction(tracking.wTc, tracking.covariance)
@@ -123,15 +124,19 @@ class RecordedInputs:
         return self._folder / f"{block:06d}.npz"
 
     def _read(self, block: int) -> list[Input]:
-        path = self._file(block)
-        arrays = load_arrays(path) if path.is_file() else {}
+        return _inputs(self._arrays_of(block), str(self._file(block)), block * BLOCK)
+
+    def _arrays_of(self, block: int, names: tuple[str, ...] | None = None) -> StateArrays:
+        """Those of these names, or all."""
+        path, wanted = self._file(block), None if names is None else (*names, _NUMBER)
+        arrays = load_arrays(path, wanted) if path.is_file() else {}
         if int(arrays.get(_NUMBER, -1)) != block:
             what = "holds other frames than its name says" if arrays else "is missing"
             raise OutputError(
                 f"{path}: this file of the run {what}; restore the file, or start again with "
                 "--overwrite"
             )
-        return _inputs(arrays, str(path), block * BLOCK)
+        return arrays
 
 
 def _arrays(sensor: Sensor, inputs: Sequence[Input]) -> StateArrays:

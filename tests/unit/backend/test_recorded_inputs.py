@@ -28,11 +28,15 @@ def test_files_that_are_not_where_they_belong_are_told(
     assert len(files) == 3
     told = [increment.index for increment, _ in inputs.recalled(state)]
     assert told == [increment.index for increment in increments]
+    np.testing.assert_array_equal(inputs.tracked(3).wTc, np.eye(4))
     files[1].write_bytes(files[2].read_bytes())
     with pytest.raises(OutputError, match="holds other frames than its name says"):
         list(inputs.recalled(state))
+    with pytest.raises(OutputError, match="holds other frames than its name says"):
+        inputs.tracked(3)
     files[1].unlink()
-    with pytest.raises(OutputError, match="is missing; restore the file"):
-        list(inputs.recalled(state))
+    for asked in (lambda: list(inputs.recalled(state)), lambda: inputs.tracked(3)):
+        with pytest.raises(OutputError, match="is missing; restore the file"):
+            asked()
     with pytest.raises(EstimatorError, match="name their folder with keep_record_in"):
         list(RecordedInputs(RIG).recalled(state))
