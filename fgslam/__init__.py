@@ -18,11 +18,13 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
 from fgslam.core import __version__, errors
 
+TYPE_CHECKING = False  # as in typing, whose import takes as long as all else here
 if TYPE_CHECKING:
+    from typing import Any
+
     from fgslam.backend.protocol import Estimator
     from fgslam.cameras.omni.camera_files import load_camera
     from fgslam.cameras.rig import StereoRig, load_rig

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+
+# Until they are answered Ctrl-C ends the process at once, without the interpreter's traceback;
+# who ignores it, as a worker does, goes on to.
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import atexit
 import os
 import resource

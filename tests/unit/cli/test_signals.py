@@ -52,6 +52,30 @@ def test_while_a_command_imports_a_signal_ends_it_with_one_line(
     assert (status, said) == (128 + number, "fgslam: interrupted\n")
 
 
+_BEFORE_IT_WATCHES = """
+import os, signal, sys
+signal.signal(signal.SIGINT, getattr(signal, sys.argv[1]))
+
+class Interrupting:
+    def find_spec(self, name, *rest):
+        if name == "fgslam.cli.signals":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+import fgslam.cli.start
+"""
+
+
+@pytest.mark.parametrize(
+    ("handler", "status"), [("default_int_handler", -signal.SIGINT), ("SIG_IGN", 0)]
+)
+def test_ctrl_c_before_signals_are_answered_ends_without_a_traceback(
+    handler: str, status: int
+) -> None:
+    """But not who ignores it, as a worker does."""
+    assert ended(_BEFORE_IT_WATCHES, handler) == (status, "")
+
+
 _WHILE_IT_STARTS_TO_WATCH = """
 import os, sys, threading
 from fgslam.cli.start import main
