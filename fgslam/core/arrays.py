@@ -135,6 +135,10 @@ class GrowingColumns:
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self._buffers[name][: self._length]
 
+    def columns(self) -> StateArrays:
+        """All columns as views, by name."""
+        return {name: self[name] for name in self._buffers}
+
     def append(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
         """Adds rows (k, ...): one array for every column."""
         count = len(next(iter(values.values())))
@@ -164,7 +168,7 @@ class GrowingColumns:
 
     def state(self) -> StateArrays:
         """A snapshot of all columns."""
-        return {name: self[name].copy() for name in self._buffers}
+        return {name: view.copy() for name, view in self.columns().items()}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Continues from :meth:`state`."""

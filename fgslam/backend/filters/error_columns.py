@@ -25,7 +25,11 @@ def found_under(prefix: str, state: StateArrays) -> StateArrays:
 
 
 class ErrorColumns:
-    """Columns (6, m) of the newest pose and (n, 3, m) of landmarks, by ascending identity."""
+    """Columns (6, m) of the newest pose and (n, 3, m) of landmarks.
+
+    Those of a landmark stay in one place while it is there: what comes and goes costs what it is,
+    whatever the map.
+    """
 
     def __init__(self, count: int, kind: type = np.float64, **more: FloatArray) -> None:
         """All zero, the map empty.
@@ -37,9 +41,10 @@ class ErrorColumns:
         """
         self._held = False
         self._gain = np.zeros((6, count))
-        self._map = GrowingColumns(
-            ids=np.empty(0, np.int64), gain=np.empty((0, 3, count), kind), **more
-        )
+        self._order = GrowingColumns(ids=np.empty(0, np.int64), row=np.empty(0, np.int64))
+        """Identities, ascending, and the rows that are theirs in the map; free ones are nobody's"""
+        self._map = GrowingColumns(gain=np.empty((0, 3, count), kind), **more)
+        self._free = np.empty(0, np.int64)
 
     def hold_map(self) -> None:
         """The map is a saved one that nothing changes: it is as well known as it was then."""
@@ -47,10 +52,12 @@ class ErrorColumns:
 
     def forget(self, ids: IntArray) -> None:
         """Landmarks that somebody else holds now, or nobody."""
-        rows, known = self._rows(ids)
-        gone = np.zeros(len(self._map), np.bool_)
-        gone[rows[known]] = True
-        self._map.drop(gone)
+        places, known = self._places(ids)
+        if known.any():
+            gone = np.zeros(len(self._order), np.bool_)
+            gone[places[known]] = True
+            self._free = np.concatenate([self._free, self._order["row"][gone]])
+            self._order.drop(gone)
 
     def state(self) -> StateArrays:
         """Everything needed to continue."""
@@ -63,26 +70,43 @@ class ErrorColumns:
     # ----------------------------------------------------------------------------------------
 
     def _state(self) -> StateArrays:
-        return {"pose_gain": self._gain, **self._map.state()}
+        held = {name: of[self._order["row"]] for name, of in self._map.columns().items()}
+        return {"pose_gain": self._gain, "ids": self._order["ids"].copy(), **held}
 
     def _restore(self, state: StateArrays) -> None:
         self._gain = state["pose_gain"]
-        self._map.restore(state)
+        self.forget(self._order["ids"].copy())
+        self._append({"ids": state["ids"], **{name: state[name] for name in self._map.columns()}})
 
     def _append(self, values: StateArrays) -> None:
         """Landmarks (k,) that are not there yet; their identities ascend."""
-        if len(values["ids"]):
-            before = len(self._map)
-            self._map.append(values)
-            self._map.keep_ascending("ids", before)
+        ids = values["ids"]
+        if not len(ids):
+            return
+        again = min(len(ids), len(self._free))
+        begun = len(self._map)
+        rows = np.concatenate([self._free[:again], np.arange(begun, begun + len(ids) - again)])
+        self._free = self._free[again:]
+        of_map = {name: values[name] for name in self._map.columns()}
+        self._map.append({name: array[again:] for name, array in of_map.items()})
+        for name, array in of_map.items():
+            self._map[name][rows[:again]] = array[:again]
+        before = len(self._order)
+        self._order.append({"ids": ids, "row": rows})
+        self._order.keep_ascending("ids", before)
+
+    def _places(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
+        """(k,) places of landmarks in the order, and which of them are there."""
+        have = self._order["ids"]
+        if not len(have):
+            return np.zeros(len(ids), np.int64), np.zeros(len(ids), np.bool_)
+        places = np.minimum(np.searchsorted(have, ids), len(have) - 1)
+        return places, np.asarray(have[places] == ids)
 
     def _rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
         """(k,) rows of landmarks in the map, and which of them are there."""
-        have = self._map["ids"]
-        if not len(have):
-            return np.zeros(len(ids), np.int64), np.zeros(len(ids), np.bool_)
-        rows = np.minimum(np.searchsorted(have, ids), len(have) - 1)
-        return rows, np.asarray(have[rows] == ids)
+        places, known = self._places(ids)
+        return (self._order["row"][places] if known.any() else places), known
 
     def _of_map(self, ids: IntArray) -> FloatArray:
         """(k, 3, m) columns of landmarks, as far as they are reported."""

@@ -175,7 +175,7 @@ class LandmarkKalman:
             homes=homes,
             lasts=self._rows.lasts[rows],
             frames=frames,
-            timestamps=np.array(self._past.timestamps)[frames],
+            timestamps=np.array([self._past.timestamps[frame] for frame in frames.tolist()]),
             poses=self.poses_of(frames),
             doubt_gain=self._errors.held_aside(ids),
             doubt_information=np.zeros((len(ids), 3, 3)),

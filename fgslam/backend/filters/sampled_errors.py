@@ -216,9 +216,10 @@ class SampledErrors(ErrorColumns):
             wTc, self._gain - adjoint(inverse(wTc)) @ moved.shares[-1] @ apart
         )
         homes = np.where(known, moved.homes, -1)
-        for home in np.unique(homes[homes >= 0]).tolist():
-            of_home = homes == home
-            motion = moved.shares[home] @ apart
+        order = np.argsort(homes, kind="stable")[np.count_nonzero(homes < 0) :]
+        ends = np.flatnonzero(np.diff(homes[order], append=-1)) + 1
+        for of_home in np.split(order, ends[:-1]) if len(order) else ():
+            motion = moved.shares[homes[of_home[0]]] @ apart
             points = skew(landmarks.positions[of_home])
             self._map["gain"][rows[of_home]] -= motion[3:] - points @ motion[:3]
 
