@@ -67,11 +67,10 @@ class Browser:
         self.driver.get(page.resolve().as_uri())
         self.wait("document.documentElement.dataset.drawn === 'yes'")
 
-    def assert_loads_quietly(self) -> None:
-        """The page loads without an error in the console and asks for nothing outside itself."""
+    def assert_loads_quietly(self, page: Path) -> None:
+        """A report loads without an error in the console and asks for nothing outside itself."""
         self.complaints(), self.requests()  # forget what came before
-        self.driver.refresh()
-        self.wait("document.documentElement.dataset.drawn === 'yes'")
+        self.open(page)
         assert self.complaints() == []
         assert self.requests() == []
 

@@ -68,8 +68,9 @@ def figure_switch(figure: str, key: str) -> str:
     return f'input[data-figure="{figure}"][data-switch="{key}"]'
 
 
-def test_page_loads_offline_without_error_or_request(browser: Browser) -> None:
-    browser.assert_loads_quietly()
+def test_page_loads_offline_without_error_or_request(offline: Browser, page: Path) -> None:
+    browser = offline
+    browser.assert_loads_quietly(page)
     for figure in FIGURES:
         assert browser.js(f"{DRAWN.format(figure)}.length") >= 2
     assert browser.js("document.querySelectorAll('#plot-map canvas').length") >= 1
@@ -185,8 +186,7 @@ def test_the_map_turns_by_mouse_and_stays_turned(browser: Browser, page: Path) -
     assert browser.js(KEPT_EYE) == pytest.approx(turned, abs=1e-6)
 
 
-def test_the_map_turns_by_arrow_keys(browser: Browser, page: Path) -> None:
-    browser.open(page)
+def test_the_map_turns_by_arrow_keys(browser: Browser) -> None:
     before = browser.js(KEPT_EYE)
     scene = browser.driver.find_element(By.ID, "plot-map")
 
@@ -209,19 +209,6 @@ def test_axes_from_above_are_equal(browser: Browser) -> None:
         "(document.getElementById('plot-above')._fullLayout)"
     )
     assert browser.js(scale) == pytest.approx(1.0, rel=1e-3)
-
-
-def test_a_phone_scrolls_the_table_and_not_the_page(browser: Browser, page: Path) -> None:
-    browser.size(*PHONE, phone=True)
-    browser.open(page)
-    assert browser.js("innerWidth") == PHONE[0]
-    assert browser.js("document.documentElement.scrollWidth") <= PHONE[0]
-    plots = browser.js(
-        "[...document.querySelectorAll('.plot')].map(p => p.getBoundingClientRect().right)"
-    )
-    assert len(plots) == len(FIGURES)
-    assert max(plots) <= PHONE[0]
-    assert browser.js("getComputedStyle(document.querySelector('.scroll')).overflowX") == "auto"
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
@@ -260,6 +247,19 @@ def test_a_foreign_script_is_refused_by_the_page(browser: Browser) -> None:
     )
     assert browser.js("window.ran === undefined") is True
     assert any("Content Security Policy" in line for line in browser.complaints())
+
+
+def test_a_phone_scrolls_the_table_and_not_the_page(browser: Browser, page: Path) -> None:
+    browser.size(*PHONE, phone=True)
+    browser.open(page)
+    assert browser.js("innerWidth") == PHONE[0]
+    assert browser.js("document.documentElement.scrollWidth") <= PHONE[0]
+    plots = browser.js(
+        "[...document.querySelectorAll('.plot')].map(p => p.getBoundingClientRect().right)"
+    )
+    assert len(plots) == len(FIGURES)
+    assert max(plots) <= PHONE[0]
+    assert browser.js("getComputedStyle(document.querySelector('.scroll')).overflowX") == "auto"
 
 
 # --------------------------------------------------------------------------------------------

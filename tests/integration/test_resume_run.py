@@ -46,7 +46,10 @@ LONG = 20
 """Frames that are enough to be interrupted for certain after the fifth."""
 
 
-@pytest.mark.parametrize("frames", [1, 2, 7, 11])
+@pytest.mark.parametrize(
+    "frames",
+    [1, 7, pytest.param(2, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)],
+)
 def test_stopped_after_some_frames(
     frames: int, recording: Path, finished: Finished, tmp_path: Path
 ) -> None:
@@ -85,7 +88,8 @@ def test_stopping_after_the_last_frame_is_finishing(recording: Path, tmp_path: P
 @pytest.mark.parametrize("kind", ["constant_velocity", "synthetic"])
 def test_resumed_with_other_odometry(kind: str, recording: Path, tmp_path: Path) -> None:
     """The motion model's own state, and noise drawn from the seed, go on as well."""
-    values = experiment(recording, odometry={"kind": kind}, seed=5)
+    dataset = {"kind": "image_folder", "path": str(recording), "stop": 8}
+    values = experiment(recording, dataset=dataset, odometry={"kind": kind}, seed=5)
     straight = run_values(values, tmp_path / "straight")
     run_values(values, tmp_path / "run", stopped=stop_after(5))
     run_values(values, tmp_path / "run", "resume")
@@ -128,7 +132,8 @@ def test_another_recording_is_refused(own_recording: Path, tmp_path: Path) -> No
 
 def test_other_versions_are_refused(recording: Path, tmp_path: Path) -> None:
     """They would not give the bytes of an uninterrupted run."""
-    values = experiment(recording)
+    dataset = {"kind": "image_folder", "path": str(recording), "stop": 4}
+    values = experiment(recording, dataset=dataset)
     run = run_values(values, tmp_path / "run", stopped=stop_after(3))
     config = run.folder / "config.yaml"
     text = config.read_text()
@@ -247,7 +252,10 @@ def long_bytes(
 
 @pytest.mark.parametrize(
     "number",
-    [signal.SIGINT, signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)],
+    [
+        signal.SIGINT,  # killed is another command, in test_resume_tasks
+        *(pytest.param(n, marks=pytest.mark.slow) for n in (signal.SIGKILL, signal.SIGTERM)),
+    ],
 )
 def test_signals(
     number: signal.Signals,

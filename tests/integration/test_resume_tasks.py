@@ -62,9 +62,13 @@ TASKS = (
 )
 EACH_TASK = pytest.mark.parametrize(
     "task",
-    [pytest.param(task, marks=pytest.mark.slow if task == "homing" else ()) for task in TASKS],
+    [
+        pytest.param(task, marks=pytest.mark.slow if task in ("homing", "slam") else ())
+        for task in TASKS
+    ],
 )
-"""A homing is a path of one leg, done by the same module."""
+"""A homing is a path of one leg, done by the same module; a run of one estimator a part of one of
+several."""
 HOUSE: dict[str, Any] = {
     "name": "short",
     "jobs": 1,
@@ -108,7 +112,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
     """A small experiment of each task."""
-    dataset = {"kind": "image_folder", "path": str(recording), "stop": 7}
+    dataset = {"kind": "image_folder", "path": str(recording), "stop": 5}
     images = experiment(recording, dataset=dataset, output=QUIET)
     panoramas = {"name": "x", "jobs": 1, "dataset": {"kind": "panoramas", "path": str(views)}}
     known: dict[str, dict[str, Any]] = {
@@ -440,7 +444,9 @@ def test_interrupted_pairs_say_so_and_count_nothing_that_is_not_done(
     assert "yet" not in whole.lines[0]
 
 
-@pytest.mark.parametrize("task", ["homing_pairs", "homing_trials"])
+@pytest.mark.parametrize(
+    "task", ["homing_pairs", pytest.param("homing_trials", marks=pytest.mark.slow)]
+)
 def test_a_command_killed_by_a_signal_resumes_to_the_same_bytes(
     task: str,
     straight: Straight,
@@ -652,26 +658,17 @@ class Kills:
         return self._straight[task]
 
 
-@pytest.mark.parametrize(
-    ("tasks", "count"),
-    [
-        (("measurements",), 2),
-        pytest.param(TASKS, 200, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
 def test_killed_at_random_moments_no_run_is_lost(
-    tasks: tuple[str, ...],
-    count: int,
-    values_of: Callable[[str], dict[str, Any]],
-    tmp_path: Path,
+    values_of: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
-    shares = np.random.default_rng(16).uniform(0.0, 1.0, count)
-    experiments = [values_of(t) for t in tasks if not t.startswith(("compare", "trials"))]
+    shares = np.random.default_rng(16).uniform(0.0, 1.0, 200)
+    experiments = [values_of(t) for t in TASKS if not t.startswith(("compare", "trials"))]
     with server(experiments, tmp_path) as forked:
         kills = Kills(values_of, forked, tmp_path)
         found = [
             (task, round(share, 3), kills.of(task, share))
-            for task, share in zip(itertools.cycle(tasks), shares, strict=False)
+            for task, share in zip(itertools.cycle(TASKS), shares, strict=False)
         ]
     print(Counter(how for *_, how in found))
     assert [one for one in found if one[2].startswith(("LOST", "OTHER"))] == []

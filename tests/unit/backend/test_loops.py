@@ -68,7 +68,7 @@ def returned(lies: bool = False, seed: int = SEED) -> Returned:
 
 
 @cache
-def at_end(name: str, lies: bool = False) -> tuple[Estimator, Estimate]:
+def at_end(name: str, lies: bool, /) -> tuple[Estimator, Estimate]:
     """The estimator and its answer after the drive; the loop was closed, or a wrong one refused."""
     estimator = build(CLOSING[name])
     play(estimator, returned(lies).increments, FREE)
@@ -102,7 +102,7 @@ def test_a_loop_within_the_sliding_window_is_a_factor_more() -> None:
     increments = drive.increments[: CLOSED + 1]
     estimator = build(SlidingWindowSettings(window=len(drive.increments), update_every=5))
     online = play(estimator, increments, FREE)
-    before = errors(at_end("sliding_window", lies=True)[1], drive)[CLOSED]
+    before = errors(at_end("sliding_window", True)[1], drive)[CLOSED]
     off = np.linalg.norm(online[-1].wTc[:3, 3] - drive.poses[CLOSED, :3, 3])
     assert off < 0.6 * before
     assert isinstance(estimator, MapSmoother)
@@ -133,7 +133,7 @@ def test_a_loop_within_a_lag_so_long_that_it_drifts_is_closed_and_a_wrong_one_re
 def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
     drive = returned()
     merged = drive.increments[CLOSED].loops[0].merged
-    landmarks = at_end(name)[1].landmarks
+    landmarks = at_end(name, False)[1].landmarks
     assert len(merged) > 10
     assert not np.isin(merged[:, 0], landmarks.ids).any()
     assert np.isin(merged[:, 1], landmarks.ids).all()
@@ -144,14 +144,14 @@ def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
 
 @every
 def test_closure_is_reported(name: str) -> None:
-    reported = [words for words in at_end(name)[1].remarks if "loop closure to frame" in words]
+    reported = [words for words in at_end(name, False)[1].remarks if "loop closure to frame" in words]
     assert len(reported) == 1
     assert f"frame {returned().increments[CLOSED].index}:" in reported[0]
 
 
 @every
 def test_a_wrong_loop_is_refused_and_changes_nothing(name: str) -> None:
-    drive, (_, found) = returned(lies=True), at_end(name, lies=True)
+    drive, (_, found) = returned(lies=True), at_end(name, True)
     reported = [words for words in found.remarks if "loop closure to frame" in words]
     assert len(reported) == 1
     assert "refused" in reported[0]
@@ -184,7 +184,7 @@ def test_without_the_gate_the_wrong_loop_is_taken(
 @pytest.mark.parametrize("name", ["landmark_kalman", "ekf", "isam2, keyframes", "sliding_window"])
 def test_state_and_replay_keep_every_bit_over_a_loop(name: str) -> None:
     increments = returned().increments
-    straight = at_end(name)[0]
+    straight = at_end(name, False)[0]
     first, second = build(CLOSING[name]), build(CLOSING[name])
     play_directly(first, increments[: CLOSED + 2], FREE)
     second.restore({key: np.array(array) for key, array in first.state().items()})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.core import geometry as g
+from fgslam.core.arrays import StateArrays
 from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
@@ -85,10 +87,30 @@ def in_map(extends: bool) -> SlamPipeline:
     )
 
 
+States = tuple[StateArrays, ...]
+
+
+def held_by(pipeline: SlamPipeline) -> tuple[Any, ...]:
+    """All that a drive goes on from; places last, which are restored with the log."""
+    tracker = pipeline.tracker
+    return (tracker.database, tracker.parts, pipeline.estimator, pipeline.places)
+
+
 @cache
-def returned(extends: bool = True) -> tuple[SlamPipeline, list[FrameReport]]:
-    pipeline = in_map(extends)
-    return pipeline, drive(pipeline, seen(PATH, DARK))
+def returned_with_states(
+    extends: bool, /
+) -> tuple[SlamPipeline, list[FrameReport], list[States]]:
+    """The whole drive; the state before each frame."""
+    pipeline, reports, states = in_map(extends), list[FrameReport](), list[States]()
+    for frame in seen(PATH, DARK):
+        states.append(tuple(one.state() for one in held_by(pipeline)))
+        reports += drive(pipeline, [frame])
+    return pipeline, reports, states
+
+
+def returned(extends: bool) -> tuple[SlamPipeline, list[FrameReport]]:
+    pipeline, reports, _ = returned_with_states(extends)
+    return pipeline, reports
 
 
 def landmarks_of_map(estimator: Estimator) -> np.ndarray:
@@ -134,7 +156,7 @@ def test_where_it_is_not_lost_no_loop_is_closed() -> None:
 
 
 def test_landmarks_made_since_the_map_was_left_end_as_duplicates() -> None:
-    pipeline, reports = returned()
+    pipeline, reports = returned(True)
     first = closings(reports)[0]
     given = int(half_a_ring().landmarks.ids.max())
     ended = reports[first + 1].increment.pruned_ids
@@ -149,7 +171,7 @@ def test_landmarks_made_since_the_map_was_left_end_as_duplicates() -> None:
 
 
 def test_a_map_that_is_left_as_it_is_stays_so_to_the_bit() -> None:
-    pipeline, _ = returned(extends=False)
+    pipeline, _ = returned(False)
     given = half_a_ring()
     assert_same_bits(pipeline.estimator.landmarks(), given.landmarks)
     np.testing.assert_array_equal(pipeline.tracker.database.ids, given.landmarks.ids)
@@ -161,17 +183,17 @@ def test_a_map_that_is_left_as_it_is_stays_so_to_the_bit() -> None:
 @pytest.mark.parametrize("extends", [True, False])
 @pytest.mark.parametrize("after_closing", [-12, 1])
 def test_continued_from_its_state_it_goes_on_to_the_bit(extends: bool, after_closing: int) -> None:
-    _, reports = returned(extends)
+    _, reports, states = returned_with_states(extends)
     stop = closings(reports)[0] + after_closing
-    whole, again = in_map(extends), in_map(extends)
-    frames = list(seen(PATH, DARK))
+    again, frames = in_map(extends), list(seen(PATH, DARK))
     log = MeasurementLog(RIG, {})
-    for report in drive(whole, frames[:stop]):
+    for report in reports[:stop]:
         log.append(report.increment)
-    again.tracker.database.restore(whole.tracker.database.state())
-    again.estimator.restore(whole.estimator.state())
-    again.places.restore(whole.places.state(), log)
-    assert_same_bits(again.places.state(), whole.places.state())
+    *others, places = states[stop]
+    for one, state in zip(held_by(again), others, strict=False):
+        one.restore(state)
+    again.places.restore(places, log)
+    assert_same_bits(again.places.state(), places)
     for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_increments(report.increment, expected.increment)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
@@ -47,8 +47,8 @@ RING = [on_ring(k) for k in range(ROUND + 16)]
 DARK = range(30, 42)  # in the dark the heading drifts by what no search window bridges
 
 
-def round_the_ring() -> SlamPipeline:
-    return pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None))
+def round_the_ring(path: list[FloatArray] = RING) -> SlamPipeline:
+    return pipeline_of(path, 0.9, dataclasses.replace(SETTINGS, lost=None))
 
 
 def refuse_closures(patch: pytest.MonkeyPatch) -> None:
@@ -60,6 +60,7 @@ class State:
     """What a drive goes on from."""
 
     database: StateArrays
+    parts: StateArrays
     estimator: StateArrays
     places: StateArrays
     taken: tuple[bool, ...]
@@ -68,8 +69,9 @@ class State:
 def state_of(pipeline: SlamPipeline) -> State:
     assert pipeline.places is not None
     assert isinstance(pipeline.estimator, Resumable)
-    parts = (pipeline.tracker.database, pipeline.estimator, pipeline.places)
-    return State(*(part.state() for part in parts), taken=pipeline.places.taken)
+    tracker = pipeline.tracker
+    held = (tracker.database, tracker.parts, pipeline.estimator, pipeline.places)
+    return State(*(one.state() for one in held), taken=pipeline.places.taken)
 
 
 @lru_cache(maxsize=2)
@@ -88,6 +90,20 @@ def ring_and_states(refusing: bool) -> tuple[SlamPipeline, list[FrameReport], li
 def ring(refusing: bool = False) -> tuple[SlamPipeline, list[FrameReport]]:
     pipeline, reports, _ = ring_and_states(refusing)
     return pipeline, reports
+
+
+def gone_on(refusing: bool, stop: int, path: list[FloatArray] = RING) -> SlamPipeline:
+    """The drive as it was before a frame, restored; it may go on along a longer path."""
+    _, reports, states = ring_and_states(refusing)
+    log = MeasurementLog(RIG, {})
+    for report in reports[:stop]:
+        log.append(report.increment)
+    again, state = round_the_ring(path), states[stop]
+    again.tracker.database.restore(state.database)
+    again.tracker.parts.restore(state.parts)
+    again.estimator.restore(state.estimator)
+    again.places.restore(state.places, log)
+    return again
 
 
 def test_return_is_recognised_and_the_drift_corrected() -> None:
@@ -160,13 +176,13 @@ def test_landmarks_found_twice_become_one() -> None:
 def test_a_map_saved_right_after_a_closure_has_each_landmark_once() -> None:
     """The next frame would make them one; who saves the map now leaves out those that end."""
     first = closings(ring()[1])[0]
-    pipeline = round_the_ring()
-    drive(pipeline, seen(RING[: first + 1], DARK))
+    pipeline, frames = gone_on(False, first), list(seen(RING, DARK))
+    drive(pipeline, [frames[first]])
     assert pipeline.places is not None
     ending, held = pipeline.places.ending, pipeline.estimator.landmarks().ids
     assert len(ending) > 5
     assert np.isin(ending, held).all()
-    (after,) = drive(pipeline, [frame for frame in seen(RING, DARK) if frame.i == first + 1])
+    (after,) = drive(pipeline, [frames[first + 1]])
     assert np.isin(ending, after.increment.pruned_ids).all()
     assert not len(pipeline.places.ending)
 
@@ -191,21 +207,22 @@ def test_a_refused_closure_is_offered_again_after_the_rest(monkeypatch: pytest.M
     """The place was not seen, as far as the map is concerned; so it can be recognised again."""
     first = closings(ring(refusing=True)[1])[0]
     longer = [on_ring(k) for k in range(ROUND + 16 + SETTINGS.loops.rest)]
-    again = pipeline_of(longer, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    again = gone_on(True, first, longer)
     refuse_closures(monkeypatch)
-    offered = closings(drive(again, seen(longer, DARK)))
-    assert offered[0] == first
+    offered = closings(drive(again, list(seen(longer, DARK))[first:]))
+    assert offered[0] == 0
     assert len(offered) >= 2
 
 
 def test_only_a_closure_that_was_taken_bounds_later_drift(monkeypatch: pytest.MonkeyPatch) -> None:
     way = {}
     for refusing in (False, True):
-        pipeline = round_the_ring()
+        first = closings(ring()[1])[0]
+        pipeline = gone_on(refusing, first)
         if refusing:
             refuse_closures(monkeypatch)
-        frames = list(seen(RING, DARK))[: closings(ring()[1])[0] + 1]
-        loop = drive(pipeline, frames)[-1].increment.loops[0]
+        (report,) = drive(pipeline, [list(seen(RING, DARK))[first]])
+        loop = report.increment.loops[0]
         way[refusing] = pipeline.places._memory.way_since(loop.frame)
     assert way[False] < 0.01
     assert way[True] > 10.0
@@ -261,13 +278,7 @@ def test_continued_from_its_state_it_goes_on_to_the_bit(
         refuse_closures(monkeypatch)
     stop = closings(reports)[0] + after_closing
     state, frames = states[stop], list(seen(RING, DARK))
-    log = MeasurementLog(RIG, {})
-    for report in reports[:stop]:
-        log.append(report.increment)
-    again = round_the_ring()
-    again.tracker.database.restore(state.database)
-    again.estimator.restore(state.estimator)
-    again.places.restore(state.places, log)
+    again = gone_on(refusing, stop)
     assert_same_bits(again.places.state(), state.places)
     assert again.places.taken == state.taken
     for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
@@ -283,9 +294,14 @@ def carried() -> list[FloatArray]:
     return [on_ring(k) for k in range(40)] + [on_ring(k) for k in range(10, 25)]
 
 
-def test_kidnapped_robot_is_relocalised_in_its_own_map() -> None:
+@cache
+def found_again() -> list[FrameReport]:
     poses = carried()
-    reports = drive(pipeline_of(poses, 0.1), seen(poses))
+    return drive(pipeline_of(poses, 0.1), seen(poses))
+
+
+def test_kidnapped_robot_is_relocalised_in_its_own_map() -> None:
+    poses, reports = carried(), found_again()
     found = [k for k, r in enumerate(reports) if r.increment.relocalised]
     assert found
     assert 40 <= found[0] <= 44
@@ -325,9 +341,7 @@ def test_kidnapped_robot_stays_lost_without_relocalisation() -> None:
 
 
 def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
-    poses = carried()
-    pipeline = pipeline_of(poses, 0.1)
-    reports = drive(pipeline, seen(poses))
+    poses, reports = carried(), found_again()
     estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
     solver, motion = EgoMotionSolver(RIG, SETTINGS.ego_motion), RingMotion(poses, 0.1)
     for k, report in enumerate(reports):
@@ -359,19 +373,13 @@ def test_a_run_that_begins_in_the_dark_maps_as_soon_as_there_is_light() -> None:
 
 def test_a_correction_is_no_motion() -> None:
     """Nor is being found elsewhere: without wheels, the next frames are expected where they are."""
-    poses = carried()
-    for settings, path, dark in (
-        (dataclasses.replace(SETTINGS, loops=None), poses, range(0)),
-        (dataclasses.replace(SETTINGS, lost=None), RING, DARK),
-    ):
-        pipeline = pipeline_of(path, 0.9 if settings.lost is None else 0.1, settings)
+    for reports in (found_again(), ring()[1]):
         steady = ConstantVelocityMotion(ConstantVelocitySettings())
         jumps = []
-        for found in seen(path, dark):
-            report = pipeline.process(found, found.i, float(found.i))
-            expected = steady.between(float(found.i))
+        for k, report in enumerate(reports):
+            expected = steady.between(float(k))
             observe(steady, report.increment, report.tracking, report.stats)
-            after = steady.between(found.i + 1.0)
+            after = steady.between(k + 1.0)
             if report.increment.loops or report.increment.relocalised:
                 assert expected is not None
                 jumps.append(float(np.linalg.norm(after.motion[:3, 3])))
