@@ -354,10 +354,11 @@ def by_information(
 # With their own settings, on ordinary noise
 
 
-def test_all_smoothers_end_within_a_fraction_of_the_error_of_each_other() -> None:
+@pytest.mark.parametrize("drives", [3, pytest.param(6, marks=pytest.mark.slow)])
+def test_all_smoothers_end_within_a_fraction_of_the_error_of_each_other(drives: int) -> None:
     """Kernels, gates and keyframes cost a little, on measurements that are all right."""
     ratios = []
-    for seed in range(6):
+    for seed in range(drives):
         simulation = drawn(20 + seed)
         best = ate(answer(BATCH, simulation.increments), simulation)
         ratios.append(

@@ -193,7 +193,10 @@ def frontend_settings(dof: int, rescue: bool) -> FrontendSettings:
     )
 
 
-@pytest.mark.parametrize(("dof", "rescue"), [(6, False), (6, True), (5, False), (3, False)])
+@pytest.mark.parametrize(
+    ("dof", "rescue"),
+    [(6, True), (3, False), *(pytest.param(n, False, marks=pytest.mark.slow) for n in (6, 5))],
+)
 def test_a_replay_repeats_the_live_run(settings: EstimatorSettings, dof: int, rescue: bool) -> None:
     """To the last bit, over missing images and missing odometry."""
     frontend = frontend_settings(dof, rescue)

@@ -21,22 +21,26 @@ LONG = (
     "homing_vector",
     "own_features",
 )
-OWN = [script for script in EXAMPLES if script.stem.startswith("own_") and script.stem not in LONG]
+HERE = [
+    script
+    for script in EXAMPLES
+    if (script.stem.startswith("own_") or script.stem == "saved_map") and script.stem not in LONG
+]
 SCRIPTS = [
     pytest.param(script, marks=pytest.mark.slow if script.stem in LONG else ())
     for script in EXAMPLES
-    if script not in OWN
+    if script not in HERE
 ]
 
 
-@pytest.mark.parametrize("script", OWN, ids=lambda path: path.stem)
-def test_extension_runs_to_its_end(
+@pytest.mark.parametrize("script", HERE, ids=lambda path: path.stem)
+def test_example_runs_to_its_end_in_this_process(
     script: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """What a user adds, in this process: one of its own would import everything first."""
+    """A process of its own would import everything, and render the laboratory, once more."""
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(script), run_name="__main__")
     assert capsys.readouterr().out

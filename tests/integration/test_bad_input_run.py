@@ -116,9 +116,16 @@ def resize_image(path: Path) -> str:
     return f"is {WIDTH // 2}x{HEIGHT // 2} but the calibration says {WIDTH}x{HEIGHT}"
 
 
-@pytest.mark.parametrize("odometry", ["recorded", "constant_velocity"])
+SPOILING = (remove_image, truncate_image, damage_image, empty_image, resize_image)
+
+
 @pytest.mark.parametrize(
-    "spoil", [remove_image, truncate_image, damage_image, empty_image, resize_image]
+    ("spoil", "odometry"),
+    [
+        *((spoil, "recorded") for spoil in SPOILING),
+        (remove_image, "constant_velocity"),
+        *(pytest.param(s, "constant_velocity", marks=pytest.mark.slow) for s in SPOILING[1:]),
+    ],
 )
 def test_an_unusable_image_is_bridged(
     spoil: Callable[[Path], str],

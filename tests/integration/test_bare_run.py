@@ -25,6 +25,7 @@ def bare(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fg.run(recording, tmp_path_factory.mktemp("runs") / "bare", UNSEEN).folder
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_recording_alone_gives_a_run_folder_that_compares(
     recording: Path,
     tmp_path: Path,

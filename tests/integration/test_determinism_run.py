@@ -24,7 +24,8 @@ def test_two_runs_in_one_process(finished: Finished, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("hash_seed", "threads", "cores"), [("0", "1", 1), ("4242", "4", os.cpu_count() or 1)]
+    ("hash_seed", "threads", "cores"),
+    [pytest.param("0", "1", 1, marks=pytest.mark.slow), ("4242", "4", os.cpu_count() or 1)],
 )
 def test_another_process(
     hash_seed: str, threads: str, cores: int, finished: Finished, tmp_path: Path
@@ -46,9 +47,9 @@ def test_another_process(
 
 def test_another_seed_matters_where_it_should(recording: Path, tmp_path: Path) -> None:
     """Otherwise equal bytes would say nothing."""
-    odometry = {"kind": "synthetic"}
-    one = run_values(experiment(recording, odometry=odometry, seed=1), tmp_path / "one")
-    two = run_values(experiment(recording, odometry=odometry, seed=2), tmp_path / "two")
+    dataset = {"kind": "image_folder", "path": str(recording), "stop": 5}
+    values = experiment(recording, dataset=dataset, odometry={"kind": "synthetic"})
+    one, two = (run_values(values | {"seed": k}, tmp_path / str(k)) for k in (1, 2))
     assert bytes_of(one.folder) != bytes_of(two.folder)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from recordings import experiment
-from running import KIND, run_values
+from running import KIND, Finished, run_values
 
 from fgslam.core.estimates import Estimate
 from fgslam.core.measurement_log import MeasurementLog
@@ -27,20 +28,27 @@ def replay(config: ExperimentConfig, log: MeasurementLog) -> Estimate:
     return estimator.estimate()
 
 
-@pytest.mark.parametrize("kind", ["recorded", "constant_velocity", "synthetic"])
+KINDS = ("recorded", "constant_velocity", "synthetic")
+FRONTENDS: dict[str, dict[str, Any]] = {
+    "height_fixed": {
+        "matching": {"widen_sigmas": 3.0},
+        "ego_motion": {"dof": 5, "kernel": "huber"},
+    },
+    "plain": {"matching": {"widen_sigmas": 3.0}},
+    "refined": {"matching": {"widen_sigmas": 3.0, "refine": True, "rescue": True}},
+}
+EACH_ONCE = tuple(zip(KINDS, FRONTENDS, strict=True))
+
+
 @pytest.mark.parametrize(
-    "frontend",
+    ("kind", "frontend"),
     [
-        {"matching": {"widen_sigmas": 3.0}},
-        {"matching": {"widen_sigmas": 3.0, "refine": True, "rescue": True}},
-        {"matching": {"widen_sigmas": 3.0}, "ego_motion": {"dof": 5, "kernel": "huber"}},
+        pytest.param(*pair, marks=() if pair in EACH_ONCE else pytest.mark.slow)
+        for pair in itertools.product(KINDS, FRONTENDS)
     ],
-    ids=["plain", "refined", "height_fixed"],
 )
-def test_replay_to_the_bit(
-    kind: str, frontend: dict[str, Any], recording: Path, tmp_path: Path
-) -> None:
-    values = experiment(recording, odometry={"kind": kind}, frontend=frontend)
+def test_replay_to_the_bit(kind: str, frontend: str, recording: Path, tmp_path: Path) -> None:
+    values = experiment(recording, odometry={"kind": kind}, frontend=FRONTENDS[frontend])
     run = run_values(values, tmp_path / "run")
     live = run.result.outputs.pipeline.estimator.estimate()
     log = MeasurementLog.load(run.folder / "measurements.npz")
@@ -57,13 +65,11 @@ def test_replay_to_the_bit(
     ).read_bytes()
 
 
-def test_a_changed_measurement_changes_the_replay(recording: Path, tmp_path: Path) -> None:
+def test_a_changed_measurement_changes_the_replay(finished: Finished) -> None:
     """Another measurement, another pose: the equality above is no accident."""
-    values = experiment(recording)
-    run = run_values(values, tmp_path / "run")
-    log = MeasurementLog.load(run.folder / "measurements.npz")
+    log = MeasurementLog.load(finished.folder / "measurements.npz")
     log.increments[5].observations.measurement[0, 0] += 0.25
-    replayed = replay(make_config(values, "test"), log)
-    live = run.result.outputs.pipeline.estimator.estimate()
+    replayed = replay(make_config(finished.values, "test"), log)
+    live = finished.result.outputs.pipeline.estimator.estimate()
     np.testing.assert_array_equal(replayed.trajectory.poses[:5], live.trajectory.poses[:5])
     assert np.abs(replayed.trajectory.poses[5:] - live.trajectory.poses[5:]).max() > 1e-9

@@ -36,7 +36,8 @@ METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
 
 
 @pytest.mark.parametrize(
-    "name", ["batch", pytest.param("gnc", marks=pytest.mark.slow), "isam2", "fixed_lag"]
+    "name",
+    ["batch", *(pytest.param(n, marks=pytest.mark.slow) for n in ("gnc", "isam2", "fixed_lag"))],
 )
 def test_pose_and_landmarks_are_consistent_over_20_drives(name: str) -> None:
     assert_consistent(SMOOTHERS[name])

@@ -26,10 +26,15 @@ ROBUST: dict[str, EstimatorSettings] = SMOOTHERS | {
     f"{name}, cauchy": dataclasses.replace(SMOOTHERS[name], kernel=CAUCHY)
     for name in ("isam2", "isam2, keyframes", "fixed_lag")
 }
+VARIANTS = ("gnc", "isam2, every frame", "isam2, cauchy", "isam2, keyframes, cauchy")
+"""Of estimators that are judged without them; of gnc, the next tests say what it finds."""
 PLAIN = BatchSettings(kernel=KernelSettings("none"), trim=False)
 
 
-@pytest.mark.parametrize("name", ROBUST)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name in VARIANTS else ()) for name in ROBUST],
+)
 def test_30_percent_gross_errors_less_than_double_the_error(name: str) -> None:
     for seed in range(3):
         simulation = drawn(seed)

@@ -59,7 +59,7 @@ def test_cost_and_gradient_are_those_of_the_factors(name: str) -> None:
 
 
 @KERNELS
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str, seed: int) -> None:
     graph, values, builder = problem(name, seed)
     expected = by_gtsam(graph, values)
