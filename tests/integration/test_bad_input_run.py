@@ -14,6 +14,7 @@ import pytest
 from recordings import HEIGHT, WIDTH, experiment, write_calibration
 from running import (
     KIND,
+    Finished,
     assert_valid_results,
     bytes_of,
     main,
@@ -216,10 +217,9 @@ def test_resumed_over_bad_frames(own_recording: Path, tmp_path: Path) -> None:
 
 
 def test_a_depth_image_that_cannot_be_read_ends_the_run_which_goes_on_later(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    values = experiment(recording)
-    straight = run_values(values, tmp_path / "straight")
+    values = finished.values
 
     def unreadable(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:
         if i == 6:
@@ -231,7 +231,7 @@ def test_a_depth_image_that_cannot_be_read_ends_the_run_which_goes_on_later(
         with pytest.raises(DatasetError, match="cannot be read"):
             run_values(values, tmp_path / "run")
     run_values(values, tmp_path / "run", "resume")
-    assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
+    assert bytes_of(tmp_path / "run") == bytes_of(finished.folder)
 
 
 # --------------------------------------------------------------------------------------------
@@ -427,7 +427,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", str(folder)], check=True)  # noqa: S603, S607
 
 
-def test_a_disk_that_fills_up(recording: Path, small_disk: Path) -> None:
+def test_a_disk_that_fills_up(recording: Path, finished: Finished, small_disk: Path) -> None:
     """One clear error; what was written before stays whole, and goes on once there is room."""
     output = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
     values = experiment(recording, output=output)
@@ -441,8 +441,7 @@ def test_a_disk_that_fills_up(recording: Path, small_disk: Path) -> None:
     assert 0 < done < 12
     moved = Path(shutil.copytree(folder, small_disk.parent / "moved"))
     run_values(values, moved, "resume")
-    straight = run_values(values, small_disk.parent / "straight")
-    assert bytes_of(moved) == bytes_of(straight.folder)
+    assert bytes_of(moved) == bytes_of(finished.folder)
 
 
 def test_a_read_only_disk(recording: Path, small_disk: Path, refusal: Refusal) -> None:

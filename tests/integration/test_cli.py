@@ -164,8 +164,9 @@ def test_run_as_a_process(recording: Path, tmp_path: Path, monkeypatch: Patch) -
     assert (status, out) == (2, "")
     assert error.count("\n") == 1
     assert "add --overwrite or --resume" in error
-    assert main(monkeypatch, "run", config, "--out", folder, "--overwrite") == 0
-    assert_valid_results(folder, 12)
+    few = ("--set", "dataset.stop=3")
+    assert main(monkeypatch, "run", config, "--out", folder, "--overwrite", *few) == 0
+    assert_valid_results(folder, 3)
 
 
 def test_the_default_folder_is_named_by_the_experiment(

@@ -155,7 +155,7 @@ def test_a_finished_run_and_no_run_at_all(finished: Finished, tmp_path: Path) ->
 
 def test_a_checkpoint_that_does_not_fit_is_refused(recording: Path, tmp_path: Path) -> None:
     values = experiment(recording)
-    run = run_values(values, tmp_path / "run", stopped=stop_after(5)).folder
+    run = run_values(values, tmp_path / "run", stopped=stop_after(2)).folder
     whole = load_arrays(run / "checkpoint.npz")
     opened = open_run(make_config(values, "test"), Opening(run, True, lambda *_: None))
     for name in whole:
@@ -169,7 +169,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(recording: Path, tmp_path: Pa
     (run / "checkpoint.npz").write_bytes(b"PK\x03\x04 half a file")
     with pytest.raises(MeasurementLogError, match=r"checkpoint\.npz: not a readable"):
         run_values(values, run, "resume")
-    assert_valid_results(run, 5)
+    assert_valid_results(run, 2)
 
 
 def test_a_log_that_lacks_frames_is_refused(recording: Path, tmp_path: Path) -> None:

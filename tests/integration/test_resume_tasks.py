@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -203,7 +204,10 @@ def run(
 
 
 def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> list[Path]:
-    """Counts renamed files from now on; the one of number ``most`` kills, before or after it."""
+    """Counts renamed files from now on; the one of number ``most`` kills, before or after it.
+
+    Those of runs: libraries rename files of their own as well, most of them only once.
+    """
     seen: list[Path] = []
     real = os.replace
 
@@ -223,7 +227,7 @@ def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> lis
             os.truncate(path, path.stat().st_size // 2)
 
     real_remove = files._remove_quietly
-    monkeypatch.setattr("fgslam.core.files.os.replace", replace)
+    monkeypatch.setattr(files, "os", SimpleNamespace(**vars(os) | {"replace": replace}))
     monkeypatch.setattr("fgslam.core.files._remove_quietly", remove_quietly)
     return seen
 

@@ -147,7 +147,10 @@ def test_waiting_landmarks_hold_no_information_about_poses(monkeypatch: pytest.M
 
 @pytest.mark.parametrize(
     "name",
-    ["fixed_lag", *(pytest.param(n, marks=pytest.mark.slow) for n in ("batch", "isam2, keyframes"))],
+    [
+        "fixed_lag",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("batch", "isam2, keyframes")),
+    ],
 )
 def test_waiting_landmarks_are_reported_with_a_consistent_covariance(name: str) -> None:
     """Landmarks seen once, over many drives: the pose's uncertainty is in their covariance."""

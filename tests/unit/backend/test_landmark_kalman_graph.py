@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -181,10 +182,14 @@ CASES = {
 }
 
 
-def run(estimator: LandmarkKalman, ego_motion: EgoMotionSettings) -> list[UpdateStats]:
+@cache
+def increments() -> list[Increment]:
     drive = dataclasses.replace(DRIVE, twist=(0.0, 0.03, 0.0, 0.0, 0.0, 0.08))
-    increments = simulate(drive, np.random.default_rng(11)).increments
-    return play(estimator, increments, ego_motion)
+    return simulate(drive, np.random.default_rng(11)).increments
+
+
+def run(estimator: LandmarkKalman, ego_motion: EgoMotionSettings) -> list[UpdateStats]:
+    return play(estimator, increments(), ego_motion)
 
 
 @pytest.mark.parametrize("case", CASES)

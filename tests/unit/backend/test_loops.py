@@ -144,7 +144,9 @@ def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
 
 @every
 def test_closure_is_reported(name: str) -> None:
-    reported = [words for words in at_end(name, False)[1].remarks if "loop closure to frame" in words]
+    reported = [
+        words for words in at_end(name, False)[1].remarks if "loop closure to frame" in words
+    ]
     assert len(reported) == 1
     assert f"frame {returned().increments[CLOSED].index}:" in reported[0]
 

@@ -97,9 +97,7 @@ def held_by(pipeline: SlamPipeline) -> tuple[Any, ...]:
 
 
 @cache
-def returned_with_states(
-    extends: bool, /
-) -> tuple[SlamPipeline, list[FrameReport], list[States]]:
+def returned_with_states(extends: bool, /) -> tuple[SlamPipeline, list[FrameReport], list[States]]:
     """The whole drive; the state before each frame."""
     pipeline, reports, states = in_map(extends), list[FrameReport](), list[States]()
     for frame in seen(PATH, DARK):
