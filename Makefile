@@ -3,6 +3,8 @@
 # A module's tests on one worker, which shares what they make; the long ones, first by name, first.
 PYTEST = .venv/bin/python -m pytest -n 2 --dist loadscope --no-loadscope-reorder
 DEMO_OUT ?= runs/demo
+# Two workers and the processes that they start would compile everything each.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all check docs fuzz bench bench-long baseline clean

@@ -32,7 +32,13 @@ def flat(report: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "name", ["euroc_v101_kf100", "kitti06", "kitti_raw_0926_5hz", "stanford_chess_grid"]
+    "name",
+    [
+        "euroc_v101_kf100",
+        "kitti06",
+        pytest.param("kitti_raw_0926_5hz", marks=pytest.mark.slow),
+        pytest.param("stanford_chess_grid", marks=pytest.mark.slow),
+    ],
 )
 def test_real_recordings_have_no_problem(shared_data: Path, name: str) -> None:
     report = inspect_recording(source(shared_data, name), (), 5)
@@ -64,6 +70,7 @@ def test_turned_left_camera_is_measured(shared_data: Path, tmp_path: Path) -> No
     assert float(reported) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.slow  # the same car's clock by default: tests/unit/datasets/test_clock.py
 def test_clock_of_the_real_odometry(shared_data: Path) -> None:
     """-0.06 s is what the images alone gave (docs/datasets/image_folder.md)."""
     root = source(shared_data, "kitti_raw_0926_5hz")

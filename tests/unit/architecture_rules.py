@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 ROOMS: dict[str, frozenset[str] | None] = {
@@ -120,6 +121,11 @@ class Module:
     lines: int
     tree: ast.Module = field(repr=False)
     is_package: bool
+
+    @cached_property
+    def nodes(self) -> tuple[ast.AST, ...]:
+        """All of the tree, found once."""
+        return tuple(ast.walk(self.tree))
 
     @property
     def layer(self) -> str:
@@ -342,7 +348,7 @@ def size_violations(module: Module) -> Iterator[Violation]:
             module.lines,
             f"module of {module.lines} lines (at most {MAX_MODULE_LINES})",
         )
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, FunctionNode):
             length = _length_without_docstring(node)
             if length > MAX_FUNCTION_LINES:
@@ -363,7 +369,7 @@ def _length_without_docstring(node: FunctionNode) -> int:
 
 def statement_violations(module: Module) -> Iterator[Violation]:
     """Handlers that swallow everything, and calls that run data as code or hide randomness."""
-    for node in _statements(module.tree):
+    for node in _statements(module.nodes):
         if isinstance(node, ast.ExceptHandler) and _swallows_everything(node):
             yield Violation(module.path, node.lineno, "handler catches everything: name the errors")
         if isinstance(node, ast.Call):
@@ -375,8 +381,10 @@ def statement_violations(module: Module) -> Iterator[Violation]:
             yield Violation(module.path, node.lineno, f"yaml.{name}: use yaml.safe_load")
 
 
-def _statements(tree: ast.Module) -> Iterator[ast.stmt | ast.expr | ast.ExceptHandler]:
-    for node in ast.walk(tree):
+def _statements(
+    nodes: tuple[ast.AST, ...],
+) -> Iterator[ast.stmt | ast.expr | ast.ExceptHandler]:
+    for node in nodes:
         if isinstance(node, ast.stmt | ast.expr | ast.ExceptHandler):
             yield node
 

@@ -211,8 +211,11 @@ def test_a_blackout_is_bridged_and_the_uncertainty_shows_it() -> None:
     assert error[-1] < 0.03
 
 
-@pytest.mark.parametrize("every", [1, 4])
-@pytest.mark.parametrize("at", [5, 10, 13])
+@pytest.mark.parametrize(
+    ("at", "every"),
+    [(5, 1), (10, 4), (13, 4)]
+    + [pytest.param(*pair, marks=pytest.mark.slow) for pair in ((5, 4), (10, 1), (13, 1))],
+)
 def test_restored_between_updates_and_keyframes_it_continues_to_the_bit(
     every: int, at: int
 ) -> None:

@@ -182,6 +182,10 @@ CASES = {
 }
 
 
+FEW = ("default", "world update", "running mean", "planar", "image alone", "uniform", "capped")
+"""Those by default, each of another kind."""
+
+
 @cache
 def increments() -> list[Increment]:
     drive = dataclasses.replace(DRIVE, twist=(0.0, 0.03, 0.0, 0.0, 0.0, 0.08))
@@ -192,7 +196,10 @@ def run(estimator: LandmarkKalman, ego_motion: EgoMotionSettings) -> list[Update
     return play(estimator, increments(), ego_motion)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=() if case in FEW else pytest.mark.slow) for case in CASES],
+)
 def test_a_run_is_the_closed_form(case: str) -> None:
     ego_motion, settings = CASES[case]
     closed, graph = both(ego_motion, **settings)

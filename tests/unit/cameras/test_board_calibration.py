@@ -79,7 +79,10 @@ def normalised_error(found: BoardCalibration, true: list[RawCamera]) -> float:
     return float(np.mean(np.concatenate(parts) ** 2))
 
 
-@pytest.mark.parametrize(("model", "cameras"), [("radtan", 3), ("equidistant", 2)])
+@pytest.mark.parametrize(
+    ("model", "cameras"),
+    [pytest.param("radtan", 3, marks=pytest.mark.slow), ("equidistant", 2)],
+)
 def test_cameras_are_found_and_their_uncertainty_is_honest(model: str, cameras: int) -> None:
     errors = []
     for seed in range(6):

@@ -217,7 +217,11 @@ def test_missing_files_are_named(tracks: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "frames", "observations", "landmarks"),
-    [("large", 26, 8189, 2634), ("00s", 77, 52544, 15638), ("00", 135, 88781, 26136)],
+    [
+        ("large", 26, 8189, 2634),
+        ("00s", 77, 52544, 15638),
+        pytest.param("00", 135, 88781, 26136, marks=pytest.mark.slow),
+    ],
 )
 def test_gtsam_s_own_files(name: str, frames: int, observations: int, landmarks: int) -> None:
     recording = open_measurements(StereoTracksSettings(file=name), 0)

@@ -357,8 +357,15 @@ def test_yaw_and_sideways_motion_are_nearly_the_same() -> None:
     assert c[0, 4] / np.sqrt(c[0, 0] * c[4, 4]) > 0.9
 
 
-@pytest.mark.parametrize("weighting", ["measurement", "landmark"])
-@pytest.mark.parametrize("prior", [True, False])
+@pytest.mark.parametrize(
+    ("prior", "weighting"),
+    [
+        (True, "landmark"),
+        (False, "measurement"),
+        pytest.param(True, "measurement", marks=pytest.mark.slow),
+        pytest.param(False, "landmark", marks=pytest.mark.slow),
+    ],
+)
 def test_errors_match_the_covariance(weighting: str, prior: bool) -> None:
     """NEES over 300 runs, exact landmarks, or noisy ones whose covariance is known."""
     rng = np.random.default_rng(99)

@@ -111,7 +111,10 @@ def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
 
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("name", list(all_pictures(0, full=False)))
-@pytest.mark.parametrize(("n", "full"), [(0, False), (0, True), (1, False), (40, True)])
+@pytest.mark.parametrize(
+    ("n", "full"),
+    [(0, False), (1, False), (40, True), pytest.param(0, True, marks=pytest.mark.slow)],
+)
 def test_every_picture_is_drawn_from_much_little_and_nothing(
     tmp_path: Path, name: str, n: int, full: bool
 ) -> None:

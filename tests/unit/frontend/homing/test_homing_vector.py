@@ -35,7 +35,10 @@ def error(views: TwoViews, vector: TwoViewVector) -> FloatArray:
     return wrap(np.array([vector.direction - views.direction, vector.rotation - views.rotation]))
 
 
-@pytest.mark.parametrize(("count", "wrong"), [(30, 0.0), (30, 0.3), (50, 0.3)])
+@pytest.mark.parametrize(
+    ("count", "wrong"),
+    [(30, 0.0), (30, 0.3), pytest.param(50, 0.3, marks=pytest.mark.slow)],
+)
 def test_median_error_at_half_a_degree(count: int, wrong: float) -> None:
     errors, nees = [], []
     for seed in range(100):
