@@ -99,10 +99,10 @@ def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly
     remarks = (*calibration.notes, *told, *also)
     if calibration.sided and len(sources) == 2:
         found = replace(found, order=(1 - sources[0], 1 - sources[1]))
-        if sources == (0, 1):
+        if sources == (0, 1) and not told:
             remarks = (*remarks, _swapped(chosen, found.rig))
     remarks = (*remarks, *implausible(calibration.source, found.rig))
-    straight = found.order[:2] == (0, 1) and asked.is_default and _is_rectified(chosen)
+    straight = found.order[:2] == (0, 1) and asked.is_default and _is_rectified(chosen, turn)
     kept = None if straight and found.correction is None else found
     return Assembly(found.rig, kept, sources, remarks)
 
@@ -175,9 +175,22 @@ def _offset(camera: RawCamera, reference: RawCamera) -> FloatArray:
 
 
 def _pair(cameras: Sequence[RawCamera]) -> Placed:
-    """Right and left: the left one sees the other at +x."""
-    sources = (1, 0) if _offset(cameras[1], cameras[0])[0] > 0.0 else (0, 1)
-    return sources, np.eye(3), ()
+    """Right and left: the left one sees the other at +x. Of two above each other, the upper one."""
+    x, y, _ = _offset(cameras[1], cameras[0])
+    if abs(x) >= abs(y):
+        return ((1, 0) if x > 0.0 else (0, 1)), np.eye(3), ()
+    lower, upper = (1, 0) if y > 0.0 else (0, 1)
+    text = (
+        f"{cameras[upper].name} is above {cameras[lower].name}: the view is turned by a quarter "
+        "turn, in which the upper camera is the left one"
+    )
+    return (lower, upper), _quarter_turn(upper_side=True), (text,)
+
+
+def _quarter_turn(upper_side: bool) -> FloatArray:
+    """Turn (3, 3) of the view after which the camera above, or the one below, is the left one."""
+    sign = 1.0 if upper_side else -1.0
+    return np.array([[0.0, sign, 0.0], [-sign, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _three(cameras: Sequence[RawCamera]) -> Placed:
@@ -209,10 +222,7 @@ def _three(cameras: Sequence[RawCamera]) -> Placed:
     if left_side == upper_side:
         turn = np.eye(3) if left_side else np.diag([-1.0, -1.0, 1.0])
         return (corner, beside, above), turn, told
-    # The upper or lower one becomes the left one, by a quarter turn.
-    sign = 1.0 if upper_side else -1.0
-    turn = np.array([[0.0, sign, 0.0], [-sign, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    return (corner, above, beside), turn, told
+    return (corner, above, beside), _quarter_turn(upper_side), told
 
 
 def _sides(cameras: Sequence[RawCamera], corner: int) -> tuple[FloatArray, FloatArray]:
@@ -242,17 +252,11 @@ def _require_side_by_side(chosen: Sequence[RawCamera], turn: FloatArray) -> None
             f"{left.name} and {right.name} are {1e3 * np.linalg.norm(offset):.3g} mm apart, as one "
             "camera; check T_BS (or T) in the calibration, and the unit of its lengths (--unit)"
         )
-    if np.abs(offset[1]) > 2.0 * np.hypot(offset[0], offset[2]):
-        raise CalibrationError(
-            f"{left.name} and {right.name} are above each other, not side by side; turn both "
-            "cameras' images by 90 degrees and calibrate with these, or correct T_BS (or R and T)"
-        )
     if np.abs(offset[0]) < 2.0 * np.hypot(offset[1], offset[2]):
         x, y, z = offset
         raise CalibrationError(
             f"{left.name} and {right.name} are not side by side (offset {x:.3f}, {y:.3f}, {z:.3f} "
-            "m along x, y, z); a horizontal stereo pair is needed, check T_BS (or R and T) in the "
-            "calibration"
+            "m along x, y, z); check T_BS (or R and T) in the calibration"
         )
     for other in chosen[1:]:
         if right.bTc[:3, 2] @ other.bTc[:3, 2] < _LEAST_COMMON_VIEW:
@@ -286,7 +290,7 @@ def _view(
         rotations = tuple(stated.rotations[k] for k in sources)
         return rotations, View(stated.matrix, stated.size, stated.kind), ()
     calibration.require_uncorrected("another view (fov_deg, view) is asked for")
-    if asked.is_default and _is_rectified(chosen):
+    if asked.is_default and _is_rectified(chosen, turn):
         return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
     told: tuple[str, ...] = ()
     natural = float(np.mean([camera.focal_px for camera in chosen]))
@@ -307,11 +311,14 @@ def _view(
         view = chosen_cylinder(chosen, rotations, asked.fov_deg)
     else:
         view = chosen_view(chosen, rotations, size, asked.fov_deg)
-    return rotations, view, (*told, *_cut_off(chosen[0], view), *_wider(chosen, rotations, view))
+    seen = np.degrees(chosen[0].field_of_view()[:2])
+    seen = seen if size == chosen[0].size else seen[::-1]
+    return rotations, view, (*told, *_cut_off(seen, view), *_wider(chosen, rotations, view))
 
 
-def _cut_off(camera: RawCamera, view: View) -> tuple[str, ...]:
-    seen, kept = np.degrees(camera.field_of_view()[:2]), np.degrees(view.angles)
+def _cut_off(seen: FloatArray, view: View) -> tuple[str, ...]:
+    """What the view does not show of the angles (2,) across and down that a camera sees."""
+    kept = np.degrees(view.angles)
     cylinder = view.kind == "cylindrical"
     if kept[0] > (_TOLD_SHARE_OF_CYLINDER if cylinder else _TOLD_SHARE) * seen[0]:
         return ()
@@ -339,9 +346,11 @@ def _wider(
     )
 
 
-def _is_rectified(chosen: Sequence[RawCamera]) -> bool:
-    """Whether the images are rectified as they are: equal cameras, moved along x or y alone."""
+def _is_rectified(chosen: Sequence[RawCamera], turn: FloatArray) -> bool:
+    """Whether the images are rectified as they are: equal cameras, to the left and above."""
     right = chosen[0]
+    if not np.array_equal(turn, np.eye(3)):
+        return False
     for k, camera in enumerate(chosen):
         turned = right.bTc[:3, :3].T @ camera.bTc[:3, :3]
         away = np.delete(_offset(camera, right), 0 if k == 1 else 1)

@@ -9,6 +9,7 @@ from pathlib import Path
 from fgslam.cameras.assembly import at_size, in_metres
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.raw_cameras import Calibration
+from fgslam.cameras.rectification import Rectifier
 from fgslam.cameras.rig import StereoRig, asked_view, load_rig, rig_of
 from fgslam.core.errors import CalibrationError
 from fgslam.datasets.settings import CalibratedSettings
@@ -44,8 +45,26 @@ def loaded_rig(
     *files: Path,
     size: tuple[int, int] | None,
     cameras: Sequence[int] | None = None,
+    pair: bool = True,
 ) -> StereoRig:
-    """:func:`fgslam.load_rig` of one file or two, in the unit, scaled, as wide as is asked for."""
+    """:func:`fgslam.load_rig` of one file or two, in the unit, scaled, as wide as is asked for.
+
+    Where the images are of a ``pair`` and the file has three cameras, those of its first two.
+    """
+    rig = _loaded(settings, *files, size=size, cameras=cameras)
+    if not pair or max(rig.sources) < 2:
+        return rig
+    pair = _loaded(settings, *files, size=size, cameras=(0, 1))
+    text = f"{files[0]} holds three cameras, the images are of two: the first two are taken"
+    return replace(pair, remarks=(text, *pair.remarks))
+
+
+def _loaded(
+    settings: CalibratedSettings,
+    *files: Path,
+    size: tuple[int, int] | None,
+    cameras: Sequence[int] | None,
+) -> StereoRig:
     return load_rig(
         *files,
         size=size,
@@ -55,6 +74,18 @@ def loaded_rig(
         view=settings.view,
         cameras=cameras,
     )
+
+
+def numbered(rig: StereoRig) -> StereoRig:
+    """The rig of images that are given as those of a file's second and first camera.
+
+    So do names with numbers, cam1 and cam0, whichever of them is the right one.
+    """
+    if rig.sources[:2] != (0, 1):
+        return rig
+    kept = rig.rectifier or Rectifier(rig.plain(), ())
+    text = "the camera of the lower number is the right one by its calibration, and is taken so"
+    return replace(rig, rectifier=replace(kept, order=(1, 0)), remarks=(*rig.remarks, text))
 
 
 def read_rig(

@@ -125,7 +125,7 @@ def _cameras(root: Path, settings: ImageFolderSettings, listed: list[dict[int, P
     path, three = _camera_file(root, settings), len(listed) == 3
     chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
     size = first_size(listed[0].values())
-    rig = loaded_rig(settings, path, size=size, cameras=chosen)
+    rig = loaded_rig(settings, path, size=size, cameras=chosen, pair=not three)
     if three and rig.vertical_baseline is None:
         raise CalibrationError(
             f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "

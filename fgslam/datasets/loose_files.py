@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
-from fgslam.datasets.sides import camera_pairs, without_side
+from fgslam.datasets.sides import camera_pairs, differ_in_number, without_side
 from fgslam.datasets.time_names import time_parts
 
 if TYPE_CHECKING:
@@ -37,6 +37,14 @@ class CameraFiles:
     right: tuple[Path, ...]
     folder: Path
     interleaved: bool
+
+    @property
+    def numbered(self) -> bool:
+        """Whether numbers tell the cameras, as in a calibration's file, and not sides."""
+        left, right = (str(files[0].relative_to(self.folder)) for files in (self.left, self.right))
+        if not self.interleaved:
+            left, right = (name.partition("/")[0] for name in (left, right))
+        return differ_in_number(left, right)
 
 
 def natural(path: Path) -> tuple[tuple[int, str], ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
-from fgslam.datasets.calibrated import calibrated_rig
+from fgslam.datasets.calibrated import calibrated_rig, numbered
 from fgslam.datasets.images import RawImages, StereoFiles, check_sizes, first_size
 from fgslam.datasets.layouts import files_of
 from fgslam.datasets.loose_files import CameraFiles, find_cameras, pair_files
@@ -32,6 +32,8 @@ def open_loose_images(
         [right for right, _ in pairs], (*own, own[0].parent, root), settings.fps, cameras.right
     )
     rig = calibrated_rig(settings, root, first_size(right for right, _ in pairs))
+    if cameras.numbered:
+        rig = numbered(rig)
     files = StereoFiles(pairs, *rig.image_size)
     check_sizes(files, root)
     files, held = files.with_bits()

@@ -56,3 +56,8 @@ def without_side(name: str, camera_number: bool = False) -> str:
     for pattern in (_WORD, _LETTER, *([_CAMERA_NUMBER] if camera_number else [])):
         name = pattern.sub("", name)
     return name
+
+
+def differ_in_number(left: str, right: str) -> bool:
+    """Whether numbers, not sides, tell two names apart: cam0 and cam1."""
+    return left != right and re.sub(r"\d+", "", left) == re.sub(r"\d+", "", right)

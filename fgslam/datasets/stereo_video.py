@@ -13,11 +13,12 @@ import numpy as np
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.datasets.calibrated import calibrated_rig
+from fgslam.datasets.calibrated import calibrated_rig, numbered
 from fgslam.datasets.images import sized
 from fgslam.datasets.layouts import films_in
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import VideoSettings
+from fgslam.datasets.sides import differ_in_number
 from fgslam.datasets.video_frames import VideoFrames
 
 _VIEWS: dict[str, tuple[int, int]] = {"side_by_side": (2, 1), "over_under": (1, 2)}
@@ -96,6 +97,8 @@ def _views(
     if len(frames) == 2:
         left, right = frames
         rig = calibrated_rig(settings, folder, (width, height))
+        if differ_in_number(left.name, right.name):
+            rig = numbered(rig)
         return lambda k: (right.load(k), left.load(k)), rig, _differences(left, right)
     film = frames[0]
     fault: CalibrationError | None = None

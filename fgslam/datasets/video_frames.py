@@ -24,6 +24,7 @@ class VideoFrames:
     way. Safe to be asked by several threads.
 
     Attributes:
+        name: of the file.
         count: frames that can be read.
         rate: frames a second, as the file states it.
         notes: what was cut off.
@@ -31,7 +32,7 @@ class VideoFrames:
 
     def __init__(self, path: Path) -> None:
         """Opens the file. Raises DatasetError where it is absent, no video, or without a frame."""
-        self._path = path
+        self._path, self.name = path, path.name
         self._lock = threading.Lock()
         self._capture = self._open()
         stated = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))

@@ -17,8 +17,9 @@ from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera
 from fgslam.datasets.bags.frames import FrameTree, view_axes
 from fgslam.datasets.bags.topics import Chosen
-from fgslam.datasets.calibrated import loaded_rig, mounted, read_rig
+from fgslam.datasets.calibrated import loaded_rig, mounted, numbered, read_rig
 from fgslam.datasets.settings import BagSettings
+from fgslam.datasets.sides import differ_in_number
 
 _BODIES = ("base_link", "base_footprint")
 """The robot itself, where odometry does not name its frame (REP 105)."""
@@ -74,6 +75,8 @@ def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | 
     if settings.camera_file is None:
         return None
     rig = loaded_rig(settings, Path(settings.camera_file), size=stated.size)
+    if differ_in_number(chosen.left, chosen.right):
+        rig = numbered(rig)
     cameras = read_calibration_file(Path(settings.camera_file), size=stated.size).cameras
     order = (0, 1) if rig.rectifier is None else rig.rectifier.order
     right, left = (rig.sources[order.index(k)] for k in (0, 1))

@@ -272,10 +272,10 @@ def test_what_a_camchain_lacks_is_named(tmp_path: Path, changes: Any, words: str
         StereoRig.load(path)
 
 
-def test_cameras_above_each_other_are_refused(tmp_path: Path) -> None:
-    above = pose(np.eye(3), np.array([0.0, 0.1, 0.0]))
+def test_cameras_behind_each_other_are_refused(tmp_path: Path) -> None:
+    behind = pose(np.eye(3), np.array([0.0, 0.0, 0.1]))
     with pytest.raises(CalibrationError, match="not side by side"):
-        StereoRig.load(write_camchain(tmp_path, T_cn_cnm1=above.tolist()))
+        StereoRig.load(write_camchain(tmp_path, T_cn_cnm1=behind.tolist()))
 
 
 def test_camera_info_of_no_pair_is_refused(tmp_path: Path) -> None:

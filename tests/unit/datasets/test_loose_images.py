@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_calibration, write_tum
 
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
@@ -423,3 +424,60 @@ def test_frames_of_one_camera_are_no_pairs(tmp_path: Path) -> None:
     for k in range(4):
         save(tmp_path / f"frame_{k}.png", picture(k))
     assert find_cameras(tmp_path) is None
+
+
+# --------------------------------------------------------------------------------------------
+# Which camera of the calibration is which
+
+
+def write_chain(root: Path, *places: tuple[float, float]) -> None:
+    """A camchain of cameras at (x, y) metres, all alike."""
+    chain = {}
+    for k, at in enumerate(places):
+        values = {
+            "camera_model": "pinhole",
+            "intrinsics": [40.0, 40.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2],
+            "distortion_model": "radtan",
+            "distortion_coeffs": [0.0] * 4,
+            "resolution": [WIDTH, HEIGHT],
+        }
+        if k:
+            before = np.subtract(places[k - 1], at)
+            values["T_cn_cnm1"] = pose(np.eye(3), np.array([*before, 0.0])).tolist()
+        chain[f"cam{k}"] = values
+    (root / "camchain.yaml").write_text(yaml.safe_dump(chain))
+
+
+@pytest.mark.parametrize(
+    ("places", "baseline"),
+    [
+        (((0.0, 0.0), (0.1, 0.0), (0.2, 0.0)), 0.1),  # in a line: not the outer two
+        (((0.0, 0.0), (0.1, 0.0), (0.0, 0.2)), 0.1),  # in an L
+    ],
+)
+def test_images_of_two_cameras_are_of_the_first_two_of_three(
+    tmp_path: Path, places: tuple[tuple[float, float], ...], baseline: float
+) -> None:
+    root = loose(tmp_path / "walk", NAMES["cam0, cam1 in one"], [0, 1])
+    (root / "calib.json").unlink()
+    write_chain(root, *places)
+    recording = opened(root)
+    assert recording.rig.baseline == pytest.approx(baseline)
+    assert recording.rig.vertical_baseline is None
+    assert codes(recording) == [(10, 60), (11, 61)]
+    assert "the first two are taken" in " ".join(recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("cam0/data, cam1/data", (60, 10)), ("left, right", (10, 60))]
+)
+def test_numbered_images_are_those_of_the_numbered_cameras(
+    tmp_path: Path, name: str, expected: tuple[int, int]
+) -> None:
+    """Camera 0 is the right one by its calibration; what is called right stays right."""
+    root = loose(tmp_path / "walk", NAMES[name], [0])
+    (root / "calib.json").unlink()
+    write_chain(root, (0.1, 0.0), (0.0, 0.0))
+    recording = opened(root)
+    assert codes(recording) == [expected]
+    assert ("lower number is the right one" in " ".join(recording.notes)) == (expected[0] == 60)
