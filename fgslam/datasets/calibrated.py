@@ -54,9 +54,9 @@ def loaded_rig(
     rig = _loaded(settings, *files, size=size, cameras=cameras)
     if not pair or max(rig.sources) < 2:
         return rig
-    pair = _loaded(settings, *files, size=size, cameras=(0, 1))
+    two = _loaded(settings, *files, size=size, cameras=(0, 1))
     text = f"{files[0]} holds three cameras, the images are of two: the first two are taken"
-    return replace(pair, remarks=(text, *pair.remarks))
+    return replace(two, remarks=(text, *two.remarks))
 
 
 def _loaded(
