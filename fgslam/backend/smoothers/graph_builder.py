@@ -367,7 +367,7 @@ class GraphBuilder:
         accepted, wTc = tracked.accepted, tracked.wTc
         rows = landmarks.rows(accepted.ids)
         positions = landmarks.positions[rows]
-        parallax = _parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
+        known = parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
         for i, identity in enumerate(accepted.ids.tolist()):
             sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
             track = self.admission.sighted(identity, sighting)
@@ -375,8 +375,8 @@ class GraphBuilder:
                 new.sightings.append((track.variable, sighting))
             else:
                 track.waiting.append(sighting)
-                if self.admission.admits(identity, float(parallax[i])):
-                    self._enter(new, identity, positions[i], wTc, float(parallax[i]))
+                if self.admission.admits(identity, float(known[i])):
+                    self._enter(new, identity, positions[i], wTc, float(known[i]))
 
     def _enter(
         self,
@@ -439,7 +439,7 @@ class GraphBuilder:
         return int(self.graph.size()) - 1
 
 
-def _parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:
+def parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:
     """Range over its standard deviation (k,), of points at ``rays`` (k, 3) from the camera."""
     distance = np.linalg.norm(rays, axis=1)
     directions = rays / np.maximum(distance, 1e-12)[:, None]

@@ -52,6 +52,14 @@ class HeldLandmarks:
         self._rows["information"][variable] = np.linalg.inv(covariance)
         self._rows["saved"][variable] = saved
 
+    def begin(self, variables: IntArray, points: FloatArray) -> None:
+        """They are elsewhere, at points (k, 3): what was known of them was of others."""
+        rows = self._rows
+        rows["point"][variables] = rows["mean"][variables] = points
+        rows["information"][variables] = 0.0
+        rows["home"][variables] = -1
+        rows["saved"][variables] = False
+
     def carried_along(self, by_frame: FloatArray) -> None:
         """Moves each with the frame with which it is off, by motions of the world (n, 4, 4)."""
         by = home_changes(np.where(self.saved, -1, self.homes), by_frame)

@@ -29,6 +29,7 @@ from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.held_landmarks import HeldLandmarks
 from fgslam.backend.smoothers.loop_closing import closed_chain
 from fgslam.backend.smoothers.refinement import MINIMUM, WholeGraphSolver, trimmed
+from fgslam.backend.smoothers.returning import LEAST, SeenAgain
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
@@ -69,13 +70,14 @@ class SlidingWindowSolver(WholeGraphSolver):
     def __init__(self, problem: GraphProblem, settings: SlidingWindowSettings) -> None:
         """An empty window."""
         super().__init__(problem.builder, problem.floor)
-        self._settings = settings
+        self._settings, self._sensor = settings, problem.sensor
         self._window = Window(problem.sensor, problem.builder.kernel)
         self._held = HeldLandmarks()
         self._new: list[NewFactors] = []
         self._solved_at = 0
         self._leaving: Solved | None = None  # the solution, until what is too old has left
-        self._taken = 0  # observations of the builder's that the window has had
+        self._taken = 0  # observations of the builder's that were looked at
+        self._waiting = np.empty(0, np.int64)  # of them, those of landmarks that may be back
         self._poses: list[FloatArray] = []
         self._drift: list[FloatArray] = []  # (6, 6) covariances, as motions of the world
         self._sizes: list[float] = []  # m^2, variance of each place
@@ -144,44 +146,100 @@ class SlidingWindowSolver(WholeGraphSolver):
         self._observe()
 
     def _observe(self) -> None:
-        seen, rows = self._builder.observed, np.arange(self._taken, len(self._builder.observed))
+        seen, new = self._builder.observed, np.arange(self._taken, len(self._builder.observed))
         self._taken = len(seen)
-        inside = seen["frame"][rows] >= self._window.frames[0]
-        rows = rows[inside & ~seen["gone"][rows]]
-        variables = seen["variable"][rows]
-        self._bring(np.setdiff1d(variables, self._window.landmarks.variables))
+        self._give_up_waiting()
+        rows = self._inside(np.concatenate([self._waiting, new]))
+        outside = ~np.isin(seen["variable"][rows], self._window.landmarks.variables)
+        self._bring(self._newest(rows[outside]))
+        waiting = ~np.isin(seen["variable"][rows], self._window.landmarks.variables)
+        self._waiting, rows = rows[waiting], rows[~waiting]
         covariance = self._builder.noise.power * seen["covariance"][rows]
-        measured = seen["measurement"][rows]
+        variables, measured = seen["variable"][rows], seen["measurement"][rows]
         self._window.observe(seen["frame"][rows], variables, measured, covariance)
 
-    def _bring(self, variables: IntArray) -> None:
-        """Landmarks into the window; what was known of them when they left it comes along."""
-        homes = self._held.homes[variables]
-        self._window.add_landmarks(self._held.of(variables[homes < 0]))
-        places = homes // _PLACE
-        for place in np.unique(places[homes >= 0]).tolist():
-            tie = None if place in self._window.places else self._tie(place)
-            self._window.bring_back(self._held.of(variables[places == place]), place, tie)
+    def _inside(self, rows: IntArray) -> IntArray:
+        """Of observations those from the window's frames that were not taken out."""
+        seen = self._builder.observed
+        inside = seen["frame"][rows] >= self._window.frames[0]
+        return np.asarray(rows[inside & ~seen["gone"][rows]])
+
+    def _newest(self, rows: IntArray) -> IntArray:
+        """Of observations in their order the last one of each landmark, by ascending variable."""
+        variables = self._builder.observed["variable"][rows]
+        last = np.unique(variables[::-1], return_index=True)[1]
+        return np.asarray(rows[::-1][last])
+
+    def _bring(self, rows: IntArray) -> None:
+        """Landmarks, by an observation each, into the window, but those that have yet to wait.
+
+        What was known of them when they left it comes along.
+        """
+        variables = self._builder.observed["variable"][rows]
+        places = self._held.homes[variables] // _PLACE
+        for place in np.unique(places[places >= 0]).tolist():
+            back, tie = variables[places == place], None
+            if place not in self._window.places:
+                back, tie = self._back(rows[places == place], place), self._tie(place)
+            if len(back):
+                self._window.bring_back(self._held.of(back), place, tie)
+        self._window.add_landmarks(self._held.of(variables[self._held.homes[variables] < 0]))
+
+    def _back(self, rows: IntArray, place: int) -> IntArray:
+        """Variables of landmarks of a place that are surely back; where many are, no other is."""
+        seen = self._placed(rows)
+        known = self._held.of(seen.variables)
+        there = seen.returned(known, self._window.poses[0], self._apart(place))
+        if there.sum() >= LEAST:
+            self._begin_elsewhere(seen.select(~there))
+        return np.asarray(seen.variables[there])
+
+    def _placed(self, rows: IntArray) -> SeenAgain:
+        """Landmarks where observations (k,) of one each have them."""
+        seen, power = self._builder.observed, self._builder.noise.power
+        poses = np.array([self._poses[frame] for frame in seen["frame"][rows].tolist()])
+        measured = seen["measurement"][rows], power * seen["covariance"][rows]
+        return SeenAgain.of(self._sensor, seen["variable"][rows], poses, *measured)
+
+    def _give_up_waiting(self) -> None:
+        """Landmarks that the window does not show to be back begin where they are seen now."""
+        seen, rows = self._builder.observed, self._waiting
+        late = seen["frame"][rows] < self._window.frames[0]
+        of_late = np.isin(seen["variable"][rows], seen["variable"][rows[late]])
+        self._begin_elsewhere(self._placed(self._newest(self._inside(rows[of_late]))))
+
+    def _begin_elsewhere(self, seen: SeenAgain) -> None:
+        """What was known of landmarks was of others."""
+        self._held.begin(seen.variables, seen.points)
 
     def _tie(self, place: int) -> Tie:
-        """How a place is off, given the one next to it, or the window's first pose.
-
-        Drift adds up: two frames share that of the best known one between them.
-        """
-        first, here = self._window.frames[0], inverse(self._window.poses[0])
-        own, frame, follows = self._frame_of(place), first, None
+        """How a place is off, given the one next to it, or the window's first pose."""
+        own, frame, follows = self._frame_of(place), self._window.frames[0], None
         for other in self._window.places:
             if abs(self._frame_of(other) - own) < abs(frame - own):
                 frame, follows = self._frame_of(other), other
-        begin, end = min(own, frame), max(own, frame)
-        least = begin + int(np.argmin(self._sizes[begin : end + 1]))
-        shared, drift, of_other = (
-            congruence(adjoint(here), self._drift[k]) + _STIFF**2 * np.eye(6)
-            for k in (least, own, frame)
-        )
+        shared, drift, of_other = self._drifts(own, frame)
         gain = np.linalg.solve(of_other, shared).T
         rest = nearest_positive(drift - gain @ shared) + _STIFF**2 * np.eye(6)
         return Tie(follows, np.asarray(gain), np.asarray(np.linalg.inv(rest)))
+
+    def _apart(self, place: int) -> FloatArray:
+        """(6, 6) covariance of the motion between a place and the window's first pose."""
+        shared, drift, here = self._drifts(self._frame_of(place), self._window.frames[0])
+        return nearest_positive(drift + here - 2.0 * shared) + _STIFF**2 * np.eye(6)
+
+    def _drifts(self, own: int, other: int) -> list[FloatArray]:
+        """(6, 6) of what two frames share, and of each, in the axes of the window's first pose.
+
+        Drift adds up: they share that of the best known frame between them.
+        """
+        here = inverse(self._window.poses[0])
+        begin, end = min(own, other), max(own, other)
+        least = begin + int(np.argmin(self._sizes[begin : end + 1]))
+        return [
+            congruence(adjoint(here), self._drift[frame]) + _STIFF**2 * np.eye(6)
+            for frame in (least, own, other)
+        ]
 
     def _frame_of(self, place: int) -> int:
         """The frame whose drift is a place's."""
