@@ -172,12 +172,14 @@ def read_camera_frames(folder: Path) -> CameraFrames:
     path = folder / "data.csv"
     stamps: list[int] = []
     paths: list[Path] = []
-    for line, text in read_lines(path):
+    for number, (line, text) in enumerate(read_lines(path)):
         words = [word.strip() for word in text.split(",")]
+        if number == 0 and not any(digit in words[0] for digit in "0123456789"):
+            continue  # names of columns
         if len(words) < 2 or not words[0].isdecimal() or not words[1]:
             raise DatasetError(
-                f"{path}, line {line}: expected a stamp in nanoseconds and a file name; correct "
-                "the line"
+                f"{path}, line {line}: expected a stamp in whole nanoseconds and a file name; "
+                "correct the line, or all stamps (seconds: times 1e9)"
             )
         if stamps and int(words[0]) <= stamps[-1]:
             raise DatasetError(
@@ -188,7 +190,22 @@ def read_camera_frames(folder: Path) -> CameraFrames:
         paths.append(folder / "data" / words[1])
     if not stamps:
         raise DatasetError(f"{path} lists no image; restore the file")
-    return CameraFrames(np.array(stamps, np.int64), tuple(paths))
+    found = np.array(stamps, np.int64)
+    _require_nanoseconds(path, found)
+    return CameraFrames(found, tuple(paths))
+
+
+_FASTEST_NS = 1_000_000  # a thousand frames a second; in microseconds it is one
+
+
+def _require_nanoseconds(path: Path, stamps: IntArray) -> None:
+    """Raises DatasetError where stamps (n,) follow each other as no camera's nanoseconds do."""
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else np.inf
+    if step < _FASTEST_NS:
+        raise DatasetError(
+            f"{path}: as nanoseconds its stamps are {step:.0f} ns apart (median); are they micro- "
+            "or milliseconds? multiply them, and those of all data.csv, by 1e3 or 1e6"
+        )
 
 
 def read_body_truth(folder: Path) -> Trajectory | None:

@@ -1,7 +1,8 @@
 """KITTI odometry in its native layout (docs/datasets/kitti.md).
 
 ``sequences/NN/{image_0,image_1,calib.txt,times.txt}`` and, for the training drives,
-``poses/NN.txt``: rectified grey pairs, camera 0 is the left one.
+``poses/NN.txt``: rectified grey pairs, camera 0 is the left one; or the colour pairs of image_2
+and image_3.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fgslam.cameras.formats.kitti import right_of_camera_0
 from fgslam.cameras.rig import load_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
@@ -27,6 +29,9 @@ from fgslam.datasets.recording import Recording, recording_identity, select_fram
 from fgslam.datasets.settings import KittiSettings
 from fgslam.datasets.tables import read_table, require_increasing
 
+_PAIRS = (("image_1", "image_0"), ("image_3", "image_2"))
+"""Folders of the right and the left camera: grey, else colour."""
+
 _POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 
 
@@ -39,27 +44,30 @@ def open_kitti(settings: KittiSettings) -> Recording:
     """
     folder = Path(settings.path) / "sequences" / settings.sequence
     require_folder(folder, "the KITTI sequence")
-    cameras = _camera_images(folder)
+    names = _pair(folder)
+    cameras = [list_numbered_images(folder / name) for name in names]
     table = read_table(folder / "times.txt", ("time",))
     stamps = table.column(0)
     require_increasing(table, stamps)
     chosen = select_frames(len(stamps), settings)
-    files = _files(folder, cameras, len(stamps))
-    rig = _read_rig(folder / "calib.txt", files)
+    files = _files(folder, names, cameras, len(stamps))
+    calibration = folder / "calib.txt"
+    rig = _read_rig(calibration, files)
     files = StereoFiles(files.paths, rig.width, rig.height)
     check_sizes(files, folder)
     files, held = files.with_bits()
     poses = _read_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
-    truth = None if poses is None else right_from_left_camera(poses, rig.baseline)[chosen]
+    if poses is not None:
+        poses = right_from_left_camera(poses[chosen], right_of_camera_0(calibration))
     return Recording(
         name=f"KITTI {settings.sequence}",
         rig=rig,
         timestamps=stamps[chosen],
         identity=recording_identity(
-            [folder / "calib.txt", folder / "times.txt"],
+            [calibration, folder / "times.txt"],
             [path for images in cameras for path in images.values()],
         ),
-        ground_truth=None if truth is None else Trajectory(stamps[chosen], truth),
+        ground_truth=None if poses is None else Trajectory(stamps[chosen], poses),
         notes=held + missing_notes(files, stamps),
         indices=chosen,
         load_images=files.load,
@@ -67,21 +75,22 @@ def open_kitti(settings: KittiSettings) -> Recording:
     )
 
 
-def _camera_images(folder: Path) -> list[dict[int, Path]]:
-    """Images of the right (image_1) and the left (image_0) camera by number."""
-    cameras = []
-    for name in ("image_1", "image_0"):
-        if not (folder / name).is_dir():
-            raise DatasetError(
-                f"{folder} has no {name}/: both grey cameras are needed (image_0 left, image_1 "
-                "right); unpack the grey odometry data set there"
-            )
-        cameras.append(list_numbered_images(folder / name))
-    return cameras
+def _pair(folder: Path) -> tuple[str, str]:
+    """Folders of the right and the left camera."""
+    for pair in _PAIRS:
+        if all((folder / name).is_dir() for name in pair):
+            return pair
+    lacking = next((name for name in _PAIRS[0] if not (folder / name).is_dir()), "")
+    raise DatasetError(
+        f"{folder} has no {lacking}/: both grey cameras are needed (image_0 left, image_1 right), "
+        "or both colour cameras (image_2 left, image_3 right); unpack the odometry data set there"
+    )
 
 
-def _files(folder: Path, cameras: list[dict[int, Path]], frames: int) -> StereoFiles:
-    named = list(zip(("image_1", "image_0"), cameras, strict=True))
+def _files(
+    folder: Path, names: tuple[str, str], cameras: list[dict[int, Path]], frames: int
+) -> StereoFiles:
+    named = list(zip(names, cameras, strict=True))
     paths = tuple(
         tuple(images.get(k, folder / name / f"{k:06d}.png") for name, images in named)
         for k in range(frames)
@@ -94,8 +103,8 @@ def _read_rig(path: Path, files: StereoFiles) -> CameraRig:
     images = files.first_images()
     if images is None:
         raise DatasetError(
-            f"{path.parent}: not one frame of times.txt has a readable image in image_0/ and in "
-            "image_1/; check the unpacked files"
+            f"{path.parent}: not one frame of times.txt has a readable image of both cameras; "
+            "check the unpacked files"
         )
     height, width = images[0].shape
     return load_rig(path, size=(width, height)).plain()

@@ -19,7 +19,7 @@ from fgslam.datasets.time_names import time_parts
 if TYPE_CHECKING:
     from fgslam.core.arrays import IntArray
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".bmp", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")
 _INSIDE = "data"  # where EuRoC and KITTI keep a camera's images
 
 

@@ -1,4 +1,4 @@
-"""KITTI: projections of the rectified grey pair, camera 0 on the left."""
+"""KITTI: projections of a rectified pair, grey (cameras 0 and 1) or colour (2 and 3)."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from fgslam.core.geometry import (
 )
 
 ODOMETRY = ("P0", "P1")
+ODOMETRY_COLOUR = ("P2", "P3")
 RAW = ("P_rect_00", "P_rect_01")
 RAW_COLOUR = ("P_rect_02", "P_rect_03")
 Size = tuple[int, int]
@@ -30,16 +31,17 @@ def is_kitti(text: str) -> bool:
 
 
 def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = None) -> Calibration:
-    """The rectified grey pair; the body is the left camera, looking ahead.
+    """A rectified pair; the body is the left camera, looking ahead.
 
-    ``keys`` are the lines of left and right camera where it is another pair, `RAW_COLOUR`.
+    ``keys`` are the lines of left and right camera; None: of the grey pair, or of the colour one
+    where only that has images beside the file.
 
     Raises:
         CalibrationError: a line is missing or malformed, or the pair is not rectified.
     """
     lines = _lines(path)
     raw = RAW[0] in lines or RAW_COLOUR[0] in lines
-    keys = keys or (RAW if raw else ODOMETRY)
+    keys = keys or (RAW if raw else _beside(path))
     left, right = (_projection(path, lines, key) for key in keys)
     if not np.allclose(left[:, :3], right[:, :3]):
         raise CalibrationError(
@@ -63,6 +65,24 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
         for key, x in zip(keys, (-offset, 0.0), strict=True)
     )
     return Calibration(str(path), "KITTI", cameras, sided=True)
+
+
+def _beside(path: Path) -> tuple[str, str]:
+    """Lines of the pair whose folders of images lie beside a calib.txt."""
+    pairs = (ODOMETRY, ODOMETRY_COLOUR)
+    return next(
+        (keys for keys in pairs if (path.parent / f"image_{keys[1][1:]}").is_dir()), pairs[0]
+    )
+
+
+def right_of_camera_0(path: Path) -> float:
+    """How far the pair's right camera is to the right of camera 0, whose poses KITTI gives, metres.
+
+    Raises:
+        CalibrationError: a line is missing or malformed.
+    """
+    right = _projection(path, _lines(path), _beside(path)[1])
+    return -float(right[0, 3] / right[0, 0])
 
 
 def left_on_inertial_unit(path: Path, keys: tuple[str, str]) -> FloatArray | None:

@@ -174,6 +174,15 @@ def test_images_without_partner_are_left_out_and_noted(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(recording.timestamps), [0.1, 0.05], atol=1e-6)
 
 
+def test_names_of_columns_need_no_hash(tmp_path: Path) -> None:
+    root = euroc(tmp_path, (LEFT, RIGHT))
+    before = opened(root).timestamps
+    for camera in ("cam0", "cam1"):
+        path = root / "mav0" / camera / "data.csv"
+        path.write_text(path.read_text().replace("#timestamp", "timestamp"), newline="\r\n")
+    np.testing.assert_array_equal(opened(root).timestamps, before)
+
+
 def test_path_may_be_mav0_itself(tmp_path: Path) -> None:
     root = euroc(tmp_path / "V1_01", (LEFT, RIGHT))
     assert opened(root / "mav0").identity == opened(root).identity
@@ -241,7 +250,8 @@ BAD = [
     (mounted(RIGHT), CalibrationError, ["are 0 mm apart, as one camera", "--unit"]),
     (mounted(UPWARDS), CalibrationError, ["45 degrees apart", "check T_BS"]),
     (text("cam0/data.csv", "#empty\n"), DatasetError, ["cam0/data.csv", "no image", "restore"]),
-    (text("cam0/data.csv", "12.5,a.png\n"), DatasetError, ["line 1", "nanoseconds"]),
+    (text("cam0/data.csv", "12.5,a.png\n"), DatasetError, ["line 1", "nanoseconds", "times 1e9"]),
+    (text("cam0/data.csv", "1000,a.png\n51000,b.png\n"), DatasetError, ["50000 ns apart", "micro"]),
     (text("cam0/data.csv", "#\n20,a.png\n20,b.png\n"), DatasetError, ["line 3", "time order"]),
     (shifted_stamps, DatasetError, ["no image", "partner", "2 ms", "pairing_tolerance_ms"]),
 ]

@@ -35,6 +35,22 @@ def test_native_layout(tmp_path: Path) -> None:
     assert recording.notes == ()
 
 
+def test_colour_cameras_have_lines_and_a_place_of_their_own(tmp_path: Path) -> None:
+    root, left = kitti(tmp_path)
+    folder = root / "sequences" / "06"
+    for grey, colour in (("image_0", "image_2"), ("image_1", "image_3")):
+        (folder / grey).rename(folder / colour)
+    with (folder / "calib.txt").open("a", encoding="utf-8") as file:
+        for key, shift in (("P2", 1.5), ("P3", -13.5)):
+            file.write(f"{key}: 30.0 0 15.5 {shift} 0 31.0 11.5 0 0 0 1 0\n")
+    recording = opened(root)
+    assert recording.rig.baseline == pytest.approx(0.5)
+    assert [int(image[0, 0]) for image in recording.frame(3).images] == [13, 63]
+    assert recording.ground_truth is not None
+    offsets = np.linalg.inv(left) @ recording.ground_truth.poses
+    np.testing.assert_allclose(offsets[:, :3, 3], np.tile([0.45, 0.0, 0.0], (5, 1)), atol=1e-8)
+
+
 def test_selection_applies_to_truth_as_well(tmp_path: Path) -> None:
     root, _ = kitti(tmp_path)
     whole, part = opened(root), opened(root, start=1, stride=2)

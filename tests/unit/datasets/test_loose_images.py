@@ -41,6 +41,7 @@ NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
     "side before": lambda k: (f"left{k}.png", f"right{k}.png"),
     "letters": lambda k: (f"frame{k}-L.png", f"frame{k}-R.png"),
     "cam0, cam1 in one": lambda k: (f"cam0_{k}.png", f"cam1_{k}.png"),
+    "WebP, capitals": lambda k: (f"Left Camera/im {k}.WEBP", f"Right Camera/im {k}.WEBP"),
     "other names": lambda k: (f"left/a{k}.png", f"right/b{k}.png"),
 }
 
