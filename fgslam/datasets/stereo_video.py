@@ -111,7 +111,23 @@ def _views(
             continue
         said = () if settings.views else (f"the film is taken as {name.replace('_', ' ')}",)
         return _Halves(film, columns, rows).load, rig, said
+    _refuse_one_view(settings, folder, film.name, (width, height))
     raise fault or DatasetError(f"{folder}: no film")
+
+
+def _refuse_one_view(
+    settings: VideoSettings, folder: Path, name: str, size: tuple[int, int]
+) -> None:
+    """Raises DatasetError where the whole film is of the size of one calibrated view."""
+    try:
+        calibrated_rig(settings, folder, size)
+    except CalibrationError:
+        return
+    raise DatasetError(
+        f"{name} is {size[0]}x{size[1]}, as large as the calibrated image of one camera: a film of "
+        "one camera alone cannot be used; one that shows both squeezed must be stretched back to "
+        "twice the width (side by side) or height"
+    )
 
 
 def _by_shape(width: int, height: int) -> list[str]:

@@ -190,6 +190,13 @@ def test_a_calibration_of_another_size_or_none(tmp_path: Path) -> None:
         opened(path)
 
 
+def test_a_film_as_large_as_one_view_is_of_one_camera(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    path = film(tmp_path / "a.avi", [view(40), view(50)])
+    with pytest.raises(DatasetError, match=r"a\.avi is 64x48, as large as .* of one camera"):
+        opened(path)
+
+
 def test_films_that_are_no_pair(tmp_path: Path) -> None:
     for name in ("front", "back"):
         film(tmp_path / f"{name}.avi", [view(1)])
