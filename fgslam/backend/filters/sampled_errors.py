@@ -52,6 +52,7 @@ _STREAM = 17  # of random numbers, beside those of the recording
 _FARTHEST_M = 1e9  # beyond, a point has no derivative; and nothing to tell
 _FLAT, _PADDING = 1e-20, 1e-9  # of the variances' sum: far below any landmark's, above rounding
 _LEAST_MATCHES = 6  # that place a frame by an old part of the drive
+_PLACE = 24  # landmarks of it that do so where fewer match: of some frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,7 +212,7 @@ class SampledErrors(ErrorColumns):
             return
         rows, known = self._rows(landmarks.ids)
         self._map["gain"][rows[known]] = moved.rotations[known] @ self._map["gain"][rows[known]]
-        apart = adjoint(wTc) @ (self._gain - self._returned(loop, landmarks, wTc))
+        apart = adjoint(wTc) @ (self._gain - self._returned(loop, landmarks, wTc, moved.homes))
         self._gain = self._on_floor(
             wTc, self._gain - adjoint(inverse(wTc)) @ moved.shares[-1] @ apart
         )
@@ -317,19 +318,38 @@ class SampledErrors(ErrorColumns):
             gain[:, :, _TERMS:] = self._drawn(covariances[new])
             self._append({"ids": ids[new], "gain": gain})
 
-    def _returned(self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray) -> FloatArray:
+    def _returned(
+        self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, homes: IntArray
+    ) -> FloatArray:
         """Errors (6, m) of the newest pose, at ``wTc``, by the landmarks of an old place."""
         seen = loop.observations
         seen = seen.select(self._rows(seen.ids)[1] & np.isin(seen.ids, landmarks.ids))
         problem = PoseProblem.of(landmarks, seen)
         ahead = in_front(self._sensor, transform_to_camera(wTc, problem.points))
         if ahead.sum() < _LEAST_MATCHES:
-            gain = np.zeros_like(self._gain)
-            gain[:, _TERMS:] = _root(loop.covariance) @ self._signs(1, 6)[0]
+            gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
+            gain[:, _TERMS:] += _root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
         problem, sights = problem.select(ahead), self._sights(wTc, problem.select(ahead))
         by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
         return sights.following(by_measurement, self._of("gain", seen.ids[ahead]))
+
+    def _of_place(self, frame: int, landmarks: LandmarkMap, homes: IntArray) -> FloatArray:
+        """Errors (6, m) of a frame's place as a motion of the world, by landmarks first seen there.
+
+        Weighted least squares over those whose first frames are nearest; zero where there are none.
+        """
+        have = np.flatnonzero(self._rows(landmarks.ids)[1] & (homes >= 0))
+        nearest = have[np.argsort(np.abs(homes[have] - frame), kind="stable")][:_PLACE]
+        near = landmarks.select(np.sort(nearest))
+        by_motion = np.concatenate(
+            [-skew(near.positions), np.tile(np.eye(3), (len(near), 1, 1))], axis=2
+        )
+        weights = np.asarray(np.linalg.inv(near.covariances + lacking(near.covariances)))
+        turned = np.swapaxes(by_motion, 1, 2) @ weights
+        information = (turned @ by_motion).sum(axis=0)
+        pull = (turned @ self._of("gain", near.ids)).sum(axis=0)
+        return np.asarray(np.linalg.pinv(information, hermitian=True) @ pull)
 
     def _on_floor(self, wTc: FloatArray, columns: FloatArray) -> FloatArray:
         basis = self._solver.floor.basis(wTc)
