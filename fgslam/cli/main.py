@@ -90,9 +90,11 @@ def run(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import experiment_of
 
     existing = existing_folder(overwrite, resume)
-    given = {**options.frames(start, stop, stride, fps, scale, unit), "estimator.kind": estimator}
-    given |= {"dataset.view": view, "map.load": map_in, "map.save": map_out}
-    chosen = [*options.as_overrides(given), *options.topics_override(topics)]
+    chosen = options.of_recording(
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+    )
+    steered = {"estimator.kind": estimator, "map.load": map_in, "map.save": map_out}
+    chosen += options.as_overrides(steered)
     settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
     if said:
         typer.echo(said)
@@ -131,9 +133,10 @@ def init(  # noqa: PLR0913 - each option is a parameter
     """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
     from fgslam.runs.bare_recording import short_config
 
-    given = {**options.frames(start, stop, stride, fps, scale, unit), "estimator.kind": estimator}
-    given["dataset.view"] = view
-    chosen = [*options.as_overrides(given), *options.topics_override(topics)]
+    chosen = options.of_recording(
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+    )
+    chosen += options.as_overrides({"estimator.kind": estimator})
     typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
 
 
@@ -348,13 +351,21 @@ def view(
 
 
 @app.command()
-def inspect(
+def inspect(  # noqa: PLR0913 - each option is a parameter
     recording: options.Recording,
+    camera: options.Camera = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    fps: options.Fps = None,
+    scale: options.Scale = None,
+    unit: options.Unit = None,
+    view: options.View = None,
+    topics: options.Topics = None,
     overrides: options.Overrides = None,
     frames: Annotated[
         int, typer.Option(min=1, help="in how many frames, evenly spread, features are matched")
     ] = 12,
-    unit: options.Unit = None,
 ) -> None:
     """Say what is in a recording, and what is wrong with it, in words.
 
@@ -363,9 +374,13 @@ def inspect(
     from fgslam.cli.console import progress_bar
     from fgslam.runs.inspection import inspect_recording
 
-    chosen = [*(overrides or ()), *options.as_overrides({"dataset.unit_m": unit})]
+    chosen = options.of_recording(
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+    )
+    given = [*(overrides or ()), *chosen]
     with stop_flag() as stopped, progress_bar() as progress:
-        report = inspect_recording(recording, chosen, frames, stoppable(progress, stopped))
+        watched = stoppable(progress, stopped)
+        report = inspect_recording(recording, given, frames, watched, camera)
     typer.echo(report)
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.datasets.layouts import fitting_layouts, is_recording, recognise_layout
+from fgslam.datasets.layouts import fitting_layouts, is_recording
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
 
@@ -45,7 +45,7 @@ def recording(given: str) -> Path:
     """Folder of a recording in a known layout, or an experiment's file. Raises FgslamError."""
     path = _folder_or_experiment(given)
     if path.suffix.lower() not in YAML_ENDINGS:
-        recognise_layout(path)
+        fitting_layouts(path)
     return path
 
 
@@ -103,25 +103,18 @@ def as_overrides(given: Mapping[str, str | float | Path | None]) -> list[str]:
     ]
 
 
-def frames(
-    start: int | None,
-    stop: int | None,
-    stride: int | None,
-    fps: float | None = None,
-    scale: float | None = None,
-    unit: float | None = None,
-) -> dict[str, str | float | Path | None]:
-    """Which frames of a recording, how fast, how large, in which unit, by the keys that say it."""
-    names = ("start", "stop", "stride", "fps", "scale", "unit_m")
-    values = (start, stop, stride, fps, scale, unit)
-    return {f"dataset.{k}": v for k, v in zip(names, values, strict=True)}
+def of_recording(topics: str | None = None, **given: str | float | None) -> list[str]:
+    """Overrides of the options of a recording: which frames, how fast, how large, and so on.
 
-
-def topics_override(topics: str | None) -> list[str]:
-    """The override of the topics of a bag, from their names between commas."""
+    Args:
+        topics: of a bag, names between commas.
+        given: the other options, each by its name, which is the data set's key.
+    """
+    chosen = as_overrides({f"dataset.{key}": value for key, value in given.items()})
     if topics is None:
-        return []
-    return [f"dataset.topics={json.dumps([name.strip() for name in topics.split(',')])}"]
+        return chosen
+    names = [name.strip() for name in topics.split(",")]
+    return [*chosen, f"dataset.topics={json.dumps(names)}"]
 
 
 # --------------------------------------------------------------------------------------------

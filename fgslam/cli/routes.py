@@ -57,8 +57,8 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.runs.bare_routes import teaching
 
-    given = {**options.frames(start, stop, stride), "poses": poses}
-    chosen = options.as_overrides(given)
+    chosen = options.of_recording(start=start, stop=stop, stride=stride)
+    chosen += options.as_overrides({"poses": poses})
     config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
     _perform(config, report, overwrite)
 
@@ -83,7 +83,7 @@ def follow(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.runs.bare_routes import following
 
-    chosen = options.as_overrides(options.frames(start, stop, stride))
+    chosen = options.of_recording(start=start, stop=stop, stride=stride)
     config = following(route, recording, camera, [*(overrides or ()), *chosen])
     _perform(config, out, overwrite)
 

@@ -67,7 +67,7 @@ def bare_experiment(
     overrides = tuple(overrides)
     values: dict[str, Any] = {
         "name": _name(folder),
-        "dataset": _dataset(folder, camera, overrides),
+        "dataset": dataset_of(folder, camera, overrides),
         "odometry": {"kind": "recorded"},
         "estimator": {"kind": DEFAULT_ESTIMATOR},
     }
@@ -101,13 +101,18 @@ def experiment_of(
     if is_recording(path):
         bare = bare_experiment(path, camera, overrides)
         return bare.config, bare.said
-    if camera is not None:
-        raise ConfigError(
-            f"{path}: --camera is for a recording; in an experiment it is dataset.camera_file"
-        )
+    require_no_camera(path, camera)
     if not path.exists():
         raise ConfigError(f"{path}: no such file or folder; {suggestion(path)}")
     return load_experiment(path, overrides), ""
+
+
+def require_no_camera(experiment: Path, camera: Path | None) -> None:
+    """Raises ConfigError where an experiment, which says its own, is given a calibration."""
+    if camera is not None:
+        raise ConfigError(
+            f"{experiment}: --camera is for a recording; in an experiment it is dataset.camera_file"
+        )
 
 
 def short_config(folder: Path, camera: Path | None = None, overrides: Iterable[str] = ()) -> str:
@@ -150,7 +155,12 @@ def _name(recording: Path) -> str:
     )
 
 
-def _dataset(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
+def dataset_of(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
+    """The keys of ``dataset`` that open a bare recording; overrides are regarded, not applied.
+
+    Raises:
+        FgslamError: the layout is not known, or cannot take that calibration or rate.
+    """
     dataset = recognise_layout(folder, _asked_kind(overrides))
     if _asked(overrides, "dataset.fps") and "fps" not in _fields(dataset["kind"]):
         raise ConfigError(

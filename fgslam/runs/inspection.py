@@ -24,8 +24,9 @@ from fgslam.datasets.checks.recording import (
     check_timing,
     share,
 )
-from fgslam.datasets.layouts import kitti_drives, recognise_layout
+from fgslam.datasets.layouts import kitti_drives
 from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
+from fgslam.runs.bare_recording import dataset_of, require_no_camera
 from fgslam.runs.config import ExperimentConfig, load_config, make_config
 from fgslam.runs.inspection_matches import judge_matches, look_at_frames, match_facts
 from fgslam.runs.opening import open_sequence
@@ -45,6 +46,7 @@ def inspect_recording(
     overrides: Items[str] = (),
     frames: int = 12,
     progress: Progress = lambda what, done, total: None,
+    camera: Path | None = None,
 ) -> str:
     """The report on a recording, as text.
 
@@ -53,11 +55,12 @@ def inspect_recording(
         overrides: ``a.b=value`` for the configuration, that of the file or the default one.
         frames: in how many frames, spread over the recording, features are matched.
         progress: called after each frame.
+        camera: calibration of a folder's recording, in place of its own.
 
     Raises:
         FgslamError: the recording cannot be opened at all, or the configuration is wrong.
     """
-    config = configure(dataset, overrides)
+    config = configure(dataset, overrides, camera)
     sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     read = max(frames, _READ_AT_LEAST)
     general = check_sequence(sequence, read, lambda done, total: progress("reading", done, total))
@@ -126,17 +129,19 @@ def facts_of(sequence: Sequence) -> Facts:
     )
 
 
-def configure(dataset: Path, overrides: Items[str]) -> ExperimentConfig:
+def configure(dataset: Path, overrides: Items[str], camera: Path | None = None) -> ExperimentConfig:
     """The experiment's configuration, or the default one for a folder in a known layout.
 
     Raises:
         FgslamError: the layout is not known, or the configuration is wrong.
     """
     if dataset.suffix.lower() in _YAML:
+        require_no_camera(dataset, camera)
         return load_config(dataset, overrides)
     # The kind is named so that an override of one of its keys finds it.
     odometry = {"kind": "recorded"}
-    values = {"name": "inspect", "dataset": recognise_layout(dataset), "odometry": odometry}
+    keys = dataset_of(dataset, camera, tuple(overrides))
+    values = {"name": "inspect", "dataset": keys, "odometry": odometry}
     return make_config(values, str(dataset), overrides)
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Callable
+from inspect import signature
 from pathlib import Path
 from types import ModuleType
 
@@ -370,6 +371,26 @@ def test_command_prints_the_report_and_succeeds(
     assert "0.001 mm apart, as one camera" in capsys.readouterr().err
     assert run_cli(monkeypatch, "inspect", str(root), "--frames", "1", "--unit", "0.5") == 0
     assert re.search(r"baseline +0\.05 m", capsys.readouterr().out)
+
+
+def test_command_takes_the_options_of_a_recording_as_init_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked, of_init = (set(signature(each).parameters) for each in (cli.inspect, cli.init))
+    assert of_init - asked == {"estimator"}
+    root, other = write(tmp_path / "drive", PAIR), tmp_path / "other.json"
+    calibration = json.loads((root / "calib.json").read_text(encoding="utf-8"))
+    other.write_text(json.dumps({**calibration, "baseline_m": 0.4}), encoding="utf-8")
+    inspected = ("inspect", str(root), "--frames", "1")
+    chosen = ("--camera", str(other), "--stop", "4", "--scale", "0.5")
+    assert run_cli(monkeypatch, *inspected, *chosen) == 0
+    assert re.search(r"frames +4 .*x\d+\n.*baseline +0\.4 m", capsys.readouterr().out, re.DOTALL)
+    assert run_cli(monkeypatch, *inspected, "--fps", "5") == 2
+    assert "states its own times; leave --fps out" in capsys.readouterr().err
+    experiment = root / "try.yaml"
+    experiment.write_text(f"name: a\ndataset: {{kind: image_folder, path: {root}}}", "utf-8")
+    assert run_cli(monkeypatch, "inspect", str(experiment), "--camera", str(other)) == 2
+    assert "--camera is for a recording" in capsys.readouterr().err
 
 
 def test_command_refuses_what_is_no_recording_in_one_line(

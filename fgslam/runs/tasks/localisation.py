@@ -19,8 +19,8 @@ from fgslam.core.geometry import yaw_pitch_roll
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.threads import one_blas_thread
-from fgslam.datasets.layouts import recognise_layout
 from fgslam.evaluation.localisation import localisation_errors
+from fgslam.runs.bare_recording import dataset_of
 from fgslam.runs.config import (
     ExperimentConfig,
     as_task,
@@ -174,7 +174,7 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
     else:
         values = {
             "name": "localize",
-            "dataset": recognise_layout(wanted.recording),
+            "dataset": dataset_of(wanted.recording, None, wanted.overrides),
             "odometry": {"kind": "recorded"},
             "frontend": settings_of_map(saved).get("frontend", {}),
         }
