@@ -101,6 +101,12 @@ class ImageFolderSettings(CalibratedSettings):
     ] = None
 
 
+PairingTolerance = Annotated[
+    float,
+    Field(gt=0.0, le=1000.0, description="largest time between the two images of a pair, ms"),
+]
+
+
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class LooseImagesSettings(CalibratedSettings):
     """Folders of images with any names, with or without times (docs/datasets/loose_images.md)."""
@@ -148,6 +154,7 @@ class VideoSettings(CalibratedSettings):
         float | None,
         Field(gt=0.0, le=1e4, description="frames a second, in place of the film's own rate"),
     ] = None
+    pairing_tolerance_ms: PairingTolerance = 20.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -170,10 +177,7 @@ class RgbdSettings(CalibratedSettings):
             description="noise of a depth of 1 m, growing with its square",
         ),
     ] = 1.425e-3
-    pairing_tolerance_ms: Annotated[
-        float,
-        Field(gt=0.0, le=1000.0, description="largest time between colour and depth, ms"),
-    ] = 20.0
+    pairing_tolerance_ms: PairingTolerance = 20.0
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -195,10 +199,7 @@ class BagSettings(CalibratedSettings):
         tuple[str, ...],
         Field(description="topics: left images, right images, odometry; empty: by type and name"),
     ] = ()
-    pairing_tolerance_ms: Annotated[
-        float,
-        Field(gt=0.0, le=1000.0, description="largest time between the two images of a pair, ms"),
-    ] = 20.0
+    pairing_tolerance_ms: PairingTolerance = 20.0
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from fgslam.cameras.rig import StereoRig
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.datasets.calibrated import calibrated_rig, numbered
+from fgslam.datasets.film_times import moments_of
 from fgslam.datasets.images import sized
 from fgslam.datasets.layouts import films_in
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
@@ -24,7 +25,6 @@ from fgslam.datasets.video_frames import VideoFrames
 _VIEWS: dict[str, tuple[int, int]] = {"side_by_side": (2, 1), "over_under": (1, 2)}
 """Views beside each other and above each other."""
 
-_UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
 _USUAL_SHAPE = 1.5  # width over height of a camera's image
 
 
@@ -48,45 +48,29 @@ def open_video(settings: VideoSettings) -> Recording:
     if not 0.0 < rate < np.inf:
         raise DatasetError(f"{films[0]} states no frame rate; say it: --fps RATE")
     views, rig, said = _views(settings, frames, films[0].parent)
-    count = min(each.count for each in frames)
-    chosen = select_frames(count, settings)
-    times, told = _times(frames, count, rate, settings.fps is not None)
+    moments = moments_of(frames, rate, settings)
+    chosen = select_frames(len(moments.times), settings)
     return Recording(
         name=given.stem if len(films) == 1 else given.resolve().name.replace("*", ""),
         rig=rig.plain(),
         rectifier=rig.rectifier,
-        timestamps=times[chosen],
+        timestamps=moments.times[chosen],
         identity=recording_identity([], films),
         ground_truth=None,
-        notes=(*rig.remarks, *(note for each in frames for note in each.notes), *said, *told),
+        notes=(
+            *rig.remarks,
+            *(note for each in frames for note in each.notes),
+            *said,
+            *moments.notes,
+        ),
         indices=chosen,
-        load_images=_Film(views, rig, grey=True).load,
-        load_colour=_Film(views, rig, grey=False).load,
+        load_images=_Film(views, moments.numbers, rig, grey=True).load,
+        load_colour=_Film(views, moments.numbers, rig, grey=False).load,
     )
 
 
-def _times(
-    frames: list[VideoFrames], count: int, rate: float, stated: bool
-) -> tuple[FloatArray, tuple[str, ...]]:
-    """Seconds (n,) of the frames by the rate, or each by its own; and what was found, in words."""
-    even = np.arange(count, dtype=np.int64) / rate
-    if stated or count < 2:
-        return even, ()
-    own = [found[:count] for film in frames if (found := film.stamps()) is not None]
-    if len(own) < len(frames):
-        return even, ()
-    notes: tuple[str, ...] = ()
-    if len(own) > 1 and (apart := float(np.abs(own[0] - own[1]).max())) > _UNEVEN / rate:
-        notes = (f"frames of one number differ in time by up to {1e3 * apart:.0f} ms in the films",)
-    if np.abs(own[0] - even).max() <= _UNEVEN / rate:
-        return even, notes
-    steps = 1e3 * np.diff(own[0])
-    note = f"frames are {steps.min():.0f} to {steps.max():.0f} ms apart: each has its own time"
-    return own[0], (note, *notes)
-
-
-Views = Callable[[int], tuple[Image, Image]]
-"""Right and left view (height, width, 3) in R, G, B by number; raises FrameError."""
+Views = Callable[..., tuple[Image, Image]]
+"""Right and left view (height, width, 3) in R, G, B, by numbers in the films; or FrameError."""
 
 
 def _views(
@@ -99,7 +83,7 @@ def _views(
         rig = calibrated_rig(settings, folder, (width, height))
         if differ_in_number(left.name, right.name):
             rig = numbered(rig)
-        return lambda k: (right.load(k), left.load(k)), rig, _differences(left, right)
+        return lambda of_left, of_right: (right.load(of_right), left.load(of_left)), rig, ()
     film = frames[0]
     fault: CalibrationError | None = None
     for name in [settings.views] if settings.views else _by_shape(width, height):
@@ -140,16 +124,6 @@ def _by_shape(width: int, height: int) -> list[str]:
     return sorted(_VIEWS, key=unusual)
 
 
-def _differences(left: VideoFrames, right: VideoFrames) -> tuple[str, ...]:
-    """What two films that should run together differ in."""
-    notes = ["frames of the two films are paired by their number: both must begin at one time"]
-    if left.count != right.count:
-        notes.append(f"the left film has {left.count} frames, the right one {right.count}")
-    if abs(left.rate - right.rate) > 1e-3 * left.rate:
-        notes.append(f"the left film has {left.rate:g} frames a second, the right {right.rate:g}")
-    return tuple(notes)
-
-
 @dataclass(frozen=True, eq=False)
 class _Halves:
     """Both views in one film."""
@@ -169,12 +143,13 @@ class _Film:
     """Rectified images of a film by number."""
 
     views: Views
+    numbers: IntArray
     rig: StereoRig
     grey: bool
 
     def load(self, index: int) -> tuple[Image, ...]:
         """(right, left). Raises FrameError."""
-        images = self.views(index)
+        images = self.views(*self.numbers[index].tolist())
         if self.grey:
             images = (_grey(images[0]), _grey(images[1]))
         size = self.rig.image_size

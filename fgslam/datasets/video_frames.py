@@ -68,6 +68,10 @@ class VideoFrames:
             return None
         return np.asarray(times - times[0])
 
+    def even(self) -> FloatArray | None:
+        """Seconds (count,) from the first frame on by the stated rate; None without a rate."""
+        return np.arange(self.count) / self.rate if 0.0 < self.rate < np.inf else None
+
     def _go_to(self, index: int) -> None:
         if index < self._next:
             self._capture.release()

@@ -91,13 +91,35 @@ def test_frames_of_a_phone_have_their_own_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.diff(stated.timestamps), 0.1, rtol=0.0, atol=1e-9)
 
 
-def test_two_films_whose_frames_drift_apart_are_told(tmp_path: Path) -> None:
+def test_frames_of_two_films_that_drift_apart_are_paired_by_time(tmp_path: Path) -> None:
+    """Of one number up to 20 ms apart, then, with other lengths, up to 75 ms."""
     calibrated(tmp_path)
     for side, level in (("left", 40), ("right", 140)):
         film(tmp_path / f"{side}.mp4", [view(level + 10 * k) for k in range(6)])
+    uneven(tmp_path / "right.mp4", [512, 717, 410, 512, 409, 512])
+    recording = opened(tmp_path)
+    assert "frames of one number differ in time by up to 20 ms in the films" in recording.notes
+    assert len(recording) == 6
     uneven(tmp_path / "right.mp4", [256, 256, 256, 1024, 768, 512])
-    notes = opened(tmp_path).notes
-    assert "frames of one number differ in time by up to 75 ms in the films" in notes
+    recording = opened(tmp_path)
+    np.testing.assert_allclose(recording.timestamps, [0.0, 0.05, 0.25], rtol=0.0, atol=1e-6)
+    assert np.abs(levels(recording, 1) - [160, 50]).max() <= _NEAR
+    left_out = "3 {} images have no partner within 20 ms and are left out"
+    assert {left_out.format("right"), left_out.format("left")} <= set(recording.notes)
+    assert len(opened(tmp_path, pairing_tolerance_ms=40.0)) > 3
+
+
+def test_films_of_other_rates_are_paired_by_time(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    film(tmp_path / "left.avi", [view(20 + 4 * k) for k in range(41)], 20.0)
+    film(tmp_path / "right.avi", [view(50 + 10 * k) for k in range(17)], 8.0)
+    recording = opened(tmp_path)
+    np.testing.assert_allclose(recording.timestamps, 0.25 * np.arange(9), rtol=0.0, atol=1e-9)
+    assert np.abs(levels(recording, 7) - [190, 160]).max() <= _NEAR
+    assert "the left film has 20 frames a second, the right 8" in recording.notes
+    assert "32 left images have no partner within 20 ms and are left out" in recording.notes
+    assert "paired by their time: both must begin at one time" in " ".join(recording.notes)
+    assert len(opened(tmp_path, fps=8.0)) == 17
 
 
 @pytest.mark.parametrize("ending", [".avi", ".mp4"])

@@ -1,0 +1,99 @@
+"""When frames of films are shown, and which belong together (docs/datasets/video.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
+from fgslam.datasets.settings import VideoSettings
+from fgslam.datasets.video_frames import VideoFrames
+
+_UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """What is shown when.
+
+    Attributes:
+        numbers: (n, films) of the frames of each film.
+        times: (n,) seconds, from the first film's beginning on.
+        notes: how that was found, and what was left out.
+    """
+
+    numbers: IntArray
+    times: FloatArray
+    notes: tuple[str, ...]
+
+
+def moments_of(films: list[VideoFrames], rate: float, settings: VideoSettings) -> Moments:
+    """Frames of one film, or of two those of one number, or of one time where that is another.
+
+    Args:
+        films: one of both views, or those of the left and of the right camera.
+        rate: frames a second of the first.
+        settings: of the recording; a rate that they state is that of each film.
+
+    Raises:
+        DatasetError: no two frames are shown at one time.
+    """
+    own = [None if settings.fps else film.stamps() for film in films]
+    if len(films) == 1:
+        return _by_number(films, own, rate)
+    either = (film.even() if its is None else its for film, its in zip(films, own, strict=True))
+    known = [times for times in either if times is not None]
+    if settings.fps or len(known) < 2 or not _part(*known):
+        how, moments = "number", _by_number(films, own, rate)
+    else:
+        how, moments = "time", _by_time(films, known, 1e-3 * settings.pairing_tolerance_ms)
+    how = f"frames of the two films are paired by their {how}: both must begin at one time"
+    return replace(moments, notes=(how, *_differences(films[0], films[1]), *moments.notes))
+
+
+def _part(left: FloatArray, right: FloatArray) -> bool:
+    """Whether frames of one number come to lie nearer to frames of another one."""
+    count = min(len(left), len(right))
+    if count < 2:
+        return False
+    apart = np.abs(left[:count] - right[:count])
+    step = min(times[-1] / (len(times) - 1) for times in (left, right))
+    return bool(apart.max() > 0.5 * step)
+
+
+def _differences(left: VideoFrames, right: VideoFrames) -> tuple[str, ...]:
+    """What two films that should run together differ in."""
+    notes = []
+    if left.count != right.count:
+        notes.append(f"the left film has {left.count} frames, the right one {right.count}")
+    if abs(left.rate - right.rate) > 1e-3 * left.rate:
+        notes.append(f"the left film has {left.rate:g} frames a second, the right {right.rate:g}")
+    return tuple(notes)
+
+
+def _by_time(films: list[VideoFrames], known: list[FloatArray], tolerance: float) -> Moments:
+    """Frames of two films that are each other's nearest."""
+    left, right = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
+    names = (films[1].name, films[0].name)
+    (of_right, of_left), notes = pair_stamps(right, left, tolerance, names)
+    return Moments(np.column_stack([of_left, of_right]), known[0][of_left], notes)
+
+
+def _by_number(films: list[VideoFrames], own: list[FloatArray | None], rate: float) -> Moments:
+    """Frames at the rate, or each at its time in the first film where these are uneven."""
+    count = min(film.count for film in films)
+    even = np.arange(count, dtype=np.int64) / rate
+    numbers = np.repeat(np.arange(count, dtype=np.int64)[:, None], len(films), axis=1)
+    shown = [times[:count] for times in own if times is not None]
+    if count < 2 or len(shown) < len(films):
+        return Moments(numbers, even, ())
+    notes: tuple[str, ...] = ()
+    if len(shown) > 1 and (apart := float(np.abs(shown[0] - shown[1]).max())) > _UNEVEN / rate:
+        notes = (f"frames of one number differ in time by up to {1e3 * apart:.0f} ms in the films",)
+    if np.abs(shown[0] - even).max() <= _UNEVEN / rate:
+        return Moments(numbers, even, notes)
+    steps = 1e3 * np.diff(shown[0])
+    note = f"frames are {steps.min():.0f} to {steps.max():.0f} ms apart: each has its own time"
+    return Moments(numbers, shown[0], (note, *notes))
