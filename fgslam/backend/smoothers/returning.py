@@ -20,6 +20,8 @@ from fgslam.core.geometry import (
     in_front,
     inverse_spd3,
     point_pose_jacobian,
+    project,
+    projection_jacobian,
     transform_to_camera,
     triangulate,
     triangulation_covariance,
@@ -34,31 +36,41 @@ _ROUNDS = 3  # of who fits all that fit, after who fits one
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenAgain(Rows):
-    """Landmarks (k,) where an observation of each has them: points (k, 3) and covariances."""
+    """Landmarks (k,) where an observation of each has them: points (k, 3) and covariances.
+
+    Of one whose depth the observation does not tell (``near`` False) they are of first order about
+    the depth that it was known to have.
+    """
 
     variables: IntArray
     points: FloatArray
     covariances: FloatArray
+    near: BoolArray
 
     @staticmethod
     def of(
         sensor: Sensor,
-        variables: IntArray,
+        known: Landmarks,
         poses: FloatArray,
         measured: FloatArray,
         noise: FloatArray,
     ) -> SeenAgain:
-        """From measurements (n, 3) at poses (n, 4, 4), as far as their depths are known."""
+        """From measurements (n, 3) at poses (n, 4, 4), of landmarks that were known before."""
         poses = poses.reshape(-1, 4, 4)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             local = triangulate(sensor, measured)
             covariances = triangulation_covariance(sensor, measured, noise)
         near = in_front(sensor, local) & np.isfinite(covariances).all(axis=(1, 2))
         near[near] = parallax(local[near], covariances[near]) >= LEAST_PARALLAX
-        poses, turned = poses[near], poses[near, :3, :3]
-        points = (turned @ local[near, :, None])[:, :, 0] + poses[:, :3, 3]
-        across = turned @ covariances[near] @ np.swapaxes(turned, 1, 2)
-        return SeenAgain(variables[near], points, across)
+        before = ((known.points - poses[:, :3, 3])[:, None] @ poses[:, :3, :3])[:, 0]
+        far = ~near & in_front(sensor, before)
+        about = _at_known_depth(sensor, before[far], measured[far], noise[far])
+        local[far], covariances[far] = about
+        kept = near | far
+        poses, turned = poses[kept], poses[kept, :3, :3]
+        points = (turned @ local[kept, :, None])[:, :, 0] + poses[:, :3, 3]
+        across = turned @ covariances[kept] @ np.swapaxes(turned, 1, 2)
+        return SeenAgain(known.variables[kept], points, across, near[kept])
 
     def returned(self, known: Landmarks, wTf: FloatArray, drift: FloatArray) -> BoolArray:
         """(k,) which are surely the same, at a place that has drifted.
@@ -78,6 +90,21 @@ class SeenAgain(Rows):
         surely = alone & off.outweigh(drift)
         together = off.agreeing(alone, drift)
         return np.asarray(surely | together)
+
+
+def _at_known_depth(
+    sensor: Sensor, before: FloatArray, measured: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Points (k, 3) of measurements, and covariances, to first order about the depths of others.
+
+    A far point itself is not normally distributed; what it is measured by is.
+    """
+    expected = measured.copy()
+    expected[:, 2] = project(sensor, before)[:, 2]
+    points = triangulate(sensor, expected)
+    jacobian = projection_jacobian(sensor, points)
+    step = np.linalg.solve(jacobian, (measured - expected)[:, :, None])[:, :, 0]
+    return points + step, triangulation_covariance(sensor, expected, noise)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -199,7 +199,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         seen, power = self._builder.observed, self._builder.noise.power
         poses = np.array([self._poses[frame] for frame in seen["frame"][rows].tolist()])
         measured = seen["measurement"][rows], power * seen["covariance"][rows]
-        return SeenAgain.of(self._sensor, seen["variable"][rows], poses, *measured)
+        return SeenAgain.of(self._sensor, self._held.of(seen["variable"][rows]), poses, *measured)
 
     def _give_up_waiting(self) -> None:
         """Landmarks that the window does not show to be back begin where they are seen now."""
@@ -209,8 +209,8 @@ class SlidingWindowSolver(WholeGraphSolver):
         self._begin_elsewhere(self._placed(self._newest(self._inside(rows[of_late]))))
 
     def _begin_elsewhere(self, seen: SeenAgain) -> None:
-        """What was known of landmarks was of others."""
-        self._held.begin(seen.variables, seen.points)
+        """What was known of landmarks was of others; those too far to be placed wait on."""
+        self._held.begin(seen.variables[seen.near], seen.points[seen.near])
 
     def _tie(self, place: int) -> Tie:
         """How a place is off, given the one next to it, or the window's first pose."""

@@ -27,7 +27,8 @@ def returned(count: int, wrong: int, drift: FloatArray = DRIFT) -> BoolArray:
     noise = np.tile(SIGMA_M**2 * np.eye(3), (count, 1, 1))
     seen = seen + SIGMA_M * rng.standard_normal(seen.shape)
     known = Landmarks(np.arange(count), there, there, np.linalg.inv(noise))
-    return SeenAgain(np.arange(count), seen, noise).returned(known, WTF, drift)
+    near = np.ones(count, np.bool_)
+    return SeenAgain(np.arange(count), seen, noise, near).returned(known, WTF, drift)
 
 
 @pytest.mark.parametrize(("right", "wrong"), [(1, 0), (0, 1), (LEAST - 1, 0), (0, 12)])
@@ -50,13 +51,45 @@ def test_one_alone_is_back_where_less_has_drifted_than_it_is_uncertain_by() -> N
     point = np.array([[0.0, 0.0, 3.0]])
     noise = SIGMA_M**2 * np.eye(3)[None]
     known = Landmarks(np.arange(1), point, point, np.linalg.inv(noise))
-    assert SeenAgain(np.arange(1), point + SIGMA_M, noise).returned(known, np.eye(4), still).all()
+    seen = SeenAgain(np.arange(1), point + SIGMA_M, noise, np.ones(1, np.bool_))
+    assert seen.returned(known, np.eye(4), still).all()
 
 
-def test_what_is_too_far_to_be_placed_is_left_out() -> None:
-    points = np.array([[0.0, 0.0, 3.0], [0.5, 0.2, 400.0]])
-    measured = np.concatenate([g.project(RIG, points), [[100.0, 80.0, -0.5], [100.0, 80.0, 0.0]]])
-    noise = np.tile(0.09 * np.eye(3), (4, 1, 1))
-    seen = SeenAgain.of(RIG, np.array([5, 7, 8, 9]), np.tile(WTF, (4, 1, 1)), measured, noise)
-    assert seen.variables.tolist() == [5]
-    np.testing.assert_allclose(seen.points, g.transform_to_world(WTF, points[:1]), atol=1e-9)
+FAR_PX = np.array([0.3, 0.3, 0.2])
+
+
+def far_away(turn: float) -> tuple[SeenAgain, Landmarks]:
+    """Eight landmarks whose depth no single observation tells, by a camera that has turned."""
+    rng = np.random.default_rng(5)
+    local = rng.uniform([-25.0, -18.0, 60.0], [25.0, 18.0, 90.0], (8, 3))
+    points = g.transform_to_world(WTF, local)
+    truly = WTF @ g.se3_exp(np.array([0.0, turn, 0.0, 0.0, 0.0, 0.0]))
+    measured = g.project(RIG, g.transform_to_camera(truly, points))
+    measured += FAR_PX * rng.standard_normal(measured.shape)
+    measured[0, 2] = -0.1
+    known = Landmarks(np.arange(8), points, points, np.tile(np.eye(3), (8, 1, 1)))
+    poses, noise = np.tile(WTF, (8, 1, 1)), np.tile(np.diag(FAR_PX**2), (8, 1, 1))
+    return SeenAgain.of(RIG, known, poses, measured, noise), known
+
+
+def test_landmarks_too_far_to_be_placed_agree_by_where_they_are_seen() -> None:
+    """Waiting for a depth that none of them tells, all of them would be lost to the window."""
+    turned, known = far_away(0.04)
+    assert turned.variables.tolist() == list(range(8))
+    assert not turned.near.any()
+    assert np.isfinite(turned.points).all()
+    assert turned.returned(known, WTF, DRIFT).all()
+    off = known.points + np.random.default_rng(7).uniform(-9.0, 9.0, (8, 3))
+    elsewhere = Landmarks(known.variables, off, off, known.information)
+    assert not turned.returned(elsewhere, WTF, DRIFT).any()
+
+
+def test_of_what_is_near_the_observation_alone_says_where_it_is() -> None:
+    points = np.array([[0.0, 0.0, 3.0], [0.5, 0.2, 400.0], [0.0, 0.0, -3.0]])
+    ahead = np.where(points[:, 2:] > 0.0, points, 4.0)
+    known = Landmarks(np.array([5, 7, 8]), *2 * [g.transform_to_world(WTF, points)], *[np.eye(3)])
+    measured, noise = g.project(RIG, ahead), np.tile(0.09 * np.eye(3), (3, 1, 1))
+    measured[2, 2] = -0.5  # and behind the camera, by what was known: of no use
+    seen = SeenAgain.of(RIG, known, np.tile(WTF, (3, 1, 1)), measured, noise)
+    assert (seen.variables.tolist(), seen.near.tolist()) == ([5, 7], [True, False])
+    np.testing.assert_allclose(seen.points, known.points[:2], atol=1e-6)
