@@ -26,6 +26,11 @@ def in_first_map(recorder: RunRecorder, parts: MapParts) -> int:
     return int((located_frames(recorder) & connected_frames(recorder, parts)).sum())
 
 
+def left_out_note(count: int) -> str:
+    """That a drive begins after its first ``count`` frames."""
+    return f"the first {count} frames could not be located: left out"
+
+
 def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     """A line where frames are located in parts that a guess alone joins to the first."""
     adrift = located_frames(recorder) & ~connected_frames(recorder, parts)

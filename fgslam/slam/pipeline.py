@@ -162,6 +162,13 @@ class SlamPipeline:
             watch.lap("places")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
 
+    def founds(self, found: FeatureFrame, least: int) -> bool:
+        """Whether a map could begin with the frame: it has ``least`` stereo matches, or more."""
+        if found.frame is None:
+            return False
+        first = self._described(dataclasses.replace(found, i=0), None, [])
+        return len(self._match_stereo(first).whole) >= least
+
     def estimate(self) -> Estimate:
         """The estimator's, with the landmarks that are on disk, without those that have ended."""
         found = self.estimator.estimate()

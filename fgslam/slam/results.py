@@ -53,7 +53,11 @@ class FrameRow(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class RunRecorder:
-    """Record of all frames, besides the estimator's result."""
+    """Record of all frames, besides the estimator's result.
+
+    Attributes:
+        left_out: frames before the first one, which saw too little to begin a map.
+    """
 
     log: MeasurementLog
     rows: list[FrameRow] = field(default_factory=list)
@@ -62,6 +66,7 @@ class RunRecorder:
     online_covariances: list[FloatArray] = field(default_factory=list)
     stage_ms: list[FloatArray] = field(default_factory=list)
     frame_digests: list[int] = field(default_factory=list)
+    left_out: int = 0
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -146,8 +151,8 @@ class Step(Brief):
     """Pose of one tracked frame, and what was matched in it.
 
     Attributes:
-        index: number of the frame in the session, from 0; -1 of one that was not located in the
-            map that the session is to begin in.
+        index: number of the frame in the session, from 0, and from 0 again where the session begins
+            anew; -1 of one that was not located in the map that the session is to begin in.
         timestamp: seconds.
         wTc: (4, 4) pose of the right camera in the world, metres.
         covariance: (6, 6) of it, [rotation, translation], radians and metres, in the tangent space

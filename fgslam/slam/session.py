@@ -46,7 +46,7 @@ from fgslam.slam.feature_stream import (
 from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
 from fgslam.slam.inputs import Images, checked_images, checked_odometry
 from fgslam.slam.motion import MotionModel, description_of
-from fgslam.slam.part_remarks import part_remarks
+from fgslam.slam.part_remarks import left_out_note, part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
 
@@ -71,7 +71,9 @@ class Session:
     may run side by side in one process, each used by one thread at a time. A frame that is refused
     leaves the session as it was.
 
-    The world is the right camera's first frame: x right, y down, z forward, metres.
+    The world is the right camera's first frame: x right, y down, z forward, metres. Frames before
+    the first one that shows enough to begin a map are left out of every result when that one comes,
+    unless odometry was measured to it: nothing says where they lie.
 
     Attributes:
         rig: the cameras.
@@ -132,6 +134,8 @@ class Session:
         self._area: ActiveArea | None = None
         self._scratch: TemporaryDirectory[str] | None = None
         self._start: MapStart | None = None
+        own = is_settings(chosen) and not hasattr(odometry, "between")
+        self._movable = beginning is None and own
         if isinstance(beginning, MapStart):
             beginning = self._begun(beginning, chosen, seed)
         self._describer = FrameDescriber(features or make_extractor(frontend))
@@ -265,6 +269,9 @@ class Session:
             if images is not None:
                 self._seen.add(found, any_uint16(images))
             if self._start is None:
+                if self.begins_anew(found, body):
+                    self._begin_anew(timestamp)
+                    found, body = replace(found, i=0), None
                 report = self.advance(found, timestamp, body)
                 if images is not None and not found.features:
                     self._seen.add(report.found, any_uint16(images))
@@ -280,14 +287,43 @@ class Session:
             located = self._locate(found)
             why = located.why
             if located.found:
-                self.pipeline = self._made(start.at(located.wTc, relocalised=True))
-                self._join_log()
-                first, stride = self.numbering
-                self.numbering = (first + stride * left_out.count, stride)
+                self._begin(start.at(located.wTc, relocalised=True), left_out.count)
                 self._start = None
                 return True
         self._left_out = _LeftOut(left_out.count + 1, timestamp, why)
         return False
+
+    def begins_anew(self, found: FeatureFrame, body: Odometry | None) -> bool:
+        """Whether the world begins with this frame, and those before it are to be left out.
+
+        They had too few stereo matches to place a frame after them, this one has enough, and no
+        odometry measured how the camera moved to it.
+
+        Args:
+            found: the frame; its features are found where it came without.
+            body: odometry of the body since the last frame, as for :meth:`advance`.
+        """
+        least, known = self.frontend.ego_motion.min_matches, self._usable(body)
+        if not (self._movable and len(self)) or (known is not None and not known.turned):
+            return False
+        if any(row.stereo >= least for row in self.recorder.rows):
+            return False
+        return self.pipeline.founds(found, least)
+
+    def _begin_anew(self, timestamp: float) -> None:
+        """Leaves out all frames so far: the next one is the first."""
+        count = len(self)
+        self._left_out = _LeftOut(self._left_out.count + count, timestamp)
+        self.log.continue_with(())
+        self.recorder = RunRecorder(self.log, left_out=self._left_out.count)
+        self._begin(None, count)
+
+    def _begin(self, arrival: Arrival | None, count: int) -> None:
+        """New parts, for a session that begins after ``count`` frames."""
+        self.pipeline = self._made(arrival)
+        self._join_log()
+        first, stride = self.numbering
+        self.numbering = (first + stride * count, stride)
 
     def advance(
         self,
@@ -354,7 +390,7 @@ class Session:
         notes = (*part_remarks(self.recorder, self.pipeline.tracker.parts), *notes)
         notes = (*notes, *self.pipeline.remarks)
         if left_out.count:
-            notes = (*notes, f"the first {left_out.count} frames could not be located: left out")
+            notes = (*notes, left_out_note(left_out.count))
         with one_blas_thread():
             return result_of(self.pipeline, self.recorder, notes, self._failed)
 

@@ -194,6 +194,28 @@ def test_the_first_frame_may_be_the_bad_one(own_recording: Path, tmp_path: Path)
     assert_valid_results(run.folder, 12)
 
 
+def test_the_world_begins_where_something_is_seen(own_recording: Path, tmp_path: Path) -> None:
+    for k in range(3):
+        for path in own_recording.glob(f"*/{k:06d}.png"):
+            assert cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
+    dataset = {"kind": "image_folder", "path": str(own_recording), "stop": 6}
+    odometry = {"kind": "constant_velocity"}
+    values = experiment(own_recording, dataset=dataset, odometry=odometry)
+    straight = run_values(values, tmp_path / "straight")
+    final = Trajectory.load(straight.folder / KIND / "final.tum")
+    np.testing.assert_array_equal(final.poses[0], np.eye(4))
+    metrics = metrics_of(straight.folder)
+    assert metrics["located"] == {"frames": 3, "of": 6}
+    assert metrics["frames_in_recording"] == 6
+    assert "the first 3 frames could not be located: left out" in metrics["notes"]
+    assert metrics["estimators"][KIND]["ate_rmse_m"] < 0.01
+    assert [increment.index for increment in straight.result.outputs.recorder.log] == [3, 4, 5]
+    run_values(values, tmp_path / "run", stopped=stop_after(2))  # nothing is seen as yet
+    run_values(values, tmp_path / "run", "resume", stopped=stop_after(3))
+    run_values(values, tmp_path / "run", "resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
+
+
 def test_a_bad_frame_keeps_its_own_number(own_recording: Path, tmp_path: Path) -> None:
     (own_recording / "right" / "000007.png").unlink()
     dataset = {"kind": "image_folder", "path": str(own_recording), "start": 3, "stride": 2}

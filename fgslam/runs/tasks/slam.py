@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -15,15 +16,17 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from fgslam.core.errors import DatasetError
+from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.tables import write_comparison_csv
-from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, provenance_of, run_task
 from fgslam.runs.folder import (
     BLOCKS_FOLDER,
     COMPARISON_FILE,
     LOG_FILE,
+    RUN_MARKER,
     SUBMAPS_FOLDER,
     ExistingFolder,
     is_run_folder,
@@ -38,6 +41,7 @@ from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_state as state
 from fgslam.runs.tasks.slam_map_entry import Entry, GivenMap
 from fgslam.runs.tasks.slam_metrics import located
+from fgslam.runs.tasks.slam_outputs import FOLDER as PICTURES
 from fgslam.runs.tasks.slam_outputs import (
     RunOutputs,
     draw_frame,
@@ -53,6 +57,7 @@ from fgslam.slam.arrival import require_map_user
 from fgslam.slam.factory import make_estimator, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
+from fgslam.slam.part_remarks import left_out_note
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.session import Session
 
@@ -69,6 +74,7 @@ class OpenedRun:
         given: the map to go on with; None without one, or while it is still to be made.
         entry: how the run enters it; None where it does not, or that is not yet known.
         resumed: the folder holds a state to go on from.
+        frames_before: selected frames before the first that shows enough to begin a map: left out.
     """
 
     config: ExperimentConfig
@@ -78,6 +84,7 @@ class OpenedRun:
     given: GivenMap | None
     entry: Entry | None
     resumed: bool
+    frames_before: int = 0
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -87,6 +94,8 @@ class OpenedRun:
             out["map"] = self.entry.as_values()
         elif self.given is not None and (entered := state.entered_by(self.given)):
             out["map"] = entered
+        if self.frames_before:
+            out[_FRAMES_BEFORE] = self.frames_before
         return out
 
     @property
@@ -122,7 +131,8 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
             landmarks = given.saved.landmarks
             user.begin_in(landmarks, given.saved.hits, fixed=not config.map.extend)
     resumed = opening.resumed and state.has_checkpoint(folder)
-    run = OpenedRun(config, opened, folder, sequence, given, None, resumed)
+    before = _frames_before(folder) if resumed else 0
+    run = OpenedRun(config, opened, folder, sequence, given, None, resumed, before)
     return dataclasses.replace(run, entry=_entry(run, given))
 
 
@@ -138,10 +148,12 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         run = dataclasses.replace(run, given=made, entry=_entry(run, made))
         write_config(run.folder, config, run.provenance)
     given, entry, sequence, opened = run.given, run.entry, run.sequence, run.opened
-    if entry is not None and entry.frames_before:
-        opened = _later(opened, entry.frames_before)
+    before = run.frames_before if entry is None else entry.frames_before
+    if before:
+        opened = _later(opened, before)
         sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
-    arrival, notes = None, tuple[str, ...]()
+    arrival = None
+    notes: tuple[str, ...] = (left_out_note(before),) if run.frames_before else ()
     if entry is not None and given is not None:
         arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
     session = Session(
@@ -155,6 +167,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     if config.map.active_radius_m is not None:
         session.keep_near(config.map.active_radius_m, run.folder / SUBMAPS_FOLDER)
     session.keep_log(run.folder / BLOCKS_FOLDER)
+    session.recorder.left_out = run.frames_before
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
     if run.resumed:
@@ -162,6 +175,21 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     elif given is not None and run.goes_on:
         state.go_on(given, session.pipeline, session.recorder)
     return outputs
+
+
+def _frames_before(folder: Path) -> int:
+    """How many frames the run in a folder left out, before the first that began a map."""
+    return int((load_config(folder / RUN_MARKER).provenance or {}).get(_FRAMES_BEFORE, 0))
+
+
+def _begin_later(run: OpenedRun, frames: int) -> OpenedRun:
+    """The run without so many frames more; nothing of what was driven over these is kept."""
+    before = run.frames_before + frames
+    run = dataclasses.replace(run, frames_before=before, resumed=False)
+    state.remove_checkpoint(run.folder)
+    shutil.rmtree(run.folder / PICTURES, ignore_errors=True)
+    write_config(run.folder, run.config, run.provenance)
+    return run
 
 
 def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:
@@ -194,7 +222,15 @@ def _require_odometry(config: ExperimentConfig, sequence: Sequence) -> None:
         )
 
 
+_FRAMES_BEFORE = "frames_before"  # in config.yaml's provenance
 _SAVING_SHARE = 10.0  # the loop runs at least this many times as long as it saves
+
+
+@dataclass(frozen=True, slots=True)
+class _Founding:
+    """The frame of the sequence with which the world begins, after some that showed too little."""
+
+    frame: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +262,9 @@ def _run(opened: OpenedRun, context: Context, watch: Watch | None) -> SlamResult
     if ended is not None and ended.status == "interrupted":
         return ended
     outputs = begin(opened, context.progress)
-    saved = _loop(outputs, context.progress, context.stopped, watch)
+    while isinstance(saved := _loop(outputs, context.progress, context.stopped, watch), _Founding):
+        opened = _begin_later(opened, saved.frame)
+        outputs = begin(opened, context.progress)
     if saved is not None:
         outputs.recorder.log.rest_in(outputs.folder / LOG_FILE)
         return _result(outputs, "interrupted", saved)
@@ -256,8 +294,11 @@ def _loop(
     progress: Progress,
     stopped: Callable[[], bool],
     watch: Watch | None = None,
-) -> EstimatorMetrics | None:
-    """Processes the remaining frames; what was saved when stopped before the last one, or None."""
+) -> EstimatorMetrics | _Founding | None:
+    """Processes the remaining frames; what was saved when stopped before the last one, or None.
+
+    Ends at a frame with which the world begins anew, without taking it in.
+    """
     sequence, recorder = outputs.sequence, outputs.recorder
     shown = frames_to_show(len(sequence)) if outputs.config.output.pictures else frozenset()
     frontend = outputs.config.frontend
@@ -268,6 +309,8 @@ def _loop(
     try:
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
+            if outputs.session.begins_anew(found, _body(outputs, found)):
+                return _Founding(found.i)
             report = _advance(outputs, found, wait_ms)
             if found.i in shown:
                 draw_frame(outputs, found.i, report)
@@ -314,11 +357,16 @@ def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameR
     return session.advance(
         found,
         float(sequence.timestamps[found.i]),
-        body_motion(sequence, found.i, session.pipeline.motion),
+        _body(outputs, found),
         index,
         wait_ms,
         lambda report: stereo_precision(sequence, found.i, report.stereo),
     )
+
+
+def _body(outputs: RunOutputs, found: FeatureFrame) -> Odometry | None:
+    """The recording's odometry to a frame, as far as it is used."""
+    return body_motion(outputs.sequence, found.i, outputs.pipeline.motion)
 
 
 def _finish(outputs: RunOutputs, context: Context) -> SlamResult:

@@ -19,6 +19,7 @@ from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.slam.arrival import Arrival, MapStart
 from fgslam.slam.factory import make_locator, make_stream
 from fgslam.slam.map_settings import MapSettings
+from fgslam.slam.part_remarks import left_out_note
 
 FIRST_FOLDER = "first"
 MAP_FILE = "map.fgmap"
@@ -99,8 +100,7 @@ class Entry:
         )
         if not self.frames_before:
             return (entered,)
-        left_out = f"the first {self.frames_before} frames could not be located: left out"
-        return (entered, left_out)
+        return (entered, left_out_note(self.frames_before))
 
 
 def open_map(path: Path) -> GivenMap:

@@ -66,9 +66,12 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
 
 
 def located(recorder: RunRecorder) -> LocatedShare:
-    """Frames that landmarks gave a pose; the first one, which the world is, among them."""
+    """Frames that landmarks gave a pose; the first one, which the world is, among them.
+
+    Of all, with those before the first one.
+    """
     known = located_frames(recorder)
-    return LocatedShare(int(known.sum()), len(known))
+    return LocatedShare(int(known.sum()), recorder.left_out + len(known))
 
 
 def frame_problems(recorder: RunRecorder) -> list[str]:

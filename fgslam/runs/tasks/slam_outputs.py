@@ -87,6 +87,11 @@ class RunOutputs:
         return self.session.recorder
 
     @property
+    def frames(self) -> int:
+        """Frames of the recording, with those before the first that began a map."""
+        return self.recorder.left_out + len(self.sequence)
+
+    @property
     def title(self) -> str:
         """The live estimator's label or kind, which names its folder."""
         return self.config.estimator.title
@@ -195,7 +200,7 @@ class RunOutputs:
         return {
             "name": self.config.name,
             "status": status,
-            "frames_in_recording": len(self.sequence),
+            "frames_in_recording": self.frames,
             "odometry": self.config.odometry.kind,
             "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
             "landmarks_permanent": int(self.pipeline.book.permanent.sum()),
@@ -213,7 +218,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     remark = f"\n{outputs.remark}" if outputs.remark else ""
     matches = numbers["landmark_matches"]
     rows: list[tuple[str, object]] = [
-        ("frames", f"{len(outputs.recorder)} of {len(outputs.sequence)}"),
+        ("frames", f"{len(outputs.recorder)} of {outputs.frames}"),
         ("located by landmarks", _located(outputs)),
         ("pose found from", _counts(numbers["status_counts"])),
         ("landmarks", metrics.landmarks),

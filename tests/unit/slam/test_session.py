@@ -15,7 +15,7 @@ from rings import on_ring, walls
 from simulated import RIG, FeatureWorld, assert_same_bits
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import EstimatorSettings, Isam2Settings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import (
@@ -54,6 +54,8 @@ class Views:
         world = FeatureWorld(walls(rng), rng)
         self.poses = [on_ring(0.4 * k) for k in range(FRAMES)]
         self.seen = [world.features(wTc, 0.2) for wTc in self.poses]
+        self.blank = len(self.seen)
+        self.seen.append([few.select(np.arange(3)) for few in self.seen[0]])
 
     def images(self, k: int) -> tuple[Image, ...]:
         """Left, right, top."""
@@ -97,6 +99,38 @@ def driven(views: Views, estimator: Any = "landmark_kalman") -> Session:
 def straight(views: Views, estimator: str = "landmark_kalman") -> Session:
     """A session of all frames and nothing else, made once; read only."""
     return driven(views, estimator)
+
+
+@pytest.mark.parametrize("estimator", [LandmarkKalmanSettings(), Isam2Settings()])
+def test_the_world_begins_with_the_first_frame_that_shows_enough(
+    views: Views, estimator: EstimatorSettings, tmp_path: Path
+) -> None:
+    late, straight = session(views, estimator), session(views, estimator)
+    late.keep_log(tmp_path / "log")
+    straight.numbering = (2, 1)
+    for k, images in enumerate((None, views.images(views.blank))):
+        assert not late.track(0.1 * k, images).status.measured
+    assert len(late.result().trajectory) == 2
+    for k in range(3):
+        step, expected = (slam.track(0.5 * k + 1, views.images(k)) for slam in (late, straight))
+        assert (step.index, step.status) == (k, expected.status)
+    assert_same_result(late, straight)
+    assert [increment.index for increment in late.log] == [2, 3, 4]
+    assert "the first 2 frames could not be located: left out" in late.result().remarks
+    replayed = replay(late.log, estimator, EgoMotionSettings())
+    assert_same_bits(replayed.estimate.trajectory, late.result().trajectory)
+
+
+def test_a_start_that_sees_nothing_stays_where_odometry_measured_it(views: Views) -> None:
+    slam = session(views)
+    slam.track(-0.5, None)
+    push(slam, views, range(1))
+    assert len(slam) == 1  # no odometry was measured to the frame that sees
+    slam = session(views)
+    slam.track(0.0, None)
+    push(slam, views, range(1, 3))
+    assert len(slam) == 3
+    assert slam.result().column("connected").all()
 
 
 def assert_same_result(first: Session, second: Session) -> None:
