@@ -238,8 +238,10 @@ def learn_from(
     """
     observed = increment.observations
     matched = observed.select(~observed.is_new).select(_fits(tracking))
-    step = inverse(before) @ tracking.wTc if tracking.status.measured else None
-    noise.expect(tracking.noise)
+    step = None
+    if tracking.status.measured:
+        step = inverse(before) @ tracking.wTc
+        noise.expect(tracking.noise)
     noise.learn(frame, step, matched.join(observed.select(observed.is_new)))
 
 

@@ -6,13 +6,14 @@ import dataclasses
 
 import numpy as np
 
+from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.backend.settings import BatchSettings, LandmarkKalmanSettings
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus
+from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, unmeasured
 from fgslam.frontend.tracking.match_noise import MatchNoise
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.replay import replay, replay_frame, replay_motion
@@ -80,3 +81,18 @@ def test_a_drive_goes_on_from_a_state_as_it_would_have() -> None:
             assert found.tracking.noise == same.tracking.noise > 8.0
             assert np.array_equal(found.stats.covariance, same.stats.covariance)
     assert np.array_equal(whole.estimate().covariances, again.estimate().covariances)
+
+
+def test_a_frame_whose_pose_is_only_predicted_says_nothing_of_the_noise() -> None:
+    """Nor does it have a graph weigh its matches by the stated noise again."""
+    log = noisy_drive(7)
+    noise = Persistence(log.rig)
+    for k, increment in enumerate(log):
+        tracking = unmeasured(Prediction(np.eye(4), np.eye(6)), EgoMotionStatus.TOO_FEW_MATCHES)
+        fresh = increment.observations.select(increment.observations.is_new)
+        if k == 3:
+            status = EgoMotionStatus.OK
+            tracking = dataclasses.replace(tracking, status=status, noise=16.0)
+        seen = dataclasses.replace(increment, observations=fresh)
+        learn_from(noise, k, seen, tracking, np.eye(4))
+        assert noise.power == (1.0 if k < 3 else 16.0)
