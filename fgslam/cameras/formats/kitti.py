@@ -69,10 +69,10 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
 
 def _beside(path: Path) -> tuple[str, str]:
     """Lines of the pair whose folders of images lie beside a calib.txt."""
-    pairs = (ODOMETRY, ODOMETRY_COLOUR)
-    return next(
-        (keys for keys in pairs if (path.parent / f"image_{keys[1][1:]}").is_dir()), pairs[0]
-    )
+    for keys in (ODOMETRY, ODOMETRY_COLOUR):
+        if all((path.parent / f"image_{key[1:]}").is_dir() for key in keys):
+            return keys
+    return ODOMETRY
 
 
 def right_of_camera_0(path: Path) -> float:

@@ -35,11 +35,16 @@ def test_native_layout(tmp_path: Path) -> None:
     assert recording.notes == ()
 
 
-def test_colour_cameras_have_lines_and_a_place_of_their_own(tmp_path: Path) -> None:
+@pytest.mark.parametrize("half_of_grey", [False, True])
+def test_colour_cameras_have_lines_and_a_place_of_their_own(
+    tmp_path: Path, half_of_grey: bool
+) -> None:
     root, left = kitti(tmp_path)
     folder = root / "sequences" / "06"
     for grey, colour in (("image_0", "image_2"), ("image_1", "image_3")):
         (folder / grey).rename(folder / colour)
+    if half_of_grey:
+        (folder / "image_1").mkdir()
     with (folder / "calib.txt").open("a", encoding="utf-8") as file:
         for key, shift in (("P2", 1.5), ("P3", -13.5)):
             file.write(f"{key}: 30.0 0 15.5 {shift} 0 31.0 11.5 0 0 0 1 0\n")
