@@ -52,6 +52,9 @@ EXPECTED_PX = 1.0
 """Displacement that a calibration is taken to leave, root mean square over the image: what the
 matcher's epipolar gate (``StereoSettings.epipolar_px``) admits; a worse rig matches nothing."""
 
+IMPLAUSIBLE_PX = 3.0 * EXPECTED_PX
+"""Displacement that no calibration is taken to leave: three deviations of what is expected."""
+
 _CAMERAS = ("left", "top")
 _CHANGES = ("yaw_deg", "pitch_deg", "roll_deg", "focal_percent")
 _CHANGE_UNITS = np.array([180.0 / np.pi] * 3 + [100.0])

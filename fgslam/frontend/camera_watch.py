@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, StateArrays
 from fgslam.core.quantiles import middle
-from fgslam.core.rig_correction import EXPECTED_PX
+from fgslam.core.rig_correction import IMPLAUSIBLE_PX
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.frontend.image_lag import (
     Followed,
@@ -28,7 +28,6 @@ from fgslam.frontend.image_lag import (
 
 _WIDE_PX = 400  # wider images are made smaller
 _SURE = 5.0  # deviations: by chance once in three million frames
-_CALIBRATED = 3.0  # times what a calibration leaves: by so much may disparities be off zero
 _WINDOW = 5  # frames that are judged together where one alone does not tell
 _ALIKE = 0.25  # frames of lag: nearer to none than this, the other direction need not be asked
 _KNOWN = 0.1  # nor where it is known so well
@@ -121,7 +120,7 @@ class CameraWatch:
         centre = middle(disparity)
         spread = 1.4826 * middle(np.abs(disparity - centre))
         allowed = _SURE * 1.2533 * spread / math.sqrt(len(disparity))  # 1.25: of a median
-        if abs(centre) > allowed + _CALIBRATED * EXPECTED_PX:
+        if abs(centre) > allowed + IMPLAUSIBLE_PX:
             pair.swapped = centre < 0.0
 
     def _weigh(

@@ -12,7 +12,7 @@ from fgslam.cameras.corrected import write_corrected
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.files import read_text, require_writable, write_text
-from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.core.rig_correction import IMPLAUSIBLE_PX, RigCorrection, term_names
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.tables import write_csv
@@ -21,6 +21,10 @@ from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE
 from fgslam.slam.factory import calibrates_itself
 
 _TOLD_SIGMAS = 3.0  # what is less than this many of its own is not told as a finding
+_DOUBT = (
+    ", more than calibrations leave: calibrate it anew, unless something large that moved was "
+    "taken for the scene"
+)
 _UNITS = {"deg": "degrees", "percent": "%"}
 _WORDS = {
     "yaw_deg": "turned by {} in yaw",
@@ -92,7 +96,7 @@ def calibration_note(calibration: SelfCalibration | None) -> str:
     what = "; ".join(parts) or "the cameras' lenses or axes differ"
     return (
         f"{what} against the rig's calibration, corrected during the drive by {rms:.2f} px "
-        f"(rms over the images){knocks}"
+        f"(rms over the images){_DOUBT * (rms > IMPLAUSIBLE_PX)}{knocks}"
     )
 
 

@@ -26,6 +26,7 @@ from fgslam.core.sensors import (
     pixel_model,
     vertical_to_horizontal,
 )
+from fgslam.runs.tasks.slam_calibration import calibration_note
 
 RIG = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
 THREE = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
@@ -100,6 +101,15 @@ def errors(**terms: float) -> FloatArray:
     for name, value in terms.items():
         out[names.index("all.radial" if name == "radial_of_all" else f"left.{name}")] = value
     return out
+
+
+def test_a_correction_larger_than_calibrations_leave_is_told_with_a_doubt() -> None:
+    plausible, large = (
+        calibration_note(calibrated(Road(frames=18), errors(yaw=yaw), 0)) for yaw in (0.002, 0.012)
+    )
+    assert "corrected during the drive by 0.98 px (rms over the images)" in plausible
+    assert "something large that moved" not in plausible
+    assert large.endswith("unless something large that moved was taken for the scene")
 
 
 def image_error(found: RigCorrection, wrong: FloatArray) -> float:
