@@ -8,7 +8,6 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
-from fgslam.datasets.settings import VideoSettings
 from fgslam.datasets.video_frames import VideoFrames
 
 _UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
@@ -29,26 +28,29 @@ class Moments:
     notes: tuple[str, ...]
 
 
-def moments_of(films: list[VideoFrames], rate: float, settings: VideoSettings) -> Moments:
+def moments_of(
+    films: list[VideoFrames], rate: float, stated: bool, tolerance: float = 0.0
+) -> Moments:
     """Frames of one film, or of two those of one number, or of one time where that is another.
 
     Args:
-        films: one of both views, or those of the left and of the right camera.
+        films: one, or those of the left and of the right camera.
         rate: frames a second of the first.
-        settings: of the recording; a rate that they state is that of each film.
+        stated: that rate is the user's, in place of each film's own times.
+        tolerance: largest time between frames of two films, seconds.
 
     Raises:
         DatasetError: no two frames are shown at one time.
     """
-    own = [None if settings.fps else film.stamps() for film in films]
+    own = [None if stated else film.stamps() for film in films]
     if len(films) == 1:
         return _by_number(films, own, rate)
     either = (film.even() if its is None else its for film, its in zip(films, own, strict=True))
     known = [times for times in either if times is not None]
-    if settings.fps or len(known) < 2 or not _part(*known):
+    if stated or len(known) < 2 or not _part(*known):
         how, moments = "number", _by_number(films, own, rate)
     else:
-        how, moments = "time", _by_time(films, known, 1e-3 * settings.pairing_tolerance_ms)
+        how, moments = "time", _by_time(films, known, tolerance)
     how = f"frames of the two films are paired by their {how}: both must begin at one time"
     return replace(moments, notes=(how, *_differences(films[0], films[1]), *moments.notes))
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from fgslam.cameras.omni.camera_files import make_camera
 from fgslam.core.errors import DatasetError
+from fgslam.datasets.film_times import moments_of
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_recording import OmniRecording, ids_of, pictures_in, times_of
 from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings
@@ -44,7 +45,7 @@ def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
 
 
 def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
-    """Open a video file; times come from its frame rate, the first frame is at 0 s.
+    """Open a video file; times come from its rate or its frames, the first of which is at 0 s.
 
     Raises:
         DatasetError: the file is absent, no video, or without a frame rate.
@@ -58,14 +59,15 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
         raise DatasetError(f"{path} states no frame rate; give dataset.frame_rate_hz")
     chosen = select_frames(frames.count, settings)
     first = frames.load(int(chosen[0]))
-    numbers = np.arange(frames.count, dtype=np.int64)
+    moments = moments_of([frames], rate, settings.frame_rate_hz is not None)
     recording = OmniRecording(
         name=path.stem,
         identity=recording_identity([path], []),
         camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), path.parent),
-        ids=numbers,
+        ids=moments.numbers[:, 0],
         names=tuple(f"frame {k}" for k in range(frames.count)),
-        timestamps=numbers / rate,
+        timestamps=moments.times,
+        notes=moments.notes,
         load_image=frames.load,
     )
     return recording.select(chosen)

@@ -30,7 +30,6 @@ from fgslam.datasets.recording import recording_identity, select_frames
 
 POSES_FILE = "poses.csv"
 _PICTURES = "panos"
-_UNEVEN = 1.25  # columns over rows a degree, or the reverse, that no one means
 _NUMBERS = ("x_m", "y_m", "heading_deg")
 _COLUMNS = ("id", "file", *_NUMBERS)
 
@@ -72,8 +71,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
         timestamps=times_of(paths, root),
         poses=None if places is None else _poses(places),
         rooms=None if places is None or not any(p.room for p in places) else _rooms(places),
-        notes=_unlike_a_panorama(size, settings)
-        + (() if places is None else _unlisted(root, paths)),
+        notes=() if places is None else _unlisted(root, paths),
         load_image=_loader(paths, size, reduced),
     )
     return recording.select(chosen)
@@ -94,20 +92,6 @@ def _reduced_size(
             "columns; give a smaller width, or null"
         )
     return settings.width, max(2, round(settings.width * size[1] / size[0]))
-
-
-def _unlike_a_panorama(size: tuple[int, int], settings: PanoramasSettings) -> tuple[str, ...]:
-    """A note where columns and rows are not equally fine: a cropped panorama, or none at all."""
-    camera = settings.camera
-    view = camera.top_elevation_deg - camera.bottom_elevation_deg
-    across, down = (size[0] - 1) / 360.0, (size[1] - 1) / view
-    if max(across, down) <= _UNEVEN * min(across, down):
-        return ()
-    return (
-        f"pictures of {size[0]}x{size[1]} pixels over 360 x {view:g} degrees have {across:.1f} "
-        f"columns but {down:.1f} rows a degree: are they whole panoramas? Else give "
-        "dataset.camera.top_elevation_deg and bottom_elevation_deg",
-    )
 
 
 def _loader(paths: Sequence[Path], size: tuple[int, int], reduced: tuple[int, int]) -> ColourLoader:

@@ -48,7 +48,9 @@ def open_video(settings: VideoSettings) -> Recording:
     if not 0.0 < rate < np.inf:
         raise DatasetError(f"{films[0]} states no frame rate; say it: --fps RATE")
     views, rig, said = _views(settings, frames, films[0].parent)
-    moments = moments_of(frames, rate, settings)
+    moments = moments_of(
+        frames, rate, settings.fps is not None, 1e-3 * settings.pairing_tolerance_ms
+    )
     chosen = select_frames(len(moments.times), settings)
     return Recording(
         name=given.stem if len(films) == 1 else given.resolve().name.replace("*", ""),

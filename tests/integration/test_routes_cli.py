@@ -120,7 +120,9 @@ def test_another_drive_follows_it(
 ) -> None:
     """Without a camera given: the route's own."""
     assert main(monkeypatch, "follow", taught, data / "again", "--out", tmp_path / "run") == 0
-    assert "the place is known" in capfd.readouterr().out.lower()
+    said = capfd.readouterr().out.lower()
+    assert "the place is known" in said
+    assert "whole panoramas?" not in said
     rows = rows_of(tmp_path / "run" / "follow.csv")
     assert len(rows) == 5
     places = [int(row["path_image"]) for row in rows]

@@ -11,6 +11,7 @@ import numpy as np
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.mirrors import RadialCamera
+from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, OutputError
@@ -41,26 +42,42 @@ _CLEARLY_OFF = 0.025
 """Of the radius: a calibrated mirror was seen off by 0.015, its rim and its axis not being one
 (docs/datasets/mirror_images.md); this is an error of 1.4 degrees at the rim, more within."""
 _LEAST_OFF_PX = 3.0
+_UNEVEN = 1.25  # columns over rows a degree, or the reverse, that no one means
 
 
 def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
-    """Opens a recording, with a note where its mirror lies off the stated centre.
+    """Opens a recording, with a note where its pictures cannot be of the stated camera.
 
     Raises:
         DatasetError: as :func:`fgslam.datasets.opening.open_omni`.
     """
     recording = open_omni(settings)
-    return replace(recording, notes=recording.notes + mirror_notes(recording))
+    return replace(recording, notes=recording.notes + camera_notes(recording))
 
 
-def mirror_notes(recording: OmniRecording) -> tuple[str, ...]:
-    """A note where the rim in the first pictures lies clearly off, or cannot be found at all.
-
-    Cameras without a mirror have none.
-    """
+def camera_notes(recording: OmniRecording) -> tuple[str, ...]:
+    """A note where mirror or panoramas are clearly not as the camera says they are."""
     camera = recording.camera
-    if not isinstance(camera, RadialCamera):
+    if isinstance(camera, Equirectangular):
+        return _panorama_notes(camera)
+    return _mirror_notes(recording, camera) if isinstance(camera, RadialCamera) else ()
+
+
+def _panorama_notes(camera: Equirectangular) -> tuple[str, ...]:
+    """A note where columns and rows are not equally fine: a cropped panorama, or none at all."""
+    view = np.rad2deg(camera.top_elevation - camera.bottom_elevation)
+    across, down = (camera.width - 1) / 360.0, (camera.height - 1) / view
+    if max(across, down) <= _UNEVEN * min(across, down):
         return ()
+    return (
+        f"pictures of {camera.width}x{camera.height} pixels over 360 x {view:g} degrees have "
+        f"{across:.1f} columns but {down:.1f} rows a degree: are they whole panoramas? Else give "
+        "dataset.camera.top_elevation_deg and bottom_elevation_deg",
+    )
+
+
+def _mirror_notes(recording: OmniRecording, camera: RadialCamera) -> tuple[str, ...]:
+    """A note where the rim in the first pictures lies clearly off, or cannot be found at all."""
     count = min(_PICTURES, len(recording))
     circles = [c for k in range(count) if (c := _rim(camera, recording, k)) is not None]
     if not circles:

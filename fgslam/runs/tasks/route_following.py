@@ -35,7 +35,7 @@ from fgslam.runs.engine import (
     write_document,
     write_page,
 )
-from fgslam.runs.tasks.homing_views import mirror_notes
+from fgslam.runs.tasks.homing_views import camera_notes
 
 FOLLOW_FILE = "follow.csv"
 COLUMNS = (
@@ -74,7 +74,7 @@ def open_following(config: FollowConfig, opening: Opening) -> Task[RunResult]:
     recording = open_omni(config.dataset)
     if config.taught_camera:
         recording = _with_taught_camera(config, path, recording)
-    recording = replace(recording, notes=recording.notes + mirror_notes(recording))
+    recording = replace(recording, notes=recording.notes + camera_notes(recording))
     ground = provenance_of(recording) | {"log": {"route": config.route, "images": len(path)}}
     return Task(ground, lambda context: _run(config, path, recording, context))
 

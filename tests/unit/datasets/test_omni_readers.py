@@ -107,14 +107,6 @@ def test_pictures_that_no_row_names_are_noted(home: Path) -> None:
     assert panoramas(home).notes == ("1 pictures of panos/ are not in poses.csv",)
 
 
-def test_pictures_that_are_no_whole_panoramas_are_noted(tmp_path: Path) -> None:
-    write(tmp_path / "p1.png", picture(0, 128, 48))
-    (note,) = panoramas(tmp_path).notes
-    assert "pictures of 128x48 pixels over 360 x 180 degrees" in note
-    limits = EquirectangularSettings(top_elevation_deg=60.0, bottom_elevation_deg=-75.0)
-    assert panoramas(tmp_path, camera=limits).notes == ()
-
-
 def test_reduction_moves_nothing() -> None:
     """A pattern of low frequency is the same function of bearing and elevation at any size."""
 

@@ -12,9 +12,12 @@ import numpy as np
 import pytest
 from dataset_builders import write_calibration
 
+from fgslam.cameras.omni.settings import EquirectangularSettings
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.omni_settings import OmniVideoSettings
+from fgslam.datasets.opening import open_omni
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import VideoSettings
 from fgslam.datasets.stereo_video import open_video
@@ -87,6 +90,8 @@ def test_frames_of_a_phone_have_their_own_times(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.timestamps, expected, rtol=0.0, atol=1e-6)
     assert "frames are 25 to 100 ms apart: each has its own time" in recording.notes
     assert levels(recording, 5).tolist() == pytest.approx([190, 90], abs=_NEAR)
+    all_around = open_omni(OmniVideoSettings(path=str(path), camera=EquirectangularSettings()))
+    np.testing.assert_allclose(all_around.timestamps, expected, rtol=0.0, atol=1e-6)
     stated = opened(path, fps=10.0)
     np.testing.assert_allclose(np.diff(stated.timestamps), 0.1, rtol=0.0, atol=1e-9)
 

@@ -12,7 +12,7 @@ import pytest
 from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
 from fgslam.core.arrays import Image
-from fgslam.datasets.omni_settings import OmniPathSettings
+from fgslam.datasets.omni_settings import OmniPathSettings, PanoramasSettings
 from fgslam.runs.tasks.homing_views import open_checked
 
 SIZE = (320, 240)
@@ -72,5 +72,10 @@ def test_a_rim_that_cannot_be_found_is_reported(tmp_path: Path) -> None:
     assert note == "the mirror's rim is not found in m1.png, so its centre is unchecked"
 
 
-def test_panoramas_have_no_mirror(tmp_path: Path) -> None:
-    assert notes(tmp_path, picture(), CENTRE, equirectangular=True) == ()
+def test_panoramas_have_no_mirror_but_rows_as_fine_as_columns(tmp_path: Path) -> None:
+    (note,) = notes(tmp_path, picture(), CENTRE, equirectangular=True)
+    assert note.startswith("pictures of 320x240 pixels over 360 x 180 degrees have 0.9 columns but")
+    limits = EquirectangularSettings(top_elevation_deg=60.0, bottom_elevation_deg=-75.0)
+    for camera, rows in ((EquirectangularSettings(), 160), (limits, 120)):
+        assert cv2.imwrite(str(tmp_path / "m1.png"), picture()[:rows])
+        assert open_checked(PanoramasSettings(path=str(tmp_path), camera=camera)).notes == ()
