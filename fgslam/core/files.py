@@ -138,6 +138,15 @@ def make_subfolder(run: Path, name: str) -> Path:
     return folder
 
 
+def remove_files(folder: Path, pattern: str) -> None:
+    """Removes files of a folder, and the folder once it is empty. Raises OutputError."""
+    for path in folder.glob(pattern):
+        with clear_output_errors(path):
+            path.unlink(missing_ok=True)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
 # --------------------------------------------------------------------------------------------
 # Text files of other tools, line by line
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.array_files import OFFSETS, Pieces, continued, write_arrays, write_pieces
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
-from fgslam.core.files import clear_output_errors, make_subfolder
+from fgslam.core.files import make_subfolder, remove_files
 from fgslam.core.log_arrays import arrays_of, frames_of, version_of
 from fgslam.core.log_file import BLOCK, FramesOnDisk, LogFile
 from fgslam.core.log_layout import CORRECTIONS, LOG, SENSOR_POSE, WITH_EVERYTHING
@@ -55,7 +55,7 @@ class LogBlocks(FramesOnDisk):
         self._read: tuple[int, list[Increment]] = (-1, [])
         self._whole: Path | None = None
         self._resting: LogFile | None = None
-        self._remove()
+        remove_files(self.folder, FILES)
 
     def __len__(self) -> int:
         return len(self._heads)
@@ -131,7 +131,7 @@ class LogBlocks(FramesOnDisk):
         """Frames are read from the file that :meth:`save` wrote from now on; the blocks go."""
         self._whole, self._resting, self._read = path, None, (-1, [])
         self._blocks, self._rows, self._last = [], [], []
-        self._remove()
+        remove_files(self.folder, FILES)
 
     def _put_away(self) -> None:
         make_subfolder(self.folder.parent, self.folder.name)
@@ -170,13 +170,6 @@ class LogBlocks(FramesOnDisk):
             # A frame before the first correction has none, which is written as zero.
             known = name == CORRECTIONS and self._calibrated
             yield np.nan_to_num(part, nan=0.0) if known else part
-
-    def _remove(self) -> None:
-        for path in self.folder.glob(FILES):
-            with clear_output_errors(path):
-                path.unlink(missing_ok=True)
-        if self.folder.is_dir() and not any(self.folder.iterdir()):
-            self.folder.rmdir()
 
 
 def _array(path: Path, name: str) -> np.ndarray[Any, Any]:

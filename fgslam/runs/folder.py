@@ -36,6 +36,7 @@ REPORT_FILE = "report.html"
 LOG_FILE = "measurements.npz"
 STATE_FILE = "checkpoint.npz"
 SUBMAPS_FOLDER = "submaps"
+INPUTS_FOLDER = "inputs"
 BLOCKS_FOLDER = "measurements"
 COMPARISON_FILE = "comparison.csv"
 CALIBRATION_FILE = "calibration.csv"
@@ -83,6 +84,7 @@ _RESULT_FILES = (
     "units/*.npz",
     f"{SUBMAPS_FOLDER}/*.fgmap",
     f"{SUBMAPS_FOLDER}/*.npz",
+    f"{INPUTS_FOLDER}/*.npz",
     f"{BLOCKS_FOLDER}/*.npz",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),

@@ -83,3 +83,8 @@ class MapSettings:
     def given(self) -> bool:
         """True if the run continues with a map."""
         return self.load is not None or self.made_from is not None
+
+    @property
+    def saves_session(self) -> bool:
+        """True if the map that the run leaves holds all that it takes to go on."""
+        return self.save is not None and self.session

@@ -15,6 +15,7 @@ from recordings import experiment, write_calibration, write_recording
 from running import (
     HANGS_AFTER_S,
     KIND,
+    SAME_BYTES,
     Finished,
     assert_valid_results,
     bytes_of,
@@ -26,6 +27,7 @@ from running import (
     write_config,
 )
 
+from fgslam.backend.smoothers import recorded_inputs
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import (
     ConfigError,
@@ -85,15 +87,32 @@ def test_stopping_after_the_last_frame_is_finishing(recording: Path, tmp_path: P
     assert run.result.status == "finished"
 
 
-@pytest.mark.parametrize("kind", ["constant_velocity", "synthetic"])
-def test_resumed_with_other_odometry(kind: str, recording: Path, tmp_path: Path) -> None:
-    """The motion model's own state, and noise drawn from the seed, go on as well."""
+def test_resumed_without_odometry(recording: Path, tmp_path: Path) -> None:
+    """The motion model's own state goes on as well."""
     dataset = {"kind": "image_folder", "path": str(recording), "stop": 8}
-    values = experiment(recording, dataset=dataset, odometry={"kind": kind}, seed=5)
+    values = experiment(recording, dataset=dataset, odometry={"kind": "constant_velocity"})
     straight = run_values(values, tmp_path / "straight")
     run_values(values, tmp_path / "run", stopped=stop_after(5))
     run_values(values, tmp_path / "run", "resume")
     assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
+
+
+def test_fixed_lag_resumes_from_files(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it was given waits there until the run has ended; drawn noise goes on as well."""
+    dataset = {"kind": "image_folder", "path": str(recording), "stop": 7}
+    made = {"estimator": {"kind": "fixed_lag"}, "odometry": {"kind": "synthetic"}, "seed": 5}
+    values = experiment(recording, dataset=dataset, **made)
+    straight, run = tmp_path / "straight", tmp_path / "run"
+    run_values(values, straight)  # all of it in memory: blocks of 256 frames
+    monkeypatch.setattr(recorded_inputs, "BLOCK", 2)
+    run_values(values, run, stopped=stop_after(5))
+    assert [block.name for block in (run / "inputs").iterdir()] == ["000000.npz"]
+    run_values(values, run, "resume")
+    names = tuple(name.replace(KIND, "fixed_lag") for name in SAME_BYTES)
+    assert bytes_of(run, names) == bytes_of(straight, names)
+    assert not (run / "inputs").exists()
 
 
 def test_killed_between_the_files_of_a_checkpoint(

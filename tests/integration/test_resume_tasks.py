@@ -117,7 +117,7 @@ def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
     images = experiment(recording, dataset=dataset, output=QUIET)
     panoramas = {"name": "x", "jobs": 1, "dataset": {"kind": "panoramas", "path": str(views)}}
     known: dict[str, dict[str, Any]] = {
-        "slam": images,
+        "slam": images | {"estimator": {"kind": "fixed_lag"}},
         "slam_compared": images | {"compare": ["odometry", "ekf"]},
         "measurements": {
             "name": "short_drive",
@@ -191,6 +191,7 @@ def doing(
 def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Units in this process, few in a block, and every state saved."""
     monkeypatch.setattr("fgslam.core.log_blocks.BLOCK", 3)
+    monkeypatch.setattr("fgslam.backend.smoothers.recorded_inputs.BLOCK", 1)
     monkeypatch.setattr("fgslam.runs.tasks.homing_views._VIEWS_A_BLOCK", 2)
     monkeypatch.setattr("fgslam.runs.tasks.homing_trials._BLOCK", 1)
     monkeypatch.setattr("fgslam.runs.tasks.homing_video._SAVE_EVERY_S", 0.0)

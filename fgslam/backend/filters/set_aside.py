@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -100,20 +99,4 @@ class SetsAside(Protocol):
 
     def take_back(self, aside: SetAside) -> None:
         """Landmarks come back, moved by what closures have corrected their homes since."""
-        ...
-
-
-INPUTS = "[0-9]" * 6 + ".npz"
-"""Files of what an estimator was given, in the folder of sub-maps."""
-
-
-@runtime_checkable
-class KeepsRecord(Protocol):
-    """An estimator whose state is all that it was given; optional."""
-
-    def keep_record_in(self, folder: Path) -> None:
-        """From now on what it was given is in files (INPUTS) of the folder, but the last frames.
-
-        Called before the first frame, and before it is restored from a state of such a run.
-        """
         ...

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from fgslam.backend.protocol import KeepsRecord
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
@@ -25,6 +26,7 @@ from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, proven
 from fgslam.runs.folder import (
     BLOCKS_FOLDER,
     COMPARISON_FILE,
+    INPUTS_FOLDER,
     LOG_FILE,
     RUN_MARKER,
     SUBMAPS_FOLDER,
@@ -164,9 +166,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         seed=config.seed,
         beginning=arrival,
     )
-    if config.map.active_radius_m is not None:
-        session.keep_near(config.map.active_radius_m, run.folder / SUBMAPS_FOLDER)
-    session.keep_log(run.folder / BLOCKS_FOLDER)
+    _keep_on_disk(session, run)
     session.recorder.left_out = run.frames_before
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
@@ -190,6 +190,16 @@ def _begin_later(run: OpenedRun, frames: int) -> OpenedRun:
     shutil.rmtree(run.folder / PICTURES, ignore_errors=True)
     write_config(run.folder, run.config, run.provenance)
     return run
+
+
+def _keep_on_disk(session: Session, run: OpenedRun) -> None:
+    """What no frame needs is in files: the log, landmarks far away, what an estimator was given."""
+    about_map, estimator = run.config.map, session.pipeline.estimator
+    if about_map.active_radius_m is not None:
+        session.keep_near(about_map.active_radius_m, run.folder / SUBMAPS_FOLDER)
+    elif isinstance(estimator, KeepsRecord) and not about_map.saves_session:
+        estimator.keep_record_in(run.folder / INPUTS_FOLDER)
+    session.keep_log(run.folder / BLOCKS_FOLDER)
 
 
 def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator, Resumable
+from fgslam.backend.protocol import INPUTS, Estimator, Resumable
 from fgslam.core import __version__
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import ConfigError, MapError, MeasurementLogError, OutputError
 from fgslam.core.estimates import Estimate
-from fgslam.core.files import require_writable
+from fgslam.core.files import remove_files, require_writable
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
 from fgslam.runs.config import ExperimentConfig, make_config
-from fgslam.runs.folder import LOG_FILE, STATE_FILE, SUBMAPS_FOLDER
+from fgslam.runs.folder import INPUTS_FOLDER, LOG_FILE, STATE_FILE, SUBMAPS_FOLDER
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.arrival import evidence_of, saved_map
@@ -138,12 +138,8 @@ def _part(state: StateArrays, part: str) -> StateArrays:
 def remove_checkpoint(folder: Path) -> None:
     """Drops the state once the run has finished, and what an estimator kept of it in files."""
     (folder / STATE_FILE).unlink(missing_ok=True)
-    if not (folder / SUBMAPS_FOLDER).is_dir():
-        return
-    from fgslam.backend.filters.set_aside import INPUTS  # loads the factors, which take a second
-
-    for path in (folder / SUBMAPS_FOLDER).glob(INPUTS):
-        path.unlink(missing_ok=True)
+    for name in (SUBMAPS_FOLDER, INPUTS_FOLDER):
+        remove_files(folder / name, INPUTS)
 
 
 _LOG = "log/"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fgslam.backend.filters.self_calibration import SETTLING
-from fgslam.backend.filters.set_aside import KeepsRecord
+from fgslam.backend.protocol import KeepsRecord
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import FrontendSettings, LoopSettings
 from fgslam.slam.factory import make_relocaliser

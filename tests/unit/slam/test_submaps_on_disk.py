@@ -11,7 +11,7 @@ import pytest
 from rings import IMAGES, ROUND, SETTINGS, drive, error_m, on_ring, pipeline_of, walls
 from simulated import RIG, FeatureWorld, assert_same_bits
 
-from fgslam.backend.filters.set_aside import INPUTS
+from fgslam.backend.protocol import INPUTS
 from fgslam.backend.settings import (
     EkfSettings,
     EstimatorSettings,
