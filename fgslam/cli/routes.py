@@ -9,6 +9,7 @@ import typer
 
 from fgslam.cli import options
 from fgslam.cli.performing import existing_folder, exit_as, show_all, under_way
+from fgslam.core.errors import OutputError
 
 if TYPE_CHECKING:
     from fgslam.runs.config_models import Experiment
@@ -60,6 +61,7 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     chosen = options.of_recording(start=start, stop=stop, stride=stride)
     chosen += options.as_overrides({"poses": poses})
     config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
+    _keep(out, overwrite)
     _perform(config, report, overwrite)
 
 
@@ -104,7 +106,9 @@ def join(
     """
     from fgslam.runs.bare_routes import joining
 
-    _perform(joining(routes, out, overrides or ()), report, overwrite)
+    config = joining(routes, out, overrides or ())
+    _keep(out, overwrite)
+    _perform(config, report, overwrite)
 
 
 def route(
@@ -133,6 +137,12 @@ def route(
 
     for line in way_said(stored, start, goal, camera, out):
         typer.echo(line)
+
+
+def _keep(out: Path, overwrite: bool) -> None:
+    """Raises OutputError where another route or map would be lost."""
+    if out.exists() and not overwrite:
+        raise OutputError(f"{out}: is there already; choose another --out, or add --overwrite")
 
 
 def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:

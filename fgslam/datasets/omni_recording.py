@@ -108,10 +108,19 @@ def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
     ]
     if not found:
         raise DatasetError(
-            f"{folder} holds no picture named {pattern} ({', '.join(IMAGE_SUFFIXES)}); check "
-            "dataset.path"
+            f"{folder} holds no picture named {pattern} ({', '.join(IMAGE_SUFFIXES)}); "
+            f"{_within(folder) or 'check dataset.path'}"
         )
     return sorted(found, key=natural)
+
+
+def _within(folder: Path) -> str:
+    """What to give instead where folders in this one hold pictures, as of a stereo recording."""
+    inner = sorted(
+        {p.parent for p in folder.glob("*/*") if p.suffix.lower() in IMAGE_SUFFIXES}, key=natural
+    )
+    shown = ", ".join(path.name for path in inner[:3])
+    return f"folders in it do ({shown}): give that of the one camera" if inner else ""
 
 
 def ids_of(names: Sequence[str]) -> IntArray:

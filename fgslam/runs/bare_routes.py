@@ -9,7 +9,7 @@ from math import degrees, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fgslam.core.errors import CalibrationError, DatasetError, StoredMapError
+from fgslam.core.errors import CalibrationError, DatasetError, OutputError, StoredMapError
 from fgslam.runs.config import make_experiment
 from fgslam.runs.config_models import Experiment
 
@@ -94,6 +94,8 @@ def way_said(
     """
     from fgslam.homing.route_map import RouteMap  # loads arrays
 
+    if out is not None and out.resolve() == stored.resolve():
+        raise OutputError(f"{out}: the map itself, which would be lost; choose another --out")
     joined = RouteMap.load(stored)
     lines = []
     if joined.knows(start):

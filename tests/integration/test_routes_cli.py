@@ -227,6 +227,18 @@ def test_wrong_routes_are_one_line_each(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     again, cut = data / "again", tmp_path / "cut.fgpath"
+    stored = taught.read_bytes()
+    teach = ("teach", again, "--camera", data / "camera.yaml")
+    for command in (teach, ("join", taught)):
+        given = (*command, "--out", taught, "--report", tmp_path / "run")
+        assert "is there already" in mistake(capfd, monkeypatch, *given)
+    said = mistake(capfd, monkeypatch, *given, "--overwrite")
+    assert "one of the routes, which would be lost" in said
+    route = ("route", taught, "--from", "a", "--to", "b", "--out", taught)
+    assert "the map itself, which would be lost" in mistake(capfd, monkeypatch, *route)
+    assert taught.read_bytes() == stored
+    said = mistake(capfd, monkeypatch, "follow", taught, data)
+    assert "folders in it do (again, drive): give that of the one camera" in said
     said = mistake(capfd, monkeypatch, "follow", data / "camera.yaml", again)
     assert "not a readable path memory" in said
     cut.write_bytes(taught.read_bytes()[:-2000])

@@ -144,20 +144,20 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
             f"file, or one of {', '.join(_KINDS)}"
         )
     if path.suffix.lower() in (".yaml", ".yml"):
-        return _settings_of(read_yaml(path, CalibrationError)), path.parent
+        return _settings_of(read_yaml(path, CalibrationError), str(path)), path.parent
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
         return BloggieSettings(file=path.name), path.parent
     return OCamCalibSettings(file=path.name), path.parent
 
 
-def _settings_of(source: object) -> OmniCameraKind:
+def _settings_of(source: object, where: str = "camera") -> OmniCameraKind:
     if isinstance(source, OmniCameraKind):
         return source
     kind = _KINDS.get(str(source.get("kind"))) if isinstance(source, Mapping) else None
     if not isinstance(source, Mapping) or kind is None:
         raise CalibrationError(
-            f"camera: {shortened(repr(source))} describes none; give a calibration file, or keys "
-            f"with a kind, one of {', '.join(_KINDS)}"
+            f"{where}: {shortened(repr(source))} describes no omnidirectional camera; give a "
+            f"calibration file, or keys with a kind, one of {', '.join(_KINDS)}"
         )
     return make_settings(kind, {str(key): value for key, value in source.items()}, "camera")
 

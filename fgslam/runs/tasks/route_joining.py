@@ -28,6 +28,9 @@ def open_joining(config: JoinConfig, opening: Opening) -> Task[RunResult]:
     """Opens the routes. Raises StoredMapError, ConfigError, or OutputError."""
     if config.map is not None and not Path(config.map).resolve().parent.is_dir():
         raise OutputError(f"{config.map}: its folder does not exist; choose another one")
+    written = None if config.map is None else Path(config.map).resolve()
+    if written in [Path(one).resolve() for one in config.routes]:
+        raise ConfigError(f"{config.map}: one of the routes, which would be lost; choose another")
     routes = {Path(one).stem: PathMemory.load(one) for one in config.routes}
     if len(routes) < len(config.routes):
         name, _ = Counter(Path(one).stem for one in config.routes).most_common(1)[0]
