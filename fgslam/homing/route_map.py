@@ -155,7 +155,9 @@ class RouteMap:
         """
         camera = camera or self.topology.camera
         if camera is None:
-            raise CalibrationError("map: it holds no camera of its own; give the image's")
+            raise CalibrationError(
+                "map: its routes were taught with several cameras; give the image's, --camera FILE"
+            )
         picture = colour_image(image, (camera.width, camera.height))
         features = OmniFeatureExtractor(camera, FEATURES).extract(picture)
         refusal = unusable(picture, features)

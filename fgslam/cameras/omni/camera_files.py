@@ -144,10 +144,20 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
             f"file, or one of {', '.join(_KINDS)}"
         )
     if path.suffix.lower() in (".yaml", ".yml"):
+        _refuse_opencv(path)
         return _settings_of(read_yaml(path, CalibrationError), str(path)), path.parent
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
         return BloggieSettings(file=path.name), path.parent
     return OCamCalibSettings(file=path.name), path.parent
+
+
+def _refuse_opencv(path: Path) -> None:
+    lines = read_lines(path, CalibrationError)
+    if lines and lines[0][1].startswith("%YAML:"):
+        raise CalibrationError(
+            f"{path} is written by OpenCV, of no omnidirectional camera that is read; give "
+            f"OCamCalib's result, or a YAML file of keys with a kind, one of {', '.join(_KINDS)}"
+        )
 
 
 def _settings_of(source: object, where: str = "camera") -> OmniCameraKind:
