@@ -163,8 +163,11 @@ class SlamPipeline:
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
 
     def founds(self, found: FeatureFrame, least: int) -> bool:
-        """Whether a map could begin with the frame: it has ``least`` stereo matches, or more."""
-        if found.frame is None:
+        """Whether a map could begin with the frame: it has ``least`` stereo matches, or more.
+
+        Not with images that the watch refuses: what they match is chance, or of two moments.
+        """
+        if found.frame is None or self._refused(found):
             return False
         first = self._described(dataclasses.replace(found, i=0), None, [])
         return len(self._match_stereo(first).whole) >= least
@@ -213,6 +216,15 @@ class SlamPipeline:
         if not fault:
             return found
         return dataclasses.replace(found, frame=None, features=(), problem=fault, refused=True)
+
+    def _refused(self, found: FeatureFrame) -> bool:
+        """Whether the watch refuses the frame, which it does not take in here."""
+        if self.watch is None:
+            return False
+        before = self.watch.state()
+        refused = self._watched(found).refused
+        self.watch.restore(before)
+        return refused
 
     def _carried(
         self, prediction: Prediction, found: FeatureFrame, landmarks: LandmarkMap

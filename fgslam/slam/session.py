@@ -269,10 +269,12 @@ class Session:
             if images is not None:
                 self._seen.add(found, any_uint16(images))
             if self._start is None:
+                now = found
                 if self.begins_anew(found, body):
+                    # An extractor that fails does so before anything has changed.
+                    now, body = self._describer.of_reference(replace(found, i=0)), None
                     self._begin_anew(timestamp)
-                    found, body = replace(found, i=0), None
-                report = self.advance(found, timestamp, body)
+                report = self.advance(now, timestamp, body)
                 if images is not None and not found.features:
                     self._seen.add(report.found, any_uint16(images))
                 return Step.of(report)

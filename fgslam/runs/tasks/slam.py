@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import shutil
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from typing import Any, TypeAlias
 
 from fgslam.backend.protocol import KeepsRecord
 from fgslam.core.errors import DatasetError
+from fgslam.core.files import remove_files
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.metrics import EstimatorMetrics
@@ -187,7 +187,7 @@ def _begin_later(run: OpenedRun, frames: int) -> OpenedRun:
     before = run.frames_before + frames
     run = dataclasses.replace(run, frames_before=before, resumed=False)
     state.remove_checkpoint(run.folder)
-    shutil.rmtree(run.folder / PICTURES, ignore_errors=True)
+    remove_files(run.folder / PICTURES, "*.png")
     write_config(run.folder, run.config, run.provenance)
     return run
 

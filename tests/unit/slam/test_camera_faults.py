@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 
 import fgslam as fg
+from fgslam.core.arrays import Image
+from fgslam.core.features import Features
+from fgslam.frontend.settings import FrontendSettings
+from fgslam.slam.factory import make_extractor
 
 BEGINS, FRAMES = 14, 22
 
@@ -61,3 +65,38 @@ def test_frames_of_a_late_camera_are_not_used_and_the_covariance_says_so(
 def test_the_watch_can_be_switched_off(recording: fg.Recording) -> None:
     status = driven(recording, {"watch_cameras": False}).result().column("status")
     assert not (status == "camera_fault").any()
+
+
+def test_the_world_does_not_begin_with_images_that_are_not_used(recording: fg.Recording) -> None:
+    times, images, _ = zip(*(recording[k] for k in range(3)), strict=True)
+    dark = np.zeros_like(images[1][0])
+    slam = fg.Slam(recording.rig)
+    slam.track(times[0], (dark, images[1][1], dark))
+    assert slam.track(times[1], images[1]).status.value == "camera_fault"  # the right image again
+    assert len(slam) == 2
+    assert slam.track(times[2], images[2]).status.value == "first"
+    assert len(slam) == 1
+    slam.close()
+
+
+@pytest.mark.parametrize("fails_at", [1, 2])
+def test_an_extractor_that_fails_where_the_world_begins_takes_no_frame_away(
+    recording: fg.Recording, fails_at: int
+) -> None:
+    extract, calls = make_extractor(FrontendSettings()), []
+
+    def failing(image: Image) -> Features:
+        calls.append(image.any())
+        if sum(calls) == fails_at:
+            raise ZeroDivisionError
+        return extract(image)
+
+    slam = fg.Slam(recording.rig, frontend={"tracking": "hybrid"}, features=failing)
+    t, images, _ = recording[1]
+    slam.track(recording[0][0], tuple(np.zeros_like(image) for image in images))
+    with pytest.raises(ZeroDivisionError):
+        slam.track(t, images)
+    assert len(slam.result().trajectory) == 1
+    assert slam.track(t, images).status.value == "first"
+    assert len(slam) == 1
+    slam.close()
