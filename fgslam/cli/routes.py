@@ -61,7 +61,7 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     chosen = options.of_recording(start=start, stop=stop, stride=stride)
     chosen += options.as_overrides({"poses": poses})
     config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
-    _keep(out, overwrite)
+    _keep(out, overwrite, (recording, poses, Path(camera) if camera else None))
     _perform(config, report, overwrite)
 
 
@@ -139,8 +139,10 @@ def route(
         typer.echo(line)
 
 
-def _keep(out: Path, overwrite: bool) -> None:
-    """Raises OutputError where another route or map would be lost."""
+def _keep(out: Path, overwrite: bool, inputs: tuple[Path | None, ...] = ()) -> None:
+    """Raises OutputError where another route or map would be lost, or an input in any case."""
+    if out.resolve() in [one.resolve() for one in inputs if one is not None]:
+        raise OutputError(f"{out}: is read, and would be lost; choose another --out")
     if out.exists() and not overwrite:
         raise OutputError(f"{out}: is there already; choose another --out, or add --overwrite")
 

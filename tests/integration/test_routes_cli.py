@@ -234,6 +234,8 @@ def test_wrong_routes_are_one_line_each(
         assert "is there already" in mistake(capfd, monkeypatch, *given)
     said = mistake(capfd, monkeypatch, *given, "--overwrite")
     assert "one of the routes, which would be lost" in said
+    given = (*teach, "--poses", taught, "--out", taught, "--overwrite")
+    assert "is read, and would be lost" in mistake(capfd, monkeypatch, *given)
     route = ("route", taught, "--from", "a", "--to", "b", "--out", taught)
     assert "the map itself, which would be lost" in mistake(capfd, monkeypatch, *route)
     assert taught.read_bytes() == stored

@@ -319,7 +319,8 @@ def _loop(
     try:
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
-            if outputs.session.begins_anew(found, _body(outputs, found)):
+            # A run that goes on with another one's session keeps its frames and its world.
+            if outputs.given is None and outputs.session.begins_anew(found, _body(outputs, found)):
                 return _Founding(found.i)
             report = _advance(outputs, found, wait_ms)
             if found.i in shown:
