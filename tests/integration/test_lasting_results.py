@@ -23,7 +23,7 @@ def test_every_variant_is_a_valid_experiment(name: str) -> None:
 
 @pytest.mark.slow
 def test_blocked_cameras_cost_nothing_of_a_lasting_map() -> None:
-    """Issue 5, section 1: the map survives 30 blocked frames, and the robot finds itself again."""
+    """The map survives 30 blocked frames, and the robot finds itself again."""
     found = lasting.blocked_features()
     lasts = lasting.run_blocked(found, lasting.VARIANTS["as committed"])
     ordinary = lasting.run_blocked(found, lasting.VARIANTS["without permanence"])
@@ -34,7 +34,8 @@ def test_blocked_cameras_cost_nothing_of_a_lasting_map() -> None:
     assert lasts.drift_m > 0.04
     assert lasts.found_at <= lasting.COVER[1] + 1
     assert lasts.error_m < 0.6 * lasts.drift_m
-    assert lasts.end_m < 0.02 < ordinary.end_m
+    assert lasts.end_m < 0.02
+    assert lasts.end_m < 0.5 * ordinary.end_m
     assert lasts.ate_m < 0.75 * ordinary.ate_m
 
 
