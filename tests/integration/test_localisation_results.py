@@ -37,7 +37,7 @@ def test_the_experiments_are_valid(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("open3d")
 def test_random_poses_are_found_in_the_lab(tmp_path: Path) -> None:
-    """Issue 5, 5.1, on its first 60 poses: never false, nearly always found."""
+    """On the first 60 poses: never false, nearly always found."""
     one, three = asked("kidnapped", tmp_path / "run", "dataset.drive.frames=180")
     assert one.counts.queries >= 50
     for judged in (one, three):
@@ -53,7 +53,7 @@ def test_random_poses_are_found_in_the_lab(tmp_path: Path) -> None:
 def test_odd_frames_of_euroc_are_found_in_the_map_of_the_even_ones(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """Issue 5, 5.2: 70 % found, all of them within 10 cm and 2 degrees."""
+    """70 % are found, all of them within 10 cm and 2 degrees."""
     data = f"{shared_data / 'euroc_v101_kf100'}"
     paths = (f"dataset.path={data}", f"map.made_from.dataset.path={data}")
     (judged,) = asked("kidnapped_euroc", tmp_path / "run", *paths)

@@ -23,7 +23,7 @@ def test_every_visit_is_a_valid_experiment(name: str) -> None:
 
 @pytest.mark.slow
 def test_what_was_moved_leaves_the_map_and_the_path_is_as_good(tmp_path: Path) -> None:
-    """Issue 5, item 5.5."""
+    """In a second visit of a room where some things were moved."""
     first = visits.first_visit(tmp_path)
     unchanged = visits.second_visit(first, visits.VISITS[visits.UNCHANGED])
     moved = visits.second_visit(first, visits.VISITS["chairs, cartons, plotter moved"])
