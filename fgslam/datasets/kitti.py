@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats.kitti import right_of_camera_0
+from fgslam.cameras.formats.kitti import pair_beside, right_of_camera_0
 from fgslam.cameras.rig import load_rig
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
@@ -29,9 +29,6 @@ from fgslam.datasets.recording import Recording, recording_identity, select_fram
 from fgslam.datasets.settings import KittiSettings
 from fgslam.datasets.tables import read_table, require_increasing
 
-_PAIRS = (("image_1", "image_0"), ("image_3", "image_2"))
-"""Folders of the right and the left camera: grey, else colour."""
-
 _POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
 
 
@@ -44,14 +41,14 @@ def open_kitti(settings: KittiSettings) -> Recording:
     """
     folder = Path(settings.path) / "sequences" / settings.sequence
     require_folder(folder, "the KITTI sequence")
-    names = _pair(folder)
+    calibration = folder / "calib.txt"
+    names = _pair(calibration)
     cameras = [list_numbered_images(folder / name) for name in names]
     table = read_table(folder / "times.txt", ("time",))
     stamps = table.column(0)
     require_increasing(table, stamps)
     chosen = select_frames(len(stamps), settings)
     files = _files(folder, names, cameras, len(stamps))
-    calibration = folder / "calib.txt"
     rig = _read_rig(calibration, files)
     files = StereoFiles(files.paths, rig.width, rig.height)
     check_sizes(files, folder)
@@ -75,12 +72,13 @@ def open_kitti(settings: KittiSettings) -> Recording:
     )
 
 
-def _pair(folder: Path) -> tuple[str, str]:
-    """Folders of the right and the left camera."""
-    for pair in _PAIRS:
-        if all((folder / name).is_dir() for name in pair):
-            return pair
-    lacking = next((name for name in _PAIRS[0] if not (folder / name).is_dir()), "")
+def _pair(calibration: Path) -> tuple[str, str]:
+    """Folders of the right and the left camera, those that the calibration is read for."""
+    found, folder = pair_beside(calibration), calibration.parent
+    if found is not None:
+        left, right = found
+        return f"image_{right}", f"image_{left}"
+    lacking = next(name for name in ("image_1", "image_0") if not (folder / name).is_dir())
     raise DatasetError(
         f"{folder} has no {lacking}/: both grey cameras are needed (image_0 left, image_1 right), "
         "or both colour cameras (image_2 left, image_3 right); unpack the odometry data set there"

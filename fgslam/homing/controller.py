@@ -164,13 +164,12 @@ class HomingController:
         self._next_look = time + self._settings.retry_s
         answer = self._front_end.look(image, self._target)
         if isinstance(answer, Sighting):
-            # One of the starts may be wrong itself; by that one no place would ever be near.
-            left = min(surely_left(begun, answer) for begun in self._begun)
             if homing.contradicts(answer.vector):
-                return self._seen_elsewhere(homing, answer.vector, left, time)
+                return self._seen_elsewhere(homing, answer, time)
             # The first estimate is near when it says so. Later ones took the place of one that
             # failed, with its distance or where its tracks ended.
-            self._recognised = self.initialisations == 1 or left <= _NEAR_FRACTION
+            first = self.initialisations == 1
+            self._recognised = first or self._surely_left(answer) <= _NEAR_FRACTION
             if arrival and not self._recognised:
                 return self._doubt(time, "target may not be so near", answer.vector)
         elif answer.reason is RefusalReason.AT_TARGET:
@@ -179,21 +178,27 @@ class HomingController:
             return self._doubt(time, f"target not seen where it is believed: {answer.details}")
         return None
 
-    def _seen_elsewhere(
-        self, homing: ActiveHoming, vector: TwoViewVector, left: float, time: float
-    ) -> Command:
+    def _surely_left(self, seen: Sighting) -> float:
+        """Of the leg, at most.
+
+        One of its starts may be wrong itself; by that one no place would ever be near.
+        """
+        return min(surely_left(begun, seen) for begun in self._begun)
+
+    def _seen_elsewhere(self, homing: ActiveHoming, seen: Sighting, time: float) -> Command:
         """The target is seen in another direction than estimated: reached, passed, or an error.
 
         At the target itself directions mean little, so its distance decides, as far as it is
         certain; rotations that contradict mean that another place is seen.
         """
-        if homing.turned_otherwise(vector):
-            return self._doubt(time, "near the target it is seen elsewhere", vector)
-        behind = abs(vector.direction) > np.pi / 2 and self._was_ahead
+        if homing.turned_otherwise(seen.vector):
+            return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
+        left = self._surely_left(seen)
+        behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
         if left <= self._settings.switch_fraction or (behind and left <= _PASS_FRACTION):
             self.remaining = left
             return self._end(time, HomingState.ARRIVED, f"passed: seen at {left:.2f} of the leg")
-        return self._doubt(time, "near the target it is seen elsewhere", vector, left)
+        return self._doubt(time, "near the target it is seen elsewhere", seen.vector, left)
 
     def _doubt(
         self, time: float, why: str, vector: TwoViewVector | None = None, left: float = 1.0

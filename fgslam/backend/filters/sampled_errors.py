@@ -330,7 +330,8 @@ class SampledErrors(ErrorColumns):
             gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
             gain[:, _TERMS:] += _root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
-        problem, sights = problem.select(ahead), self._sights(wTc, problem.select(ahead))
+        problem = problem.select(ahead)
+        sights = self._sights(wTc, problem)
         by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
         return sights.following(by_measurement, self._of("gain", seen.ids[ahead]))
 

@@ -18,8 +18,7 @@ from fgslam.core.geometry import (
     reorthonormalise,
 )
 
-ODOMETRY = ("P0", "P1")
-ODOMETRY_COLOUR = ("P2", "P3")
+_PAIRS = ((0, 1), (2, 3))  # of the odometry data: left and right camera, grey, else colour
 RAW = ("P_rect_00", "P_rect_01")
 RAW_COLOUR = ("P_rect_02", "P_rect_03")
 Size = tuple[int, int]
@@ -67,12 +66,18 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
     return Calibration(str(path), "KITTI", cameras, sided=True)
 
 
+def pair_beside(path: Path) -> tuple[int, int] | None:
+    """Left and right camera whose folders of images lie beside a calib.txt; None: of no pair."""
+    for pair in _PAIRS:
+        if all((path.parent / f"image_{number}").is_dir() for number in pair):
+            return pair
+    return None
+
+
 def _beside(path: Path) -> tuple[str, str]:
-    """Lines of the pair whose folders of images lie beside a calib.txt."""
-    for keys in (ODOMETRY, ODOMETRY_COLOUR):
-        if all((path.parent / f"image_{key[1:]}").is_dir() for key in keys):
-            return keys
-    return ODOMETRY
+    """Lines of the pair whose images lie beside a calib.txt; of the grey one where none does."""
+    left, right = pair_beside(path) or _PAIRS[0]
+    return f"P{left}", f"P{right}"
 
 
 def right_of_camera_0(path: Path) -> float:

@@ -128,14 +128,15 @@ class EgoMotionSolver:
                 return self._fall_back(prediction, problem, EgoMotionStatus.DIVERGED)
             wTc = minimum.wTc
             weights = self._information(wTc, problem)
-            kept = self._inliers(wTc, problem, weights)
+            measured = self._measured(wTc, problem)
+            kept = self._inliers(*measured, weights)
             if not robust and np.array_equal(kept, inliers):
                 break
             used, inliers, robust = inliers, kept, False
         else:
             inliers = used  # the set did not come to rest: the pose is that of the last one used
         found = self._finish(prediction, problem, minimum, inliers, iterations)
-        misfit = self._misfit(wTc, problem, weights)
+        misfit = self._misfit(*measured, weights)
         noise = self.noise.variance
         return dataclasses.replace(found, weighted_at=weighted_at, noise=noise, misfit=misfit)
 
@@ -283,22 +284,22 @@ class EgoMotionSolver:
         """Predicted less measured (k, 3)."""
         return measurement_difference(self.sensor, project(self.sensor, points), measurement)
 
-    def _inliers(self, wTc: FloatArray, problem: PoseProblem, information: FloatArray) -> BoolArray:
-        residual, distance = self._measured(wTc, problem)
+    def _inliers(
+        self, residual: FloatArray, distance: FloatArray, information: FloatArray
+    ) -> BoolArray:
         near = distance <= self.farthest  # so in front, too
         if self._judges:
             squared = _squared(residual[near], information[near])
             near[near] = squared <= self._settings.outlier_sigmas**2
         return near
 
-    def _misfit(self, wTc: FloatArray, problem: PoseProblem, information: FloatArray) -> float:
+    def _misfit(self, residual: FloatArray, distance: FloatArray, information: FloatArray) -> float:
         """Variance of the residuals over the stated one, by the median of their squares.
 
         NaN where matches are not judged by their deviations, or none is ahead.
         """
         if not self._judges:
             return math.nan
-        residual, distance = self._measured(wTc, problem)
         ahead = np.isfinite(distance)
         if not ahead.any():
             return math.nan
@@ -321,7 +322,8 @@ class EgoMotionSolver:
             status = EgoMotionStatus.CAPPED
             wTc = self.floor.constrain(prediction.wTc @ se3_exp(allowed * correction))
             # The matches belong to another pose; what of it was cut off is the least we may err.
-            inliers = inliers & self._inliers(wTc, problem, self._information(wTc, problem))
+            measured = self._measured(wTc, problem)
+            inliers = inliers & self._inliers(*measured, self._information(wTc, problem))
             cut_off = (1.0 - allowed) * correction
             covariance = self.floor.allowed_part(
                 wTc, prediction.covariance + np.outer(cut_off, cut_off)

@@ -319,10 +319,11 @@ def _loop(
     try:
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
+            body = body_motion(sequence, found.i, outputs.pipeline.motion)
             # A run that goes on with another one's session keeps its frames and its world.
-            if outputs.given is None and outputs.session.begins_anew(found, _body(outputs, found)):
+            if outputs.given is None and outputs.session.begins_anew(found, body):
                 return _Founding(found.i)
-            report = _advance(outputs, found, wait_ms)
+            report = _advance(outputs, found, body, wait_ms)
             if found.i in shown:
                 draw_frame(outputs, found.i, report)
             if watch is not None:
@@ -360,7 +361,9 @@ def save_progress(outputs: RunOutputs) -> EstimatorMetrics:
     return metrics
 
 
-def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameReport:
+def _advance(
+    outputs: RunOutputs, found: FeatureFrame, body: Odometry | None, wait_ms: float
+) -> FrameReport:
     """Pushes one frame with its odometry into the session."""
     sequence, session = outputs.sequence, outputs.session
     # A frame without images has a number, too: the one that the selection gives it.
@@ -368,16 +371,11 @@ def _advance(outputs: RunOutputs, found: FeatureFrame, wait_ms: float) -> FrameR
     return session.advance(
         found,
         float(sequence.timestamps[found.i]),
-        _body(outputs, found),
+        body,
         index,
         wait_ms,
         lambda report: stereo_precision(sequence, found.i, report.stereo),
     )
-
-
-def _body(outputs: RunOutputs, found: FeatureFrame) -> Odometry | None:
-    """The recording's odometry to a frame, as far as it is used."""
-    return body_motion(outputs.sequence, found.i, outputs.pipeline.motion)
 
 
 def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
