@@ -42,7 +42,7 @@ from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.runs.config import make_config
 from fgslam.runs.engine import Opening, resume_command
-from fgslam.runs.tasks.slam import begin, open_run
+from fgslam.runs.tasks.slam_opening import begin, open_run
 
 LONG = 20
 """Frames that are enough to be interrupted for certain after the fifth."""
