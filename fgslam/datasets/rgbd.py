@@ -43,6 +43,9 @@ _TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
 _NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
 # Where 16 bits are only assumed to be millimetres: farther than RealSense, Kinect and Orbbec see.
 _FARTHEST_GUESSED_M = 10.0
+_NEAREST_OF_TUM_M = 0.4  # nearer than Kinect sees in its near mode, of which TUM's layout is
+_ENDS = (1.0, 99.0)  # percentiles of depth that are its nearest and farthest: few pixels are wrong
+_SAMPLES = 5  # depth images, over the whole recording
 _SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor")
 _TUM_CAMERAS = {
     "1": (517.3, 516.5, 318.6, 255.3),
@@ -84,7 +87,7 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
         timestamps=stamps[chosen],
         identity=recording_identity(lists, (path for pair in pairs for path in pair)),
         ground_truth=_true_poses(truth, stamps[chosen]) if truth.is_file() else None,
-        notes=(*notes, *known, said),
+        notes=(*notes, *known, *said),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,
@@ -145,24 +148,58 @@ def _listed(path: Path) -> tuple[IntArray, list[Path]]:
 
 def _scale(
     root: Path, pairs: tuple[tuple[Path, Path], ...], settings: RgbdSettings
-) -> tuple[float, str]:
+) -> tuple[float, tuple[str, ...]]:
     """Units a metre, and the depth that follows from it in words. Raises DatasetError."""
-    depth = _first_depth(root, pairs)
-    assumed = _TUM_SCALE if (root / "depth.txt").is_file() else _MILLIMETRES
+    seen, of_integers = _some_depths(root, pairs)
     stated = settings.depth_scale or _stated_scale(root, settings)
-    scale = stated or (assumed if depth.dtype == np.uint16 else 1.0)
-    seen = depth[np.isfinite(depth) & (depth > 0)]
-    if len(seen) == 0:
-        raise DatasetError(f"{pairs[0][1]} holds no depth at all; check the depth images")
+    doubt: tuple[str, ...] = ()
+    if stated is None and of_integers:
+        scale, doubt = _assumed_scale(root, seen)
+    else:
+        scale = stated or 1.0
     median = float(np.median(seen)) / scale
-    guessed = stated is None and depth.dtype == np.uint16
+    guessed = stated is None and of_integers
     if not _NEAREST_M < median < (_FARTHEST_GUESSED_M if guessed else _FARTHEST_M):
         raise DatasetError(
             f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
             "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, "
             "10000 for tenths of them, 1 for metres"
         )
-    return scale, f"depth is taken as {scale:g} units a metre: its median is {median:.3g} m"
+    assumed = ", which nothing states" if guessed else ""
+    said = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
+    return scale, (*doubt, said)
+
+
+def _assumed_scale(root: Path, seen: FloatArray) -> tuple[float, tuple[str, ...]]:
+    """TUM's units a metre or millimetres, whichever a depth camera can have seen; doubt in words.
+
+    No motion tells: all that is seen is the same in a world of another size. Where both or neither
+    can be, it is the layout's own.
+
+    Args:
+        root: the recording, in TUM's layout or another.
+        seen: (n,) depths in units.
+    """
+    near, far = np.percentile(seen, _ENDS)
+    of_tum = (root / "depth.txt").is_file()
+    own, other = (_TUM_SCALE, _MILLIMETRES) if of_tum else (_MILLIMETRES, _TUM_SCALE)
+    possible = {
+        _TUM_SCALE: near > _NEAREST_OF_TUM_M * _TUM_SCALE
+        and far < _FARTHEST_GUESSED_M * _TUM_SCALE,
+        _MILLIMETRES: near > _NEAREST_M * _MILLIMETRES and far < _FARTHEST_GUESSED_M * _MILLIMETRES,
+    }
+    refused = float(np.median(seen)) >= _FARTHEST_GUESSED_M * own  # it may be a third unit
+    scale, left = own, other
+    if possible[other] and not possible[own] and not refused:
+        scale, left = other, own
+    if scale == own and possible[own] and not possible[other]:
+        return scale, ()
+    return scale, (
+        f"nothing states the unit of depth, and the size of the map depends on it: at {scale:g} "
+        f"units a metre it is {near / scale:.2g} to {far / scale:.2g} m, at {left:g} "
+        f"{near / left:.2g} to {far / left:.2g} m; say which: --set dataset.depth_scale={left:g} "
+        f"or {scale:g}",
+    )
 
 
 def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
@@ -178,13 +215,21 @@ def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
     return None
 
 
-def _first_depth(root: Path, pairs: tuple[tuple[Path, Path], ...]) -> FloatArray | Image:
-    for _, path in pairs:
+def _some_depths(root: Path, pairs: tuple[tuple[Path, Path], ...]) -> tuple[FloatArray, bool]:
+    """Known depths (n,) of some images, in their own units, and whether these are integers."""
+    images = []
+    for row in np.unique(np.linspace(0, len(pairs) - 1, _SAMPLES).astype(int)).tolist():
         try:
-            return read_depth_image(path)
+            images.append(read_depth_image(pairs[row][1]))
         except FrameError:
             continue
-    raise DatasetError(f"{root}: not one depth image can be read; restore them")
+    if not images:
+        raise DatasetError(f"{root}: not one depth image can be read; restore them")
+    known = [depth[np.isfinite(depth) & (depth > 0)] for depth in images]
+    seen = np.concatenate(known).astype(np.float64)
+    if len(seen) == 0:
+        raise DatasetError(f"{pairs[0][1]} holds no depth at all; check the depth images")
+    return seen, bool(images[0].dtype == np.uint16)
 
 
 # --------------------------------------------------------------------------------------------

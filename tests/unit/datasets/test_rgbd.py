@@ -108,7 +108,9 @@ def test_the_layout_of_tum(tmp_path: Path) -> None:
     assert truth is not None
     assert np.allclose(truth.poses[:, 0, 3], [0.02, 0.04, 0.08], rtol=0.0, atol=1e-4)
     assert "1 colour images have no partner within 20 ms" in recording.notes[0]
-    assert recording.notes[-1] == "depth is taken as 5000 units a metre: its median is 2 m"
+    assert recording.notes[-1] == (
+        "depth is taken as 5000 units a metre, which nothing states: its median is 2 m"
+    )
 
 
 def test_the_noise_of_depth_is_part_of_the_experiment(tmp_path: Path) -> None:
@@ -140,6 +142,37 @@ def test_depth_in_the_wrong_unit_is_said(tmp_path: Path) -> None:
         opened(root, depth_scale=1.0)
     with pytest.raises(DatasetError, match=r"median depth is 0\.01 m at 1e\+06 units a metre"):
         opened(root, depth_scale=1e6)
+
+
+def depths(root: Path, scale: float, nearest: float, farthest: float) -> None:
+    """Another wall, seen at an angle: from ``nearest`` to ``farthest`` metres away."""
+    ramp = np.linspace(nearest, farthest, WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)
+    for path in (root / "depth").iterdir():
+        save(path, np.rint(scale * ramp).astype(np.uint16))
+
+
+@pytest.mark.parametrize(
+    ("scale", "nearest", "farthest", "sure"),
+    [(5000, 0.7, 3.0, True), (1000, 0.5, 4.0, True), (5000, 0.5, 1.8, False)],
+)
+@pytest.mark.parametrize("lists", [True, False])
+def test_the_unit_of_depth_is_what_a_camera_can_have_seen_or_in_doubt(
+    tmp_path: Path, scale: float, nearest: float, farthest: float, sure: bool, lists: bool
+) -> None:
+    root = tum(tmp_path / "room") if lists else folders(tmp_path / "room", 1e-3)
+    camera(root)
+    depths(root, scale, nearest, farthest)
+    *before, said = opened(root).notes
+    doubt = [note for note in before if "nothing states the unit of depth" in note]
+    chosen = scale if sure else 5000 if lists else 1000
+    assert said.startswith(f"depth is taken as {chosen:g} units a metre, which nothing states: ")
+    assert [note for note in doubt if "--set dataset.depth_scale=" in note] == doubt
+    assert bool(doubt) == (not sure or lists != (scale == 5000))
+    if not sure:  # both can be: the layout's own is taken
+        assert "0.51 to 1.8 m" in doubt[0]
+        assert "2.6 to 8.9 m" in doubt[0]
+    stated = opened(root, depth_scale=scale).notes
+    assert not [note for note in stated if "nothing states" in note]
 
 
 def folders(root: Path, unit_m: float) -> Path:
