@@ -51,9 +51,14 @@ def watch() -> None:
     os.set_blocking(writer, False)
     # Written to at once, whatever the main thread is at: handlers in Python wait for its next step.
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    for number in _SIGNALS:
+    for number in _answered():
         signal.signal(number, _end_now)
     threading.Thread(target=_end_late, args=(reader,), daemon=True).start()
+
+
+def _answered() -> list[signal.Signals]:
+    """Those that the process does not ignore: who starts it under nohup wants it to go on."""
+    return [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
 
 
 def _end_now(number: int, frame: FrameType | None) -> None:
@@ -65,7 +70,7 @@ def _end_now(number: int, frame: FrameType | None) -> None:
 
 def nothing_to_end() -> None:
     """The command has ended: a signal changes nothing, but for who does not end by himself."""
-    for number in _SIGNALS:
+    for number in _answered():
         signal.signal(number, _pass_over)
 
 
@@ -135,7 +140,7 @@ def stop_flag() -> Iterator[Callable[[], bool]]:
             _ignore_further()
             raise KeyboardInterrupt
 
-    before = {n: signal.signal(n, handle) for n in _SIGNALS}
+    before = {n: signal.signal(n, handle) for n in _answered()}
     try:
         yield was_asked
     finally:

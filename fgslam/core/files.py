@@ -12,7 +12,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError, FgslamError, OutputError
@@ -124,10 +124,8 @@ def require_writable(folder: Path) -> None:
 
 
 def _remove_quietly(path: Path) -> None:
-    try:
+    with suppress(OSError):
         path.unlink(missing_ok=True)
-    except OSError:
-        return
 
 
 def make_subfolder(run: Path, name: str) -> Path:
@@ -138,13 +136,19 @@ def make_subfolder(run: Path, name: str) -> Path:
     return folder
 
 
+def remove_file(path: Path) -> None:
+    """Removes a file, if it is there. Raises OutputError."""
+    with clear_output_errors(path):
+        path.unlink(missing_ok=True)
+
+
 def remove_files(folder: Path, pattern: str) -> None:
     """Removes files of a folder, and the folder once it is empty. Raises OutputError."""
     for path in folder.glob(pattern):
-        with clear_output_errors(path):
-            path.unlink(missing_ok=True)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+        remove_file(path)
+    with clear_output_errors(folder):
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 # --------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import os
 import platform
+from contextlib import suppress
 from pathlib import Path
 
 from fgslam.core.errors import OutputError
@@ -37,8 +38,10 @@ class Owner:
 
     def __exit__(self, *error: object) -> None:
         if self._file is not None:
-            # Before the lock goes: who opens the name after that makes a file of its own.
-            self._path.unlink(missing_ok=True)
+            # Before the lock goes: who opens the name after that makes a file of its own. What
+            # cannot be removed any more is taken over, and hides no error that was the reason.
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)
             os.close(self._file)
             self._file = None
 

@@ -80,6 +80,7 @@ class FrameDescriber:
         """Takes any extractor; threads start with the first frame."""
         self._extract = extract
         self._pool: ThreadPoolExecutor | None = None
+        self._reference: tuple[Frame, _Timed] | None = None
 
     def describe(self, i: int, frame: Frame | None) -> FeatureFrame:
         """Frame ``i`` with its features; without images (None) it has none."""
@@ -92,16 +93,25 @@ class FrameDescriber:
             return found
         if self._pool is None:
             self._pool = ThreadPoolExecutor(len(frame.images))
-        timed = partial(_timed, self._extract)
-        tasks = [self._pool.submit(timed, *view) for view in _views(frame)]
+        timed, known = partial(_timed, self._extract), self._known(frame)
+        views = list(_views(frame))[len(known) :]
+        tasks = [*known, *(self._pool.submit(timed, *view) for view in views)]
         return _Pending(found.i, frame, "", found.load_ms, tasks).finish()
 
     def of_reference(self, found: FeatureFrame) -> FeatureFrame:
         """The frame with the features of its reference image alone, unless it has any."""
         if found.frame is None or found.features:
             return found
-        features, ms = _timed(self._extract, *next(iter(_views(found.frame))))
+        if not self._known(found.frame):
+            done = _Timed()
+            done.set_result(_timed(self._extract, *next(iter(_views(found.frame)))))
+            self._reference = found.frame, done
+        ((features, ms),) = (known.result() for known in self._known(found.frame))
         return replace(found, features=(features,), sift_ms=ms)
+
+    def _known(self, frame: Frame) -> list[_Timed]:
+        """The features of a frame's reference image, where no other was asked for since."""
+        return [self._reference[1]] if self._reference and self._reference[0] is frame else []
 
     def close(self) -> None:
         """Ends the threads."""
@@ -163,6 +173,9 @@ class FeatureStream:
         return _Pending(i, frame, "", load_ms, tasks)
 
 
+_Timed: TypeAlias = Future[tuple[Features, float]]
+"""An image's features, and how long it took to find them."""
+
 _Margin: TypeAlias = npt.NDArray[np.float32] | None
 
 
@@ -219,7 +232,7 @@ class _Pending:
     frame: Frame | None
     problem: str
     load_ms: float
-    tasks: list[Future[tuple[Features, float]]]
+    tasks: list[_Timed]
 
     def finish(self) -> FeatureFrame:
         results = [task.result() for task in self.tasks]

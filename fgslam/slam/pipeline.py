@@ -106,6 +106,7 @@ class SlamPipeline:
     submaps: SubMaps | None = None
     rewound: bool = False
     _ended: IntArray = field(default_factory=_nobody, init=False)
+    _tried: tuple[FeatureFrame, StereoFeatures] | None = field(default=None, init=False)
 
     def process(
         self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
@@ -170,7 +171,8 @@ class SlamPipeline:
         if found.frame is None or self._refused(found):
             return False
         first = self._described(dataclasses.replace(found, i=0), None, [])
-        return len(self._match_stereo(first).whole) >= least
+        self._tried = first, self._match_stereo(first)
+        return len(self._tried[1].whole) >= least
 
     def estimate(self) -> Estimate:
         """The estimator's, with the landmarks that are on disk, without those that have ended."""
@@ -261,6 +263,9 @@ class SlamPipeline:
     def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
         if found.frame is None:
             return StereoFeatures.empty()
+        tried, self._tried = self._tried, None
+        if tried and tried[0].frame is found.frame and tried[0].features is found.features:
+            return tried[1]
         if self.key_frames is not None and len(found.features) == 1:
             images, features = found.frame.images, found.features[0]
             return self.key_frames.stereo.match(images, features, self._correction())

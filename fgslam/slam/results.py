@@ -57,6 +57,7 @@ class RunRecorder:
 
     Attributes:
         left_out: frames before the first one, which saw too little to begin a map.
+        most_stereo: stereo matches of the frame that has the most.
     """
 
     log: MeasurementLog
@@ -67,6 +68,7 @@ class RunRecorder:
     stage_ms: list[FloatArray] = field(default_factory=list)
     frame_digests: list[int] = field(default_factory=list)
     left_out: int = 0
+    most_stereo: int = field(default=0, init=False)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -85,6 +87,7 @@ class RunRecorder:
         frame = report.found.frame
         self.frame_digests.append(0 if frame is None else frame.digest())
         self.rows.append(row)
+        self.most_stereo = max(self.most_stereo, row.stereo)
 
     def column(self, name: str) -> npt.NDArray[Any]:
         """One number of all frames."""
@@ -109,6 +112,7 @@ class RunRecorder:
         """Continues from :meth:`state` and the log of as many frames."""
         columns = [state[name].tolist() for name in FrameRow._fields]
         self.rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
+        self.most_stereo = max((row.stereo for row in self.rows), default=0)
         self.tracked_poses = list(state["tracked_poses"])
         self.online_poses = list(state["online_poses"])
         self.online_covariances = list(state["online_covariances"])

@@ -308,7 +308,7 @@ class Session:
         least, known = self.frontend.ego_motion.min_matches, self._usable(body)
         if not (self._movable and len(self)) or (known is not None and not known.turned):
             return False
-        if any(row.stereo >= least for row in self.recorder.rows):
+        if self.recorder.most_stereo >= least:
             return False
         return self.pipeline.founds(found, least)
 

@@ -123,7 +123,10 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         opened = _later(opened, before)
         sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
     arrival = None
-    notes: tuple[str, ...] = (left_out_note(before),) if run.frames_before else ()
+    left_out = run.frames_before
+    if given is not None and run.goes_on:
+        left_out = state.left_out_before(given)
+    notes: tuple[str, ...] = (left_out_note(left_out),) if left_out else ()
     if entry is not None and given is not None:
         arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
     session = Session(
@@ -135,7 +138,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         beginning=arrival,
     )
     _keep_on_disk(session, run)
-    session.recorder.left_out = run.frames_before
+    session.recorder.left_out = left_out
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
     if run.resumed:

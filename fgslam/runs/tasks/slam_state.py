@@ -14,7 +14,7 @@ from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import ConfigError, MapError, MeasurementLogError, OutputError
 from fgslam.core.estimates import Estimate
-from fgslam.core.files import remove_files, require_writable
+from fgslam.core.files import remove_file, remove_files, require_writable
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
@@ -137,13 +137,14 @@ def _part(state: StateArrays, part: str) -> StateArrays:
 
 def remove_checkpoint(folder: Path) -> None:
     """Drops the state once the run has finished, and what an estimator kept of it in files."""
-    (folder / STATE_FILE).unlink(missing_ok=True)
+    remove_file(folder / STATE_FILE)
     for name in (SUBMAPS_FOLDER, INPUTS_FOLDER):
         remove_files(folder / name, INPUTS)
 
 
 _LOG = "log/"
 _TIMES = "recorder/stage_ms"
+_LEFT_OUT = "frames_left_out"
 _SAME_SETTINGS = ("seed", "odometry", "frontend", "estimator")
 
 
@@ -208,16 +209,17 @@ def window(config: ExperimentConfig, given: GivenMap) -> ExperimentConfig:
             )
     start, stride = then["dataset"]["start"], then["dataset"]["stride"]
     after = start + stride * drive["frames"]
+    asked = start - stride * _frames_before(drive)
     same = {name: value for name, value in then["dataset"].items() if name not in ("start", "stop")}
     if any(now["dataset"].get(name) != value for name, value in same.items()):
         raise MapError(
             f"{where}: its run had another dataset; map.start continue needs the same one, "
             "map.start last does not"
         )
-    if config.dataset.start not in (start, after):
+    if config.dataset.start not in (asked, start, after):
         raise MapError(
             f"{where}: its run stopped before frame {after}; set dataset.start to {after}, or as "
-            f"it was, to {start}"
+            f"it was, to {asked}"
         )
     dataset = dataclasses.replace(config.dataset, start=start)
     return config.model_copy(update={"dataset": dataset})
@@ -256,6 +258,11 @@ def entered_by(given: GivenMap) -> dict[str, Any] | None:
     return _last_drive(given.saved).get("entered")
 
 
+def left_out_before(given: GivenMap) -> int:
+    """How many frames the run that is gone on with left out, before the first that began a map."""
+    return int(_last_drive(given.saved).get(_LEFT_OUT, 0))
+
+
 def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     """Takes the session up where it stopped. Raises MapError where its arrays do not fit."""
     session, where = given.saved.session, str(given.path)
@@ -278,6 +285,12 @@ def _settings_of(drive: dict[str, Any], where: str) -> dict[str, Any]:
             f"{where}: its run had settings that this fgslam does not know ({error}); use "
             "map.start last"
         ) from None
+
+
+def _frames_before(drive: dict[str, Any]) -> int:
+    """How many selected frames of a drive came before its first one."""
+    entered = drive.get("entered") or {}
+    return int(drive.get(_LEFT_OUT, 0)) + int(entered.get("frames_before", 0))
 
 
 def _last_drive(saved: SavedMap) -> dict[str, Any]:
@@ -329,6 +342,7 @@ def _drive(outputs: RunOutputs, estimate: Estimate) -> dict[str, Any]:
         "fgslam": __version__,
         "recording": {"name": outputs.sequence.name, "identity": outputs.sequence.identity},
         "frames": len(outputs.recorder),
+        _LEFT_OUT: outputs.recorder.left_out,
         "entered": None if entry is None else entry.as_values(),
         "estimator": outputs.pipeline.estimator.kind,
         "valid_hits": config.frontend.database.valid_hits,

@@ -14,6 +14,7 @@ from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import BatchSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
+from fgslam.backend.smoothers.held_landmarks import HeldLandmarks
 from fgslam.backend.smoothers.landmark_elimination import Eliminated
 from fgslam.backend.smoothers.sliding_window import SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother
@@ -196,6 +197,21 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
     went = np.linalg.norm(held.points - points, axis=1)[~ours & outside & (held.homes > 10)]
     assert went.min() > 0.01
     assert np.linalg.norm(window.landmarks.mean - mean, axis=1)[~inside].min() > 0.01
+
+
+def test_a_landmark_that_was_another_is_this_drive_s_and_goes_with_it() -> None:
+    held, all_of_them = HeldLandmarks(), np.arange(3)
+    for k in all_of_them.tolist():
+        held.enter(np.full(3, float(k)))
+        held.know(k, np.full(3, float(k)), np.eye(3), saved=True)
+    held.begin(np.array([1]), np.full((1, 3), 7.0))
+    assert held.saved.tolist() == [True, False, True]
+    begun = held.of(all_of_them)
+    np.testing.assert_array_equal(begun.points[1], begun.mean[1])
+    np.testing.assert_array_equal(begun.information[1], np.zeros((3, 3)))
+    held.left(begun, home=0)
+    held.carried_along(g.se3_exp(np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]))[None])
+    assert held.points[:, 0].tolist() == [0.0, 9.0, 2.0]
 
 
 def matched(increment: Increment, saved: IntArray) -> Increment:

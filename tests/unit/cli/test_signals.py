@@ -76,6 +76,30 @@ def test_ctrl_c_before_signals_are_answered_ends_without_a_traceback(
     assert ended(_BEFORE_IT_WATCHES, handler) == (status, "")
 
 
+_ONE_IGNORED = """
+import os, signal, sys
+ignored, sent = map(int, sys.argv[1:])
+signal.signal(ignored, signal.SIG_IGN)
+from fgslam.cli import signals
+signals.watch()
+with signals.stop_flag() as stopped:
+    os.kill(os.getpid(), sent)
+    print(stopped(), file=sys.stderr)
+signals.nothing_to_end()
+os.kill(os.getpid(), ignored)
+os._exit(signal.getsignal(ignored) is not signal.SIG_IGN)
+"""
+
+
+@pytest.mark.parametrize("number", _SIGNALS)
+def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored(
+    number: signal.Signals,
+) -> None:
+    (other,) = {*_SIGNALS} - {number}
+    assert ended(_ONE_IGNORED, int(number), int(number)) == (0, "False\n")
+    assert ended(_ONE_IGNORED, int(number), int(other)) == (0, "True\n")
+
+
 _WHILE_IT_STARTS_TO_WATCH = """
 import os, sys, threading
 from fgslam.cli.start import main

@@ -16,7 +16,7 @@ import fgslam.report
 import fgslam.runs
 from fgslam.core import files as whole_files
 from fgslam.core.errors import OutputError
-from fgslam.core.files import make_subfolder, replacing, write_bytes, write_text
+from fgslam.core.files import make_subfolder, remove_files, replacing, write_bytes, write_text
 from fgslam.runs.engine import is_finished
 from fgslam.runs.folder import create_run_folder, is_run_folder
 from fgslam.runs.units import UnitStore
@@ -54,6 +54,16 @@ def test_previous_version_stands_until_the_new_one_is_complete(tmp_path: Path) -
         assert target.read_text() == "old"
         assert partial.parent == target.parent
     assert target.read_text() == "new"
+
+
+def test_a_folder_that_cannot_be_removed_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_text(Path("a.txt"), "one")
+    with pytest.raises(OutputError, match=r"^cannot write \.: .*; choose another folder$"):
+        remove_files(Path(), "*.txt")  # a folder has no other name than this one for itself
+    assert not list(tmp_path.iterdir())
 
 
 def test_library_writers_see_their_suffix(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ import fgslam as fg
 from fgslam.core.arrays import Image
 from fgslam.core.features import Features
 from fgslam.frontend.settings import FrontendSettings
+from fgslam.frontend.stereo import StereoMatcher
 from fgslam.slam.factory import make_extractor
 
 BEGINS, FRAMES = 14, 22
@@ -79,15 +82,14 @@ def test_the_world_does_not_begin_with_images_that_are_not_used(recording: fg.Re
     slam.close()
 
 
-@pytest.mark.parametrize("fails_at", [1, 2])
 def test_an_extractor_that_fails_where_the_world_begins_takes_no_frame_away(
-    recording: fg.Recording, fails_at: int
+    recording: fg.Recording,
 ) -> None:
     extract, calls = make_extractor(FrontendSettings()), []
 
     def failing(image: Image) -> Features:
         calls.append(image.any())
-        if sum(calls) == fails_at:
+        if sum(calls) == 1:
             raise ZeroDivisionError
         return extract(image)
 
@@ -99,4 +101,33 @@ def test_an_extractor_that_fails_where_the_world_begins_takes_no_frame_away(
     assert len(slam.result().trajectory) == 1
     assert slam.track(t, images).status.value == "first"
     assert len(slam) == 1
+    assert sum(calls) == 2  # once for each time that the frame came
     slam.close()
+
+
+@pytest.mark.parametrize("tracking", ["sift", "hybrid"])
+def test_frames_before_the_world_begins_are_worked_on_once(
+    recording: fg.Recording, tracking: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    extract, calls, matched = make_extractor(FrontendSettings()), [], []
+    match = StereoMatcher.match_all
+
+    def counted(image: Image) -> Features:
+        calls.append(image)
+        return extract(image)
+
+    def match_counted(*given: Any) -> Any:
+        matched.append(given)
+        return match(*given)
+
+    monkeypatch.setattr(StereoMatcher, "match_all", match_counted)
+    slam = fg.Slam(recording.rig, frontend={"tracking": tracking}, features=counted)
+    images = recording[0][1]
+    assert images is not None
+    for k in range(1, 5):
+        slam.track(0.1 * k, tuple(np.full_like(image, k) for image in images))
+    slam.close()
+    assert slam.recorder.most_stereo == 0
+    first = 1 if tracking == "hybrid" else len(images)
+    assert len(calls) == first + 3 * len(images)
+    assert len(matched) == (3 if tracking == "hybrid" else 4)
