@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.video_frames import VideoFrames
 
 _UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
+
+_LASTING = 15  # frames over which films part, not only jitter: at most half of the film
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +59,16 @@ def moments_of(
 
 
 def _part(left: FloatArray, right: FloatArray) -> bool:
-    """Whether frames of one number come to lie nearer to frames of another one."""
+    """Whether frames of one number come to lie nearer to frames of another one, and stay there.
+
+    Single frames may be late: by the time alone they would lose their partners.
+    """
     count = min(len(left), len(right))
     if count < 2:
         return False
-    apart = np.abs(left[:count] - right[:count])
+    apart = sliding_window_view(left[:count] - right[:count], min(_LASTING, count // 2))
     step = min(times[-1] / (len(times) - 1) for times in (left, right))
-    return bool(apart.max() > 0.5 * step)
+    return bool(np.abs(np.median(apart, axis=1)).max() > 0.5 * step)
 
 
 def _differences(left: VideoFrames, right: VideoFrames) -> tuple[str, ...]:

@@ -114,6 +114,24 @@ def test_frames_of_two_films_that_drift_apart_are_paired_by_time(tmp_path: Path)
     assert len(opened(tmp_path, pairing_tolerance_ms=40.0)) > 3
 
 
+@pytest.mark.parametrize("missed", [False, True])
+def test_frames_whose_times_jitter_belong_together_by_number_until_one_is_missed(
+    tmp_path: Path, missed: bool
+) -> None:
+    """Each eighth frame of the right camera is late by 0.7 of a frame; then one is missed."""
+    calibrated(tmp_path)
+    for side, level in (("left", 20), ("right", 60)):
+        film(tmp_path / f"{side}.mp4", [view(level + 2 * k) for k in range(48)])
+    late = [358 if k % 8 == 3 else 0 for k in range(49)]  # 512 are 50 ms
+    lengths = [512 + late[k + 1] - late[k] for k in range(48)]
+    lengths[20] += 512 * missed
+    uneven(tmp_path / "right.mp4", lengths)
+    recording = opened(tmp_path)
+    how = "time" if missed else "number"
+    assert f"paired by their {how}:" in " ".join(recording.notes)
+    assert len(recording) == (41 if missed else 48)
+
+
 def test_films_of_other_rates_are_paired_by_time(tmp_path: Path) -> None:
     calibrated(tmp_path)
     film(tmp_path / "left.avi", [view(20 + 4 * k) for k in range(41)], 20.0)
