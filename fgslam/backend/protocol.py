@@ -136,8 +136,8 @@ class KeepsRecord(Protocol):
     def keep_record_in(self, folder: Path) -> None:
         """From now on what it was given is in files (INPUTS) of the folder, but the last frames.
 
-        Its state is then incomplete without them. Called before the first frame, and before it is
-        restored from a state of such a run.
+        Its state, whole before, is then incomplete without them. Called before the first frame,
+        and before it is restored from a state of such a run.
         """
         ...
 

@@ -49,6 +49,7 @@ class LagSmoother(Smoother):
         super().__init__(problem, solver)
         self._lag = solver
         self._away = np.empty(0, np.int64)  # identities, ascending
+        self._inputs.keep_in(None)
 
     @property
     def homes(self) -> IntArray:
@@ -113,7 +114,10 @@ class LagSmoother(Smoother):
         return self._doubt.added(found, aside.doubt_gain) if self._doubt.present else found
 
     def keep_record_in(self, folder: Path) -> None:
-        """From now on what it was given is in files of the folder, but for the last frames."""
+        """From now on what it was given is in files of the folder, but for the last frames.
+
+        Without: in a file that goes with the process, and its state is whole.
+        """
         self._inputs.keep_in(folder)
 
     def state(self) -> StateArrays:

@@ -1,7 +1,7 @@
 """What an estimator was given, frame by frame: the state of those that cannot show their inside.
 
 Of the tracking only what smoothers use is kept: pose, covariance, inliers, residuals, and whether
-the landmarks determined it. On a long drive all but the last frames can be in files.
+the landmarks determined it. On a long drive all but the last frames can be on disk.
 """
 
 from __future__ import annotations
@@ -14,11 +14,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.core.array_files import load_arrays, write_arrays
+from fgslam.backend.smoothers.input_blocks import BlockFiles, UnnamedBlocks
 from fgslam.core.arrays import FloatArray, StateArrays
-from fgslam.core.errors import EstimatorError, OutputError
+from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
-from fgslam.core.files import make_subfolder
 from fgslam.core.log_arrays import frames_of
 from fgslam.core.log_file import BLOCK
 from fgslam.core.measurement_log import MeasurementLog
@@ -26,7 +25,7 @@ from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.sensors import Sensor
 
 Input: TypeAlias = tuple[Increment, EgoMotion]
-_ON_DISK, _NUMBER = "blocks", "block"
+_ON_DISK = "blocks"
 
 
 class RecordedInputs:
@@ -35,20 +34,21 @@ class RecordedInputs:
     def __init__(self, sensor: Sensor) -> None:
         """None yet; all are kept in memory."""
         self._sensor = sensor
-        self._folder: Path | None = None
-        self._blocks = 0
+        self._blocks: BlockFiles | UnnamedBlocks | None = None
+        self._away = 0  # how many blocks
         self._last: list[Input] = []
         self._timestamps = array("d")
 
     def __len__(self) -> int:
         return len(self._timestamps)
 
-    def keep_in(self, folder: Path) -> None:
+    def keep_in(self, folder: Path | None) -> None:
         """From now on only the last few hundred frames are in memory, the others in the folder.
 
         It is made when needed. Files of a run before are written anew as this one gets there.
+        None: they are in a file without a name, or in memory where there is no room for it.
         """
-        self._folder = folder
+        self._blocks = UnnamedBlocks() if folder is None else BlockFiles(folder)
 
     def append(self, increment: Increment, tracking: EgoMotion) -> None:
         """Keeps one update's arguments.
@@ -56,20 +56,27 @@ class RecordedInputs:
         Raises:
             OutputError: a block of them cannot be written.
         """
-        if self._folder is not None and len(self._last) >= 2 * BLOCK:
-            make_subfolder(self._folder.parent, self._folder.name)
-            arrays = _arrays(self._sensor, self._last[:BLOCK])
-            write_arrays(self._file(self._blocks), arrays | {_NUMBER: np.array(self._blocks)})
-            self._blocks += 1
-            del self._last[:BLOCK]
+        if len(self._last) >= 2 * BLOCK:
+            self._put_away()
         self._timestamps.append(increment.timestamp)
         self._last.append((increment, tracking))
 
     def __iter__(self) -> Iterator[Input]:
         """Raises OutputError for a block that is missing, MeasurementLogError for a damaged one."""
-        for block in range(self._blocks):
-            yield from self._read(block)
+        yield from self._recalled(self._away)
         yield from self._last
+
+    def _put_away(self) -> None:
+        """The oldest block of those in memory, where another place was named."""
+        if self._blocks is None:
+            return
+        try:
+            self._blocks.write(self._away, _arrays(self._sensor, self._last[:BLOCK]))
+        except OSError:  # of the file without a name, which nobody asked for
+            self._last, self._blocks, self._away = list(self), None, 0
+        else:
+            self._away += 1
+            del self._last[:BLOCK]
 
     def timestamps(self) -> FloatArray:
         """(n,) seconds."""
@@ -87,10 +94,10 @@ class RecordedInputs:
             MeasurementLogError: it is damaged.
         """
         block, row = divmod(frame, BLOCK)
-        if block < self._blocks:
-            kept = self._arrays_of(block, ("wTc", "covariance"))
+        if self._blocks is not None and block < self._away:
+            kept = self._blocks.read(block, ("wTc", "covariance"))
             return Prediction(kept["wTc"][row], kept["covariance"][row])
-        tracking = self._last[frame - BLOCK * self._blocks][1]
+        tracking = self._last[frame - BLOCK * self._away][1]
         return Prediction(tracking.wTc, tracking.covariance)
 
     def motions(self) -> list[Odometry | None]:
@@ -99,8 +106,9 @@ class RecordedInputs:
 
     def state(self) -> StateArrays:
         """All of it as plain arrays; without what is in files, but for how many these are."""
-        on_disk = {_ON_DISK: np.array(self._blocks)} if self._folder is not None else {}
-        return _arrays(self._sensor, self._last) | on_disk
+        if isinstance(self._blocks, BlockFiles):
+            return _arrays(self._sensor, self._last) | {_ON_DISK: np.array(self._away)}
+        return _arrays(self._sensor, list(self))
 
     def recalled(self, state: StateArrays) -> Iterator[Input]:
         """Everything that :meth:`state` told of, in order, to be put in once more.
@@ -111,32 +119,19 @@ class RecordedInputs:
             MeasurementLogError: one is damaged.
         """
         blocks = int(state.get(_ON_DISK, 0))
-        for block in range(blocks):
-            yield from self._read(block)
-        yield from _inputs(state, "the smoother's saved state", blocks * BLOCK)
-
-    def _file(self, block: int) -> Path:
-        if self._folder is None:
+        if blocks and not isinstance(self._blocks, BlockFiles):
             raise EstimatorError(
                 "a part of the smoother's state is in files; name their folder with "
                 "keep_record_in before restore"
             )
-        return self._folder / f"{block:06d}.npz"
+        yield from self._recalled(blocks)
+        yield from _inputs(state, "the smoother's saved state", blocks * BLOCK)
 
-    def _read(self, block: int) -> list[Input]:
-        return _inputs(self._arrays_of(block), str(self._file(block)), block * BLOCK)
-
-    def _arrays_of(self, block: int, names: tuple[str, ...] | None = None) -> StateArrays:
-        """Those of these names, or all."""
-        path, wanted = self._file(block), None if names is None else (*names, _NUMBER)
-        arrays = load_arrays(path, wanted) if path.is_file() else {}
-        if int(arrays.get(_NUMBER, -1)) != block:
-            what = "holds other frames than its name says" if arrays else "is missing"
-            raise OutputError(
-                f"{path}: this file of the run {what}; restore the file, or start again with "
-                "--overwrite"
-            )
-        return arrays
+    def _recalled(self, blocks: int) -> Iterator[Input]:
+        """The inputs of the first blocks."""
+        if (kept := self._blocks) is not None:
+            for block in range(blocks):
+                yield from _inputs(kept.read(block), kept.name_of(block), block * BLOCK)
 
 
 def _arrays(sensor: Sensor, inputs: Sequence[Input]) -> StateArrays:
