@@ -134,14 +134,19 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     i = np.arange(len(a))
     j = np.argmin(squared, axis=1)
     best = squared[i, j]
-    mutual = np.argmin(squared, axis=0)[j] == i
     squared[i, j] = np.inf
-    keep = mutual & (best < ratio * ratio * squared.min(axis=1))
-    return i[keep], j[keep]
+    clear = best < ratio * ratio * squared.min(axis=1)
+    squared[i, j] = best
+    # Columns are slow to search: only those that somebody clearly wants.
+    i, j = i[clear], j[clear]
+    mutual = np.argmin(squared[:, j], axis=0) == i
+    return i[mutual], j[mutual]
 
 
 def _squared_distances(a: ByteArray, b: ByteArray) -> npt.NDArray[np.float32]:
     # Exact in float32: every sum of 128 products of bytes is below 2^24.
     x, y = a.astype(np.float32), b.astype(np.float32)
-    norms = np.einsum("ij,ij->i", x, x)[:, None] + np.einsum("ij,ij->i", y, y)
-    return np.asarray(norms - 2.0 * (x @ y.T), np.float32)
+    out = np.asarray((-2.0 * x) @ y.T, np.float32)
+    out += np.einsum("ij,ij->i", x, x)[:, None]
+    out += np.einsum("ij,ij->i", y, y)
+    return out
