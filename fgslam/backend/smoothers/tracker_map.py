@@ -67,18 +67,23 @@ class TrackerMap:
     def reported(self, answer: Solution) -> LandmarkMap:
         """The tracker's landmarks where the graph has them; those that wait, from their pose."""
         known = self._tracker.landmarks()
-        positions, covariances = np.empty((len(known), 3)), np.empty((len(known), 3, 3))
+        positions, covariances = known.positions.copy(), known.covariances.copy()
+        waiting: dict[int, list[tuple[int, Sighting]]] = {}
         for row, identity in enumerate(known.ids.tolist()):
             track = self._admission.tracks.get(identity)
             if track is None:
-                positions[row], covariances[row] = known.positions[row], known.covariances[row]
-            elif track.variable in answer.points:
+                continue
+            if track.variable in answer.points:
                 positions[row] = answer.points[track.variable]
                 covariances[row] = answer.point_covariances[track.variable]
             elif track.left_at is not None:
                 positions[row], covariances[row] = track.left_at
             else:
-                positions[row], covariances[row] = self._seen_from(answer, track.last)
+                waiting.setdefault(track.last.frame, []).append((row, track.last))
+        for frame, seen in waiting.items():
+            rows = [row for row, _ in seen]
+            found = self._seen_from(answer, frame, [sighting for _, sighting in seen])
+            positions[rows], covariances[rows] = found
         return LandmarkMap(known.ids.copy(), positions, covariances)  # theirs change later
 
     def _in_graph(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
@@ -110,10 +115,11 @@ class TrackerMap:
         self._anchors = anchors
         return np.concatenate(ids), np.concatenate(positions)
 
-    def _seen_from(self, answer: Solution, sighting: Sighting) -> tuple[FloatArray, FloatArray]:
-        """Position and covariance of a landmark from a single sighting."""
-        at, measured = sighting.frame, (sighting.measurement[None], sighting.covariance[None])
-        places, covariances = placed(
-            self._sensor, answer.poses[at], *measured, answer.pose_covariances[at]
-        )
-        return places[0], covariances[0]
+    def _seen_from(
+        self, answer: Solution, frame: int, sightings: list[Sighting]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Positions (k, 3) and covariances (k, 3, 3) of landmarks, each by one sighting of it."""
+        measured = np.array([sighting.measurement for sighting in sightings])
+        covariances = np.array([sighting.covariance for sighting in sightings])
+        pose_covariance = answer.pose_covariances[frame]
+        return placed(self._sensor, answer.poses[frame], measured, covariances, pose_covariance)
