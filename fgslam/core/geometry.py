@@ -283,8 +283,8 @@ def yaw_pitch_roll(wTc: FloatArray) -> tuple[float, float, float]:
 
 
 def transform_to_camera(wTc: FloatArray, points: FloatArray) -> FloatArray:
-    """World points (n, 3) in camera coordinates."""
-    return np.asarray((points - wTc[:3, 3]) @ wTc[:3, :3])
+    """World points (n, 3) in the coordinates of cameras ``wTc`` (..., 4, 4): (..., n, 3)."""
+    return np.asarray((points - wTc[..., None, :3, 3]) @ wTc[..., :3, :3])
 
 
 def transform_to_world(wTc: FloatArray, points: FloatArray) -> FloatArray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -178,7 +179,7 @@ def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
     for three cameras has variances 5/12, 5/12 and 3/4 against the paper's 1, 1 and 1.
     """
     if kind == "fused":
-        return np.asarray(np.linalg.pinv(pixel_model(cameras, ratio)), np.float64)
+        return partial_map(range(cameras), cameras, ratio)
     out = np.zeros((3, 2 * cameras))
     out[0, 0] = out[1, 1] = 1.0
     # Weights inverse to the variances; one half each where both baselines are equal.
@@ -191,15 +192,23 @@ def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
 
 
 def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:
-    """The map `fused` (3, 2 * seen) from the pixels of two cameras or more of a rig's.
+    """The map `fused` (3, 2 * seen) from the pixels of two cameras or more of a rig's; read only.
 
     Args:
         seen: which: 0 right, 1 left, 2 top.
         cameras: how many the rig has.
         ratio: :func:`vertical_to_horizontal`.
     """
+    return _fused_map(tuple(seen), cameras, ratio)
+
+
+@lru_cache(maxsize=64)
+def _fused_map(seen: tuple[int, ...], cameras: int, ratio: float) -> FloatArray:
+    """Inverted once: each frame asks for it several times."""
     model = pixel_model(cameras, ratio).reshape(cameras, 2, 3)[list(seen)]
-    return np.asarray(np.linalg.pinv(model.reshape(-1, 3)), np.float64)
+    out = np.asarray(np.linalg.pinv(model.reshape(-1, 3)), np.float64)
+    out.flags.writeable = False
+    return out
 
 
 def _horizontal_weight(ratio: float) -> float:

@@ -369,20 +369,23 @@ class EgoMotionSolver:
         )
 
     def image_residuals(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
-        """The paper's E (k,): distance of projection and measurement in the image; inf if behind.
+        """The paper's E (..., k), distance of projection and measurement in the image; inf behind.
 
-        Pixels; of a range-bearing sensor the angle in radians, range aside.
+        Of poses (..., 4, 4). Pixels; of a range-bearing sensor the angle in radians, range aside.
         """
         return self._measured(wTc, problem)[1]
 
     def _measured(self, wTc: FloatArray, problem: PoseProblem) -> tuple[FloatArray, FloatArray]:
-        """Residuals (k, 3), and distances (k,) in the image; inf if behind."""
-        points = transform_to_camera(wTc, problem.points)
+        """Residuals (..., k, 3), and distances (..., k) in the image; inf if behind."""
+        every = transform_to_camera(wTc, problem.points)
+        points = every.reshape(-1, 3)
         behind = ~in_front(self.sensor, points)
         points[behind] = (0.0, 0.0, 1.0)
-        residual = self._residual(points, problem.measurement)
-        distance = np.linalg.norm(residual[:, :2], axis=1)
-        return residual, np.where(behind, np.inf, distance)
+        measurement = np.broadcast_to(problem.measurement, every.shape).reshape(-1, 3)
+        residual = self._residual(points, measurement)
+        across, down = residual[:, 0], residual[:, 1]
+        distance = np.where(behind, np.inf, np.sqrt(across * across + down * down))
+        return residual.reshape(every.shape), distance.reshape(every.shape[:-1])
 
 
 def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:

@@ -74,7 +74,7 @@ class Resection:
         local = triangulate(self._solver.sensor, problem.measurement)
         chosen = self._samples(problem, local)
         poses = align(local[chosen], problem.points[chosen], floor)
-        agreeing = np.array([int(self._near(wTc, problem).sum()) for wTc in poses])
+        agreeing = self._near(poses, problem).sum(axis=1)
         return np.asarray(poses[np.argsort(-agreeing, kind="stable")[:_REFINED]])
 
     def _samples(self, problem: PoseProblem, local: FloatArray) -> IntArray:
@@ -90,7 +90,7 @@ class Resection:
         return np.asarray(drawn[keep if keep.any() else slice(None)][:_SAMPLES])
 
     def _near(self, wTc: FloatArray, problem: PoseProblem) -> BoolArray:
-        """(k,) matches that a pose from a few others agrees with."""
+        """(..., k) matches that poses (..., 4, 4) from a few others agree with."""
         near = _NEAR * self._solver.farthest
         return np.asarray(self._solver.image_residuals(wTc, problem) <= near)
 
