@@ -28,7 +28,8 @@ def contrast_share(image: Image) -> float:
     The grey levels that all but the darkest and the brightest hundredth of the pixels lie in. An
     image that fills two thirds of the scale has the share 1, one of half the light half of it.
     """
-    counts = np.cumsum(np.bincount(image.ravel(), minlength=_GREY_LEVELS))
+    levels = (_GREY_LEVELS,)
+    counts = np.cumsum(cv2.calcHist([image], [0], None, levels, (0, _GREY_LEVELS)), dtype=np.int64)
     low, high = np.searchsorted(counts, np.array(_TAILS) * image.size)
     return float(min(1.0, (high - low) / _FULL_RANGE))
 
