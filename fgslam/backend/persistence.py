@@ -8,11 +8,12 @@ or backwards as a drift of the camera would. docs/derivations/measurement_noise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from fgslam.backend.open_tracks import LONGEST, OpenTracks, Tracks, tracks_of
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import (
@@ -28,9 +29,6 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.sensors import Sensor
 
-LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
-LONGEST = 30  # sightings of a track, at which it is judged although it goes on
-ENDED_AFTER = 5  # frames without a sighting
 _EVERY = 5  # frames between judgements
 _ITERATIONS = 5
 _BENDS = 4.0  # deviations at which the weight of a residual falls while the place is fitted
@@ -42,13 +40,6 @@ STATED = np.array([30.0, 0.3])
 _BOUNDS = (0.05, 400.0)  # of variances over the stated ones
 _FITS = 3.2
 """Medians of an image residual within which 99.9 % lie that are normal in column and row."""
-
-
-@dataclass(slots=True)
-class _Track:
-    frames: list[int] = field(default_factory=list)
-    measurement: list[FloatArray] = field(default_factory=list)
-    covariance: list[FloatArray] = field(default_factory=list)
 
 
 class MeasurementNoise(Protocol):
@@ -112,7 +103,7 @@ class Persistence:
     def __init__(self, sensor: Sensor) -> None:
         """As stated, until tracks have ended."""
         self._sensor = sensor
-        self._tracks: dict[int, _Track] = {}
+        self._tracks = OpenTracks()
         self._pose = np.eye(4)
         self._poses: dict[int, FloatArray] = {}
         # Of single residuals and of leanings (rows) the sum of squares, and its expectation.
@@ -140,22 +131,13 @@ class Persistence:
         unmeasured step would: all tracks end before it.
         """
         if step is None:
-            self._judge(frame, list(self._tracks))
+            self._judge(frame, *self._tracks.take_all())
             step = np.eye(4)
         self._pose = reorthonormalise(self._pose @ step)
         self._poses[frame] = self._pose
-        measured = zip(
-            accepted.ids.tolist(), accepted.measurement, accepted.covariance, strict=True
-        )
-        for identity, measurement, covariance in measured:
-            track = self._tracks.get(identity)
-            if track is None:
-                track = self._tracks[identity] = _Track()
-            track.frames.append(frame)
-            track.measurement.append(measurement)
-            track.covariance.append(covariance)
+        self._tracks.add(frame, accepted)
         if frame % _EVERY == 0:
-            self._judge(frame, [i for i, track in self._tracks.items() if _over(track, frame)])
+            self._judge(frame, *self._tracks.take_ended(frame))
 
     def smoothed(self, frames: list[int], poses: FloatArray) -> None:
         """Takes in how the latest frames lie to each other, for tracks that are still to be judged.
@@ -172,18 +154,12 @@ class Persistence:
 
     def state(self) -> StateArrays:
         """Everything needed to continue; sightings of the open tracks one after the other."""
-        tracks = self._tracks.values()
-        return {
+        return self._tracks.state() | {
             "sums": self._sums.copy(),
             "expected": np.array(self._expected),
             "pose": self._pose,
             "pose_frames": np.array(list(self._poses), np.int64),
             "poses": np.array(list(self._poses.values())).reshape(-1, 4, 4),
-            "ids": np.array(list(self._tracks), np.int64),
-            "counts": np.array([len(track.frames) for track in tracks], np.int64),
-            "frames": np.array([k for track in tracks for k in track.frames], np.int64),
-            "measurement": np.array([z for t in tracks for z in t.measurement]).reshape(-1, 3),
-            "covariance": np.array([c for t in tracks for c in t.covariance]).reshape(-1, 3, 3),
         }
 
     def restore(self, state: StateArrays) -> None:
@@ -191,32 +167,20 @@ class Persistence:
         self._sums, self._pose = state["sums"].copy(), state["pose"]
         self._expected = float(state["expected"])
         self._poses = dict(zip(state["pose_frames"].tolist(), state["poses"], strict=True))
-        ends = np.cumsum(state["counts"])
-        self._tracks = {
-            i: _Track(
-                state["frames"][end - count : end].tolist(),
-                list(state["measurement"][end - count : end]),
-                list(state["covariance"][end - count : end]),
-            )
-            for i, count, end in zip(
-                state["ids"].tolist(), state["counts"].tolist(), ends.tolist(), strict=True
-            )
-        }
+        self._tracks.restore(state)
 
     def _ratio(self, which: int) -> float:
         squares, expectation = self._sums[which]
         squares += STATED[which] * (self._expected - 1.0)
         return float(np.clip(squares / expectation, *_BOUNDS))
 
-    def _judge(self, frame: int, ended: list[int]) -> None:
-        tracks = [self._tracks.pop(i) for i in ended]
-        tracks = [track for track in tracks if len(track.frames) >= LEAST_SIGHTINGS]
-        if tracks:
-            sightings = _Sightings.of(tracks, self._poses)
-            fitted = sightings.fitted(self._sensor)
+    def _judge(self, frame: int, ended: StateArrays, counts: IntArray) -> None:
+        """Tracks of so many sightings (m,) that were taken out."""
+        if len(counts):
+            fitted = _Sightings.of(ended, counts, self._poses).fitted(self._sensor)
             if fitted is not None:
                 self._sums += fitted.powers()
-        first = min((track.frames[0] for track in self._tracks.values()), default=frame)
+        first = self._tracks.first_frame(frame)
         self._poses = {k: wTc for k, wTc in self._poses.items() if k >= first}
 
 
@@ -268,38 +232,6 @@ def _inverses(normal: FloatArray) -> FloatArray:
     return found
 
 
-def _over(track: _Track, frame: int) -> bool:
-    return len(track.frames) >= LONGEST or frame - track.frames[-1] > ENDED_AFTER
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracks:
-    """Sightings (n) of m tracks, one track after the other; ``start`` (m,): each one's first."""
-
-    start: IntArray
-    sightings: int
-
-    @property
-    def counts(self) -> IntArray:
-        """(m,) sightings of each track."""
-        return np.diff(np.append(self.start, self.sightings))
-
-    @property
-    def track(self) -> IntArray:
-        """(n,) which track each sighting belongs to."""
-        return np.repeat(np.arange(len(self.start)), self.counts)
-
-    def select(self, kept: BoolArray) -> Tracks:
-        """Those of a mask (m,)."""
-        return tracks_of(self.counts[kept])
-
-
-def tracks_of(counts: IntArray) -> Tracks:
-    """Tracks of so many sightings (m,)."""
-    ends = np.cumsum(counts)
-    return Tracks(ends - counts, int(counts.sum()))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sightings:
     """All sightings (n) of m tracks.
@@ -317,13 +249,11 @@ class _Sightings:
     tracks: Tracks
 
     @staticmethod
-    def of(tracks: list[_Track], poses: dict[int, FloatArray]) -> _Sightings:
-        counts = np.array([len(track.frames) for track in tracks])
-        covariance = np.concatenate([track.covariance for track in tracks])
+    def of(seen: StateArrays, counts: IntArray, poses: dict[int, FloatArray]) -> _Sightings:
         return _Sightings(
-            inverse(np.array([poses[k] for track in tracks for k in track.frames])),
-            np.concatenate([track.measurement for track in tracks]),
-            np.linalg.inv(np.linalg.cholesky(covariance)),
+            inverse(np.array([poses[k] for k in seen["frame"].tolist()])),
+            seen["measurement"],
+            np.asarray(np.linalg.inv(np.linalg.cholesky(seen["covariance"])), np.float64),
             tracks_of(counts),
         )
 

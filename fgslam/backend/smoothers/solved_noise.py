@@ -10,15 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.backend.persistence import (
-    ENDED_AFTER,
-    LEAST_SIGHTINGS,
-    LONGEST,
-    STATED,
-    Fitted,
-    Tracks,
-    tracks_of,
-)
+from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, Tracks, tracks_of
+from fgslam.backend.persistence import STATED, Fitted
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import BoolArray, IntArray
 from fgslam.factors.graphs import number
