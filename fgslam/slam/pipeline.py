@@ -153,6 +153,8 @@ class SlamPipeline:
         stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
         self.tracker.noise.learn(seen.tracking)
+        if described is not None and self.watch is not None:
+            self._look_for_other_motion(index, described, seen, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")
         if self.calibration is not None:
@@ -185,12 +187,14 @@ class SlamPipeline:
 
     def state(self) -> StateArrays:
         """What the loop itself keeps between frames."""
-        return {"ended": self._ended} | self.tracker.noise.state()
+        tracker = self.tracker
+        return {"ended": self._ended} | tracker.noise.state() | tracker.other_motion.state()
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`; the parts have states of their own."""
         self._ended = state["ended"]
         self.tracker.noise.restore(state)
+        self.tracker.other_motion.restore(state)
 
     @property
     def book(self) -> LandmarkBook:
@@ -199,8 +203,9 @@ class SlamPipeline:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is to be said of landmarks on disk."""
-        return () if self.submaps is None else self.submaps.remarks
+        """What is to be said of landmarks on disk, and of frames that show two motions."""
+        on_disk = () if self.submaps is None else self.submaps.remarks
+        return (*self.tracker.other_motion.remarks(), *on_disk)
 
     def _before(self, found: FeatureFrame) -> _Before:
         """What a frame changes until its features are found, where it came without."""
@@ -345,6 +350,14 @@ class SlamPipeline:
             return seen
         loops = self.places.look(seen.tracking.wTc, landmarks, stereo, seen.association)
         return dataclasses.replace(seen, loops=loops)
+
+    def _look_for_other_motion(
+        self, index: int, stereo: StereoFeatures, seen: _Seen, stats: UpdateStats
+    ) -> None:
+        """Whether the features that the map does not explain move rigidly, too."""
+        association = seen.association
+        known = association.partners(len(stereo)), association.known
+        self.tracker.other_motion.look(index, stereo, known, seen.tracking, stats.wTc)
 
     def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
         self.tracker.parts.book(increment, stats.closed)

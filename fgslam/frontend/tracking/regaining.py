@@ -24,7 +24,7 @@ from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.frontend.tracking.resection import Resection, sample_size
 
 _LATELY = 10  # frames before the last sighting whose landmarks are looked for
-_FALSE_POSES = 1e-6  # poses by chance that are allowed in a frame
+FALSE_POSES = 1e-6  # poses by chance that are allowed in a frame
 
 
 class Regainer:
@@ -76,7 +76,7 @@ class Regainer:
     def _certain(self, found: EgoMotion, problem: PoseProblem) -> bool:
         agreeing = places(problem.measurement[found.inliers, :2], self._solver.farthest)
         size = sample_size(self._solver.floor)
-        if log_false_poses(len(problem), agreeing, size, self._by_chance) > math.log(_FALSE_POSES):
+        if log_false_poses(len(problem), agreeing, size, self._by_chance) > math.log(FALSE_POSES):
             return False
         return 2 * self._resection.rival(problem, found) <= int(found.inliers.sum())
 

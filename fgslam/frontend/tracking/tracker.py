@@ -24,6 +24,7 @@ from fgslam.frontend.tracking.map_matching import (
     predicted_covariance,
 )
 from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.other_motion import OtherMotion
 from fgslam.frontend.tracking.regaining import Regainer
 from fgslam.frontend.tracking.resection import Resection
 
@@ -62,6 +63,11 @@ class Association:
         out[self.features[taken]] = self.observations.ids[taken]
         return out
 
+    @property
+    def known(self) -> IntArray:
+        """Identities of the landmarks that were seen again."""
+        return self.observations.ids[~self.rejected & ~self.observations.is_new]
+
     @staticmethod
     def nothing() -> Association:
         """Association of a frame without images: nothing matched, nothing missed."""
@@ -96,6 +102,7 @@ class LandmarkTracker:
         self.noise = ego_motion.noise
         self.resection = Resection(ego_motion)
         self.parts = MapParts()
+        self.other_motion = OtherMotion(rig, ego_motion)
         self._regainer = Regainer(rig, database, ego_motion, self.parts)
 
     def track(
