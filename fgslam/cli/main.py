@@ -226,9 +226,18 @@ app.command()(routes.route)
 
 
 @app.command()
-def localize(
+def localize(  # noqa: PLR0913 - each option is a parameter
     map_file: options.SavedMap,
     recording: options.Recording,
+    camera: options.Camera = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    fps: options.Fps = None,
+    scale: options.Scale = None,
+    unit: options.Unit = None,
+    view: options.View = None,
+    topics: options.Topics = None,
     frame: Annotated[
         int | None,
         typer.Option(min=0, help="the recording's frame to locate; default all, one by one"),
@@ -250,9 +259,13 @@ def localize(
     from fgslam.runs.tasks.localisation import Wanted
     from fgslam.runs.tasks.localisation import localize as locate
 
-    wanted = Wanted(
-        map_file, recording, tuple(overrides or ()), frame, frames, out, existing_folder(overwrite)
+    chosen = options.of_recording(
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
     )
+    wanted = Wanted(
+        map_file, recording, (*(overrides or ()), *chosen), frame, frames, out,
+        existing_folder(overwrite), camera,
+    )  # fmt: skip
     with under_way() as (progress, stopped):
         result = locate(wanted, progress, stopped)
     show_all([result])

@@ -66,7 +66,7 @@ def test_every_frame_with_files_that_repeat_the_run(
     monkeypatch: pytest.MonkeyPatch, recording: Path, map_file: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "found"
-    four = ("--set", "dataset.start=2", "--set", "dataset.stop=6")
+    four = ("--start", 2, "--stop", 6)
     assert main(monkeypatch, "localize", map_file, recording, *four, "--out", out) == 0
     rows = rows_of(out)
     assert [int(row["frame"]) for row in rows] == [2, 3, 4, 5]
@@ -125,7 +125,7 @@ def test_nothing_to_see_is_refused_not_an_error(
         (("--frame", 99), "--frame 99: "),
         (("--frame", 12, "--frames", 3), "ends with frame 11; choose a smaller one"),
         (("--frame", 1, "--frames", 3), "--frame 1: too few frames before it"),
-        (("--frame", 3, "--set", "dataset.stride=2"), "--frame 3: not among the frames selected"),
+        (("--frame", 3, "--stride", 2), "--frame 3: not among the frames selected"),
         (("--frames", 13), "12 frames are selected, and a query takes 13"),
         (("--set", "localisation.fame=3"), "unknown key localisation.fame"),
     ],
@@ -167,8 +167,12 @@ def test_wrong_maps_and_recordings_are_reported(
     values = {"name": "m", "dataset": {"kind": "simulated_measurements"}}
     measured.write_text(yaml.safe_dump(values), encoding="utf-8")
     assert "measurements have no appearance" in line(map_file, measured)
-    write_calibration(own_recording, baseline_m=0.2)
-    assert "another rig (baseline 0.1" in line(map_file, own_recording)
+    camera = ("--camera", own_recording / "calib.json")
+    assert "it is dataset.camera_file" in line(map_file, measured, *camera)
+    (tmp_path / "wider").mkdir()
+    write_calibration(tmp_path / "wider", baseline_m=0.2)
+    wider = ("--camera", tmp_path / "wider" / "calib.json")
+    assert "another rig (baseline 0.1" in line(map_file, own_recording, *wider)
 
 
 def test_a_map_that_is_made_first_and_one_that_is_there_answer_alike(

@@ -20,7 +20,7 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.localisation import localisation_errors
-from fgslam.runs.bare_recording import dataset_of
+from fgslam.runs.bare_recording import dataset_of, require_no_camera
 from fgslam.runs.config import (
     ExperimentConfig,
     as_task,
@@ -108,6 +108,7 @@ class Wanted:
         frames: of a query: 1, or a short submap of so many.
         out: folder of the results; None: none are written.
         existing: what to do where it holds a run already.
+        camera: calibration of a recording, in place of its own.
     """
 
     map_file: Path
@@ -117,6 +118,7 @@ class Wanted:
     frames: int = 1
     out: Path | None = None
     existing: ExistingFolder = "refuse"
+    camera: Path | None = None
 
 
 @one_blas_thread()
@@ -165,6 +167,7 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
     """The experiment's settings for queries in this map; of a folder those that made the map."""
     where = str(wanted.recording)
     if wanted.recording.suffix.lower() in _YAML:
+        require_no_camera(wanted.recording, wanted.camera)
         given = load_experiment(wanted.recording, wanted.overrides)
         if not isinstance(given, ExperimentConfig | LocalisationConfig):
             load_config(wanted.recording)  # says which task this cannot do
@@ -174,7 +177,7 @@ def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
     else:
         values = {
             "name": "localize",
-            "dataset": dataset_of(wanted.recording, None, wanted.overrides),
+            "dataset": dataset_of(wanted.recording, wanted.camera, wanted.overrides),
             "odometry": {"kind": "recorded"},
             "frontend": settings_of_map(saved).get("frontend", {}),
         }
@@ -253,7 +256,7 @@ def _of_one_frame(config: LocalisationConfig, wanted: Wanted) -> LocalisationCon
     if frame < dataset.start or not selected or (dataset.stop or frame + 1) <= frame:
         raise ConfigError(
             f"--frame {frame}: not among the frames selected (start {dataset.start}, stop "
-            f"{dataset.stop}, stride {dataset.stride}); choose another, or --set dataset.start=..."
+            f"{dataset.stop}, stride {dataset.stride}); choose another, or other --start, ..."
         )
     if first < dataset.start:
         raise ConfigError(
