@@ -13,6 +13,7 @@ import numpy as np
 
 from fgslam.core.array_files import ArrayFile
 from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.geometry import is_rigid
 
 _ROUNDED = 1e-9
 """Of a covariance's trace: what rounding may take from its smallest eigenvalue."""
@@ -47,6 +48,13 @@ def require_covariances(
     if wrong.any():
         row = int(np.argmax(wrong))
         raise _refusal(file, where, f"array {name}, row {row}, is no covariance")
+
+
+def require_motions(file: ArrayFile, name: str, motions: FloatArray, where: str) -> None:
+    """Raises the file's error unless all of (n, 4, 4) are rigid motions."""
+    wrong = [not is_rigid(motion) for motion in motions]
+    if any(wrong):
+        raise _refusal(file, where, f"array {name}, row {wrong.index(True)}, is no rigid motion")
 
 
 def require_single(file: ArrayFile, name: str, ids: IntArray, start: IntArray, where: str) -> None:

@@ -21,7 +21,12 @@ from fgslam.core.array_files import (
     rows_of,
     split,
 )
-from fgslam.core.array_values import require_covariances, require_finite, require_single
+from fgslam.core.array_values import (
+    require_covariances,
+    require_finite,
+    require_motions,
+    require_single,
+)
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.log_layout import (
@@ -188,8 +193,8 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
         header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
     sensor = header.get("sensor")
     keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
-    given = set(sensor or ()) - ({_EXACT, _VIEW} if keys is _RIG else set())
-    if keys is None or given != {"kind", *keys}:
+    given = set(sensor if isinstance(sensor, dict) else ())
+    if keys is None or given - ({_EXACT, _VIEW} if keys is _RIG else set()) != {"kind", *keys}:
         raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
     if not isinstance(header.get("motion"), dict):
         raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")
@@ -225,6 +230,7 @@ def _require_sound(arrays: StateArrays, where: str) -> None:
     known = ~np.isnan(arrays["odometry_motion"][:, 0, 0])
     motions = {"odometry_motion": _with_translation(arrays["odometry_motion"][known])}
     require_finite(LOG, motions, ("odometry_motion",), where)
+    require_motions(LOG, "odometry_motion", motions["odometry_motion"], where)
     moved = arrays["odometry_covariance"][known]
     require_covariances(LOG, "odometry_covariance", moved, where, definite=False)
     ids, start = arrays["observation_id"], arrays["observation_start"]

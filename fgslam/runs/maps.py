@@ -216,13 +216,15 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
 
     Raises:
         MapError: one is no map, another rig made it, they do not overlap or that is ambiguous, or
-            ``out`` is there already.
+            ``out`` is there already, or one of the two.
         OutputError: the map cannot be written.
     """
     # Not before: no run merges maps, and these load much of SciPy.
     from fgslam.frontend.places.map_alignment import align_maps
     from fgslam.frontend.places.map_fusion import adds_nothing, merge_maps
 
+    if out.resolve() in (first.resolve(), second.resolve()):
+        raise MapError(f"{out}: is merged, and would be lost; choose another --out")
     if out.exists() and not overwrite:
         raise MapError(f"{out}: is there already; choose another --out, or add --overwrite")
     a, b = load_map(first), load_map(second)

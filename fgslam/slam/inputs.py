@@ -11,13 +11,14 @@ import numpy.typing as npt
 
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import FrameError, OdometryError
+from fgslam.core.errors import ConfigError, FrameError, OdometryError
 from fgslam.core.geometry import is_rigid
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry import pose_noise
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.frontend.features.images import grey_image
+from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.motion import MotionModel
 
 Images: TypeAlias = Sequence[npt.ArrayLike]
@@ -25,6 +26,16 @@ Images: TypeAlias = Sequence[npt.ArrayLike]
 
 _NAMES = ("left", "right", "top")
 _SYMMETRY = 1e-6  # relative: covariances that were added up in another order
+
+
+def checked_extractor(features: FeatureExtractor | None) -> FeatureExtractor | None:
+    """Raises ConfigError for what cannot be called."""
+    if features is not None and not callable(features):
+        raise ConfigError(
+            f"features: {type(features).__name__} cannot be called; give a function from an image "
+            "to fgslam.Features, or None for SIFT"
+        )
+    return features
 
 
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:

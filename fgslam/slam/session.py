@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -17,8 +16,9 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core.arrays import FloatArray
-from fgslam.core.checks import later_time, require_seed
+from fgslam.core.checks import is_finite_number, later_time, require_seed
 from fgslam.core.errors import ConfigError, FrameError, SessionError
+from fgslam.core.files import named_folder
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
@@ -44,7 +44,7 @@ from fgslam.slam.feature_stream import (
     undescribed,
 )
 from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
-from fgslam.slam.inputs import Images, checked_images, checked_odometry
+from fgslam.slam.inputs import Images, checked_extractor, checked_images, checked_odometry
 from fgslam.slam.motion import MotionModel, description_of
 from fgslam.slam.part_remarks import left_out_note, part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -138,7 +138,7 @@ class Session:
         self._movable = beginning is None and own
         if isinstance(beginning, MapStart):
             beginning = self._begun(beginning, chosen, seed)
-        self._describer = FrameDescriber(features or make_extractor(frontend))
+        self._describer = FrameDescriber(checked_extractor(features) or make_extractor(frontend))
         self.pipeline = self._made(beginning)
         self.recorder = RunRecorder(MeasurementLog(rig, description_of(self.pipeline.motion)))
         self._join_log()
@@ -173,7 +173,7 @@ class Session:
         self._locate = make_locator(self.rig, self.frontend, start.saved, seed)
         return start.at(np.eye(4), relocalised=True)
 
-    def keep_near(self, radius_m: float, folder: Path | None = None) -> None:
+    def keep_near(self, radius_m: float, folder: str | Path | None = None) -> None:
         """Keeps in memory only landmarks near the robot; the others wait on disk until needed.
 
         What is tracked, and every result, is of the whole map. Called before the first frame.
@@ -185,35 +185,38 @@ class Session:
 
         Raises:
             ConfigError: the radius is not positive, or the estimator keeps all landmarks.
+            OutputError: the folder is none.
             SessionError: frames have been tracked already.
         """
         if len(self) or self._left_out.count:
             raise SessionError("keep_near comes before the first frame; make a new session")
-        if not 0.0 < radius_m < math.inf:
-            raise ConfigError(f"active radius {radius_m} m: give a positive number of metres")
+        if not is_finite_number(radius_m) or radius_m <= 0.0:
+            raise ConfigError(f"active radius {radius_m!r}: give a positive number of metres")
         from fgslam.slam.submaps.memory import ActiveArea, require_sets_aside
 
         require_sets_aside(self.pipeline.estimator)
         resumable = folder is not None
-        if folder is None:
+        if folder is not None:
+            folder = named_folder(folder)
+        else:
             self._scratch = TemporaryDirectory(prefix="fgslam-submaps-")
             folder = Path(self._scratch.name) / "submaps"
         self._area = ActiveArea(radius_m, folder, resumable)
         self._near(self.pipeline)
 
-    def keep_log(self, folder: Path) -> None:
+    def keep_log(self, folder: str | Path) -> None:
         """Keeps all but the last frames of the log in a folder of its own, for a long drive.
 
         It is read from there where it is needed: replays and :meth:`MeasurementLog.save` give the
         same. Blocks of an earlier log go. Called before the first frame.
 
         Raises:
-            OutputError: blocks of an earlier log cannot be removed.
+            OutputError: that is no folder, or blocks of an earlier log cannot be removed.
             SessionError: frames have been tracked already.
         """
         if len(self):
             raise SessionError("keep_log comes before the first frame; make a new session")
-        self.log.keep_in(folder)
+        self.log.keep_in(named_folder(folder))
 
     def _join_log(self) -> None:
         if self.pipeline.places is not None:

@@ -15,6 +15,7 @@ from simulated import assert_same_bits
 from fgslam.core import geometry as g
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError
+from fgslam.core.geometry import se3_exp
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import (
     BiasEffect,
@@ -34,11 +35,11 @@ def increment(k: int, rng: np.random.Generator, seen: int, with_odometry: bool) 
     noise = rng.standard_normal((seen, 3, 3))
     covariance = noise @ np.swapaxes(noise, 1, 2)
     covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2.0 + 0.1 * np.eye(3)
-    step = rng.standard_normal((6, 6))
+    step, motion = rng.standard_normal((6, 6)), se3_exp(rng.standard_normal(6))
     return Increment(
         index=3 * k,
         timestamp=0.1 + k / 3.0,
-        odometry=Odometry(rng.standard_normal((4, 4)), step @ step.T) if with_odometry else None,
+        odometry=Odometry(motion, step @ step.T) if with_odometry else None,
         observations=Observations(
             rng.permutation(1000)[:seen].astype(np.int64),
             rng.standard_normal((seen, 3)),
@@ -210,6 +211,7 @@ def test_another_version_is_refused(file: Path, version: object) -> None:
     "change",
     [
         {"sensor": None},
+        {"sensor": 7},
         {"sensor": {"kind": "stereo", "width": 3}},
         {"sensor": {"kind": "sonar", "max_range_m": 3.0}},
         {"version": 1},
@@ -435,6 +437,7 @@ def spoilt(file: Path, name: str, at: object, value: object) -> Path:
         ("odometry_covariance", (1, 0, 0), -1.0, "array odometry_covariance, row 0, is no"),
         ("odometry_covariance", (1, 0, 1), 1e6, "array odometry_covariance, row 0, is no"),
         ("odometry_motion", (1, 2, 2), np.inf, "array odometry_motion is not finite"),
+        ("odometry_motion", 1, 2.0 * np.eye(4), "array odometry_motion, row 0, is no rigid"),
         ("rig_bTc", (0, 0), 7.0, "the log's rig cannot be one: bTc must be a rigid motion"),
     ],
 )

@@ -74,6 +74,8 @@ def test_the_last_axis_turns_fastest_and_experiments_slowest() -> None:
 
 
 def test_grids_that_cannot_be_told_apart_or_done_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"map\.save: a sweep saves no map; leave it out"):
+        Grid((), read_axes(["map.save=a.fgmap,b.fgmap"]))
     one = Source("x", VALUES, "x")
     with pytest.raises(ConfigError, match="two experiments are called x"):
         Grid((one, one), ())

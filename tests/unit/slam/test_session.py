@@ -26,6 +26,7 @@ from fgslam.core.errors import (
     FgslamError,
     FrameError,
     OdometryError,
+    OutputError,
     SessionError,
 )
 from fgslam.core.estimates import EgoMotionStatus, Prediction
@@ -479,6 +480,23 @@ def test_an_impossible_rig_is_refused(change: dict[str, Any], words: str) -> Non
 def test_a_negative_seed_is_refused() -> None:
     with pytest.raises(ConfigError, match="seed is -1; give a whole number"):
         Session(RIG, seed=-1)
+
+
+def test_what_is_no_extractor_radius_or_folder_is_refused(tmp_path: Path) -> None:
+    given: Any = 5
+    with pytest.raises(ConfigError, match="features: int cannot be called; give a function"):
+        Session(RIG, features=given)
+    slam, file, number = Session(RIG, "landmark_kalman"), tmp_path / "file", "5"
+    file.touch()
+    for radius in (number, 0.0, float("nan")):
+        with pytest.raises(ConfigError, match="give a positive number of metres"):
+            slam.keep_near(radius)  # type: ignore[arg-type]
+    for keep in (slam.keep_log, lambda folder: slam.keep_near(50.0, folder)):
+        with pytest.raises(OutputError, match="it is not a folder; choose another name"):
+            keep(str(file))
+        with pytest.raises(OutputError, match="folder: it is a int; give its path"):
+            keep(given)
+    slam.keep_log(str(tmp_path / "log"))
 
 
 def test_what_is_no_rig_is_refused() -> None:

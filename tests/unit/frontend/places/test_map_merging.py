@@ -230,6 +230,10 @@ def test_merged_files(world: World, tmp_path: Path) -> None:
     content = out.read_bytes()
     merge_files(a, b, out, overwrite=True)
     assert out.read_bytes() == content
+    (tmp_path / "link").symlink_to(a)
+    for lost in (a, b, tmp_path / "link"):
+        with pytest.raises(MapError, match="is merged, and would be lost; choose another --out"):
+            merge_files(a, b, lost, overwrite=True)
     other = replace(world.seen(np.arange(50), BTA), rig=replace(RIG, fx=300.0))
     save_map(other, b)
     with pytest.raises(MapError, match="made with another rig"):
