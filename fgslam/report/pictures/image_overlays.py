@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize, hsv_to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator, NullLocator, ScalarFormatter
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
@@ -142,20 +141,12 @@ def draw_flow(
         axes = figure.subplots()
         show_image(axes, image, title or "Flow between frames", note)
         add_segments(axes, np.stack([before, after], axis=1), 1.6, color=SKY)
-        rim = [withStroke(linewidth=3.4, foreground="black", alpha=0.6)]
+        cross: dict[str, Any] = {"s": 42, "marker": "x", "zorder": 4}
         axes.scatter(
             before[:, 0], before[:, 1], s=26, c=YELLOW, edgecolors="black", linewidths=0.7, zorder=3
         )
-        axes.scatter(
-            after[:, 0],
-            after[:, 1],
-            s=42,
-            c=ORANGE,
-            marker="x",
-            linewidths=1.8,
-            zorder=4,
-            path_effects=rim,
-        )
+        axes.scatter(after[:, 0], after[:, 1], c="black", alpha=0.6, linewidths=3.4, **cross)
+        axes.scatter(after[:, 0], after[:, 1], c=ORANGE, linewidths=1.8, **cross)
         figure.legend(handles=_flow_legend(), loc="outside lower center", ncols=3)
 
 

@@ -14,7 +14,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patheffects import AbstractPathEffect, withStroke
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.files import replacing
@@ -33,6 +32,7 @@ MAP_COLOURS = "viridis"
 DPI = 160
 
 _NO_METADATA: dict[str, Any] = {"Software": None}
+_PACKING: dict[str, Any] = {"compress_level": 3}  # half the time of 6, the same size within a tenth
 # On the screen whites become this grey, so that bright marks stand out on windows and posters.
 _WHITE = 0.78
 
@@ -82,7 +82,12 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
         yield figure
         with replacing(path) as partial:
             figure.savefig(
-                partial, format="png", bbox_inches="tight", pad_inches=0.1, metadata=_NO_METADATA
+                partial,
+                format="png",
+                bbox_inches="tight",
+                pad_inches=0.1,
+                metadata=_NO_METADATA,
+                pil_kwargs=_PACKING,
             )
 
 
@@ -121,12 +126,11 @@ def add_segments(axes: Axes, segments: FloatArray, width: float, **colours: Any)
 
     ``colours`` are those of a LineCollection (`color`, or `array`, `cmap` and `norm`).
     """
-    rim: list[AbstractPathEffect] = [
-        withStroke(linewidth=width + 1.4, foreground="black", alpha=0.55)
-    ]
-    lines = LineCollection(list(segments), linewidths=width, **colours)
-    lines.set_path_effects(rim)
-    lines.set_capstyle("round")
-    lines.set_joinstyle("round")
-    axes.add_collection(lines, autolim=False)
+    # Two collections: as an effect of its path each line would be drawn by itself, and ten times
+    # as long.
+    ends: dict[str, Any] = {"capstyle": "round", "joinstyle": "round"}
+    rims = LineCollection(segments, linewidths=width + 1.4, color="black", alpha=0.55, **ends)
+    lines = LineCollection(segments, linewidths=width, **ends, **colours)
+    for drawn in (rims, lines):
+        axes.add_collection(drawn, autolim=False)
     return lines
