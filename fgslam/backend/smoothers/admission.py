@@ -218,6 +218,22 @@ class LandmarkAdmission:
             del self._recent[identity]
         return [(i, track) for i, track in left if track.variable >= 0]
 
+    def recent(self, since: int) -> tuple[IntArray, IntArray, IntArray]:
+        """Landmarks (k,) seen in a frame or later, latest first.
+
+        Returns:
+            Their identities, variables (-1: it waits outside) and the frames that saw them last.
+        """
+        seen = list(self._seen(since))
+        variables = [track.variable for _, track in seen]
+        frames = [track.last.frame for _, track in seen]
+        identities = [identity for identity, _ in seen]
+        return (
+            np.array(identities, np.int64),
+            np.array(variables, np.int64),
+            np.array(frames, np.int64),
+        )
+
     def waiting(self, since: int = 0) -> list[tuple[int, Track]]:
         """Landmarks that are not in the graph, seen in a frame or later, within a bounded lag."""
         return [(i, track) for i, track in self._seen(since) if track.variable < 0]

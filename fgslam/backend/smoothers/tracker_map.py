@@ -50,8 +50,12 @@ class TrackerMap:
         Landmarks that the graph knows nothing of stay; where a loop moved the map they
         move along with the last pose, near which they are, unless they are a saved map's.
         """
-        ids, positions = self._in_graph(smoothed.values, smoothed.since)
-        waiting_ids, waiting_positions = self._waiting(smoothed.values, smoothed.since)
+        ids, variables, frames = self._admission.recent(smoothed.since)
+        inside = variables >= 0
+        waiting_ids, waiting_positions = self._waiting(
+            smoothed.values, ids[~inside], frames[~inside]
+        )
+        ids, positions = self._in_graph(smoothed.values, ids[inside], variables[inside])
         ids = np.concatenate([ids, waiting_ids])
         positions = np.concatenate([positions, waiting_positions])
         if smoothed.by_loop:
@@ -86,34 +90,32 @@ class TrackerMap:
             positions[rows], covariances[rows] = found
         return LandmarkMap(known.ids.copy(), positions, covariances)  # theirs change later
 
-    def _in_graph(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
-        """Identities and positions of the tracker's landmarks that ``values`` hold."""
-        tracks = self._admission.in_graph(since)
-        ids = np.array([identity for identity, _ in tracks], np.int64)
-        wanted = np.array([track.variable for _, track in tracks], np.int64)
+    def _in_graph(
+        self, values: Any, ids: IntArray, wanted: IntArray
+    ) -> tuple[IntArray, FloatArray]:
+        """Those landmarks (k,) of the tracker that ``values`` hold by variables (k,); positions."""
         inside = isinstance(values, WindowValues)
         variables, positions = values.landmarks() if inside else landmarks_in(values)
         known = np.isin(wanted, variables) & np.isin(ids, self._tracker.landmarks().ids)
         return ids[known], positions[np.searchsorted(variables, wanted[known])]
 
-    def _waiting(self, values: Any, since: int) -> tuple[IntArray, FloatArray]:
-        """Landmarks outside the graph, moved along with the pose that saw them last."""
-        last_seen: dict[int, list[int]] = {}
-        for identity, track in self._admission.waiting(since):
-            last_seen.setdefault(track.last.frame, []).append(identity)
+    def _waiting(self, values: Any, ids: IntArray, frames: IntArray) -> tuple[IntArray, FloatArray]:
+        """Landmarks (k,) outside the graph, moved along with the frames (k,) that saw them last."""
+        present = [f for f in np.unique(frames).tolist() if values.exists(pose_key(f))]
+        anchors = {frame: poses_of_frame(values, frame) for frame in present}
+        order = np.argsort(frames, kind="stable")
+        order = order[np.isin(frames[order], present)]
+        ids, frames = ids[order], frames[order]
         known = self._tracker.landmarks()
-        ids, positions = [np.empty(0, np.int64)], [np.empty((0, 3))]
-        anchors = {}
-        for frame, identities in last_seen.items():
-            if values.exists(pose_key(frame)):
-                anchors[frame] = poses_of_frame(values, frame)
-                # One just taken out of the graph is where the graph had it, and follows from here.
-                moved = anchors[frame] @ inverse(self._anchors.get(frame, anchors[frame]))
-                ids.append(np.array(identities, np.int64))
-                before = known.positions[known.rows(ids[-1])]
-                positions.append(transform_to_world(moved, before))
+        positions = known.positions[known.rows(ids)]
+        first = np.searchsorted(frames, [*present, np.inf])
+        for k, (frame, wTc) in enumerate(anchors.items()):
+            # One just taken out of the graph is where the graph had it, and follows from here.
+            moved = wTc @ inverse(self._anchors.get(frame, wTc))
+            own = slice(first[k], first[k + 1])
+            positions[own] = transform_to_world(moved, positions[own])
         self._anchors = anchors
-        return np.concatenate(ids), np.concatenate(positions)
+        return ids, positions
 
     def _seen_from(
         self, answer: Solution, frame: int, sightings: list[Sighting]
