@@ -129,8 +129,9 @@ def add_segments(axes: Axes, segments: FloatArray, width: float, **colours: Any)
     # Two collections: as an effect of its path each line would be drawn by itself, and ten times
     # as long.
     ends: dict[str, Any] = {"capstyle": "round", "joinstyle": "round"}
-    rims = LineCollection(segments, linewidths=width + 1.4, color="black", alpha=0.55, **ends)
-    lines = LineCollection(segments, linewidths=width, **ends, **colours)
+    paths = list(segments)
+    rims = LineCollection(paths, linewidths=width + 1.4, color="black", alpha=0.55, **ends)
+    lines = LineCollection(paths, linewidths=width, **ends, **colours)
     for drawn in (rims, lines):
         axes.add_collection(drawn, autolim=False)
     return lines
