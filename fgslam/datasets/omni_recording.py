@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.files import shown_in
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES, natural
 from fgslam.datasets.stamps import written_stamps
@@ -59,14 +59,13 @@ class OmniRecording:
         """Picture ``i`` (camera.height, camera.width, 3) in R, G, B, 0 <= i < len.
 
         Raises:
-            FrameError: it is missing or damaged.
-            CalibrationError: it has another size than the camera.
+            FrameError: it is missing or damaged, or has another size than the camera.
         """
         if not 0 <= i < len(self):
             raise IndexError(f"picture {i} of {self.name}: expected 0 to {len(self) - 1}")
         image = self.load_image(i)
         if image.shape[:2] != (self.camera.height, self.camera.width):
-            raise CalibrationError(
+            raise FrameError(
                 f"{self.name}: picture {self.names[i]} has {image.shape[1]}x{image.shape[0]} "
                 f"pixels, but the camera is calibrated for {self.camera.width}x"
                 f"{self.camera.height}; all pictures must have that size"

@@ -86,7 +86,7 @@ class Taught:
         memory: the path.
         rows: one a path image.
         seen: images that were compared.
-        unusable: images that were too dark or empty, in words.
+        unusable: images that were too dark, empty or not to be read, in words.
     """
 
     memory: PathMemory
@@ -176,6 +176,11 @@ class Teacher:
         else:
             self._last = _View(number, name, features)
             self._look(self._last)
+
+    def leave_out(self, number: int, why: str) -> None:
+        """Goes on after an image that could not be read, or is not the camera's."""
+        self._unusable.append(why)
+        self.next = number + 1
 
     def finish(self) -> Taught:
         """The path; its last image is the last one seen that lies apart from the one before.

@@ -48,7 +48,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder_of(root / "drive", np.arange(0.0, 3.6, 0.4))
     folder_of(root / "again", np.arange(0.2, 3.6, 0.8))
     (root / "camera.yaml").write_text(CAMERA, encoding="utf-8")
-    times = "".join(f"view_{k}.png {5 + k}\n" for k in range(9))
+    PictureFile.fromarray(np.ascontiguousarray(seen_at(1.8)[:, :200])).save(
+        root / "drive" / "view_4a.png"
+    )
+    times = "".join(f"view_{k}.png {5 + k}\n" for k in range(9)) + "view_4a.png 9.5\n"
     (root / "drive" / "times.txt").write_text(times, encoding="utf-8")
     # SLAM on the drive: 0.4 m a second along x.
     poses = "".join(f"{5 + 0.5 * k} {0.2 * k} 0 0 0 0 0 1\n" for k in range(17))
@@ -86,6 +89,8 @@ def test_a_route_is_taught_with_the_reason_of_each_path_image(taught: Path, data
     path = PathMemory.load(taught)
     assert path.camera == textured_room_camera()
     assert len(path) == len(rows) < 9
+    other = "view_4a.png has 200x91 pixels, the first one 301x91; all must have one size"
+    assert other in (data / "taught" / "report.html").read_text(encoding="utf-8")
     assert (rows[0]["reason"], rows[-1]["reason"]) == ("start", "end")
     numbers = json.loads((data / "taught" / "metrics.json").read_text(encoding="utf-8"))
     assert numbers["kilobytes_per_image"] <= 20.0
@@ -155,8 +160,11 @@ def test_another_place_is_said(
     for k in range(2):
         noise = rng.integers(0, 255, (91, 301, 3), np.uint8)
         PictureFile.fromarray(noise).save(other / f"{k}.png")
+    PictureFile.fromarray(noise[:, :200]).save(other / "2.png")
     assert main(monkeypatch, "follow", taught, other, "--out", tmp_path / "run") == 1
-    assert "is recognised on the route" in capfd.readouterr().out
+    said = " ".join(capfd.readouterr().out.split())
+    assert "Not one of 2 images is recognised on the route" in said
+    assert "2.png has 200x91 pixels, the first one 301x91" in said
 
 
 def film_of(path: Path, count: int) -> Path:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgslam.core.errors import OutputError
+from fgslam.core.errors import FrameError, OutputError
 from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
@@ -110,7 +110,10 @@ def _teach(teacher: Teacher, recording: OmniRecording, context: Context) -> bool
         if context.stopped():
             return False
         if i >= teacher.next or i == last:
-            teacher.take(i, recording.names[i], recording.image(i))
+            try:
+                teacher.take(i, recording.names[i], recording.image(i))
+            except FrameError as error:
+                teacher.leave_out(i, str(error))
         context.progress("teaching", i + 1, len(recording))
     return True
 
