@@ -24,6 +24,7 @@ from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.frontend.tracking.resection import Resection, sample_size
 
 _LATELY = 10  # frames before the last sighting whose landmarks are looked for
+_AT_LAST = 0  # likewise where that fails: among few landmarks few others look like the right one
 FALSE_POSES = 1e-6  # poses by chance that are allowed in a frame
 
 
@@ -42,7 +43,17 @@ class Regainer:
 
     def find(self, landmarks: LandmarkMap, features: StereoFeatures) -> Prediction | None:
         """Pose and covariance; None where none is to be believed. The same input, the same bits."""
-        recent = np.intersect1d(self._database.described_lately(_LATELY), landmarks.ids)
+        for frames in (_LATELY, _AT_LAST):
+            found = self._found_by(frames, landmarks, features)
+            if found is not None:
+                return Prediction(found.wTc, found.covariance)
+        return None
+
+    def _found_by(
+        self, frames: int, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> EgoMotion | None:
+        """The frame by what the last frames described; None if it is not to be believed."""
+        recent = np.intersect1d(self._database.described_lately(frames), landmarks.ids)
         looks = self._database.appearances(recent)
         latest = np.flatnonzero(np.diff(looks.ids, append=-1))
         part = self._parts.of(looks.ids[latest])
@@ -51,10 +62,7 @@ class Regainer:
             for one in np.unique(part).tolist()
         ]
         found = [one for one in within if one is not None]
-        if not found:
-            return None
-        best = max(found, key=lambda one: int(one.inliers.sum()))
-        return Prediction(best.wTc, best.covariance)
+        return max(found, key=lambda one: int(one.inliers.sum()), default=None)
 
     def _among(
         self,

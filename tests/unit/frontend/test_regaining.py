@@ -122,3 +122,14 @@ def test_landmarks_described_lately(scene: Scene) -> None:
     left = first & set(database.described_lately(1).tolist())
     assert not left & set(scene.ids_at(np.arange(75)).tolist())
     assert len(left) > 60
+
+
+def test_doubles_seen_before_do_not_hide_what_the_last_frame_saw(scene: Scene) -> None:
+    """Among all of lately each feature has two landmarks that look alike; at last it has one."""
+    rng, before = np.random.default_rng(6), scene.world
+    scene.world = FeatureWorld(points_in_view(RIG, 150, (1.5, 5.0), rng), rng)
+    scene.world._descriptors = before._descriptors
+    scene.step(np.eye(4))
+    found = tracked_at(scene, ABSURD).ego_motion
+    assert found.status is EgoMotionStatus.RELOCALISED
+    np.testing.assert_allclose(g.se3_log(g.inverse(TURNED) @ found.wTc), 0.0, atol=4e-3)
