@@ -206,7 +206,7 @@ def test_a_path_of_mirror_images(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no picture named \.\. "):
         open_omni(OmniPathSettings(path=str(tmp_path), pattern="..", camera=camera))
     write(tmp_path / "m2.png", picture(2, 48, 64))
-    with pytest.raises(CalibrationError, match=r"m2\.png has 48x64 .* calibrated for 64x48"):
+    with pytest.raises(FrameError, match=r"m2\.png has 48x64 .* calibrated for 64x48"):
         recording.image(1)
     with pytest.raises(CalibrationError, match=r"calibrated for 320x240 pixels, but .* 64x48"):
         open_omni(
