@@ -171,6 +171,7 @@ def _correction_arrays(frames: Sequence[Increment], terms: int) -> StateArrays:
             [unknown if s.values is None else s.values for s in settled], (terms,)
         ),
         "rig_knocks": np.array([s.knocks for s in settled], np.int64),
+        "rig_field_px": np.array([s.field_px for s in settled], np.float64),
     }
 
 
@@ -320,8 +321,12 @@ def _settled(
         return [None] * frames
     expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
     LOG.require(arrays, expected, where)
-    rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), strict=True)
-    found = [SettledRig(row if np.isfinite(row).all() else None, n) for row, n in rows]
+    field = arrays.get("rig_field_px", np.zeros(frames))  # not in every log of version 6 or 7
+    LOG.require({"rig_field_px": field}, {"rig_field_px": ("f", (frames,))}, where)
+    if not (np.isfinite(field) & (field >= 0.0)).all():
+        raise LOG.damaged("rig_field_px", where)
+    rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), field.tolist(), strict=True)
+    found = [SettledRig(row if np.isfinite(row).all() else None, n, px) for row, n, px in rows]
     return [None if one.knocks == _UNSETTLED else one for one in found]
 
 

@@ -29,7 +29,15 @@ from fgslam.core.sensors import Sensor
 BLOCK = 256  # frames
 
 # Offsets, and the arrays whose rows they count.
-_OF_FRAMES = ("relocalised", CORRECTIONS, "rig_settled", "rig_knocks", *PER_FRAME, *PER_TURN)
+_OF_FRAMES = (
+    "relocalised",
+    CORRECTIONS,
+    "rig_settled",
+    "rig_knocks",
+    "rig_field_px",
+    *PER_FRAME,
+    *PER_TURN,
+)
 _FROM_FRAMES = {
     "observation_start": tuple(PER_OBSERVATION),
     "missed_start": ("missed_id",),

@@ -124,10 +124,13 @@ class SettledRig(Brief):
         values: (p,) of the correction (:func:`fgslam.core.rig_correction.term_names`); None where
             each frame's own is no worse.
         knocks: how often the rig was found to have moved before.
+        field_px: what no term of the correction follows, taken off nothing: standard deviation of
+            one coordinate in each image (:mod:`fgslam.core.rig_field`); 0 in older logs.
     """
 
     values: FloatArray | None
     knocks: int
+    field_px: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

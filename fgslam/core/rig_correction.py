@@ -254,11 +254,14 @@ class RigCorrection(Brief):
         rig: as calibrated.
         values: (p,) in the order of :func:`term_names`; zero for an exact calibration.
         covariance: (p, p) of the above.
+        field_px: what no term follows: standard deviation of one coordinate in each image
+            (:mod:`fgslam.core.rig_field`), pixels.
     """
 
     rig: CameraRig
     values: FloatArray
     covariance: FloatArray
+    field_px: float = 0.0
 
     @staticmethod
     def none(rig: CameraRig) -> RigCorrection:

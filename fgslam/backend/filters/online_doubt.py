@@ -1,9 +1,10 @@
 """What the doubt about a rig's calibration adds to poses and landmarks, frame by frame.
 
 The Schmidt-Kalman filter's cross terms (Schmidt 1966), as derivatives: how the newest pose and each
-landmark of the map follow the terms that all cameras share, which no estimator here estimates. A
-frame costs what it sees. Estimates stay as they are. Final covariances of a whole graph have the
-same from the graph (:mod:`fgslam.backend.smoothers.rig_doubt`).
+landmark of the map follow the terms that all cameras share, and the field that no term follows,
+neither of which is estimated. A frame costs what it sees. Estimates stay as they are. Final
+covariances of a whole graph have the same from the graph
+(:mod:`fgslam.backend.smoothers.rig_doubt`).
 docs/derivations/measurement_noise.md.
 """
 
@@ -32,6 +33,7 @@ from fgslam.core.rig_correction import (
     shared_displacements,
     shared_information,
 )
+from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import (
     CameraRig,
     Sensor,
@@ -47,34 +49,63 @@ _NONE = np.zeros((6, 6))
 
 
 class RigTerms:
-    """The terms in SHARED of a rig that calibrates itself: unknown, with a covariance.
+    """The terms in SHARED of a rig that calibrates itself, then the modes of its field: unknown.
 
-    Of a rig that is exact, or that is taken as stated, there are none.
+    Of a rig that is exact, or that is taken as stated, there is no doubt.
     """
 
     def __init__(self, sensor: Sensor) -> None:
         """``sensor``: that measures; only a rig of cameras is ever in doubt."""
         self.rig = sensor if isinstance(sensor, CameraRig) and not sensor.exact else None
-        self.applied: FloatArray = np.empty(0)
-        """Correction of the rig, as last heard."""
-        self.covariance: FloatArray | None = None
+        self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig))
+        """How many there are, q."""
+        self.deviations: FloatArray | None = None
+        """(q, q) lower root of their covariance; None: no doubt."""
+        self._applied: FloatArray = np.empty(0)
+        self._field_px = 0.0
+
+    @property
+    def covariance(self) -> FloatArray | None:
         """(q, q) of the terms; None: no doubt."""
+        return None if self.deviations is None else self.deviations @ self.deviations.T
 
-    def hear(self, correction: FloatArray | None) -> None:
-        """Of the correction that a frame's measurements contain; it changes seldom."""
-        if self.rig is None or correction is None or np.array_equal(correction, self.applied):
+    def hear(self, increment: Increment) -> None:
+        """Of the correction that a frame's measurements contain, and what was known beside it."""
+        known = increment.settled_rig
+        self._hear(increment.rig_correction, 0.0 if known is None else known.field_px)
+
+    def shifts(self, measured: FloatArray) -> FloatArray:
+        """(k, 3, q) by which a unit of each displaces measurements (k, 3); zero without doubt."""
+        if self.rig is None or self.deviations is None:
+            return np.zeros((len(measured), 3, self.count))
+        pixels = pixels_of(self.rig, measured)
+        of_pixels = [shared_displacements(self.rig, pixels), field_displacements(self.rig, pixels)]
+        return fused(self.rig, np.concatenate(of_pixels, axis=2))
+
+    def state(self) -> StateArrays:
+        """What was heard last."""
+        return {"applied": self._applied, "field_px": np.array(self._field_px)}
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from :meth:`state`."""
+        applied = state["applied"]
+        self._hear(applied if applied.size else None, float(state["field_px"]))
+
+    def _hear(self, correction: FloatArray | None, field_px: float) -> None:
+        """Both change seldom."""
+        if self.rig is None or correction is None:
             return
-        self.applied = correction
+        if np.array_equal(correction, self._applied) and field_px == self._field_px:
+            return
+        self._applied, self._field_px = correction, field_px
         none = RigCorrection.none(self.rig)
-        self.covariance = shared_covariance(dataclasses.replace(none, values=correction))
-
-    def restore(self, applied: FloatArray) -> None:
-        """Continues from what was last applied."""
-        self.hear(applied if applied.size else None)
+        shared = shared_covariance(dataclasses.replace(none, values=correction))
+        self.deviations = field_px * np.eye(self.count)
+        self.deviations[: len(SHARED), : len(SHARED)] = np.linalg.cholesky(shared)
 
 
 class OnlineDoubt(ErrorColumns):
-    """Derivatives of the newest pose and of the landmarks by the terms in SHARED.
+    """Derivatives of the newest pose and of the landmarks by what is unknown of the rig.
 
     Of a rig that is exact, or that is taken as stated, there is no doubt: nothing is added.
     """
@@ -87,19 +118,19 @@ class OnlineDoubt(ErrorColumns):
             floor: a hard one leaves the pose these directions alone.
         """
         # By landmark: derivative in world axes, information given the poses.
-        super().__init__(len(SHARED), information=np.empty((0, 3, 3)))
         self._terms = RigTerms(sensor)
+        super().__init__(self._terms.count, information=np.empty((0, 3, 3)))
         self._floor = floor
         self._wTc: FloatArray | None = None
 
     @property
     def present(self) -> bool:
         """Whether there is any doubt."""
-        return self._terms.covariance is not None
+        return self._terms.deviations is not None
 
     def observe(self, increment: Increment, wTc: FloatArray) -> None:
         """Takes in a frame: its accepted measurements and its pose as estimated."""
-        self._terms.hear(increment.rig_correction)
+        self._terms.hear(increment)
         rig = self._terms.rig
         if rig is None or not self.present:
             return
@@ -107,7 +138,7 @@ class OnlineDoubt(ErrorColumns):
             self._gain = adjoint(inverse(inverse(self._wTc) @ wTc)) @ self._gain
         seen = increment.observations.select(~increment.rejected)
         near = seen.measurement[:, 2] > _LEAST_DISPARITY_PX
-        look = _Look(rig, seen.select(near), wTc)
+        look = _Look(rig, self._terms, seen.select(near), wTc)
         rows, known = self._rows(look.ids)
         if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
             basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
@@ -128,9 +159,10 @@ class OnlineDoubt(ErrorColumns):
 
     def of_pose(self) -> FloatArray:
         """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
-        if self._terms.covariance is None:
+        if self._terms.deviations is None:
             return _NONE  # one for all frames: a smoother keeps what it is told of each
-        return self._gain @ self._terms.covariance @ self._gain.T
+        root = self._gain @ self._terms.deviations
+        return np.asarray(root @ root.T)
 
     def pose(self, newest: Prediction) -> Prediction:
         """The newest pose with what the doubt adds to its covariance."""
@@ -155,17 +187,17 @@ class OnlineDoubt(ErrorColumns):
         terms = self._terms.covariance
         if terms is None:
             return covariance
-        gain = np.concatenate([self._gain, self._of_map(ids).reshape(-1, len(SHARED))])
+        gain = np.concatenate([self._gain, self._of_map(ids).reshape(-1, self._terms.count)])
         return np.asarray(covariance + gain @ terms @ gain.T)
 
     # ----------------------------------------------------------------------------------------
 
     def _state(self) -> StateArrays:
         pose = np.empty((0, 4, 4)) if self._wTc is None else self._wTc[None]
-        return {"applied": self._terms.applied, "pose": pose, **super()._state()}
+        return {**self._terms.state(), "pose": pose, **super()._state()}
 
     def _restore(self, state: StateArrays) -> None:
-        self._terms.restore(state["applied"])
+        self._terms.restore(state)
         self._wTc = next(iter(state["pose"]), None)
         super()._restore(state)
 
@@ -190,11 +222,13 @@ class OnlineDoubt(ErrorColumns):
 class _Look:
     """Measurements (k) of a frame, linearised where they have their points."""
 
-    def __init__(self, rig: CameraRig, seen: Observations, wTc: FloatArray) -> None:
+    def __init__(
+        self, rig: CameraRig, terms: RigTerms, seen: Observations, wTc: FloatArray
+    ) -> None:
         points = triangulate(rig, seen.measurement)
         projection = projection_jacobian(rig, points)
         self.ids = seen.ids
-        self.shift = shared_shifts(rig, seen.measurement)
+        self.shift = terms.shifts(seen.measurement)
         self.by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
         self.by_point = projection @ wTc[:3, :3].T
         self.covariance = seen.covariance

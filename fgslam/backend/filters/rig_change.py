@@ -72,12 +72,14 @@ class KnownCorrections:
         applied: (p,) of each, the correction that its measurements contain.
         knocks: of each, how often the rig was found to have moved before.
         settled: after so many knocks, what was known last for all frames alike, if anything.
+        field_px: what no term follows, as known last.
     """
 
     begins: list[int] = field(default_factory=list)
     applied: list[FloatArray] = field(default_factory=list)
     knocks: list[int] = field(default_factory=list)
     settled: dict[int, FloatArray | None] = field(default_factory=dict)
+    field_px: float = 0.0
 
     def note(self, frame: int, increment: Increment) -> None:
         """Takes in one more frame; one without a correction says nothing."""
@@ -87,6 +89,7 @@ class KnownCorrections:
         knocks = 0 if known is None else known.knocks
         if known is not None:
             self.settled[knocks] = known.values
+            self.field_px = known.field_px
         if not (self.begins and knocks == self.knocks[-1] and (applied == self.applied[-1]).all()):
             self.begins.append(frame)
             self.applied.append(applied)

@@ -25,7 +25,7 @@ from fgslam.backend.filters.loop_correction import (
     as_motions_of_the_world,
     founds_anew,
 )
-from fgslam.backend.filters.online_doubt import RigTerms, shared_shifts
+from fgslam.backend.filters.online_doubt import RigTerms
 from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
@@ -41,12 +41,10 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Increment, LoopClosure, Observations
-from fgslam.core.rig_correction import SHARED
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 SAMPLES = 48
 """A variance from them is known to the root of 2 / SAMPLES, a deviation to 10 %."""
-_TERMS = len(SHARED)
 _NOISE = "noise_"  # of names in a state
 _STREAM = 17  # of random numbers, beside those of the recording
 _FARTHEST_M = 1e9  # beyond, a point has no derivative; and nothing to tell
@@ -136,7 +134,7 @@ class Sights(NamedTuple):
 
 
 class SampledErrors(ErrorColumns):
-    """Columns by the terms in SHARED, then by SAMPLES draws of all noise."""
+    """Columns by what is unknown of the rig, then by SAMPLES draws of all noise."""
 
     def __init__(self, solver: EgoMotionSolver, off: bool = False) -> None:
         """The first pose is known, the map empty.
@@ -146,11 +144,12 @@ class SampledErrors(ErrorColumns):
             off: nothing is sampled, and what is reported is what the filter has.
         """
         # Single precision: a sample stands for a deviation that is known to a tenth.
-        super().__init__(0 if off else _TERMS + SAMPLES, np.float32)
+        self._terms = RigTerms(solver.sensor)
+        self._count = self._terms.count  # of columns before the draws
+        super().__init__(0 if off else self._count + SAMPLES, np.float32)
         self._off = off
         self._solver = solver
         self._sensor = solver.sensor
-        self._terms = RigTerms(solver.sensor)
         self._noise = Persistence(solver.sensor)
         self._random = np.random.default_rng(_STREAM)
         self._taken = 1.0  # variance over the stated one that the newest pose took
@@ -164,13 +163,13 @@ class SampledErrors(ErrorColumns):
         if self._off:
             return
         self._random = np.random.default_rng((_STREAM, step.frame))
-        self._terms.hear(step.increment.rig_correction)
+        self._terms.hear(step.increment)
         learn_from(self._noise, step.frame, step.increment, step.tracking, step.before.wTc)
         self._taken = step.tracking.noise
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
         moved = carried @ self._gain
-        moved[:, _TERMS:] += _root(noise) @ self._signs(1, 6)[0]
+        moved[:, self._count :] += _root(noise) @ self._signs(1, 6)[0]
         sights = self._sights(wTc, problem)
         self._enter(used.ids, sights, problem.point_covariances, moved)
         rows, _ = self._rows(used.ids)
@@ -193,7 +192,7 @@ class SampledErrors(ErrorColumns):
         if not self._off:
             points = transform_to_camera(wTc, placed.points)
             near = in_front(self._sensor, points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
-            gain = np.zeros((len(ids), 3, _TERMS + SAMPLES))
+            gain = np.zeros((len(ids), 3, self._count + SAMPLES))
             gain[near] = self._sights(wTc, placed.select(near)).placed(self._gain)
             self._append({"ids": ids, "gain": gain})
 
@@ -275,20 +274,19 @@ class SampledErrors(ErrorColumns):
 
     def _state(self) -> StateArrays:
         learned = under(_NOISE, self._noise.state())
-        return {"applied": self._terms.applied, **learned, **super()._state()}
+        return {**self._terms.state(), **learned, **super()._state()}
 
     def _restore(self, state: StateArrays) -> None:
-        self._terms.restore(state["applied"])
+        self._terms.restore(state)
         self._noise.restore(found_under(_NOISE, state))
         super()._restore(state)
 
     def _sights(self, wTc: FloatArray, seen: PoseProblem) -> Sights:
         points = transform_to_camera(wTc, seen.points)
         projection = projection_jacobian(self._sensor, points)
-        shift = np.zeros((len(seen), 3, _TERMS + SAMPLES))
-        if self._terms.covariance is not None and self._terms.rig is not None:
-            shift[:, :, :_TERMS] = shared_shifts(self._terms.rig, seen.measurement)
-        shift[:, :, _TERMS:] = self._drawn(self._noise.power * seen.measurement_covariance)
+        shift = np.zeros((len(seen), 3, self._count + SAMPLES))
+        shift[:, :, : self._count] = self._terms.shifts(seen.measurement)
+        shift[:, :, self._count :] = self._drawn(self._noise.power * seen.measurement_covariance)
         by_pose = projection @ point_pose_jacobian(points)
         return Sights(by_pose, projection @ wTc[:3, :3].T, shift)
 
@@ -315,7 +313,7 @@ class SampledErrors(ErrorColumns):
         new = ~self._rows(ids)[1]
         if new.any():
             gain = Sights(*(each[new] for each in sights)).placed(pose)
-            gain[:, :, _TERMS:] = self._drawn(covariances[new])
+            gain[:, :, self._count :] = self._drawn(covariances[new])
             self._append({"ids": ids[new], "gain": gain})
 
     def _returned(
@@ -328,7 +326,7 @@ class SampledErrors(ErrorColumns):
         ahead = in_front(self._sensor, transform_to_camera(wTc, problem.points))
         if ahead.sum() < _LEAST_MATCHES:
             gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
-            gain[:, _TERMS:] += _root(loop.covariance) @ self._signs(1, 6)[0]
+            gain[:, self._count :] += _root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
         problem = problem.select(ahead)
         sights = self._sights(wTc, problem)
@@ -367,12 +365,11 @@ class SampledErrors(ErrorColumns):
         The inverse of a covariance of N samples is N / (N - d - 1) times too large in the mean
         (inverse Wishart): by so much the covariance is stated larger.
         """
-        terms, drawn = columns[..., :_TERMS], columns[..., _TERMS:]
+        terms, drawn = columns[..., : self._count], columns[..., self._count :]
         drawn = np.asarray(drawn / np.sqrt(SAMPLES - freedom - 1.0))
-        if self._terms.covariance is None:
+        if self._terms.deviations is None:
             return drawn
-        by_terms = terms @ np.linalg.cholesky(self._terms.covariance)
-        return np.concatenate([by_terms, drawn], axis=-1)
+        return np.concatenate([terms @ self._terms.deviations, drawn], axis=-1)
 
 
 def lacking(covariances: FloatArray) -> FloatArray:

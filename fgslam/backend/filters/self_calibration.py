@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fgslam.backend.filters.field_size import FieldSize
 from fgslam.backend.filters.rig_filter import TRUSTED_WINDOWS, RigFilter
 from fgslam.backend.filters.rig_models import WeighedCorrection, weighed
 from fgslam.core.arrays import FloatArray, StateArrays
@@ -89,6 +90,7 @@ class SelfCalibration:
         """How many gave evidence."""
         self.knocks = 0
         """How often the rig was found to have moved."""
+        self._field = FieldSize(rig, pixel_sigma)
         self._suspected = False
         self._sigma = pixel_sigma
         self._frames: list[tuple[FloatArray, Observations]] = []
@@ -100,10 +102,15 @@ class SelfCalibration:
         return self._whole.noise_factor
 
     @property
+    def field_px(self) -> float:
+        """What no term follows: standard deviation of one coordinate in each image, pixels."""
+        return self._field.px
+
+    @property
     def settled(self) -> SettledRig:
         """What all frames since the rig was moved last are best corrected by, as known now."""
         settled = self.found.settled
-        return SettledRig(None if settled is None else settled.values, self.knocks)
+        return SettledRig(None if settled is None else settled.values, self.knocks, self.field_px)
 
     @property
     def _priors(self) -> tuple[FloatArray, FloatArray]:
@@ -113,7 +120,9 @@ class SelfCalibration:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
         if increment.relocalised:
             self._frames.clear()
-        self._frames.append((wTc, _accepted(increment)))
+        accepted = _accepted(increment)
+        self._field.observe(accepted, self.found.applied.values)
+        self._frames.append((wTc, accepted))
         if len(self._frames) >= WINDOW:
             frames, self._frames = self._frames, []
             self._take(frames, increment.timestamp)
@@ -157,6 +166,7 @@ class SelfCalibration:
                 "counts": np.array([self.windows, self.knocks, self._suspected, len(self._frames)]),
             }
             | _step_arrays(self.steps, len(self._whole.free))
+            | self._field.state()
         )
 
     def restore(
@@ -169,6 +179,7 @@ class SelfCalibration:
         self.windows, self.knocks, suspected, waiting = map(int, state["counts"])
         self._suspected = bool(suspected)
         self.steps = _steps_of(state)
+        self._field.restore(state)
         found = weighed(self._whole.known, self._early.known, self._priors)
         applied = dataclasses.replace(found.applied, values=state["applied"])
         self.found = dataclasses.replace(found, applied=applied)

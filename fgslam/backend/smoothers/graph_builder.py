@@ -145,7 +145,8 @@ class GraphBuilder:
         applied = self.corrections.applied
         if not applied or not isinstance(self._sensor, CameraRig):
             return None
-        return dataclasses.replace(RigCorrection.none(self._sensor), values=applied[-1])
+        none, px = RigCorrection.none(self._sensor), self.corrections.field_px
+        return dataclasses.replace(none, values=applied[-1], field_px=px)
 
     @property
     def variables(self) -> int:

@@ -21,6 +21,7 @@ from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE
 from fgslam.slam.factory import calibrates_itself
 
 _TOLD_SIGMAS = 3.0  # what is less than this many of its own is not told as a finding
+_TOLD_FIELD_PX = 0.1  # of a field that is told: recordings of good rigs show up to so much
 _DOUBT = (
     ", more than calibrations leave: calibrate it anew, unless something large that moved was "
     "taken for the scene"
@@ -78,6 +79,7 @@ def calibration_numbers(calibration: SelfCalibration) -> dict[str, JsonValue]:
         "chi_square": known.significance(),
         "degrees_of_freedom": len(known.values),
         "displacement_rms_px": found.applied.rms_px(),
+        "field_px": calibration.field_px,
         "changes": changes,
         "terms": terms,
     }
@@ -90,14 +92,20 @@ def calibration_note(calibration: SelfCalibration | None) -> str:
     found = calibration.found
     knocks = f"; the rig moved {calibration.knocks} times on the way" * bool(calibration.knocks)
     if found.probabilities["exact"] > 0.5:
-        return f"the drive agrees with the rig's calibration{knocks}"
+        return f"the drive agrees with the rig's calibration{knocks}{_field(calibration)}"
     parts = [text for camera in ("left", "top") if (text := _told(found.estimated, camera))]
     rms = found.applied.rms_px()
     what = "; ".join(parts) or "the cameras' lenses or axes differ"
     return (
         f"{what} against the rig's calibration, corrected during the drive by {rms:.2f} px "
-        f"(rms over the images){_DOUBT * (rms > IMPLAUSIBLE_PX)}{knocks}"
+        f"(rms over the images){_DOUBT * (rms > IMPLAUSIBLE_PX)}{knocks}{_field(calibration)}"
     )
+
+
+def _field(calibration: SelfCalibration) -> str:
+    """What is left, where that is more than usual."""
+    px = calibration.field_px
+    return f"; {px:.2f} px in each image are left, uneven over it" * (px >= _TOLD_FIELD_PX)
 
 
 def _told(known: RigCorrection, camera: str) -> str:

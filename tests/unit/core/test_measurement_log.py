@@ -351,7 +351,7 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
     log.increments[1] = replace(
         log.increments[1],
         rig_correction=np.arange(terms, dtype=np.float64),
-        settled_rig=SettledRig(np.arange(1.0, 1.0 + terms), 2),
+        settled_rig=SettledRig(np.arange(1.0, 1.0 + terms), 2, 0.3),
     )
     log.increments[2] = replace(
         log.increments[2], rig_correction=np.zeros(terms), settled_rig=SettledRig(None, 0)
@@ -369,8 +369,15 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
     settled = back.increments[1].settled_rig
     assert settled is not None
     assert settled.values is not None
-    assert settled.knocks == 2
+    assert (settled.knocks, settled.field_px) == (2, 0.3)
     np.testing.assert_array_equal(settled.values, np.arange(1.0, 1.0 + terms))
+    field = arrays.pop("rig_field_px")
+    older = MeasurementLog.from_arrays(arrays, "x.npz").increments[1].settled_rig
+    assert older is not None
+    assert older.field_px == 0.0
+    for wrong in (field[1:], -field, np.full_like(field, np.nan)):
+        with pytest.raises(MeasurementLogError, match="rig_field_px"):
+            MeasurementLog.from_arrays(arrays | {"rig_field_px": wrong}, "x.npz")
     write_arrays(tmp_path / "log.npz", arrays | {"rig_correction": arrays["rig_correction"][:, 1:]})
     with pytest.raises(MeasurementLogError, match="rig_correction"):
         MeasurementLog.load(tmp_path / "log.npz")
