@@ -159,10 +159,11 @@ def _entries(path: Path) -> list[_Entry]:
     text = read_text(path, CalibrationError, "give OCamCalib's calib_results.txt")
     entries, comment = [], ""
     for number, line in enumerate(text.splitlines(), 1):
-        if line.lstrip().startswith("#"):
-            comment = line.strip(" \t#")
+        values, _, beside = line.replace("%", "#").partition("#")  # MATLAB's comments, too
+        if beside and not values.strip():
+            comment = beside.strip(" \t#")
         elif line.strip():
-            entries.append(_Entry(number, comment, line.split()))
+            entries.append(_Entry(number, comment, values.replace(",", " ").split()))
             comment = ""
     return entries
 

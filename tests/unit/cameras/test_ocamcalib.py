@@ -59,6 +59,11 @@ def test_calibration_file_is_read_in_full(calibration: OCamCalibration) -> None:
     assert calibration.disagreement(RING) < 0.05
 
 
+def test_comments_stand_beside_values_too(calibration: OCamCalibration, tmp_path: Path) -> None:
+    noted = text(centre="545.872616, 674.318875  # row, column", affine="0.999 0.003 0.002 % c d e")
+    assert read(tmp_path, noted.replace("#ROI", "% ROI")) == calibration
+
+
 def test_pixels_are_exact_where_the_inverse_polynomial_is_not(calibration: OCamCalibration) -> None:
     camera = calibration.camera()
     rng = np.random.default_rng(6)
