@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -49,20 +50,34 @@ def write_film(path: Path, frames: Iterable[Image], fps: float) -> int:
 
 
 def _write_mp4(path: Path, frames: Iterable[Image], fps: float) -> int:
+    """Raises OSError or OutputError; OpenCV itself tells of no file that it cannot write."""
     count, writer = 0, None
+    path.write_bytes(b"\0")
     try:
         for frame in frames:
             if writer is None:
                 size = (frame.shape[1], frame.shape[0])
                 writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), fps, size)
                 if not writer.isOpened():
-                    raise OutputError(f"cannot write {path}: no encoder for MP4; use .gif")
+                    raise OutputError("cannot write films as MP4: no encoder for them; use .gif")
             writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             count += 1
     finally:
         if writer is not None:
             writer.release()
+    _require_whole(path, count)
     return count
+
+
+def _require_whole(path: Path, count: int) -> None:
+    """Raises OutputError for a film of other frames than were given: its end is its table."""
+    film = cv2.VideoCapture(str(path)) if count else None
+    if film is None:
+        return
+    found = round(film.get(cv2.CAP_PROP_FRAME_COUNT)) if film.isOpened() else 0
+    film.release()
+    if found != count:
+        raise OSError(errno.ENOSPC, f"of {count} frames {found} were written")
 
 
 def _write_gif(path: Path, frames: Iterable[Image], fps: float) -> int:

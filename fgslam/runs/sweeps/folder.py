@@ -12,6 +12,7 @@ import yaml
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, require_writable, write_text
 from fgslam.runs.folder import REPORT_FILE, ExistingFolder, versions
+from fgslam.runs.owner import OWNER_NAME, Owner
 from fgslam.runs.sweeps.grid import Grid
 from fgslam.runs.sweeps.table import TABLE_FILE, TIMES_FILE
 
@@ -40,9 +41,13 @@ class Plan:
 
 
 def begin_sweep(
-    folder: Path, existing: ExistingFolder, plan: Plan, *, check_only: bool = False
+    folder: Path, existing: ExistingFolder, plan: Plan, owner: Owner | None = None
 ) -> None:
-    """Makes the folder, or finds what it holds. Raises OutputError where that is in the way."""
+    """Makes the folder the owner's, or finds what it holds; without an owner only looks.
+
+    Raises:
+        OutputError: what it holds is in the way, or another process writes there.
+    """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"cannot write {folder}: it is not a folder; choose another name")
     held = (folder / MARKER).is_file()
@@ -61,10 +66,11 @@ def begin_sweep(
         raise OutputError(
             f"{folder} exists and holds something else than a sweep; choose another folder"
         )
-    if check_only:
+    if owner is None:
         return
     with clear_output_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
+        owner.take()
         require_writable(folder)
         for name in _FILES if existing == "overwrite" else ():
             (folder / name).unlink(missing_ok=True)
@@ -72,7 +78,7 @@ def begin_sweep(
 
 
 def _is_whole(path: Path) -> bool:
-    return not is_unfinished_file(path)
+    return path.name != OWNER_NAME and not is_unfinished_file(path)
 
 
 def _description(plan: Plan) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from fgslam.runs.crews import NOT_BEGUN, Crew
 from fgslam.runs.dask_crew import LocalCrew, crew_at
 from fgslam.runs.engine import Opening, RunResult, Status
 from fgslam.runs.folder import REPORT_FILE, ExistingFolder, versions
+from fgslam.runs.owner import Owner
 from fgslam.runs.run import opener_of
 from fgslam.runs.sweeps.case import CaseResult, CaseTask, perform_case
 from fgslam.runs.sweeps.findings import Findings, find
@@ -121,10 +122,10 @@ def run_sweep(
         FgslamError: a case is impossible, the recording cannot be opened, or the results cannot be
             written.
     """
-    begin_sweep(folder, existing, plan, check_only=True)
+    begin_sweep(folder, existing, plan)
     keys, config = _checked(plan, watch)
-    with crew as workers:
-        begin_sweep(folder, existing, plan)
+    with Owner(folder) as owner, crew as workers:
+        begin_sweep(folder, existing, plan, owner)
         with Journal(folder / JOURNAL_FILE) as journal:
             work = _Work(plan, keys, journal, RunningMeans(plan.grid, metric), folder)
             work.do(workers, watch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import cv2
@@ -39,4 +40,16 @@ def test_gif_is_thinned_to_ten_frames_a_second_and_narrowed(tmp_path: Path) -> N
 def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, name: str, frames: int) -> None:
     with pytest.raises(OutputError, match="cannot write"):
         write_film(tmp_path / name, greys(frames), 10.0)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_film_for_which_there_is_no_room_is_no_film(tmp_path: Path) -> None:
+    frames = np.random.default_rng(1).integers(0, 256, (9, 96, 96, 3), dtype=np.uint8)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(OutputError, match=r"a\.mp4: the disk is full; free some space"):
+            write_film(tmp_path / "a.mp4", frames, 10.0)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not list(tmp_path.iterdir())

@@ -8,8 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.core.errors import ConfigError
+from fgslam.core.errors import ConfigError, OutputError
+from fgslam.runs.folder import ExistingFolder
+from fgslam.runs.owner import OWNER_NAME, Owner
 from fgslam.runs.sweeps.case import CaseTask
+from fgslam.runs.sweeps.folder import JOURNAL_FILE, Plan, begin_sweep
 from fgslam.runs.sweeps.grid import Axis, Grid, Source, make_axes, read_axes, read_source
 
 VALUES = {"name": "drive", "dataset": {"kind": "simulated_measurements", "stop": 5}}
@@ -82,6 +85,22 @@ def test_grids_that_cannot_be_told_apart_or_done_are_refused() -> None:
     long = Axis("a", [str(k) for k in range(1001)])
     with pytest.raises(ConfigError, match="1,002,001 cases"):
         Grid((one,), (long, Axis("b", long.values)))
+
+
+@pytest.mark.parametrize("existing", ["resume", "overwrite"])
+def test_a_folder_in_which_another_process_sweeps_is_left_alone(
+    existing: ExistingFolder, tmp_path: Path
+) -> None:
+    plan = Plan(Grid((Source("x", {}, "x"),), read_axes(["seed=0:2"])))
+    (tmp_path / OWNER_NAME).touch()  # of one that was killed before it wrote anything
+    with Owner(tmp_path) as first:
+        begin_sweep(tmp_path, "refuse", plan, first)
+        (tmp_path / JOURNAL_FILE).write_text("a case")
+        with pytest.raises(OutputError, match="is writing there; wait for it to end"):
+            begin_sweep(tmp_path, existing, plan, Owner(tmp_path))
+        assert (tmp_path / JOURNAL_FILE).read_text() == "a case"
+    with Owner(tmp_path) as second:
+        begin_sweep(tmp_path, existing, plan, second)
 
 
 def test_paths_of_recordings_hold_wherever_a_worker_starts(
