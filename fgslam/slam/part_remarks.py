@@ -7,6 +7,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.slam.bridging import bridged_frames
 from fgslam.slam.results import RunRecorder
 
 
@@ -32,6 +33,25 @@ def left_out_note(count: int) -> str:
 
 
 def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+    """Lines on frames that nothing measured, and on those located in parts of their own."""
+    return (*_of_bridged(recorder, parts), *_of_adrift(recorder, parts))
+
+
+def _of_bridged(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+    """A line where final poses may be interpolated."""
+    frames = bridged_frames(parts)
+    frames = frames[frames < len(recorder)]
+    if not len(frames):
+        return ()
+    numbers = recorder.log.numbers[frames]
+    return (
+        f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]} are not located in the first "
+        "map: in the final trajectory they are interpolated between the located frames around, "
+        "where that is more certain than what the estimator knows",
+    )
+
+
+def _of_adrift(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     """A line where frames are located in parts that a guess alone joins to the first."""
     adrift = located_frames(recorder) & ~connected_frames(recorder, parts)
     if not adrift.any():

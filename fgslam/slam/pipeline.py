@@ -28,6 +28,7 @@ from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import unmeasured
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
+from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
 from fgslam.slam.submaps.whole import LandmarkBook
@@ -177,13 +178,16 @@ class SlamPipeline:
         return len(self._tried[1].whole) >= least
 
     def estimate(self) -> Estimate:
-        """The estimator's, with the landmarks that are on disk, without those that have ended."""
+        """The estimator's, with frames bridged that nothing measured between located ones.
+
+        Landmarks that are on disk are among it, those that have ended are not.
+        """
         found = self.estimator.estimate()
         if self.submaps is not None:
-            return dataclasses.replace(found, landmarks=self.submaps.whole().landmarks)
-        if len(self._ended):
-            return dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
-        return found
+            found = dataclasses.replace(found, landmarks=self.submaps.whole().landmarks)
+        elif len(self._ended):
+            found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
+        return bridged(found, self.tracker.parts)
 
     def state(self) -> StateArrays:
         """What the loop itself keeps between frames."""

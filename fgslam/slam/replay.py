@@ -39,8 +39,10 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
+from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.frontend.tracking.resection import Resection
 from fgslam.slam.arrival import Arrival, take_over
+from fgslam.slam.bridging import bridged
 from fgslam.slam.factory import made_or_given
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel
 from fgslam.slam.pipeline import Stopwatch, observe
@@ -269,6 +271,7 @@ class _Replaying:
         self._covariances: list[FloatArray] = []
         self._rows: list[ReplayRow] = []
         self._closed: list[bool] = []
+        self._parts = MapParts()
 
     def book(self, increment: Increment, frame: ReplayedFrame) -> None:
         """Keeps a frame's numbers. Raises FloatingPointError for a pose that is not finite."""
@@ -278,6 +281,7 @@ class _Replaying:
         self._poses.append(np.array(stats.wTc))
         self._covariances.append(np.array(stats.covariance))
         self._closed += stats.closed
+        self._parts.book(increment, stats.closed)
         self._rows.append(
             ReplayRow(
                 status=frame.tracking.status.value,
@@ -300,6 +304,7 @@ class _Replaying:
         final_ms = math.nan
         if estimator is not None and self._rows:
             estimate, why = estimate_of_failed(estimator, online, covariances)
+            estimate = bridged(estimate, self._parts)
             final_ms = math.nan if why else 1e3 * (time.perf_counter() - start)
             failure = "; ".join(filter(None, (failure, why)))
         else:

@@ -38,8 +38,14 @@ STATUSES = ["first", "ok", "too_few_matches", "relocalised", "ok"]
 
 
 def test_nothing_is_said_of_one_map() -> None:
+    assert part_remarks(recorded(STATUSES), Apart([True] * 5)) == ()
+    assert in_first_map(recorded(STATUSES), Apart([True] * 5)) == 4
+
+
+def test_frames_that_are_interpolated_are_told() -> None:
     parts = Apart([True, True, False, True, True])
-    assert part_remarks(recorded(STATUSES), parts) == ()
+    (remark,) = part_remarks(recorded(STATUSES), parts)
+    assert remark.startswith("1 frames from 20 to 20 are not located in the first map")
     assert in_first_map(recorded(STATUSES), parts) == 4
 
 
