@@ -47,13 +47,13 @@ def draw_features(
     Args:
         path: the PNG to write.
         images: (height, width) uint8, in the order right, left[, top]; drawn as top, left, right.
-        features: of each image.
+        features: of each image, or of the first ones alone: only these are drawn.
         title: heading of the whole picture, e.g. the frame.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    order = (2, 1, 0) if len(images) == 3 else (1, 0)
+    order = tuple(reversed(range(len(features))))
     stacked = images[0].shape[1] > _PANORAMIC_ASPECT * images[0].shape[0]
     rows, columns = (len(order), 1) if stacked else (1, len(order))
     width, height = _size(images[0], rows, columns, bool(title))

@@ -192,6 +192,18 @@ def test_feature_appears_where_it_was_found(tmp_path: Path) -> None:
     assert columns.max() - columns.min() == pytest.approx(20 / 160 * width, abs=6)
 
 
+def test_only_images_with_features_are_drawn(tmp_path: Path) -> None:
+    """On key frames of carried landmarks SIFT sees the reference image alone."""
+    white = np.full((120, 160), 255, np.uint8)
+    aspects = []
+    for seen in (1, 2, 3):
+        draw_features(tmp_path / f"{seen}.png", (white,) * 3, (features(4),) * seen)
+        height, width = imread(tmp_path / f"{seen}.png").shape[:2]
+        aspects.append(width / height)
+    assert aspects[1] > 1.5 * aspects[0]
+    assert aspects[2] > 1.3 * aspects[1]
+
+
 def test_far_landmarks_do_not_shrink_the_map() -> None:
     rng = np.random.default_rng(5)
     near = rng.uniform(-5, 5, (500, 2))
