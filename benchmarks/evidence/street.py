@@ -82,7 +82,7 @@ def drive(
         slam.track(k * _PERIOD_S, images)
     result = slam.result()
     slam.close()
-    times = _PERIOD_S * np.arange(len(poses))
+    times = np.asarray(_PERIOD_S * np.arange(len(poses)), np.float64)
     error = evaluate_trajectory(result.trajectory, Trajectory(times, poses), Alignment.SE3)
     way = _length(result.trajectory.poses) / _length(poses)
     assert result.rig is not None
