@@ -165,6 +165,12 @@ def test_another_place_is_said(
     said = " ".join(capfd.readouterr().out.split())
     assert "Not one of 2 images is recognised on the route" in said
     assert "2.png has 200x91 pixels, the first one 301x91" in said
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "damaged or of another size" in page
+    rows = rows_of(tmp_path / "run" / "follow.csv")
+    assert [row["name"] for row in rows] == ["0.png", "1.png", "2.png"]
+    assert (rows[2]["image"], rows[2]["time_s"], rows[2]["state"]) == ("2", "0.2", "")
+    assert "2.png has 200x91 pixels, the first one 301x91" in rows[2]["refusal"]
 
 
 def film_of(path: Path, count: int) -> Path:

@@ -100,14 +100,16 @@ def _run(
 ) -> RunResult:
     """Stopped early, the images so far count."""
     folder = context.folder
-    commands, damaged = _follow(config, path, recording, context)
-    whole = len(commands) + len(damaged) == len(recording)
-    rows = [_row(i, recording, path, command) for i, command in commands.items()]
-    write_csv(folder / FOLLOW_FILE, COLUMNS, rows)
+    commands, left_out = _follow(config, path, recording, context)
+    whole = len(commands) + len(left_out) == len(recording)
+    rows = {i: _row(i, recording, path, command) for i, command in commands.items()}
+    rows |= {i: _row_left_out(i, recording, why) for i, why in left_out.items()}
+    write_csv(folder / FOLLOW_FILE, COLUMNS, [rows[i] for i in sorted(rows)])
     numbers = _numbers(list(commands.values()), len(recording))
     result = RunResult(
         config, folder, "finished" if whole else "interrupted", _sentences(numbers, path),
-        (_table(numbers), *_refusals(list(commands.values()))), (*recording.notes, *damaged),
+        (_table(numbers), *_refusals(list(commands.values()), len(left_out))),
+        (*recording.notes, *left_out.values()),
         (("table", str(folder / FOLLOW_FILE)),), failed=not numbers["sure"],
     )  # fmt: skip
     write_document(result, numbers)
@@ -121,11 +123,11 @@ def _run(
 
 def _follow(
     config: FollowConfig, path: PathMemory, recording: OmniRecording, context: Context
-) -> tuple[dict[int, DriveCommand], list[str]]:
-    """Commands by image, and images that could not be read, in words."""
+) -> tuple[dict[int, DriveCommand], dict[int, str]]:
+    """Commands by image, and by image why it was left out: damaged, or of another size."""
     behaviour = HomingBehaviourSettings(steering=config.steering)
     commands: dict[int, DriveCommand] = {}
-    damaged: list[str] = []
+    left_out: dict[int, str] = {}
     with PathFollower(
         recording.camera, path, behaviour=behaviour, seed=config.seed, by="looks"
     ) as follower:
@@ -135,9 +137,9 @@ def _follow(
             try:
                 commands[i] = follower.step(recording.image(i), _time(recording, i))
             except FrameError as error:
-                damaged.append(str(error))
+                left_out[i] = str(error)
             context.progress("following", i + 1, len(recording))
-    return commands, damaged
+    return commands, left_out
 
 
 def _time(recording: OmniRecording, i: int) -> float:
@@ -171,6 +173,17 @@ def _row(i: int, recording: OmniRecording, path: PathMemory, command: DriveComma
         "" if known else command.reason,
         *_metres(None if place is None else place.metric),
     ]
+
+
+def _row_left_out(i: int, recording: OmniRecording, why: str) -> list[Cell]:
+    """Nothing is told to the robot after such an image."""
+    cells: dict[str, Cell] = {
+        "image": int(recording.ids[i]),
+        "name": recording.names[i],
+        "time_s": _time(recording, i),
+        "refusal": why,
+    }
+    return [cells.get(column) for column in COLUMNS]
 
 
 def _metres(metric: MetricPlace | None) -> list[Cell]:
@@ -242,10 +255,11 @@ def _table(numbers: dict[str, JsonValue]) -> TextTable:
     return TextTable("follow", "The recording on the route", "", (Column("", "number"),), cells)
 
 
-def _refusals(commands: list[DriveCommand]) -> tuple[TextTable, ...]:
+def _refusals(commands: list[DriveCommand], left_out: int) -> tuple[TextTable, ...]:
     """Why images have no homing vector, numbers in the reasons as n; none where all have."""
     unknown = [c for c in commands if not np.isfinite(c.homing.covariance[1, 1])]
     kinds = Counter(_NUMBER.sub("n", c.reason.split(":")[0]) for c in unknown)
+    kinds += Counter({"damaged or of another size": left_out})
     if not kinds:
         return ()
     rows = tuple((kind, (str(count),)) for kind, count in kinds.most_common())
