@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray
+from fgslam.core.arrays import BoolArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.slam.bridging import bridged_frames
@@ -45,9 +45,9 @@ def _of_bridged(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
         return ()
     numbers = recorder.log.numbers[frames]
     return (
-        f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]} are not located in the first "
-        "map: in the final trajectory they are interpolated between the located frames around, "
-        "where that is more certain than what the estimator knows",
+        f"{_named(numbers)}: not located in the first map; in the final trajectory interpolated "
+        "between the located frames around, where that is more certain than what the estimator "
+        "knows",
     )
 
 
@@ -59,7 +59,14 @@ def _of_adrift(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     numbers = recorder.log.numbers[adrift]
     known, n = in_first_map(recorder, parts), len(recorder)
     return (
-        f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]} are located beside each other "
-        "only, not in the first map: before them is a gap that neither landmarks nor odometry "
-        f"bridge; {known} of {n} frames ({100.0 * known / n:.0f} %) are located in the first map",
+        f"{_named(numbers)}: located beside each other only, not in the first map; before is a gap "
+        f"that neither landmarks nor odometry bridge; {known} of {n} frames "
+        f"({100.0 * known / n:.0f} %) are located in the first map",
     )
+
+
+def _named(numbers: IntArray) -> str:
+    """Frames by how many they are and the first and last of them."""
+    if len(numbers) == 1:
+        return f"frame {numbers[0]}"
+    return f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]}"

@@ -45,14 +45,14 @@ def test_nothing_is_said_of_one_map() -> None:
 def test_frames_that_are_interpolated_are_told() -> None:
     parts = Apart([True, True, False, True, True])
     (remark,) = part_remarks(recorded(STATUSES), parts)
-    assert remark.startswith("1 frames from 20 to 20 are not located in the first map")
+    assert remark.startswith("frame 20: not located in the first map")
     assert in_first_map(recorded(STATUSES), parts) == 4
 
 
 def test_frames_beyond_a_gap_are_told() -> None:
     parts = Apart([True, True, False, False, False])
     (remark,) = part_remarks(recorded(STATUSES), parts)
-    assert remark.startswith("2 frames from 30 to 40 are located beside each other only")
+    assert remark.startswith("2 frames from 30 to 40: located beside each other only")
     assert remark.endswith("2 of 5 frames (40 %) are located in the first map")
 
 
