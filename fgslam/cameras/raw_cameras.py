@@ -27,6 +27,7 @@ class RawCamera:
         bTc: (4, 4) pose of the camera in the body.
         name: in messages.
         model: name of a model in :data:`fgslam.cameras.lenses.LENSES`.
+        topic: of its images in ROS; empty where the file states none.
     """
 
     width: int
@@ -36,6 +37,7 @@ class RawCamera:
     bTc: FloatArray
     name: str = "camera"
     model: str = "radtan"
+    topic: str = ""
 
     @property
     def lens(self) -> Lens:

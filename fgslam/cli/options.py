@@ -191,7 +191,8 @@ Topics = Annotated[
     str | None,
     typer.Option(
         metavar="LEFT,RIGHT[,ODOMETRY]",
-        help="of a ROS bag: which topics, where their names do not tell; sets dataset.topics",
+        help="of a ROS bag: which topics, where their names do not tell; of three cameras in the "
+        "order of --camera FILE; sets dataset.topics",
     ),
 ]
 Estimator = Annotated[

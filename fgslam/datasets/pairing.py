@@ -13,7 +13,7 @@ _NAMED_SKEW_S = 1e-3  # what synchronised cameras differ by at most
 
 
 def pair_stamps(
-    right: IntArray, left: IntArray, tolerance: float, names: tuple[str, str]
+    right: IntArray, left: IntArray, tolerance: float, names: tuple[str, str], side: str = "left"
 ) -> tuple[tuple[IntArray, IntArray], tuple[str, ...]]:
     """Rows of the right and the left images that are each other's nearest in time.
 
@@ -22,6 +22,7 @@ def pair_stamps(
         left: (m,) stamps of the left one.
         tolerance: largest difference in seconds.
         names: of the right and the left camera, in messages.
+        side: of the camera in place of the left one, in notes.
 
     Returns:
         The paired rows, and notes on images left without a partner and on how far pairs differ.
@@ -41,7 +42,7 @@ def pair_stamps(
             f"within {1e3 * tolerance:g} ms, the nearest differ by {1e3 * skew.min():.4g} ms; "
             "raise dataset.pairing_tolerance_ms or restore the stamps"
         )
-    alone = (("right", len(rows) - len(kept)), ("left", len(left) - len(kept)))
+    alone = (("right", len(rows) - len(kept)), (side, len(left) - len(kept)))
     notes = tuple(
         f"{n} {camera} images have no partner within {1e3 * tolerance:g} ms and are left out"
         for camera, n in alone

@@ -197,7 +197,7 @@ class BagSettings(CalibratedSettings):
     kind: Literal["bag"] = "bag"
     topics: Annotated[
         tuple[str, ...],
-        Field(description="topics: left images, right images, odometry; empty: by type and name"),
+        Field(description="topics: left, right[, top] images, odometry; empty: by type and name"),
     ] = ()
     pairing_tolerance_ms: PairingTolerance = 20.0
 

@@ -87,6 +87,7 @@ def _camera(part: Values, bTc: FloatArray, file: str) -> RawCamera:
             bTc,
             name,
             lens,
+            str(part.tree.get("rostopic") or ""),
         )
     )
 

@@ -89,6 +89,7 @@ def _kalibr_camera(camera: RawCamera) -> dict[str, Any]:
         "distortion_model": kind,
         "distortion_coeffs": [float(v) for v in distortion],
         "resolution": list(camera.size),
+        **({"rostopic": camera.topic} if camera.topic else {}),
     }
 
 

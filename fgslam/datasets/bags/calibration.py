@@ -16,7 +16,7 @@ from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera
 from fgslam.datasets.bags.frames import FrameTree, view_axes
-from fgslam.datasets.bags.topics import Chosen
+from fgslam.datasets.bags.topics import Chosen, FileCameras
 from fgslam.datasets.calibrated import loaded_rig, mounted, numbered, read_rig
 from fgslam.datasets.settings import BagSettings
 from fgslam.datasets.sides import differ_in_number
@@ -55,6 +55,18 @@ class _Found:
     notes: tuple[str, ...] = ()
 
 
+def file_cameras(settings: BagSettings) -> FileCameras:
+    """What the calibration file says of topics; a file at fault is refused with the rig."""
+    if settings.camera_file is None:
+        return FileCameras()
+    file = Path(settings.camera_file)
+    try:
+        cameras = read_calibration_file(file).cameras
+    except CalibrationError:
+        return FileCameras(file.name)
+    return FileCameras(file.name, tuple(camera.topic for camera in cameras))
+
+
 def rig_of_bag(
     settings: BagSettings, stated: Stated, chosen: Chosen
 ) -> tuple[StereoRig, Chosen, tuple[str, ...]]:
@@ -74,13 +86,28 @@ def rig_of_bag(
 def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | None:
     if settings.camera_file is None:
         return None
-    rig = loaded_rig(settings, Path(settings.camera_file), size=stated.size)
+    file, numbers = Path(settings.camera_file), chosen.numbers
+    cameras = read_calibration_file(file, size=stated.size).cameras
+    if numbers:
+        rig = loaded_rig(settings, file, size=stated.size, cameras=numbers, pair=False)
+        return _of_numbers(rig, [cameras[k] for k in numbers], chosen)
+    rig = loaded_rig(settings, file, size=stated.size)
     if differ_in_number(chosen.left, chosen.right):
         rig = numbered(rig)
-    cameras = read_calibration_file(Path(settings.camera_file), size=stated.size).cameras
     order = (0, 1) if rig.rectifier is None else rig.rectifier.order
     right, left = (rig.sources[order.index(k)] for k in (0, 1))
     return _Found(rig, (cameras[left], cameras[right]), chosen)
+
+
+def _of_numbers(rig: StereoRig, cameras: list[RawCamera], chosen: Chosen) -> _Found:
+    """The topics on the sides where the calibration sees their cameras."""
+    views = [chosen.views[k] for k in rig.sources[: rig.cameras]]
+    right, left, *top = views
+    placed = replace(chosen, left=left, right=right, top=top[0] if top else None)
+    if rig.rectifier is not None:
+        rig = replace(rig, rectifier=replace(rig.rectifier, order=tuple(range(rig.cameras))))
+    by_side = (cameras[rig.sources[1]], cameras[rig.sources[0]])
+    return _Found(rig, by_side, placed)
 
 
 # --------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.datasets.bags import messages
-from fgslam.datasets.bags.calibration import Stated, rig_of_bag
+from fgslam.datasets.bags.calibration import Stated, file_cameras, rig_of_bag
 from fgslam.datasets.bags.cut import Message
 from fgslam.datasets.bags.files import BagFiles, MessagesByPlace, bag_files, paths_of
 from fgslam.datasets.bags.frames import FrameTree
@@ -38,18 +38,17 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     where = Path(settings.path)
     paths = paths_of(where)
     files = BagFiles(paths)
-    chosen = choose_topics(files.topics, settings.topics, str(where))
+    chosen = choose_topics(files.topics, settings.topics, str(where), file_cameras(settings))
     index = _indexed(files, chosen)
     source = _Images(files, index, chosen)
     height, width = source.first(chosen.right).shape
     stated = Stated(index.infos, index.frames, index.tree, (width, height))
     rig, chosen, notes = rig_of_bag(settings, stated, chosen)
-    (rows, partners), unpaired = _pairs(index, chosen, settings)
-    stamps = NANOSECONDS * index.stamps[chosen.right][rows].astype(np.float64)
+    rows, unpaired = _paired(index, chosen, settings)
+    stamps = NANOSECONDS * index.stamps[chosen.right][rows[:, 0]].astype(np.float64)
     used = select_frames(len(rows), settings)
-    places = np.column_stack(
-        [index.places[chosen.right][rows], index.places[chosen.left][partners]]
-    )
+    views = (chosen.right, chosen.left, *chosen.views[2:])
+    places = np.column_stack([index.places[v][rows[:, k]] for k, v in enumerate(views)])
     held = source.use_bits(places[:, 0])
     images = _Pairs(source, places, rig)
     return Recording(
@@ -99,7 +98,7 @@ class _Index:
 
 
 def _indexed(files: BagFiles, chosen: Chosen) -> _Index:
-    images, infos = {chosen.left, chosen.right}, {chosen.left_info, chosen.right_info}
+    images, infos = set(chosen.views), {chosen.left_info, chosen.right_info}
     motion = chosen.motion.name if chosen.motion else None
     topics = frozenset(name for name in (*images, *infos, motion, *chosen.transforms) if name)
     first: dict[str, dict[str, Any]] = {}
@@ -159,12 +158,19 @@ def _in_order(
     return places[kept], own[kept], notes
 
 
-def _pairs(
+def _paired(
     index: _Index, chosen: Chosen, settings: BagSettings
-) -> tuple[tuple[IntArray, IntArray], tuple[str, ...]]:
-    right, left = index.stamps[chosen.right], index.stamps[chosen.left]
-    tolerance = 1e-3 * settings.pairing_tolerance_ms
-    return pair_stamps(right, left, tolerance, (chosen.right, chosen.left))
+) -> tuple[IntArray, tuple[str, ...]]:
+    """Rows (n, 2 or 3) of the right, left[, top] images of one time, and notes."""
+    right, tolerance = index.stamps[chosen.right], 1e-3 * settings.pairing_tolerance_ms
+    notes: tuple[str, ...] = ()
+    rows = np.arange(len(right))[:, None]
+    for side, view in zip(("left", "top"), (chosen.left, *chosen.views[2:]), strict=False):
+        (kept, partners), said = pair_stamps(
+            right[rows[:, 0]], index.stamps[view], tolerance, (chosen.right, view), side
+        )
+        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *said)
+    return rows, notes
 
 
 # --------------------------------------------------------------------------------------------
@@ -176,8 +182,7 @@ class _Images:
 
     def __init__(self, files: BagFiles, index: _Index, chosen: Chosen) -> None:
         self._files, self._index = files, index
-        views = (chosen.left, chosen.right)
-        self._messages = MessagesByPlace(files, index.topics, index.times, views)
+        self._messages = MessagesByPlace(files, index.topics, index.times, chosen.views)
         self._bits = 16
 
     def use_bits(self, places: IntArray) -> tuple[str, ...]:
@@ -218,14 +223,14 @@ class _Images:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of images by frame."""
+    """Images of both cameras, or of three, by frame."""
 
     images: _Images
     places: IntArray
     rig: StereoRig
 
     def load(self, index: int) -> tuple[Image, ...]:
-        """Rectified (right, left). Raises FrameError: damaged or of another size."""
+        """Rectified (right, left[, top]). Raises FrameError: damaged or of another size."""
         return self._rectified(index, self.images.load)
 
     def load_colour(self, index: int) -> tuple[Image, ...]:

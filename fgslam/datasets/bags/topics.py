@@ -27,11 +27,13 @@ class Chosen:
     """Topics that are used.
 
     Attributes:
-        left, right: of images.
+        left, right, top: of images; top is None where there are two cameras.
         left_info, right_info: of their camera_info; None where there is none.
         motion: of odometry, or None.
         transforms: of tf_static; where the bag has none, of tf, which says again what stays.
         notes: what else could have been taken.
+        numbers: which cameras of the calibration file left, right[, top] are, so that it tells the
+            sides; empty: the topics do.
     """
 
     left: str
@@ -41,10 +43,33 @@ class Chosen:
     motion: Topic | None
     transforms: tuple[str, ...]
     notes: tuple[str, ...]
+    numbers: tuple[int, ...] = ()
+    top: str | None = None
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Left, right[, top]."""
+        return (self.left, self.right, *([] if self.top is None else [self.top]))
 
 
-def choose_topics(topics: Sequence[Topic], wanted: Sequence[str], where: str) -> Chosen:
-    """The topics of one stereo pair and of its odometry.
+@dataclass(frozen=True, slots=True)
+class FileCameras:
+    """The cameras of a calibration file.
+
+    Attributes:
+        file: its name; empty: there is none.
+        topics: of each camera's images, empty where it states none; () where it cannot be read
+            before the images' size is known.
+    """
+
+    file: str = ""
+    topics: tuple[str, ...] = ()
+
+
+def choose_topics(
+    topics: Sequence[Topic], wanted: Sequence[str], where: str, cameras: FileCameras
+) -> Chosen:
+    """The topics of two or three cameras and of their odometry.
 
     Raises:
         DatasetError: a wanted topic is not there or of no use, or the bag has no pair of cameras.
@@ -53,22 +78,17 @@ def choose_topics(topics: Sequence[Topic], wanted: Sequence[str], where: str) ->
     named = _named(used, wanted, where)
     images = [topic for topic in named if topic.kind in IMAGES]
     motions = [topic for topic in named if topic.kind in MOTIONS]
-    if wanted and len(images) not in (0, 2):
-        raise DatasetError(
-            f"{where}: {len(images)} topics of images are named; name the left camera's and the "
-            "right one's"
-        )
-    others: tuple[str, ...] = ()
     if images:
-        left, right = (topic.name for topic in images)
+        views = _Views(*_as_named([topic.name for topic in images], cameras, where))
     else:
-        left, right, others = _pair(used, where)
+        views = _by_file(used, cameras, where) or _by_names(used, cameras, where)
+    left, right, *top = views.topics
     infos = _infos(used, left, right)
-    notes = (f"also there: {', '.join(others)}; --topics chooses",) if others else ()
     motion = motions[0] if motions else _motion(used)
     of_frames = tuple(topic.name for topic in used if topic.kind in kinds.TRANSFORMS)
     transforms = tuple(name for name in of_frames if name.endswith("tf_static")) or of_frames
-    return Chosen(left, right, *infos, motion, transforms, notes)
+    third = top[0] if top else None
+    return Chosen(left, right, *infos, motion, transforms, views.notes, views.numbers, third)
 
 
 def _named(topics: Sequence[Topic], wanted: Sequence[str], where: str) -> list[Topic]:
@@ -84,18 +104,92 @@ def _named(topics: Sequence[Topic], wanted: Sequence[str], where: str) -> list[T
     return [by_name[name] for name in wanted]
 
 
-def _pair(topics: Sequence[Topic], where: str) -> tuple[str, str, tuple[str, ...]]:
-    """The preferred pair of image topics, left first, and the other pairs in words."""
-    views = [t.name for t in topics if t.kind in IMAGES and not _NO_VIEW.search(t.name)]
+# --------------------------------------------------------------------------------------------
+# Which topics are the cameras
+
+
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """Topics of left, right[, top], their cameras in the file, and what else could be taken."""
+
+    topics: tuple[str, ...]
+    numbers: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def _as_named(
+    names: Sequence[str], cameras: FileCameras, where: str
+) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """The user's topics and, where the file tells them or must, their cameras in it."""
+    if len(names) not in (2, 3):
+        raise DatasetError(
+            f"{where}: {len(names)} topics of images are named; name the left camera's and the "
+            "right one's, or those of three cameras in the order of their --camera FILE"
+        )
+    numbers = {_absolute(topic): k for k, topic in enumerate(cameras.topics) if topic}
+    found = [numbers.get(name.removesuffix(_TRANSPORT)) for name in names]
+    known = tuple(k for k in found if k is not None)
+    if len(set(known)) == len(names):
+        return tuple(names), known
+    if len(names) == 2:
+        return tuple(names), ()
+    if not cameras.file or len(cameras.topics) not in (0, 3):
+        known_of = f"{cameras.file} is of {len(cameras.topics)}" if cameras.file else "none"
+        raise DatasetError(
+            f"{where}: three topics of images are named, which need one calibration of all three "
+            f"cameras ({known_of}); give it by --camera FILE, or name two topics"
+        )
+    return tuple(names), (0, 1, 2)
+
+
+def _by_file(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Views | None:
+    """The topics that the calibration file states; None where the bag has not two of them."""
+    by_view = _by_view([topic.name for topic in topics if topic.kind in IMAGES])
+    stated = {k: _absolute(topic) for k, topic in enumerate(cameras.topics) if topic}
+    found = {k: by_view[view] for k, view in stated.items() if view in by_view}
+    if len(found) < 2:
+        return None
+    listed = ", ".join(found.values())
+    if len(found) > 3:
+        raise DatasetError(
+            f"{where}: {cameras.file} names the topics of {len(found)} cameras, {listed}; say "
+            "which two or three form the rig: --topics"
+        )
+    note = f"topics by rostopic of {cameras.file}: {listed}"
+    return _Views(tuple(found.values()), tuple(found), (note,))
+
+
+def _absolute(topic: str) -> str:
+    return "/" + topic.strip().strip("/").removesuffix(_TRANSPORT)
+
+
+def _by_view(names: Sequence[str]) -> dict[str, str]:
+    """Topics by their names without transport, raw before compressed."""
     by_view: dict[str, str] = {}
-    for name in sorted(views, key=len):
-        by_view.setdefault(name.removesuffix(_TRANSPORT), name)  # raw before compressed
+    for name in sorted(names, key=len):
+        by_view.setdefault(name.removesuffix(_TRANSPORT), name)
+    return by_view
+
+
+def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Views:
+    """The preferred pair; with a file of three cameras the one that the next number names, too."""
+    views = [t.name for t in topics if t.kind in IMAGES and not _NO_VIEW.search(t.name)]
+    by_view = _by_view(views)
     pairs = sorted(camera_pairs(by_view), key=lambda pair: (_rank(pair[0]), pair))
     if not pairs:
         raise DatasetError(_no_pair(topics, views, where))
-    left, right = pairs[0]
-    others = tuple(f"{a} with {b}" for a, b in pairs[1:])
-    return by_view[left], by_view[right], others
+    used, *others = pairs
+    third = [pair for pair in others if pair[0] == used[1] and len(cameras.topics) == 3][:1]
+    names = (*used, *(pair[1] for pair in third))
+    also = ", ".join(f"{a} with {b}" for a, b in others if (a, b) not in third)
+    notes = [f"also there: {also}; --topics chooses"] if also else []
+    shown = set(_by_view([topic.name for topic in topics if topic.kind in IMAGES]))
+    absent = [topic for topic in cameras.topics if topic and _absolute(topic) not in shown]
+    if absent:
+        text = f"no images here of {', '.join(absent)}, the rostopic in {cameras.file}"
+        notes.insert(0, f"{text}: topics are told by their names")
+    numbers = (0, 1, 2) if third else ()
+    return _Views(tuple(by_view[name] for name in names), numbers, tuple(notes))
 
 
 def _rank(view: str) -> int:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from bags import (
     PERIOD_NS,
     START_NS,
@@ -19,7 +21,7 @@ from bags import (
     twists,
     write_bag,
 )
-from dataset_builders import WIDTH, picture, write_calibration
+from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibration
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
@@ -28,6 +30,7 @@ from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.camera_files import Asked, convert_calibration
 
 KINDS = (".bag", ".db3", ".mcap")
 
@@ -169,6 +172,114 @@ def test_one_camera_info_is_not_enough_but_a_file_is(tmp_path: Path) -> None:
         opened(path)
     write_calibration(tmp_path)
     assert opened(path, camera_file=str(tmp_path / "calib.json")).rig.baseline == 0.2
+
+
+PLACES = {"right": (0.0, 0.0), "left": (-0.2, 0.0), "top": (0.0, -0.15), "far": (-0.4, 0.0)}
+
+
+def camchain(folder: Path, topics: Mapping[str, str]) -> str:
+    """Kalibr's file of these cameras in this order, each with its topic, or with none."""
+    chain: dict[str, dict[str, Any]] = {}
+    for k, (name, topic) in enumerate(topics.items()):
+        before = PLACES[list(topics)[max(k - 1, 0)]]
+        step = np.eye(4)
+        step[:2, 3] = np.subtract(before, PLACES[name])
+        chain[f"cam{k}"] = {
+            "camera_model": "pinhole",
+            "intrinsics": [CALIBRATION[key] for key in ("fx", "fy", "cx", "cy")],
+            "distortion_model": "radtan",
+            "distortion_coeffs": [0.0] * 4,
+            "resolution": [WIDTH, HEIGHT],
+            **({"T_cn_cnm1": step.tolist()} if k else {}),
+            **({"rostopic": topic} if topic else {}),
+        }
+    file = folder / "camchain.yaml"
+    file.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    return str(file)
+
+
+def views(codes: Mapping[str, int], frames: int = 2) -> list[Any]:
+    """Images of cameras whose corner pixel is their code and the frame's number."""
+    made = [(name, code, k) for k in range(frames) for name, code in codes.items()]
+    return [
+        (name, START_NS + k * PERIOD_NS, "sensor_msgs/msg/Image", raw_image(picture(code + k)))
+        for name, code, k in made
+    ]
+
+
+@pytest.mark.parametrize("order", [("left", "right"), ("right", "left")])
+def test_a_camchain_says_which_topics_are_its_cameras(
+    tmp_path: Path, order: tuple[str, str]
+) -> None:
+    """Also which of them is the right one, whatever the names say."""
+    images = {"/a/cam1": 60, "/b/cam0": 10, "/cam0/image_raw": 110, "/cam1/image_raw": 120}
+    path = write_bag(tmp_path / "a.bag", views(images))
+    topics = {"left": "/a/cam1", "right": "/b/cam0"}
+    file = camchain(tmp_path, {name: topics[name] for name in order})
+    found = bare_experiment(path, Path(file))
+    named = ", ".join(topics[name] for name in order)
+    assert f"note: topics by rostopic of camchain.yaml: {named}\n" in found.said + "\n"
+    assert codes(opened(path, camera_file=file), 1) == (11, 61)
+    chosen = opened(path, camera_file=file, topics=("/a/cam1", "/b/cam0"))
+    assert codes(chosen, 1) == (11, 61)
+    assert not any("rostopic" in note for note in chosen.notes)
+    other = camchain(tmp_path, {"left": "/elsewhere", "right": "/b/cam0"})
+    by_name = opened(path, camera_file=other)
+    assert codes(by_name, 0) == (120, 110)
+    assert "no images here of /elsewhere, the rostopic in camchain.yaml" in by_name.notes[0]
+
+
+def test_the_images_may_be_compressed_that_a_camchain_names(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.mcap", stereo(1, compressed_image, ("/x", "/y")))
+    file = camchain(tmp_path, {"left": "/x/image_raw", "right": "y/image_raw"})
+    assert codes(opened(path, camera_file=file), 0) == (10, 60)
+    written = tmp_path / "again.yaml"
+    convert_calibration(Asked(Path(file)), written)
+    assert codes(opened(path, camera_file=str(written)), 0) == (10, 60)
+
+
+TRIO = {"top": "/t/image", "left": "/l/image", "right": "/r/image"}
+
+
+def test_three_cameras(tmp_path: Path) -> None:
+    """Their topics by the file's rostopics, by --topics, or by consecutive numbers in names."""
+    images = dict(zip(TRIO.values(), (110, 60, 10), strict=True))
+    path = write_bag(tmp_path / "a.bag", views(images)[:-1])  # the last image of the right one
+    file = camchain(tmp_path, TRIO)
+    found = bare_experiment(path, Path(file))
+    assert found.said.startswith("a: ROS bag, 3 cameras 32x24; 1 frames")
+    recording = opened(path, camera_file=file)
+    assert codes(recording, 0) == (10, 60, 110)
+    assert recording.rig.vertical_baseline == pytest.approx(0.15)
+    assert "1 top images have no partner within 20 ms" in " ".join(recording.notes)
+    two = opened(path, camera_file=file, topics=("/l/image", "/r/image"))
+    assert codes(two, 0) == (10, 60)
+    blank = camchain(tmp_path, dict.fromkeys(TRIO, ""))
+    named = opened(path, camera_file=blank, topics=tuple(TRIO.values()))
+    assert codes(named, 0) == (10, 60, 110)
+    numbered = {f"/cam{k}/image_raw": code for k, code in enumerate(images.values())}
+    by_name = opened(write_bag(tmp_path / "b.bag", views(numbered)), camera_file=blank)
+    assert codes(by_name, 1) == (11, 61, 111)
+
+
+def test_three_cameras_need_a_calibration_of_three(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "a.bag", views(dict.fromkeys(TRIO.values(), 10)))
+    topics = tuple(TRIO.values())
+    with pytest.raises(DatasetError, match=r"need one calibration of all three cameras \(none\)"):
+        opened(path, topics=topics)
+    pair = camchain(tmp_path, {"left": "", "right": ""})
+    with pytest.raises(DatasetError, match=r"\(camchain\.yaml is of 2\); give it by --camera FILE"):
+        opened(path, topics=topics, camera_file=pair)
+
+
+def test_of_four_cameras_some_must_be_chosen(tmp_path: Path) -> None:
+    four = {**TRIO, "far": "/f/image"}
+    images = dict(zip(four.values(), (110, 60, 10, 160), strict=True))
+    path, file = write_bag(tmp_path / "a.bag", views(images)), camchain(tmp_path, four)
+    with pytest.raises(DatasetError, match=r"names the topics of 4 cameras, .*: --topics"):
+        opened(path, camera_file=file)
+    far = opened(path, camera_file=file, topics=("/f/image", "/l/image"))
+    assert codes(far, 0) == (60, 160)
 
 
 def test_a_camera_info_without_baseline(tmp_path: Path) -> None:
