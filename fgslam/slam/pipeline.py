@@ -154,10 +154,11 @@ class SlamPipeline:
         stats = updated(self.estimator, increment, seen.tracking)
         observe(self.motion, increment, seen.tracking, stats)
         self.tracker.noise.learn(seen.tracking)
-        if described is not None and self.watch is not None:
-            self._look_for_other_motion(index, described, seen, stats)
         self._remember(increment, seen, stats)
         watch.lap("update")
+        if described is not None and self.watch is not None:
+            self._look_for_other_motion(index, described, seen, stats)
+        watch.lap("watch")  # not the estimator's time
         if self.calibration is not None:
             self.calibration.observe(increment, stats.wTc)
         watch.lap("calibrate")

@@ -18,7 +18,7 @@ import numpy as np
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray, Rows, StateArrays
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.features import StereoFeatures
-from fgslam.core.geometry import inverse
+from fgslam.core.geometry import rotate_covariances, transform_to_world
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
@@ -36,7 +36,7 @@ class _Unexplained(Rows):
     """Features (n,) of a frame that no landmark known before it explains.
 
     ``ids`` are the landmarks that they began, -1 for none; ``positions`` (n, 3) and
-    ``covariances`` (n, 3, 3) in that frame's camera, metres.
+    ``covariances`` (n, 3, 3) in the world, by that frame's pose, metres.
     """
 
     ids: IntArray
@@ -53,6 +53,15 @@ class _Unexplained(Rows):
             np.empty((0, 3, 3)),
         )
 
+    @staticmethod
+    def of(features: StereoFeatures, ids: IntArray, wTc: FloatArray) -> _Unexplained:
+        return _Unexplained(
+            ids,
+            features.descriptors,
+            transform_to_world(wTc, features.position),
+            rotate_covariances(wTc[:3, :3], features.position_covariance),
+        )
+
 
 class OtherMotion:
     """Remembers the frames of a drive that show a second rigid motion."""
@@ -63,7 +72,6 @@ class OtherMotion:
         self._resection = Resection(solver)
         self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
         self._before = _Unexplained.none()
-        self._pose = np.full((4, 4), np.nan)
         self._latest: deque[tuple[int, float]] = deque(maxlen=_WINDOW)
         self._doubted: dict[int, float] = {}
 
@@ -79,7 +87,7 @@ class OtherMotion:
 
         Args:
             index: its number.
-            features: (n,) its features.
+            features: (n,) those found in every image.
             known: (n,) the landmark that each is taken for, -1 for none, and the identities of
                 those among them that were known before.
             tracking: its pose, as it was tracked.
@@ -87,8 +95,6 @@ class OtherMotion:
         """
         partners, old = known
         left = np.flatnonzero(~np.isin(partners, old))
-        if features.complete is not None:
-            left = left[features.complete[left]]
         left = left[np.argsort(-features.scale[left], kind="stable")[:_LARGEST]]
         share = self._share(features, left, old, tracking) if tracking.status.measured else 0.0
         self._latest.append((index, share))
@@ -96,13 +102,9 @@ class OtherMotion:
         if len(seen) >= _FRAMES:
             self._doubted.update(seen)
         followed = tracking.status.measured or tracking.status is EgoMotionStatus.FIRST
-        self._pose = wTc if followed else np.full((4, 4), np.nan)
-        self._before = _Unexplained(
-            partners[left],
-            features.descriptors[left],
-            features.position[left],
-            features.position_covariance[left],
-        )
+        self._before = _Unexplained.none()
+        if followed:
+            self._before = _Unexplained.of(features.select(left), partners[left], wTc)
 
     def remarks(self) -> tuple[str, ...]:
         """What is to be said of the frames with two motions."""
@@ -122,7 +124,7 @@ class OtherMotion:
     ) -> float:
         """Matches that agree with another motion over those of the pose; zero where none is."""
         before = self._before.select(~np.isin(self._before.ids, old))
-        if min(len(left), len(before)) < _FEWEST or np.isnan(self._pose[0, 0]):
+        if min(len(left), len(before)) < _FEWEST:
             return 0.0
         i, j = mutual_nearest(features.descriptors[left], before.descriptors)
         problem = PoseProblem(
@@ -131,8 +133,7 @@ class OtherMotion:
             features.measurement[left[i]],
             features.measurement_covariance[left[i]],
         )
-        followed = inverse(self._pose) @ tracking.wTc
-        against = self._solver.image_residuals(followed, problem) > self._solver.farthest
+        against = self._solver.image_residuals(tracking.wTc, problem) > self._solver.farthest
         if against.sum() < _FEWEST:
             return 0.0
         rest = problem.select(against)
@@ -154,7 +155,6 @@ class OtherMotion:
         out = {
             f"before_{one.name}": getattr(self._before, one.name) for one in fields(_Unexplained)
         }
-        out["before_pose"] = self._pose
         out["other_motions"] = np.array(list(self._latest)).reshape(-1, 2)
         out["doubted"] = np.array(list(self._doubted.items())).reshape(-1, 2)
         return out
@@ -162,7 +162,6 @@ class OtherMotion:
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
         self._before = _Unexplained(*(state[f"before_{one.name}"] for one in fields(_Unexplained)))
-        self._pose = state["before_pose"]
         pairs = [(int(one), float(share)) for one, share in state["other_motions"]]
         self._latest = deque(pairs, maxlen=_WINDOW)
         self._doubted = {int(one): float(share) for one, share in state["doubted"]}

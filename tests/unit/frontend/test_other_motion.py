@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import time
+from typing import Any
+
 import cv2
 import numpy as np
+import pytest
 from textured_room import TEXTURE
 
 from fgslam.core.arrays import Image
@@ -11,6 +15,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.other_motion import OtherMotion
+from fgslam.slam.results import STAGES
 from fgslam.slam.session import Session
 
 RIG = CameraRig(240, 180, 180.0, 180.0, 119.5, 89.5, 0.12, None, np.eye(4))
@@ -18,6 +23,7 @@ SCENE = ((5.0, -9.0, 9.0), (3.0, -1.6, -0.9), (2.5, 0.7, 1.5))
 """Planes that face the camera: depth, left and right edge in metres."""
 BOARD_M = 0.5
 FRAMES = 6
+_SLOW_S = 0.05
 
 
 def seen(planes: list[tuple[float, float, float]], x: float, z: float) -> Image:
@@ -64,7 +70,16 @@ def test_something_large_that_passes_is_told() -> None:
             np.testing.assert_array_equal(other.state()[name], array)
 
 
-def test_a_scene_that_stands_has_one_motion() -> None:
+def test_a_scene_that_stands_has_one_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    look = OtherMotion.look
+
+    def slowly(*arguments: Any) -> None:
+        time.sleep(_SLOW_S)
+        look(*arguments)
+
+    monkeypatch.setattr(OtherMotion, "look", slowly)
     with drive(1.6, 0.0) as session:
         assert session.result().notes == ()
         assert session.pipeline.tracker.other_motion.remarks() == ()
+        watching = session.recorder.stage_ms[-1][STAGES.index("watch")]
+        assert watching >= 1e3 * _SLOW_S, "the time is not the estimator's"
