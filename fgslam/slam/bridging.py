@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
@@ -149,9 +148,8 @@ class _Drive:
     def stretches(self, gap: Gap) -> IntArray:
         """(w,) where located frames begin, in a row as many as a gap with its ends; the nearest."""
         count = gap[1] - gap[0] + 1
-        if count > len(self.known):
-            return np.empty(0, np.int64)
-        starts = np.flatnonzero(sliding_window_view(self.known, count).all(axis=1))
+        before = np.concatenate([[0], np.cumsum(self.known)])  # located frames before each
+        starts = np.flatnonzero(before[count:] - before[:-count] == count)
         return starts[np.argsort(np.abs(starts - gap[0]), kind="stable")[:_STRETCHES]]
 
     def way(self, first: int, frame: int, last: int) -> _Way:
