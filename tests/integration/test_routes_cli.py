@@ -253,8 +253,8 @@ def test_wrong_routes_are_one_line_each(
     route = ("route", taught, "--from", "a", "--to", "b", "--out", taught)
     assert "the map itself, which would be lost" in mistake(capfd, monkeypatch, *route)
     assert taught.read_bytes() == stored
-    opencv = tmp_path / "mei.yaml"
-    opencv.write_text("%YAML:1.0\n---\nmodel_type: MEI\n", encoding="utf-8")
+    opencv = tmp_path / "pair.yaml"
+    opencv.write_text("%YAML:1.0\n---\nM1: 1\n", encoding="utf-8")
     said = mistake(capfd, monkeypatch, "follow", taught, again, "--camera", opencv)
     assert f"{opencv} is written by OpenCV, of no omnidirectional camera that is read" in said
     said = mistake(capfd, monkeypatch, "follow", taught, data)

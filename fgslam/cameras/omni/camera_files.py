@@ -10,7 +10,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.formats.kalibr import is_camchain
+from fgslam.cameras.formats.slam_settings import is_camodocal
+from fgslam.cameras.formats.trees import read_tree
 from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import (
     HyperbolicMirror,
     MirrorFrame,
@@ -24,10 +29,12 @@ from fgslam.cameras.omni.settings import (
     CylinderSettings,
     EquirectangularSettings,
     HyperbolicMirrorSettings,
+    LensSettings,
     MirrorMountSettings,
     OCamCalibSettings,
     RadialPolynomialSettings,
 )
+from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.errors import CalibrationError, shortened
 from fgslam.core.files import read_lines
 from fgslam.core.settings import make_settings
@@ -41,6 +48,7 @@ OmniCameraKind: TypeAlias = (
     | CylinderSettings
     | HyperbolicMirrorSettings
     | OCamCalibSettings
+    | LensSettings
     | RadialPolynomialSettings
     | BloggieSettings
 )
@@ -53,10 +61,11 @@ def load_camera(
     """An omnidirectional camera from a calibration file, or from the keys of its model.
 
     Args:
-        source: the path of an OCamCalib result file (``calib_results.txt``), of BloggieUnwarp's
-            ``settings.txt`` or of a YAML file of keys; or the keys themselves, as under
-            ``dataset.camera`` of an experiment: ``{"kind": "mirror", "xi": 0.92}``; or the kind
-            alone: ``"equirectangular"``, ``"cylinder"``, ``"mirror"``, ``"radial_polynomial"``.
+        source: the path of an OCamCalib result file (``calib_results.txt``), of a camera of
+            camodocal (MEI) or Kalibr whose middle looks down, of BloggieUnwarp's ``settings.txt``
+            or of a YAML file of keys; or the keys themselves, as under ``dataset.camera`` of an
+            experiment: ``{"kind": "mirror", "xi": 0.92}``; or the kind alone:
+            ``"equirectangular"``, ``"cylinder"``, ``"mirror"``, ``"radial_polynomial"``.
         size: width and height of the images, pixels; None where the calibration states it.
 
     Raises:
@@ -120,10 +129,8 @@ def make_camera(
             return Cylinder(*size, float(tangents[0]), float(tangents[1]))
         case HyperbolicMirrorSettings():
             return _hyperbolic(settings, _stated_size("mirror", settings.size, image_size))
-        case OCamCalibSettings():
-            calibration = read_ocamcalib(_find(settings.file, folder))
-            ahead = math.radians(settings.ahead_deg)
-            return calibration.camera(image_size, settings.ring_px, ahead, settings.clockwise)
+        case OCamCalibSettings() | LensSettings():
+            return _calibrated(settings, _find(settings.file, folder), image_size)
         case RadialPolynomialSettings():
             size = _stated_size(settings.kind, settings.size, image_size)
             frame = _frame(settings, size, settings.centre)
@@ -144,6 +151,9 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
             f"file, or one of {', '.join(_KINDS)}"
         )
     if path.suffix.lower() in (".yaml", ".yml"):
+        tree = read_tree(path)
+        if tree is not None and "kind" not in tree and (is_camodocal(tree) or is_camchain(tree)):
+            return LensSettings(file=path.name), path.parent
         _refuse_opencv(path)
         return _settings_of(read_yaml(path, CalibrationError), str(path)), path.parent
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
@@ -156,7 +166,8 @@ def _refuse_opencv(path: Path) -> None:
     if lines and lines[0][1].startswith("%YAML:"):
         raise CalibrationError(
             f"{path} is written by OpenCV, of no omnidirectional camera that is read; give "
-            f"OCamCalib's result, or a YAML file of keys with a kind, one of {', '.join(_KINDS)}"
+            "OCamCalib's result, camodocal's of one camera (MEI), or a YAML file of keys with a "
+            f"kind, one of {', '.join(_KINDS)}"
         )
 
 
@@ -177,6 +188,7 @@ _KINDS: dict[str, type[OmniCameraKind]] = {
     "cylinder": CylinderSettings,
     "mirror": HyperbolicMirrorSettings,
     "ocamcalib": OCamCalibSettings,
+    "lens": LensSettings,
     "radial_polynomial": RadialPolynomialSettings,
     "bloggie": BloggieSettings,
 }
@@ -209,6 +221,31 @@ def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMir
     inner = settings.inner_radius_px
     inner = focal * scales[lowest] if inner is None else inner
     return HyperbolicMirror(frame, inner, outer, xi=settings.xi, focal_px=focal)
+
+
+def _calibrated(
+    settings: OCamCalibSettings | LensSettings, path: Path, size: Size | None
+) -> OmniCamera:
+    ahead, clockwise = math.radians(settings.ahead_deg), settings.clockwise
+    if isinstance(settings, OCamCalibSettings):
+        return read_ocamcalib(path).camera(size, settings.ring_px, ahead, clockwise)
+    raw = _only_camera(path, size)
+    return LensCamera.of(raw, settings.ring_px, settings.middle == "up", ahead, clockwise)
+
+
+def _only_camera(path: Path, size: Size | None) -> RawCamera:
+    cameras = read_calibration_file(path).cameras
+    if len(cameras) != 1:
+        raise CalibrationError(
+            f"{path}: is of {len(cameras)} cameras, an omnidirectional camera is one; leave only "
+            "that one in the file"
+        )
+    if size not in (None, cameras[0].size):
+        raise CalibrationError(
+            f"{path} calibrates pictures of {cameras[0].width}x{cameras[0].height}, but the "
+            f"pictures have {size[0]}x{size[1]} pixels; scale them, or calibrate again"
+        )
+    return cameras[0]
 
 
 def _stated_size(kind: str, calibrated: Size | None, size: Size | None) -> Size:

@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame, RadialPolynomial
 from fgslam.cameras.omni.ocamcalib import OCamCamera
 from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
@@ -14,7 +15,14 @@ from fgslam.core.errors import CalibrationError
 
 _MODELS: dict[str, Any] = {
     model.__name__: model
-    for model in (Equirectangular, Cylinder, HyperbolicMirror, RadialPolynomial, OCamCamera)
+    for model in (
+        Equirectangular,
+        Cylinder,
+        HyperbolicMirror,
+        RadialPolynomial,
+        OCamCamera,
+        LensCamera,
+    )
 }
 
 

@@ -122,6 +122,30 @@ class OCamCalibSettings(MirrorMountSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
+class LensSettings(MirrorMountSettings):
+    """A camera of camodocal (MEI, KANNALA_BRANDT) or of Kalibr whose axis is vertical."""
+
+    kind: Literal["lens"] = "lens"
+    file: Annotated[
+        str,
+        Field(
+            min_length=1, description="its calibration, looked for beside the pictures, then here"
+        ),
+    ] = "camera.yaml"
+    middle: Annotated[
+        Literal["down", "up"],
+        Field(
+            description="where the picture's middle looks: down as of a mirror above the camera, "
+            "up as of a fisheye that looks up"
+        ),
+    ] = "down"
+    ring_px: Annotated[
+        Pair | None,
+        Field(description="inner and outer radius; null: the largest circle in the picture"),
+    ] = None
+
+
+@dataclass(frozen=True, config=STRICT)
 class RadialPolynomialSettings(MirrorMountSettings):
     """The paper's polynomial of elevation over radius, or a line between two elevations."""
 
@@ -165,6 +189,7 @@ OmniCameraSettings: TypeAlias = Annotated[
     | CylinderSettings
     | HyperbolicMirrorSettings
     | OCamCalibSettings
+    | LensSettings
     | RadialPolynomialSettings
     | BloggieSettings,
     Field(discriminator="kind"),

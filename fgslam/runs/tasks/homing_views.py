@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import RadialCamera
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
@@ -56,11 +57,23 @@ def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
 
 
 def camera_notes(recording: OmniRecording) -> tuple[str, ...]:
-    """A note where mirror or panoramas are clearly not as the camera says they are."""
+    """Notes where mirror or panoramas are clearly not as stated, or what a file does not state."""
     camera = recording.camera
     if isinstance(camera, Equirectangular):
         return _panorama_notes(camera)
+    if isinstance(camera, LensCamera):
+        return (_lens_note(camera),)
     return _mirror_notes(recording, camera) if isinstance(camera, RadialCamera) else ()
+
+
+def _lens_note(camera: LensCamera) -> str:
+    """What no calibration of a lens says."""
+    stated, other = ("up", "down") if camera.up else ("down", "up")
+    turn = "clockwise" if camera.clockwise else "counter-clockwise"
+    return (
+        f"the picture's middle is taken to look {stated}, bearings to grow {turn} in it; "
+        f"dataset.camera.middle={other} and dataset.camera.clockwise say otherwise"
+    )
 
 
 def _panorama_notes(camera: Equirectangular) -> tuple[str, ...]:
