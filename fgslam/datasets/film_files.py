@@ -70,10 +70,10 @@ def _write_mp4(path: Path, frames: Iterable[Image], fps: float) -> int:
 
 
 def _require_whole(path: Path, count: int) -> None:
-    """Raises OutputError for a film of other frames than were given: its end is its table."""
-    film = cv2.VideoCapture(str(path)) if count else None
-    if film is None:
+    """Raises OSError unless the film has ``count`` frames: its table of them is written last."""
+    if not count:
         return
+    film = cv2.VideoCapture(str(path))
     found = round(film.get(cv2.CAP_PROP_FRAME_COUNT)) if film.isOpened() else 0
     film.release()
     if found != count:

@@ -103,9 +103,10 @@ def calibration_note(calibration: SelfCalibration | None) -> str:
 
 
 def _field(calibration: SelfCalibration) -> str:
-    """What is left, where that is more than usual."""
+    """What no term of a correction follows, where that is more than usual."""
     px = calibration.field_px
-    return f"; {px:.2f} px in each image are left, uneven over it" * (px >= _TOLD_FIELD_PX)
+    left = f"; {px:.2f} px (rms) of distortion in each image that no correction describes are left"
+    return left * (px >= _TOLD_FIELD_PX)
 
 
 def _told(known: RigCorrection, camera: str) -> str:
