@@ -413,9 +413,17 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
         calibration.require_uncorrected(f"images of {size[0]}x{size[1]} pixels are given")
     if other and not scale:
         _require_one_size(calibration.cameras)
-        raise CalibrationError(
+        different = (
             f"{calibration.source} is for images of {other[0].width}x{other[0].height} pixels, the "
-            f"images have {size[0]}x{size[1]}; if they were resized as a whole, say so: --set "
+            f"images have {size[0]}x{size[1]}"
+        )
+        if other[0].size == size[::-1]:
+            raise CalibrationError(
+                f"{different}: they lie on their side; turn them upright again (of a film: remove "
+                "its rotation), or calibrate them as they are"
+            )
+        raise CalibrationError(
+            f"{different}; if they were resized as a whole, say so: --set "
             "dataset.resized=true, --scale of fgslam camera, scale=True of load_rig"
         )
     cameras = tuple(

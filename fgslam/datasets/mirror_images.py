@@ -67,7 +67,7 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
         ids=moments.numbers[:, 0],
         names=tuple(f"frame {k}" for k in range(frames.count)),
         timestamps=moments.times,
-        notes=moments.notes,
+        notes=(*frames.notes, *moments.notes),
         load_image=frames.load,
     )
     return recording.select(chosen)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -27,7 +28,7 @@ class VideoFrames:
         name: of the file.
         count: frames that can be read.
         rate: frames a second, as the file states it.
-        notes: what was cut off.
+        notes: what was cut off; how the frames are turned.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,11 +39,9 @@ class VideoFrames:
         stated = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS))
         self.count = stated if stated > 0 and self._reaches(stated) else self._counted()
-        self.notes: tuple[str, ...] = ()
         if self.count < 1:
             raise DatasetError(f"{path} holds no frame; give a video file")
-        if self.count < stated:
-            self.notes = (f"{path.name} is cut off: {self.count} of {stated} frames can be read",)
+        self.notes: tuple[str, ...] = tuple(self._noticed(stated))
         self._next = 0
         self._kept: OrderedDict[int, Image] = OrderedDict()
 
@@ -96,6 +95,15 @@ class VideoFrames:
             raise FrameError(
                 f"video {self._path}: frame {number} cannot be decoded; leave it out with "
                 "dataset.start, stop or stride"
+            )
+
+    def _noticed(self, stated: int) -> Iterator[str]:
+        if self.count < stated:
+            yield f"{self.name} is cut off: {self.count} of {stated} frames can be read"
+        if turn := round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)):
+            yield (
+                f"{self.name} states that it is to be turned by {turn} degrees, and is read so: "
+                "the calibration must be of images turned so"
             )
 
     def _reaches(self, stated: int) -> bool:

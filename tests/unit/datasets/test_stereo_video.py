@@ -43,6 +43,16 @@ def film(path: Path, frames: list[Image], rate: float = 20.0) -> Path:
     return path
 
 
+def turned_by_180(path: Path) -> Path:
+    """States in the film's track header that frames are to be shown upside down (tkhd's matrix)."""
+    data = bytearray(path.read_bytes())
+    at = data.find(b"tkhd") + 4 + 4 + 20 + 16  # version and flags, times and numbers of version 0
+    for place in (at, at + 16):
+        data[place : place + 4] = (-(1 << 16)).to_bytes(4, "big", signed=True)
+    path.write_bytes(data)
+    return path
+
+
 def stereo_frames(join: Callable[[list[Image]], Image], count: int = 6) -> list[Image]:
     """Left views of 40, 50, ... and right ones of 140, 150, ..."""
     return [join([view(40 + 10 * k), view(140 + 10 * k)]) for k in range(count)]
@@ -249,3 +259,23 @@ def test_films_that_are_no_pair(tmp_path: Path) -> None:
         opened(tmp_path)
     with pytest.raises(DatasetError, match=r"film \(lacks one film, or one of a left and one of"):
         recognise_layout(tmp_path)
+
+
+def test_a_film_that_states_a_rotation_is_shown_so_and_that_is_said(tmp_path: Path) -> None:
+    """Two halves one above the other, left camera below: turned, it is above."""
+    calibrated(tmp_path)
+    over = turned_by_180(film(tmp_path / "walk.mp4", stereo_frames(lambda v: np.vstack(v[::-1]))))
+    recording = opened(over)
+    assert np.allclose(levels(recording, 0), (140, 40), atol=_NEAR)
+    said = "walk.mp4 states that it is to be turned by 180 degrees"
+    assert said in recording.notes[0]
+    around = OmniVideoSettings(path=str(over), camera=EquirectangularSettings())
+    assert said in open_omni(around).notes[0]
+
+
+def test_images_on_their_side_are_called_so(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    for side in ("left", "right"):
+        film(tmp_path / f"{side}.mp4", [view(90, SIZE[::-1])] * 2)
+    with pytest.raises(CalibrationError, match="64x48 pixels, the images have 48x64: they lie on"):
+        opened(tmp_path)
