@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.runs import EXPERIMENTS, say
 from benchmarks.tables import Cell, Table
-from fgslam.backend.filters.online_doubt import shared_covariance, shared_shifts
+from fgslam.backend.filters.online_doubt import fused, pixels_of, shared_covariance
 from fgslam.backend.settings import (
     BatchSettings,
     EkfSettings,
@@ -28,7 +28,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.rig_correction import RigCorrection
+from fgslam.core.rig_correction import RigCorrection, shared_displacements
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
@@ -179,7 +179,8 @@ def _displaced(
     increment: Increment, rig: CameraRig, terms: FloatArray, applied: FloatArray
 ) -> Increment:
     seen = increment.observations
-    moved = seen.measurement + shared_shifts(rig, seen.measurement) @ terms
+    of_pixels = shared_displacements(rig, pixels_of(rig, seen.measurement))
+    moved = seen.measurement + fused(rig, of_pixels) @ terms
     return dataclasses.replace(
         increment,
         observations=dataclasses.replace(seen, measurement=moved),

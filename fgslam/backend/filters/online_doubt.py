@@ -264,11 +264,6 @@ class _Look:
         return np.asarray(basis @ np.linalg.solve(normal, (pull @ off).sum(axis=0)))
 
 
-def shared_shifts(rig: CameraRig, measured: FloatArray) -> FloatArray:
-    """(k, 3, q) by which a unit of each term of SHARED displaces measurements (k, 3)."""
-    return fused(rig, shared_displacements(rig, pixels_of(rig, measured)))
-
-
 def pixels_of(rig: CameraRig, measured: FloatArray) -> FloatArray:
     """(k, cameras, 2) where a point of these measurements (k, 3) is seen."""
     model = pixel_model(rig.cameras, vertical_to_horizontal(rig))

@@ -224,7 +224,8 @@ class LandmarkAdmission:
         Returns:
             Their identities, variables (-1: it waits outside) and the frames that saw them last.
         """
-        seen = list(self._seen(since))
+        latest = reversed(self._recent.items())
+        seen = list(itertools.takewhile(lambda each: each[1].last.frame >= since, latest))
         variables = [track.variable for _, track in seen]
         frames = [track.last.frame for _, track in seen]
         identities = [identity for identity, _ in seen]
@@ -234,19 +235,10 @@ class LandmarkAdmission:
             np.array(frames, np.int64),
         )
 
-    def waiting(self, since: int = 0) -> list[tuple[int, Track]]:
-        """Landmarks that are not in the graph, seen in a frame or later, within a bounded lag."""
-        return [(i, track) for i, track in self._seen(since) if track.variable < 0]
-
-    def in_graph(self, since: int = 0) -> list[tuple[int, Track]]:
-        """Landmarks that are in the graph, seen in a frame or later."""
-        return [(i, track) for i, track in self._seen(since) if track.variable >= 0]
-
-    def _seen(self, since: int) -> Iterable[tuple[int, Track]]:
+    def in_graph(self) -> list[tuple[int, Track]]:
+        """Landmarks that are in the graph, the one seen last first."""
         latest = reversed(self._recent.items())
-        if since <= 0:
-            return latest
-        return itertools.takewhile(lambda each: each[1].last.frame >= since, latest)
+        return [(i, track) for i, track in latest if track.variable >= 0]
 
     def describe(self, identity: int, variable: int) -> str:
         """A landmark's identity and sightings, in words."""
