@@ -161,18 +161,32 @@ def test_noisy_copies_find_each_other(rng: np.random.Generator) -> None:
     np.testing.assert_array_equal(order[j], np.arange(60))
 
 
-def test_matches_equal_those_of_exhaustive_search(rng: np.random.Generator) -> None:
-    a, b = descriptors(rng, 40), descriptors(rng, 50)
-    b[:15] = a[10:25] // 2 + descriptors(rng, 15) // 2
-    distance = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
-    expected = []
-    for i, row in enumerate(distance):
-        first, second = np.argsort(row)[:2]
-        if distance[:, first].argmin() == i and row[first] < 0.9 * row[second]:
-            expected.append((i, int(first)))
-    found = list(zip(*(index.tolist() for index in mutual_nearest(a, b, 0.9)), strict=True))
-    assert found == expected
-    assert 10 <= len(found) < 40
+def exhaustive(a: np.ndarray, b: np.ndarray, ratio: float) -> list[tuple[int, int]]:
+    """In whole numbers; the first of several that are equally near."""
+    squared = ((a[:, None].astype(np.int64) - b[None].astype(np.int64)) ** 2).sum(axis=2)
+    found = []
+    for i, row in enumerate(squared):
+        j = int(row.argmin())
+        second = np.delete(row, j).min() if len(b) > 1 else np.inf
+        if squared[:, j].argmin() == i and row[j] < ratio**2 * second:
+            found.append((i, j))
+    return found
+
+
+@pytest.mark.parametrize("largest", [2, 120, 256])
+def test_matches_equal_those_of_exhaustive_search(rng: np.random.Generator, largest: int) -> None:
+    total = 0
+    for rows, columns in [(40, 50), (1, 1), (1, 9), (9, 1), (2, 2), (7, 7), (50, 13)]:
+        a, b = (rng.integers(0, largest, (n, 128), dtype=np.uint8) for n in (rows, columns))
+        alike = min(rows, columns) // 2 + 1
+        a[-1] = a[0]  # two that are equally near
+        b[:alike] = np.where(rng.random((alike, 128)) < 0.6, a[-alike:], b[:alike])
+        b[-1] = b[0] if columns > 2 else b[-1]
+        expected = exhaustive(a, b, 0.9)
+        found = [index.tolist() for index in mutual_nearest(a, b, 0.9)]
+        assert list(zip(*found, strict=True)) == expected
+        total += len(expected)
+    assert total >= 10
 
 
 def test_ambiguous_and_absent_descriptors_do_not_match(rng: np.random.Generator) -> None:

@@ -48,6 +48,16 @@ def test_noise_is_measured_whatever_the_image_shows(sigma: float, structure: str
     assert noise_sigma(image) == pytest.approx(np.hypot(sigma, 12**-0.5), abs=0.15)
 
 
+@pytest.mark.parametrize("size", [(3, 3), (4, 5), (31, 17)])
+@pytest.mark.parametrize("levels", [2, 256])
+def test_noise_is_the_median_of_the_answers(size: tuple[int, int], levels: int) -> None:
+    image = np.random.default_rng(2).integers(0, levels, size) * (255 // (levels - 1))
+    image[:3, :3] = 255 * (np.indices((3, 3)).sum(axis=0) % 2)  # the largest answer there is
+    answers = np.abs(ndimage.convolve(image, [[1, -2, 1], [-2, 4, -2], [1, -2, 1]])[1:-1, 1:-1])
+    expected = max(np.median(answers) / (0.6745 * 6.0), 12**-0.5)
+    assert noise_sigma(image.astype(np.uint8)[:, ::-1][:, ::-1]) == pytest.approx(expected)
+
+
 def test_rounding_is_the_least_noise() -> None:
     assert noise_sigma(np.zeros((240, 320), np.uint8)) == pytest.approx(12**-0.5)
     assert noise_sigma(np.zeros((2, 2), np.uint8)) == pytest.approx(12**-0.5)
