@@ -31,6 +31,7 @@ from fgslam.core.geometry import (
 
 MODELS = {"radtan": 5, "equidistant": 4}
 """Lenses that can be calibrated, and how many parameters each has; names as of the lenses."""
+NAMES = ("left", "right", "top")
 LEAST_VIEWS = 5
 _TURN = 6  # numbers of a pose: rotation vector and translation
 _OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once in 270,000
@@ -248,8 +249,8 @@ class _Problem:
             count = sum(c == camera for _, c, _ in self.seen)
             if count < LEAST_VIEWS:
                 raise CalibrationError(
-                    f"camera {camera} shows the board in {count} images that can be used; "
-                    f"{LEAST_VIEWS} are needed at least, twenty are good"
+                    f"the {NAMES[camera]} camera shows the board in {count} images that can be "
+                    f"used; {LEAST_VIEWS} are needed at least, twenty are good"
                 )
         self._row_of = {v: k for k, v in enumerate(sorted({v for v, _, _ in self.seen}))}
 

@@ -50,7 +50,10 @@ def stereo(
     Left and right images of one moment have the same name but for the side.
     """
     if len(images) > 2:
-        raise ConfigError(f"a pair has two cameras; {len(images)} folders were given")
+        raise ConfigError(
+            f"{len(images)} folders or files were given; give the folder of all images, or that of "
+            "the left and that of the right ones"
+        )
     _calibrate(images, (target, board, square, spacing, dictionary), lens, out)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.assembly import assembled
-from fgslam.cameras.board_calibration import MODELS, BoardCalibration, View, calibrate
+from fgslam.cameras.board_calibration import MODELS, NAMES, BoardCalibration, View, calibrate
 from fgslam.cameras.board_check import DEPTH_SHARE, HeldOut, coverage, held_out
 from fgslam.cameras.boards import Board, find_corners, sizes_that_fit
 from fgslam.cameras.formats.own import raw_values
@@ -25,7 +25,6 @@ from fgslam.datasets.images import bits_of, read_grey_image
 from fgslam.datasets.loose_files import find_cameras, images_in, pair_files
 from fgslam.report.pictures.board import draw_corners
 
-NAMES = ("left", "right", "top")
 _ROWS_PX = 0.5  # stereo matching takes rows that agree to 1.5; half a pixel leaves it room
 _SQUARE = 0.01  # of the square's side: what a tape measure is good for
 _COVERAGE = 0.5
@@ -90,7 +89,8 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
     """Files of each moment, left, right[, top], and what was left out."""
     for folder in folders:
         if not folder.is_dir():
-            raise DatasetError(f"{folder}: no such folder; give the folder of the images")
+            what = "is a file" if folder.is_file() else "no such folder"
+            raise DatasetError(f"{folder}: {what}; give the folder of the images")
     if len(folders) == 1:
         found = find_cameras(folders[0])
         if found is None:

@@ -250,15 +250,16 @@ def compare_runs(
 
 def metrics_of(results: Sequence[RunResult]) -> dict[str, dict[str, Any]]:
     """Numbers of estimators, as metrics.json has them, by the run's name and their title."""
-    return {result.config.name: result.metrics["estimators"] for result in results}
+    names = _told_apart([one.config.name for one in results], results)
+    return {name: one.metrics["estimators"] for name, one in zip(names, results, strict=True)}
 
 
 def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:
     """Final ATE of each estimator on each run, where there are several runs of SLAM."""
-    found = _of_slam(results)
-    names = [named(one.config) for one in results if isinstance(one.config, ExperimentConfig)]
-    columns = [(name, values) for name, (_, values) in zip(names, found, strict=True)]
-    return (ate_table(columns),) if len(found) > 1 else ()
+    slam = [one for one in results if isinstance(one.config, ExperimentConfig)]
+    names = _told_apart([named(one.config) for one in slam], slam)  # type: ignore[arg-type]
+    found = [values for _, values in _of_slam(results)]
+    return (ate_table(list(zip(names, found, strict=True))),) if len(found) > 1 else ()
 
 
 def load_run(run: Path) -> ExperimentConfig | HomingExperiment:
@@ -322,7 +323,17 @@ def _opened(task: Task[RunResult], *_: object) -> Task[RunResult]:
 def _of_slam(results: Sequence[RunResult]) -> list[tuple[str, dict[str, Any]]]:
     """Name and numbers of each run, where they are of SLAM."""
     slam = [one for one in results if isinstance(one.config, ExperimentConfig)]
-    return [(one.config.name, one.metrics["estimators"]) for one in slam]
+    names = _told_apart([one.config.name for one in slam], slam)
+    return [(name, one.metrics["estimators"]) for name, one in zip(names, slam, strict=True)]
+
+
+def _told_apart(names: Sequence[str], results: Sequence[RunResult]) -> list[str]:
+    """The runs' names; those that several have, as runs of one recording do, with the folder."""
+    folders = [r.folder.parent if r.folder.name == DEFAULT_FOLDER else r.folder for r in results]
+    return [
+        name if names.count(name) == 1 else f"{name}, {folder}"
+        for name, folder in zip(names, folders, strict=True)
+    ]
 
 
 def _require_one_kind(runs: Sequence[Path], configs: Sequence[Experiment]) -> None:

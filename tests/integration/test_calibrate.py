@@ -82,6 +82,10 @@ def test_mistakes_of_calibrate(tmp_path: Path, monkeypatch: Patch, capfd: Captur
     assert main(monkeypatch, "calibrate", "stereo", tmp_path, *sizes) == 2
     assert "no image of 1 moments shows a chessboard of 9x6" in capfd.readouterr().err
     assert "no such folder" in reported("stereo", tmp_path / "gone", *sizes)
+    one, other = tmp_path / "left1.png", tmp_path / "right1.png"
+    assert "left1.png: is a file; give the folder" in reported("stereo", one, other, *sizes)
+    said = reported("stereo", one, one, other, other, *sizes)
+    assert "4 folders or files were given; give the folder of all images" in said
     wrong = ("--board", "nine", "--square", "0.025")
     assert "give columns and rows as 9x6" in reported("stereo", tmp_path, *wrong)
     assert "is not known" in reported("stereo", tmp_path, *sizes, "--target", "circles")

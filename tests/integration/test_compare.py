@@ -226,6 +226,13 @@ def test_two_runs_are_compared_side_by_side(
     rows = rows_of(out / "comparison.csv")
     assert [row["estimator"] for row in rows] == ["odometry", "odometry"]
     assert "final ATE, cm, SE3 aligned" in capsys.readouterr().out
+    assert rows[0]["run"] != rows[1]["run"]
+    twice = tmp_path / "twice"
+    shutil.copytree(plain, twice)
+    again = ("--out", tmp_path / "one name", "--estimators", "odometry")
+    assert main(monkeypatch, "compare", plain, twice, *again) == 0
+    names = [row["run"] for row in rows_of(tmp_path / "one name" / "comparison.csv")]
+    assert [Path(name).name for name in names] == [plain.name, "twice"]
     assert (out / plain.name / "odometry" / "final.tum").is_file()
 
 
