@@ -23,6 +23,7 @@ _GROUPS = 8  # of landmarks; a deviation from them is known to a quarter
 _LEAST_GROUPS = 4
 _TOGETHER = 64  # identities, given one after the other: neighbours share the noise of their texture
 _EVERY = 6  # frames between two estimates
+_FREE_PX = 100.0  # prior of the terms, so wide that none of them is left to the modes
 _SURE = 2.0  # standard errors above zero from which a field is one
 
 
@@ -35,7 +36,7 @@ class FieldSize:
         self._contradicting = null_space(
             pixel_model(rig.cameras, vertical_to_horizontal(rig)).T
         )  # (2 * cameras, 2 * cameras - 3) pixels that no point has
-        self._prior = pixel_sigma**2 * prior_information(rig)
+        self._prior = pixel_sigma**2 * prior_information(rig, _FREE_PX)
         size = len(self._prior) + field_modes(rig) + 1
         self._normal = np.zeros((_GROUPS, size, size))
         self._rows = np.zeros(_GROUPS, np.int64)
@@ -43,12 +44,12 @@ class FieldSize:
         self.px = 0.0
         """Standard deviation of one coordinate in each image, pixels; 0: none is seen."""
 
-    def observe(self, seen: Observations, applied: FloatArray) -> None:
-        """Takes in what a frame's pose accepted, measured with a correction (p,)."""
+    def observe(self, seen: Observations) -> None:
+        """Takes in what a frame's pose accepted."""
         pixels = seen.pixels[:, : self._rig.cameras]
         whole = np.asarray(np.isfinite(pixels).all(axis=(1, 2)), np.bool_)
         if whole.any():
-            self._add(seen.select(whole), applied)
+            self._add(seen.select(whole))
         self._frames += 1
         if self._frames % _EVERY == 0:
             variance, error = self._variance()
@@ -70,11 +71,15 @@ class FieldSize:
 
     # ----------------------------------------------------------------------------------------
 
-    def _add(self, seen: Observations, applied: FloatArray) -> None:
-        """At the predicted pixels, whose noise is not that of the contradiction."""
+    def _add(self, seen: Observations) -> None:
+        """At the predicted pixels, whose noise is not that of the contradiction.
+
+        The contradictions are raw. Less what was applied, which changes on the way, no one value
+        of the terms would follow them, and the rest would be taken for a field.
+        """
         rig, exact = self._rig, pixels_of(self._rig, seen.measurement)
         terms = displacements(rig, exact)
-        off = seen.pixels[:, : rig.cameras].reshape(len(seen), -1) - terms @ applied
+        off = seen.pixels[:, : rig.cameras].reshape(len(seen), -1)
         columns = np.concatenate([terms, field_displacements(rig, exact), off[..., None]], axis=2)
         columns = self._contradicting.T @ columns
         group = seen.ids // _TOGETHER % _GROUPS

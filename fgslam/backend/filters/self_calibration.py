@@ -121,7 +121,7 @@ class SelfCalibration:
         if increment.relocalised:
             self._frames.clear()
         accepted = _accepted(increment)
-        self._field.observe(accepted, self.found.applied.values)
+        self._field.observe(accepted)
         self._frames.append((wTc, accepted))
         if len(self._frames) >= WINDOW:
             frames, self._frames = self._frames, []

@@ -170,6 +170,13 @@ def test_the_error_of_the_correction_is_what_its_covariance_says(
     assert low < np.mean(nees) < high
 
 
+def test_a_correction_that_becomes_known_on_the_way_is_no_field() -> None:
+    spread = np.linalg.cholesky(np.linalg.inv(prior_information(RIG)))
+    for seed in (1, 2, 5):
+        wrong = spread @ np.random.default_rng(seed).standard_normal(len(spread))
+        assert calibrated(Road(), wrong, 100 + seed).field_px == 0.0
+
+
 def wrong_by(rng: np.random.Generator) -> dict[str, float]:
     """Yaw, pitch and roll of 0.02 to 0.2 degrees, a focal ratio off by 0.1 to 0.5 %."""
     turn = np.deg2rad(rng.uniform(0.02, 0.2, 3)) * rng.choice([-1.0, 1.0], 3)
