@@ -8,6 +8,7 @@ docs/derivations/self_calibration.md.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,6 +24,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Observations
 from fgslam.core.rig_correction import displacements
+from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import (
     CameraRig,
     measurement_map,
@@ -48,12 +50,25 @@ class RigEvidence:
         score: (p,) ``information @ (best - at)``: where this window alone would go.
         at: (p,) the correction at which both are taken.
         landmarks: that were seen in two frames or more.
+        lean: (p, q) Hessian of the correction against the modes of a field
+            (:mod:`fgslam.core.rig_field`), which are zero at ``at``.
+        field: (q, q) Hessian of those.
+        pull: (q,) where they would go.
     """
 
     information: FloatArray
     score: FloatArray
     at: FloatArray
     landmarks: int
+    lean: FloatArray
+    field: FloatArray
+    pull: FloatArray
+
+    def over(self, factor: float) -> RigEvidence:
+        """The same with a variance that is larger by a factor."""
+        scaled = ("information", "score", "lean", "field", "pull")
+        parts = {name: getattr(self, name) / factor for name in scaled}
+        return dataclasses.replace(self, **parts)
 
 
 @dataclass(slots=True, eq=False)
@@ -71,12 +86,14 @@ class _Prediction:
         local: (m, 3) points in the cameras that see them.
         residual: (m, 2 * cameras) predicted less raw pixels, in sigmas.
         unit: (m, 2 * cameras, p) displacements of the predicted pixels.
+        exact: (m, cameras, 2) those pixels.
     """
 
     state: _State
     local: FloatArray
     residual: FloatArray
     unit: FloatArray
+    exact: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +105,15 @@ class _Normal:
     point_inverse: FloatArray
     coupling: FloatArray
     point_gradient: FloatArray
+
+
+def _of_last(normal: _Normal, count: int) -> tuple[FloatArray, FloatArray]:
+    """Information and score of the last unknowns, poses eliminated. Raises LinAlgError."""
+    poses, mixed = normal.hessian[:-count, :-count], normal.hessian[:-count, -count:]
+    gain = np.linalg.solve(poses, np.column_stack([mixed, normal.gradient[:-count]]))
+    information = normal.hessian[-count:, -count:] - mixed.T @ gain[:, :-1]
+    score = -(normal.gradient[-count:] - mixed.T @ gain[:, -1])
+    return (information + information.T) / 2.0, score
 
 
 class RigAlignment:
@@ -134,15 +160,14 @@ class RigAlignment:
             return None
         state, normal = found
         p = len(correction)
-        poses, mixed = normal.hessian[:-p, :-p], normal.hessian[:-p, -p:]
         try:
-            gain = np.linalg.solve(poses, np.column_stack([mixed, normal.gradient[:-p]]))
+            information, score = _of_last(normal, p)
+            joint, pull = _of_last(self._with_field(state), p + field_modes(self._rig))
         except np.linalg.LinAlgError:
             return None
-        information = normal.hessian[-p:, -p:] - mixed.T @ gain[:, :-1]
-        score = -(normal.gradient[-p:] - mixed.T @ gain[:, -1])
-        information = (information + information.T) / 2.0
-        return RigEvidence(information, score, state.correction, len(self._first))
+        lean, field = joint[:p, p:], joint[p:, p:]
+        count = len(self._first)
+        return RigEvidence(information, score, state.correction, count, lean, field, pull[p:])
 
     # ----------------------------------------------------------------------------------------
 
@@ -197,10 +222,11 @@ class RigAlignment:
         local = self._local(state)
         safe = np.where(local[:, 2:] > _NEAREST_M, local, [0.0, 0.0, 1.0])
         exact = project(self._rig, safe) @ self._model.T
-        unit = displacements(self._rig, exact.reshape(-1, self._rig.cameras, 2))
+        pixels = exact.reshape(-1, self._rig.cameras, 2)
+        unit = displacements(self._rig, pixels)
         unit *= self._free
         residual = (exact + unit @ state.correction - self._raw()) / self._sigma
-        self._last = _Prediction(state, local, residual, unit)
+        self._last = _Prediction(state, local, residual, unit, pixels)
         return self._last
 
     def _cost(self, state: _State, around: FloatArray, prior: FloatArray) -> float:
@@ -230,8 +256,18 @@ class RigAlignment:
                 break
         return state, self._linearise(state)
 
-    def _linearise(self, state: _State) -> _Normal:
+    def _with_field(self, state: _State) -> _Normal:
+        """Normal equations with the modes of a field as further unknowns, at zero."""
         found = self._predicted(state)
+        modes = field_displacements(self._rig, found.exact)
+        unit = np.concatenate([found.unit, modes], axis=2)
+        return self._normal(dataclasses.replace(found, unit=unit))
+
+    def _linearise(self, state: _State) -> _Normal:
+        return self._normal(self._predicted(state))
+
+    def _normal(self, found: _Prediction) -> _Normal:
+        state = found.state
         local, residual, unit = found.local, found.residual, found.unit
         squared = (residual**2).sum(axis=1)
         root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
 from fgslam.core.measurements import Observations
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import RigCorrection, prior_information
+from fgslam.core.rig_field import field_modes
 from fgslam.core.sensors import CameraRig
 
 TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
@@ -31,14 +33,58 @@ _KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are
 _DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
 
 
+class _Field(NamedTuple):
+    """Modes of a field (:mod:`fgslam.core.rig_field`) as the same windows show them.
+
+    Eliminated from what is known, they would need their prior at once; so they are kept beside it,
+    and the prior may change with what is found. docs/derivations/self_calibration.md.
+
+    Attributes:
+        lean: (p, q) how the correction known changes with the modes.
+        information: (q, q) of the modes, the correction being unknown.
+        score: (q,) where they would go.
+    """
+
+    lean: FloatArray
+    information: FloatArray
+    score: FloatArray
+
+    @staticmethod
+    def none(rig: CameraRig, terms: int) -> _Field:
+        """Before the drive."""
+        q = field_modes(rig)
+        return _Field(np.zeros((terms, q)), np.zeros((q, q)), np.zeros(q))
+
+    def after(self, told: RigEvidence, before: FloatArray, covariance: FloatArray) -> _Field:
+        """With a window of the noise that it states.
+
+        Args:
+            told: what the window says.
+            before: (p,) the correction known before it.
+            covariance: (p, p) of the correction known after it.
+        """
+        off = told.at - before
+        score = told.score + told.information @ off
+        mixed = told.information @ self.lean + told.lean
+        gain = covariance @ mixed
+        own = self.lean.T @ mixed + told.lean.T @ self.lean + told.field
+        pull = told.pull + told.lean.T @ off + self.lean.T @ score
+        return _Field(
+            self.lean - gain,
+            self.information + own - mixed.T @ gain,
+            self.score + pull - gain.T @ score,
+        )
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RigFilter:
     """What is known of a rig's correction, and how noisy the windows are that tell it.
 
     Attributes:
-        known: the correction so far.
+        known: the correction so far, as if there were no field.
         free: (p,) terms that windows inform; the others are held at zero.
         prior: (p, p) information before the drive, about zero.
+        field: its modes, as unknowns of the same windows.
         misfit: squared distances of windows from what was known, in their own deviations, added up.
         freedom: how many numbers that is of.
     """
@@ -46,6 +92,7 @@ class RigFilter:
     known: RigCorrection
     free: BoolArray
     prior: FloatArray
+    field: _Field
     misfit: float = 0.0
     freedom: float = 0.0
 
@@ -55,7 +102,7 @@ class RigFilter:
         prior = prior_information(rig, free=free)
         covariance = np.asarray(np.linalg.inv(prior), np.float64)
         none = dataclasses.replace(RigCorrection.none(rig), covariance=covariance)
-        return RigFilter(none, free, prior)
+        return RigFilter(none, free, prior, _Field.none(rig, len(prior)))
 
     @property
     def information(self) -> FloatArray:
@@ -108,7 +155,23 @@ class RigFilter:
         covariance = (covariance + covariance.T) / 2.0
         values = self.known.values + covariance @ (score / factor)
         known = dataclasses.replace(self.known, values=values, covariance=covariance)
-        return dataclasses.replace(self, known=known)
+        field = self.field.after(evidence.over(factor), self.known.values, covariance)
+        return dataclasses.replace(self, known=known, field=field)
+
+    def under(self, field_px: float) -> RigCorrection:
+        """What is known where a field of this standard deviation is not; pixels, 0: there is none.
+
+        Its modes are unknowns that all windows share, with that prior, and are eliminated.
+        """
+        if field_px == 0.0:
+            return self.known
+        known, lean, told, score = self.known, *self.field
+        modes = np.linalg.inv(told + np.eye(len(score)) / field_px**2)
+        return dataclasses.replace(
+            known,
+            values=known.values + lean @ (modes @ score),
+            covariance=known.covariance + lean @ modes @ lean.T,
+        )
 
     def heard(
         self, rig: CameraRig, frames: Sequence[tuple[FloatArray, Observations]], sigma_px: float
@@ -123,6 +186,7 @@ class RigFilter:
             f"{prefix}values": self.known.values,
             f"{prefix}covariance": self.known.covariance,
             f"{prefix}evidence": np.array([self.misfit, self.freedom]),
+            **{f"{prefix}field_{name}": part for name, part in self.field._asdict().items()},
         }
 
     def restored(self, state: StateArrays, prefix: str) -> RigFilter:
@@ -130,4 +194,5 @@ class RigFilter:
         values, covariance = state[f"{prefix}values"], state[f"{prefix}covariance"]
         known = dataclasses.replace(self.known, values=values, covariance=covariance)
         misfit, freedom = map(float, state[f"{prefix}evidence"])
-        return RigFilter(known, self.free, self.prior, misfit, freedom)
+        field = _Field(*(state[f"{prefix}field_{name}"] for name in _Field._fields))
+        return RigFilter(known, self.free, self.prior, field, misfit, freedom)

@@ -82,7 +82,8 @@ class SelfCalibration:
         self._rig, early = rig, early_terms(rig)
         self._whole = RigFilter.of(rig, np.ones_like(early))
         self._early = RigFilter.of(rig, early)
-        self.found = weighed(self._whole.known, self._early.known, self._priors)
+        self._field = FieldSize(rig, pixel_sigma)
+        self.found = self._weighed()
         """As known now, and what of it is worth applying."""
         self.steps: list[CalibrationStep] = []
         """How it became known, window by window."""
@@ -90,7 +91,6 @@ class SelfCalibration:
         """How many gave evidence."""
         self.knocks = 0
         """How often the rig was found to have moved."""
-        self._field = FieldSize(rig, pixel_sigma)
         self._suspected = False
         self._sigma = pixel_sigma
         self._frames: list[tuple[FloatArray, Observations]] = []
@@ -149,7 +149,7 @@ class SelfCalibration:
         self._suspected = False
         pairs = zip(filters, said, strict=True)
         self._early, self._whole = (of.after(what) for of, (_, what) in pairs)
-        found = weighed(self._whole.known, self._early.known, self._priors)
+        found = self._weighed()
         self.found = self._held(found)
         self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
 
@@ -180,7 +180,7 @@ class SelfCalibration:
         self._suspected = bool(suspected)
         self.steps = _steps_of(state)
         self._field.restore(state)
-        found = weighed(self._whole.known, self._early.known, self._priors)
+        found = self._weighed()
         applied = dataclasses.replace(found.applied, values=state["applied"])
         self.found = dataclasses.replace(found, applied=applied)
         begin = len(log) - waiting
@@ -190,6 +190,11 @@ class SelfCalibration:
         ]
 
     # ----------------------------------------------------------------------------------------
+
+    def _weighed(self) -> WeighedCorrection:
+        """As known now, under the field found so far."""
+        whole, early = self._whole.under(self.field_px), self._early.under(self.field_px)
+        return weighed(whole, early, self._priors)
 
     def _held(self, found: WeighedCorrection) -> WeighedCorrection:
         """With the old correction where the new one is no farther from it than noise goes.
