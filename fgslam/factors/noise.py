@@ -23,6 +23,7 @@ stiffer, and a blind drive with a pitched camera fails (docs/derivations/factors
 
 _EXACT = 1e-6  # radians and metres: the deviation of what has no variance
 _RELATIVE = 1e-3  # of the largest deviation of the same covariance, for the same reason
+_ROUNDING = 64 * np.finfo(float).eps  # of the largest variance: an eigenvalue's own error, 6 by 6
 
 
 def m_estimator(name: KernelName, width: float) -> Any:
@@ -130,11 +131,12 @@ class Whitening:
 def positive_definite(covariance: FloatArray) -> FloatArray:
     """A pose covariance (6, 6) whose exactly known directions are held stiffly.
 
-    Their deviation is a micrometre or a microradian, or a thousandth of the largest one.
+    Their deviation is a micrometre or a microradian, or a thousandth of the largest one. Known
+    exactly is also what has no variance beyond the rounding of the largest one.
     """
     symmetric = 0.5 * (covariance + covariance.T)
     variances, directions = np.linalg.eigh(symmetric)
-    if variances[0] >= _EXACT**2:
+    if variances[0] >= max(_EXACT**2, _ROUNDING * variances[-1]):
         return np.asarray(symmetric)
     kept = np.maximum(variances, max(_EXACT**2, _RELATIVE**2 * variances[-1]))
     return np.asarray((directions * kept) @ directions.T)

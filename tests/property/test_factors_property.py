@@ -120,7 +120,21 @@ def test_a_floor_costs_nothing_on_it_and_the_same_everywhere_at_a_heading(
         assert close(cost(here, wTc), cost(there, along @ wTc), absolute=1e-6)
 
 
+ROUNDED_ABOVE_ZERO = np.array(
+    [
+        [0.0, 0.1114, 0.25],
+        [1.0, 0.25, -1.0],
+        [0.25, 0.25, 1.0],
+        [0.25, 0.25, 0.25],
+        [0.25, 0.25, 0.25],
+        [0.25, 0.45263569, 0.25],
+    ]
+)
+"""Root of a covariance of rank three whose smallest computed eigenvalue can be positive."""
+
+
 @given(arrays(np.float64, (6, 3), elements=st.floats(-1.0, 1.0)), st.floats(1e-9, 1e3))
+@example(ROUNDED_ABOVE_ZERO, 941.0)
 def test_a_singular_covariance_becomes_definite_and_never_smaller(
     root: FloatArray, size: float
 ) -> None:
