@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fgslam.core.estimates import Trajectory
 from fgslam.core.recordings import Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE
 from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
@@ -109,9 +111,17 @@ def process(found: FoundFeatures, pipeline: SlamPipeline) -> Iterator[FrameRepor
 def trajectory_error(
     pipeline: SlamPipeline, sequence: Sequence, alignment: Alignment = Alignment.SE3
 ) -> TrajectoryError:
-    """Errors of the system's trajectory so far."""
-    estimate = pipeline.estimator.estimate().trajectory
-    return evaluate_trajectory(estimate, sequence.ground_truth, alignment)
+    """Errors of the system's trajectory so far, as a run of it would state them."""
+    truth = sequence.ground_truth
+    known = None if truth is None else _as_kept(truth)
+    return evaluate_trajectory(pipeline.estimate().trajectory, known, alignment)
+
+
+def _as_kept(truth: Trajectory) -> Trajectory:
+    """The truth in the digits of a run's folder, by which a run and its replays are judged."""
+    with tempfile.TemporaryDirectory() as folder:
+        truth.save(Path(folder) / GROUND_TRUTH_FILE)
+        return Trajectory.load(Path(folder) / GROUND_TRUTH_FILE)
 
 
 def say(text: str) -> None:

@@ -153,7 +153,10 @@ def test_features_found_before_give_the_run_s_own_numbers(demo: Run) -> None:
     found = find_features(config)
     pipeline = make_system(config, found.sequence)
     inliers = [int(r.tracking.inliers.sum()) for r in process(found, pipeline)]
-    assert inliers == demo.result.outputs.recorder.column("inliers").tolist()
+    outputs = demo.result.outputs
+    assert inliers == outputs.recorder.column("inliers").tolist()
+    own = outputs.pipeline.estimate().trajectory
+    assert np.array_equal(pipeline.estimate().trajectory.poses, own.poses)
     error = trajectory_error(pipeline, found.sequence, Alignment.SE3)
     assert error.ate_rmse_m == demo.estimator["ate_rmse_m"]
 
