@@ -124,7 +124,7 @@ def in_frames(messages: Iterable[Written], frames: Mapping[str, str]) -> list[Wr
 def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> Path:
     """The bag; its ending says which kind. Of ROS 2 the file inside its folder.
 
-    ``packed``: with compressed chunks, lz4 in ROS 1 and zstd in ROS 2.
+    ``packed``: with compressed chunks, lz4 in ROS 1 and zstd in MCAP; SQLite's file as a whole.
     """
     ros1 = path.suffix == ".bag"
     made = Maker(_types(ros1), ros1)
@@ -140,10 +140,12 @@ def write_bag(path: Path, written: Iterable[Written], packed: bool = False) -> P
     folder = path.with_suffix("")
     bag2 = Writer2(folder, version=9, storage_plugin=plugin)
     if packed:
-        bag2.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        mcap = plugin == StoragePlugin.MCAP
+        mode = CompressionMode.STORAGE if mcap else CompressionMode.FILE
+        bag2.set_compression(mode, CompressionFormat.ZSTD)
     with bag2 as writer:
         made.write(writer, messages)
-    return folder / path.name
+    return next(folder.glob(f"{path.name}*"))
 
 
 def _types(ros1: bool) -> Typestore:

@@ -24,6 +24,8 @@ from fgslam.datasets.stamps import stamps_of
 from fgslam.datasets.tables import trajectory_at_frames
 
 CALIBRATION = "calib_cam_to_cam.txt"
+_OF_360 = Path("calibration", "perspective.txt")  # of KITTI-360
+_INSIDE = ("data", "data_rect")
 _PAIRS = (("image_00", "image_01"), ("image_02", "image_03"))
 """Folders of the left and the right camera: grey, else colour."""
 
@@ -45,13 +47,13 @@ def open_kitti_raw(
     drive = kitti_raw_drive(Path(settings.path))
     if drive is None:
         raise DatasetError(f"{settings.path} holds no drive of KITTI raw; check dataset.path")
-    names = next((pair for pair in _PAIRS if all(_has_images(drive / n) for n in pair)), None)
+    names = next((pair for pair in _PAIRS if all(_images(drive / n) for n in pair)), None)
     if names is None:
         raise DatasetError(
             f"{drive} has no two cameras' images (image_00 and image_01, or image_02 and image_03, "
-            "each with data/); unpack the drive's synced and rectified data"
+            "each with data/ or data_rect/); unpack the drive's synced and rectified data"
         )
-    left, right = (tuple(images_in(drive / name / "data")) for name in names)
+    left, right = (_images(drive / name) for name in names)
     pairs, notes = pair_files(CameraFiles(left, right, drive, interleaved=False))
     folder = drive / names[1]
     stamps, assumed, lists = stamps_of([path for path, _ in pairs], (folder,), None, right)
@@ -94,15 +96,18 @@ def _untrue(oxts: Oxts | None, iTc: FloatArray | None) -> tuple[str, ...]:
     )
 
 
-def _has_images(camera: Path) -> bool:
-    return (camera / "data").is_dir() and bool(images_in(camera / "data"))
+def _images(camera: Path) -> tuple[Path, ...]:
+    inside = next((camera / name for name in _INSIDE if (camera / name).is_dir()), None)
+    return () if inside is None else tuple(images_in(inside))
 
 
 def _rig(
     settings: KittiRawSettings, drive: Path, names: tuple[str, str], size: tuple[int, int] | None
 ) -> tuple[StereoRig, FloatArray | None]:
     """The rig, and the pose (4, 4) of the right camera on the inertial unit where it is known."""
-    path = next((p for p in (drive / CALIBRATION, drive.parent / CALIBRATION) if p.is_file()), None)
+    root = drive.resolve().parent
+    places = (drive / CALIBRATION, root / CALIBRATION, root / _OF_360, root.parent / _OF_360)
+    path = next((p for p in places if p.is_file()), None)
     keys = kitti.RAW if names == _PAIRS[0] else kitti.RAW_COLOUR
     if settings.camera_file is not None:
         rig = loaded_rig(settings, Path(settings.camera_file), size=size)

@@ -69,7 +69,8 @@ def fitting_layouts(given: Path) -> tuple[str, ...]:
     if not given.is_dir():
         return _fitting_files(given)
     complete = [kind for kind, layout in LAYOUTS.items() if not layout.lacking(given)]
-    complete = [kind for kind in complete if not LAYOUTS[kind].last] or complete
+    if complete != ["rgbd", "loose_images"]:  # a depth camera's folder may have its pair, too
+        complete = [kind for kind in complete if not LAYOUTS[kind].last] or complete
     fitting = complete or [kind for kind, layout in LAYOUTS.items() if layout.begun(given)]
     if not fitting:
         raise DatasetError(_unknown(given))
@@ -177,6 +178,8 @@ def _unknown(folder: Path) -> str:
         )
     if not shown_in(folder):
         return f"{folder} is empty; give the folder of a recording, docs/datasets/ has the layouts"
+    if inside := _recordings_in(folder):
+        return f"{folder} has none of the known layouts; in it has {inside}: give that folder"
     if (alone := one_camera(folder)) is not None:
         return (
             f"{alone} holds images of one camera only; a stereo pair is the least, beside a "
@@ -185,6 +188,26 @@ def _unknown(folder: Path) -> str:
         )
     missing = "; ".join(_with_lacking(folder, layout) for layout in LAYOUTS.values())
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
+
+
+_LOOKED_INTO = 50  # folders of one level
+
+
+def _recordings_in(folder: Path) -> str:
+    """Folders of a known layout in this one, at most two levels deep, in words; perhaps none."""
+    level = [folder]
+    for _ in range(2):
+        level = [path for above in level for path in shown_in(above) if path.is_dir()]
+        level = level[:_LOOKED_INTO]
+        found = [str(path) for path in level if _has_layout(path)]
+        if found:
+            more = f" or {len(found) - 3} more" if len(found) > 3 else ""
+            return " or ".join(found[:3]) + more
+    return ""
+
+
+def _has_layout(folder: Path) -> bool:
+    return any(not layout.lacking(folder) for layout in LAYOUTS.values())
 
 
 def _with_lacking(folder: Path, layout: Layout) -> str:
@@ -233,11 +256,21 @@ def _image_folder_begun(folder: Path) -> bool:
     return pair or not _absent(folder, ("calib.json", "times.txt"))
 
 
-BAG_ENDINGS = (".bag", ".db3", ".mcap")
+BAG_ENDINGS = (".bag", ".db3", ".mcap", ".zstd")
+
+
+def is_bag(file: Path) -> bool:
+    """Whether a file is a bag by its name."""
+    return file.suffix in BAG_ENDINGS[:3] or is_packed_bag(file)
+
+
+def is_packed_bag(file: Path) -> bool:
+    """Whether it is one of ROS 2 that is compressed as a whole (compression mode file)."""
+    return file.suffix == ".zstd" and Path(file.stem).suffix in BAG_ENDINGS
 
 
 def _lacking_of_bag(folder: Path) -> tuple[str, ...]:
-    found = any(file.suffix in BAG_ENDINGS for file in shown_in(folder))
+    found = any(map(is_bag, shown_in(folder)))
     return () if found else ("a file *.bag, *.db3 or *.mcap",)
 
 
@@ -254,7 +287,8 @@ def kitti_raw_drive(folder: Path) -> Path | None:
         folder / "image_02" / "timestamps.txt"
     ).is_file():
         return folder
-    inside = [path for path in folder.glob("*_drive_*") if path.is_dir()]
+    places = (folder, folder / "data_2d_raw")  # KITTI-360 has it in there
+    inside = [p for place in places for p in place.glob("*_drive_*") if p.is_dir()]
     return kitti_raw_drive(inside[0]) if len(inside) == 1 else None
 
 
@@ -278,11 +312,17 @@ def _lacking_of_video(folder: Path) -> tuple[str, ...]:
 _COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
 
 
+_DEPTH_FOLDERS = ("aligned_depth", "aligned_depth_to_color", "depth_aligned", "depth")
+"""Of several the first: beside one that is registered to colour, depth is as it was measured."""
+
+
 def colour_and_depth(folder: Path) -> tuple[Path, Path] | None:
     """Folders of colour and of depth images beside each other, or None."""
-    colour = next((folder / name for name in _COLOUR_FOLDERS if (folder / name).is_dir()), None)
-    depth = folder / "depth"
-    return (colour, depth) if colour is not None and depth.is_dir() else None
+    colour, depth = (
+        next((folder / name for name in names if (folder / name).is_dir()), None)
+        for names in (_COLOUR_FOLDERS, _DEPTH_FOLDERS)
+    )
+    return None if colour is None or depth is None else (colour, depth)
 
 
 def _lacking_of_rgbd(folder: Path) -> tuple[str, ...]:

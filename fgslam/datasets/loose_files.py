@@ -19,7 +19,9 @@ from fgslam.datasets.time_names import time_parts
 if TYPE_CHECKING:
     from fgslam.core.arrays import IntArray
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp"),
+)
 _INSIDE = "data"  # where EuRoC and KITTI keep a camera's images
 
 
@@ -31,12 +33,14 @@ class CameraFiles:
         left, right: the files.
         folder: that of all.
         interleaved: both cameras' files lie in one folder, and their names say which is which.
+        others: further pairs of folders, which are not taken.
     """
 
     left: tuple[Path, ...]
     right: tuple[Path, ...]
     folder: Path
     interleaved: bool
+    others: tuple[tuple[str, str], ...] = ()
 
     @property
     def numbered(self) -> bool:
@@ -85,8 +89,9 @@ def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles
     if files is None:
         folders = _two_folders(root)
         if folders is not None:
-            left, right = (tuple(images_in(folder)) for folder in folders)
-            return CameraFiles(left, right, root, interleaved=False)
+            used, others = folders
+            left, right = (tuple(images_in(folder)) for folder in used)
+            return CameraFiles(left, right, root, interleaved=False, others=others)
         files = images_in(root)
     named = {path.name: path for path in files}
     pairs = camera_pairs(named, any_number=False)
@@ -119,20 +124,28 @@ def _moment(stem: str) -> str:
     return re.sub(r"[_-]\d+$", "", stem)
 
 
-def _two_folders(root: Path) -> tuple[Path, Path] | None:
-    """Folders of images whose names differ in the side; of several pairs the first."""
+def _two_folders(root: Path) -> tuple[tuple[Path, Path], tuple[tuple[str, str], ...]] | None:
+    """Folders of images whose names differ in the side, and further pairs of them."""
     with_images = {}
     for folder in (path for path in shown_in(root) if path.is_dir()):
         for place in (folder, folder / _INSIDE):
-            if place.is_dir() and images_in(place):
-                with_images[folder.name] = place
+            if place.is_dir() and (found := images_in(place)):
+                if not _of_both_cameras(found):
+                    with_images[folder.name] = place
                 break
     pairs = camera_pairs(with_images)
     if not pairs:
         return None
     words = [pair for pair in pairs if not re.search(r"\d", pair[0])]
     left, right = (words or list(pairs))[0]
-    return with_images[left], with_images[right]
+    others = tuple(pair for pair in pairs if not {left, right} & set(pair))
+    return (with_images[left], with_images[right]), others
+
+
+def _of_both_cameras(files: Sequence[Path]) -> bool:
+    """Whether most files of a folder have a partner of the other side in it."""
+    pairs = camera_pairs([path.name for path in files], any_number=False)
+    return len({name for pair in pairs for name in pair}) * 2 > len(files)
 
 
 Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]

@@ -40,6 +40,8 @@ def open_loose_images(
     chosen = select_frames(len(pairs), settings)
     odometry_file = find_odometry(root, settings.odometry_file)
     images = RawImages(files, rig)
+    also = ", ".join(" with ".join(pair) for pair in cameras.others)
+    others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
     return Recording(
         name=root.resolve().name,
         rig=rig.plain(),
@@ -50,7 +52,7 @@ def open_loose_images(
             (p for pair in pairs for p in pair),
         ),
         ground_truth=None,
-        notes=(*rig.remarks, *held, *unpaired, *assumed),
+        notes=(*rig.remarks, *held, *others, *unpaired, *assumed),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,

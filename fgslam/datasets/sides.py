@@ -8,8 +8,13 @@ from collections.abc import Iterable
 _WORD = re.compile(
     r"(?:(?<![a-z])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image))(left|right)", re.IGNORECASE
 )
-_LETTER = re.compile(r"(?<![a-z0-9])([lr])(?![a-z0-9])", re.IGNORECASE)
-_CAMERA_NUMBER = re.compile(r"(?<=cam)[_-]?(\d+)(?!\d)", re.IGNORECASE)
+_LETTER = re.compile(
+    r"(?:(?<![a-z0-9])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image))([lr])(?:(?![a-z0-9])|(?=cam))",
+    re.IGNORECASE,
+)
+_CAMERA_NUMBER = re.compile(
+    r"(?:(?<=cam)|(?<=camera)|(?<=infra)|(?<=infrared))[_-]?(\d+)(?!\d)", re.IGNORECASE
+)
 _NUMBER = re.compile(r"(\d+)")
 
 
@@ -21,8 +26,8 @@ def camera_pairs(names: Iterable[str], any_number: bool = True) -> tuple[tuple[s
 
     Args:
         names: of topics, folders or files, all different.
-        any_number: whether a number by itself may tell the side; else only one behind ``cam``:
-            numbers of files count frames.
+        any_number: whether a number by itself may tell the side; else only one behind ``cam``
+            or ``infra``: numbers of files count frames.
     """
     found: set[tuple[str, str]] = set()
     sides: dict[tuple[str, str], dict[int, str]] = {}

@@ -213,7 +213,7 @@ def _by_name(
 
 def _stem(word: str) -> str:
     """A file's name without folder and ending; of a number its value."""
-    name = re.sub(r"\.(png|jpe?g|p[gp]m|bmp|tiff?|webp)$", "", word.rpartition("/")[2], flags=re.I)
+    name = re.sub(r"\.(png|jpe?g|p[gnp]m|bmp|tiff?|webp)$", "", word.rpartition("/")[2], flags=re.I)
     return str(int(name)) if name.isdecimal() else name
 
 

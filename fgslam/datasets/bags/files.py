@@ -22,7 +22,7 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.files import shown_in
 from fgslam.datasets.bags.cut import BROKEN, CutBag, CutDatabase, CutMcap, Message
-from fgslam.datasets.layouts import BAG_ENDINGS, files_of
+from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
 
 T = TypeVar("T")
 ANY_BROKEN = (AnyReaderError, *BROKEN)
@@ -123,16 +123,23 @@ class BagFiles:
 
 def paths_of(given: Path) -> list[Path]:
     """What is opened: a folder that is one ROS 2 bag, or all files of a folder or pattern."""
-    if (given / "metadata.yaml").is_file():
-        return [given]
-    return bag_files(given) if given.is_dir() else files_of(given)
+    folder = given.parent if is_packed_bag(given) else given
+    if (folder / "metadata.yaml").is_file():
+        return [folder]
+    found = bag_files(given) if given.is_dir() else files_of(given)
+    if packed := next(filter(is_packed_bag, found), None):
+        raise DatasetError(
+            f"{packed} is compressed as a whole, and no metadata.yaml is beside it; unpack it: "
+            f"zstd -d {packed.name}"
+        )
+    return found
 
 
 def bag_files(path: Path) -> list[Path]:
     """The files of a folder that are bags, or the file itself."""
     if not path.is_dir():
         return [path]
-    return [file for file in shown_in(path) if file.suffix in BAG_ENDINGS and file.is_file()]
+    return [file for file in shown_in(path) if is_bag(file) and file.is_file()]
 
 
 def _open(paths: list[Path], cut: bool) -> AnyReader:

@@ -1,0 +1,145 @@
+"""Layouts of data sets that people have, by their names of folders and files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import stereo, write_bag
+from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_calibration
+
+from fgslam.core.errors import DatasetError
+from fgslam.datasets.bags.reader import open_bag
+from fgslam.datasets.kitti_raw import open_kitti_raw
+from fgslam.datasets.layouts import colour_and_depth, recognise_layout
+from fgslam.datasets.loose_images import open_loose_images
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.settings import (
+    BagSettings,
+    KittiRawSettings,
+    LooseImagesSettings,
+    RecordedOdometrySettings,
+)
+
+NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
+    "TartanAir": lambda k: (f"image_left/{k:06d}_left.png", f"image_right/{k:06d}_right.png"),
+    "TartanAir V2": lambda k: (
+        f"image_lcam_front/{k:06d}_lcam_front.png",
+        f"image_rcam_front/{k:06d}_rcam_front.png",
+    ),
+    "letters behind cam": lambda k: (f"camL_{k}.png", f"camR_{k}.png"),
+    "infra in one folder": lambda k: (f"infra1_{k}.png", f"infra2_{k}.png"),
+    "RealSense's viewer": lambda k: (f"{k}_Infrared_1.png", f"{k}_Infrared_2.png"),
+    "New College": lambda k: (f"{k}-left.pnm", f"{k}-right.pnm"),
+}
+
+
+def images(root: Path, names: Callable[[int], tuple[str, str]], frames: int = 3) -> Path:
+    """Frame k has corner pixels 10 + k (right) and 60 + k (left)."""
+    for k in range(frames):
+        for name, code in zip(names(k), (60, 10), strict=True):
+            save(root / name, picture(code + k))
+    write_calibration(root)
+    return root
+
+
+def opened(root: Path) -> Recording:
+    return open_loose_images(LooseImagesSettings(path=str(root)), RecordedOdometrySettings())
+
+
+def codes(recording: Recording) -> list[tuple[int, ...]]:
+    frames = [recording.frame(i).images for i in range(len(recording))]
+    return [tuple(int(image[0, 0]) for image in views) for views in frames]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_that_data_sets_give(tmp_path: Path, name: str) -> None:
+    root = images(tmp_path / "walk", NAMES[name])
+    assert recognise_layout(root)["kind"] == "loose_images"
+    assert codes(opened(root)) == [(10, 60), (11, 61), (12, 62)]
+
+
+def test_names_with_a_time_in_them_are_times(tmp_path: Path) -> None:
+    """As Malaga's: the rest of the names stays; a serial number in it is no time."""
+    times = ("1261228749.918590", "1261228749.968589", "1261228750.018594")
+
+    def names(k: int) -> tuple[str, str]:
+        return f"img_40123456789_{times[k]}_left.png", f"img_40123456789_{times[k]}_right.png"
+
+    recording = opened(images(tmp_path, names))
+    assert np.allclose(recording.timestamps, [float(t) for t in times], rtol=0.0, atol=1e-6)
+    assert recording.notes == ()
+    counted = images(tmp_path / "b", lambda k: (f"a{10**9 + k}_L.png", f"a{10**9 + k}_R.png"))
+    assert "no list of times" in opened(counted).notes[0]
+
+
+def test_folders_that_hold_a_pair_each_are_no_cameras(tmp_path: Path) -> None:
+    """pair_000 and pair_001 are moments, not cameras; one of them alone is a recording."""
+    root = images(tmp_path / "set", lambda k: (f"pair_{k:03d}/left.png", f"pair_{k:03d}/right.png"))
+    with pytest.raises(
+        DatasetError, match=r"in it has .*pair_000 or .*pair_001 or .*pair_002: giv"
+    ):
+        recognise_layout(root)
+
+
+def test_a_recording_further_inside_is_named(tmp_path: Path) -> None:
+    images(tmp_path / "run" / "stereo", lambda k: (f"left/{k}.png", f"right/{k}.png"))
+    save(tmp_path / "run" / "mono" / "1.png", picture(1))
+    with pytest.raises(DatasetError, match=r"in it has .*/run/stereo: give that folder"):
+        recognise_layout(tmp_path)
+
+
+def test_further_pairs_of_folders_are_said(tmp_path: Path) -> None:
+    root = images(tmp_path, lambda k: (f"lcam_back/{k}.png", f"rcam_back/{k}.png"))
+    images(tmp_path, lambda k: (f"lcam_front/{k}.png", f"rcam_front/{k}.png"))
+    assert "also there: lcam_front with rcam_front; leave one pair" in opened(root).notes[0]
+
+
+def test_a_pair_beside_colour_and_depth_is_chosen_by_the_user(tmp_path: Path) -> None:
+    root = images(tmp_path, lambda k: (f"infra1/{k}.png", f"infra2/{k}.png"))
+    for name in ("color", "depth"):
+        save(root / name / "0.png", picture(0))
+    with pytest.raises(DatasetError, match="equally well: colour and depth; folder of images; say"):
+        recognise_layout(root)
+    assert recognise_layout(root, "loose_images")["kind"] == "loose_images"
+
+
+def test_depth_registered_to_colour_comes_before_depth_as_measured(tmp_path: Path) -> None:
+    """OpenLORIS has both, of one size."""
+    for name in ("color", "depth", "aligned_depth"):
+        (tmp_path / name).mkdir()
+    assert colour_and_depth(tmp_path) == (tmp_path / "color", tmp_path / "aligned_depth")
+
+
+def test_kitti_360(tmp_path: Path) -> None:
+    drive = tmp_path / "data_2d_raw" / "2013_05_28_drive_0000_sync"
+    for number, code in (("00", 60), ("01", 10)):
+        for k in range(3):
+            save(drive / f"image_{number}" / "data_rect" / f"{k:010d}.png", picture(code + k))
+        times = "".join(f"2013-05-28 08:46:02.{k}04000000\n" for k in range(3))
+        (drive / f"image_{number}" / "timestamps.txt").write_text(times, encoding="utf-8")
+    lines = ["calib_time: 30-Aug-2018 10:04:35"]
+    for number, shift in (("00", 0.0), ("01", -12.0)):
+        lines.append(f"S_rect_{number}: {WIDTH} {HEIGHT}")
+        lines.append(f"P_rect_{number}: {CALIBRATION['fx']} 0 15.5 {shift} 0 30 11.5 0 0 0 1 0")
+    (tmp_path / "calibration").mkdir()
+    (tmp_path / "calibration" / "perspective.txt").write_text("\n".join(lines), encoding="utf-8")
+    for given in (tmp_path, drive.parent, drive):
+        assert recognise_layout(given)["kind"] == "kitti_raw"
+        recording = open_kitti_raw(KittiRawSettings(path=str(given)))
+        assert recording.rig.baseline == pytest.approx(0.4, abs=1e-12)
+        assert codes(recording) == [(10, 60), (11, 61), (12, 62)]
+
+
+def test_a_bag_that_is_compressed_as_a_whole(tmp_path: Path) -> None:
+    file = write_bag(tmp_path / "packed.db3", stereo(3), packed=True)
+    assert file.name == "packed.db3.zstd"
+    for given in (file, file.parent):
+        assert recognise_layout(given)["kind"] == "bag"
+        again = open_bag(BagSettings(path=str(given)), RecordedOdometrySettings())
+        assert codes(again) == [(10, 60), (11, 61), (12, 62)]
+    (file.parent / "metadata.yaml").unlink()
+    with pytest.raises(DatasetError, match=r"compressed as a whole.* zstd -d packed\.db3\.zstd"):
+        open_bag(BagSettings(path=str(file)), RecordedOdometrySettings())
