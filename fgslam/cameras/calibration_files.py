@@ -7,12 +7,22 @@ from pathlib import Path
 from typing import TypeAlias
 
 from fgslam.cameras.corrected import read_own_format
-from fgslam.cameras.formats import kalibr, kitti, makers, opencv, own, ros, slam_settings
+from fgslam.cameras.formats import (
+    kalibr,
+    kitti,
+    makers,
+    middlebury,
+    opencv,
+    own,
+    ros,
+    slam_settings,
+)
 from fgslam.cameras.formats.trees import Tree, read_tree
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text, shown_in
+from fgslam.core.sides import camera_pairs
 
 Size: TypeAlias = tuple[int, int]
 Reader: TypeAlias = Callable[[Path, Tree, Size | None], Calibration]
@@ -20,7 +30,8 @@ Reader: TypeAlias = Callable[[Path, Tree, Size | None], Calibration]
 KNOWN = (
     "known: calib.json of fgslam, Kalibr's camchain, OpenCV's stereo files (M1, D1, M2, D2, R, T), "
     "left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, EuRoC's sensor.yaml, settings "
-    "of ORB-SLAM, stella_vslam, VINS and SVO, files of Basalt, OAK, ZED, RealSense and OCamCalib"
+    "of ORB-SLAM, stella_vslam, VINS, OKVIS and SVO, Middlebury's calib.txt, files of Basalt, OAK, "
+    "ZED, RealSense and OCamCalib"
 )
 
 
@@ -29,6 +40,11 @@ def _without_size(read: Callable[[Path, Tree], Calibration]) -> Reader:
 
 
 def _rectified(path: Path, tree: Tree, _: Size | None) -> Calibration:
+    if path.suffix.lower() != ".json":
+        raise CalibrationError(
+            f"{path}: {', '.join(sorted(own.OWN & tree.keys()))} are keys of fgslam's calib.json; "
+            "write it so (docs/datasets/image_folder.md has its keys)"
+        )
     found = read_own_format(path, "vertical_baseline_m" in tree)
     rig = found.rig if isinstance(found, Rectifier) else found
     return own.calibration_of(rig, path, own.stated_corrections(path, tree))
@@ -48,11 +64,22 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (slam_settings.is_orb_slam, slam_settings.read_orb_slam),
     (slam_settings.is_stella, _without_size(slam_settings.read_stella)),
     (slam_settings.is_multicol, _without_size(slam_settings.read_multicol)),
+    (slam_settings.is_okvis, _without_size(slam_settings.read_okvis)),
     (slam_settings.is_svo, _without_size(slam_settings.read_svo)),
     (opencv.is_opencv_pair, opencv.read_opencv_pair),
     (opencv.is_opencv_single, opencv.read_opencv_single),
 )
 """What recognises a format by its keys, and reads it; the first that fits counts."""
+
+
+_TEXTS: tuple[tuple[Callable[[str], bool], Callable[[Path, str, Size | None], Calibration]], ...]
+_TEXTS = (
+    (kitti.is_kitti, lambda path, _, size: kitti.read_kitti(path, size)),
+    (middlebury.is_middlebury, lambda path, *_: middlebury.read_middlebury(path)),
+    (makers.is_zed, makers.read_zed),
+    (makers.is_ocamcalib, lambda path, *_: makers.read_ocam(path)),
+)
+"""The same of files that are no keys and values."""
 
 
 def read_calibration_file(
@@ -74,18 +101,27 @@ def read_calibration_file(
         return _of_two(path, other, size)
     if path.is_dir():
         return _of_folder(path, size)
-    text = read_text(path, CalibrationError, f"restore the file; {KNOWN}")
-    if kitti.is_kitti(text):
-        return kitti.read_kitti(path, size)
-    if makers.is_zed(text):
-        return makers.read_zed(path, text, size)
-    if makers.is_ocamcalib(text):
-        return makers.read_ocam(path)
+    if remedy := _REMEDIES.get(path.suffix.lower()):
+        raise CalibrationError(f"{path} is not read: {remedy}")
+    archive = path.suffix.lower() == ".npz"
+    text = "" if archive else read_text(path, CalibrationError, f"restore the file; {KNOWN}")
+    for recognises, read in _TEXTS:
+        if recognises(text):
+            return read(path, text, size)
     tree = read_tree(path)
     if tree is None:
         raise CalibrationError(f"{path} holds no keys and values of a calibration; {KNOWN}")
     beside = _partner(path, tree)
     return _of_tree(path, tree, size) if beside is None else _of_two(*beside, size)
+
+
+_REMEDIES = {
+    ".mat": "in MATLAB, [K1,D1,K2,D2,R,T] = stereoParametersToOpenCV(stereoParams), then write "
+    "jsonencode of a struct with M1, D1, M2, D2, R, T and image_size to a .json (--unit 0.001 "
+    "where the squares were in millimetres)",
+    ".pkl": "a pickle may run programs; save its arrays by numpy.savez as M1, D1, M2, D2, R, T",
+}
+"""What to do with files that hold calibrations in a form that nobody else can read."""
 
 
 def _of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration:
@@ -105,12 +141,48 @@ _PARTNERS = (
 
 def _partner(path: Path, tree: Tree) -> tuple[Path, Path] | None:
     """The two files of a pair, where this is one of them and the other lies beside it."""
-    alone = kalibr.is_asl(tree) or ros.is_camera_info(tree) or opencv.is_half(tree)
+    if not _is_alone(tree):
+        return None
     for names in _PARTNERS:
         first, second = (path.with_name(name) for name in names)
-        if alone and path.name in names and first.is_file() and second.is_file():
+        if path.name in names and first.is_file() and second.is_file():
             return first, second
-    return None
+    pairs = [pair for pair in _pairs_beside(path.parent) if path in pair]
+    return pairs[0] if len(pairs) == 1 else None
+
+
+def _is_alone(tree: Tree) -> bool:
+    """Whether it is one file of two that belong together."""
+    return kalibr.is_asl(tree) or ros.is_camera_info(tree) or _is_half(tree)
+
+
+def _is_half(tree: Tree) -> bool:
+    """Whether it is OpenCV's intrinsics or extrinsics; other files have matrices of a pair, too."""
+    known = next((read for recognises, read in _READERS if recognises(tree)), None)
+    return known is opencv.read_opencv_pair and opencv.is_half(tree)
+
+
+def _pairs_beside(folder: Path) -> list[tuple[Path, Path]]:
+    """Files of a folder that belong together: by the side in their names, or OpenCV's halves."""
+    trees = {path: tree for path in shown_in(folder) if (tree := _tree_or_none(path)) is not None}
+    halves = [path for path, tree in trees.items() if _is_half(tree)]
+    inner = [path for path in halves if opencv.has_intrinsics(trees[path])]
+    if len(halves) == 2 and len(inner) == 1:
+        return [(inner[0], next(path for path in halves if path != inner[0]))]
+    sided = {path.name: path for path in trees if path not in halves and _is_alone(trees[path])}
+    return [(sided[left], sided[right]) for left, right in camera_pairs(sided)]
+
+
+def _tree_or_none(path: Path) -> Tree | None:
+    if path.suffix.lower() not in _TREES or not path.is_file():
+        return None
+    try:
+        return read_tree(path)
+    except CalibrationError:
+        return None
+
+
+_TREES = (".yaml", ".yml", ".json", ".xml", ".npz")
 
 
 # --------------------------------------------------------------------------------------------
@@ -133,7 +205,8 @@ def _of_two(first: Path, second: Path, size: Size | None) -> Calibration:
         return Calibration(f"{first} and {second}", "ASL sensor.yaml, a pair", cameras)
     merged = {**trees[1], **trees[0]}
     if any(map(opencv.is_opencv_pair, both)):
-        return opencv.read_opencv_pair(first, merged, size)
+        inner = second if opencv.has_intrinsics(trees[1]) else first
+        return opencv.read_opencv_pair(inner, merged, size)
     one = [_of_tree(path, tree, size) for path, tree in zip((first, second), both, strict=True)]
     raise CalibrationError(
         f"{first} ({one[0].format}) and {second} ({one[1].format}) do not say how the cameras "
@@ -145,7 +218,7 @@ def _of_two(first: Path, second: Path, size: Size | None) -> Calibration:
 # A folder
 
 
-_SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".txt", ".conf")
+_SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".npz", ".txt", ".conf")
 
 
 def _of_folder(folder: Path, size: Size | None) -> Calibration:
@@ -165,7 +238,7 @@ def _of_folder(folder: Path, size: Size | None) -> Calibration:
     if found:
         names = ", ".join(Path(one.source).name for one in found)
         raise CalibrationError(f"{folder}: holds several calibrations ({names}); name one")
-    own = [path for path in shown_in(folder) if path.suffix.lower() in _SUFFIXES[:4]]
+    own = [path for path in shown_in(folder) if path.suffix.lower() in _SUFFIXES[:5]]
     if len(own) == 1 and own[0].is_file():
         _require_readable(own[0], size)
     raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {KNOWN}")
@@ -177,7 +250,8 @@ def _require_readable(path: Path, size: Size | None) -> None:
 
 
 def _rigs(files: Iterable[Path], size: Size | None) -> Iterable[Calibration]:
-    """Of the files those that describe two cameras or more."""
+    """Of the files those that describe two cameras or more; two that belong together once."""
+    sources = set()
     for path in files:
         if path.suffix.lower() not in _SUFFIXES or not path.is_file():
             continue
@@ -185,5 +259,6 @@ def _rigs(files: Iterable[Path], size: Size | None) -> Iterable[Calibration]:
             found = read_calibration_file(path, size=size)
         except CalibrationError:
             continue
-        if len(found.cameras) > 1:
+        if len(found.cameras) > 1 and found.source not in sources:
+            sources.add(found.source)
             yield found

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
+from fgslam.core.sides import camera_pairs
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural, one_camera
-from fgslam.datasets.sides import camera_pairs
 
 _DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
 _RUN_CONFIG = "config.yaml"

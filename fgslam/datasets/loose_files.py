@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
-from fgslam.datasets.sides import camera_pairs, differ_in_number, without_side
+from fgslam.core.sides import camera_pairs, differ_in_number, without_side
 from fgslam.datasets.time_names import time_parts
 
 if TYPE_CHECKING:

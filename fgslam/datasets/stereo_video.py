@@ -13,13 +13,13 @@ import numpy as np
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.sides import differ_in_number
 from fgslam.datasets.calibrated import calibrated_rig, numbered
 from fgslam.datasets.film_times import moments_of
 from fgslam.datasets.images import sized
 from fgslam.datasets.layouts import films_in
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import VideoSettings
-from fgslam.datasets.sides import differ_in_number
 from fgslam.datasets.video_frames import VideoFrames
 
 _VIEWS: dict[str, tuple[int, int]] = {"side_by_side": (2, 1), "over_under": (1, 2)}

@@ -50,7 +50,30 @@ def read_camchain(path: Path, tree: Tree) -> Calibration:
     for part in parts:
         before = cameras[-1].bTc if cameras else None
         cameras.append(_camera(part, _pose(part, before, by_imu), path.name))
-    return Calibration(str(path), "Kalibr camchain", tuple(cameras))
+    notes = tuple(_contradiction(part, k, parts, cameras) for k, part in enumerate(parts) if k)
+    told = tuple(filter(None, notes))
+    return Calibration(str(path), "Kalibr camchain", tuple(cameras), notes=told)
+
+
+_CONTRADICTION_M = 0.005  # what two calibrations of one rig agree to, and the angle beside it
+_CONTRADICTION = np.cos(np.radians(1.0))
+
+
+def _contradiction(part: Values, k: int, parts: list[Values], cameras: list[RawCamera]) -> str:
+    """What to tell where the step to a camera and the places on the IMU say different things."""
+    if not all("T_cam_imu" in p for p in (part, parts[k - 1])) or "T_cn_cnm1" not in part:
+        return ""
+    by_imu = parts[k - 1].motion("T_cam_imu") @ inverse(part.motion("T_cam_imu"))
+    by_step = inverse(cameras[k - 1].bTc) @ cameras[k].bTc
+    apart = float(np.linalg.norm(by_imu[:3, 3] - by_step[:3, 3]))
+    cosine = 0.5 * (float(np.trace(by_imu[:3, :3].T @ by_step[:3, :3])) - 1.0)
+    if apart < _CONTRADICTION_M and cosine > _CONTRADICTION:
+        return ""
+    return (
+        f"{part.path.name}: {part.where}T_cn_cnm1 and T_cam_imu contradict each other by "
+        f"{apart:.3f} m and {np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.1f} degrees; "
+        "T_cn_cnm1 is taken"
+    )
 
 
 def _pose(part: Values, before: FloatArray | None, by_imu: bool) -> FloatArray:

@@ -137,7 +137,14 @@ def _oak_camera(part: Values, bTc: FloatArray) -> RawCamera:
 # ZED
 
 
-_ZED_SIZES = {"2K": (2208, 1242), "FHD": (1920, 1080), "HD": (1280, 720), "VGA": (672, 376)}
+_ZED_SIZES = {
+    "2K": (2208, 1242),
+    "FHD1200": (1920, 1200),
+    "FHD": (1920, 1080),
+    "HD": (1280, 720),
+    "SVGA": (960, 600),
+    "VGA": (672, 376),
+}
 
 
 def is_zed(text: str) -> bool:
@@ -146,7 +153,7 @@ def is_zed(text: str) -> bool:
 
 
 def read_zed(path: Path, text: str, size: tuple[int, int] | None) -> Calibration:
-    """The pair at one of the four resolutions; the body is the left camera.
+    """The pair at one of its resolutions; the body is the left camera.
 
     ``RX``, ``CV`` and ``RZ`` are the rotation vector that takes points from the left to the right
     camera. Lengths there are millimetres.
@@ -171,7 +178,7 @@ def read_zed(path: Path, text: str, size: tuple[int, int] | None) -> Calibration
         -1e-3 * stereo.named(("baseline", "ty", "tz"), 0.0),
     )
     cameras = tuple(
-        _zed_camera(Values(path, _section(parser, f"{side}_CAM_{name}"), f"{side}: "), name, bTc)
+        _zed_camera(Values(path, _zed_values(parser, side, name), f"{side}: "), name, bTc)
         for side, bTc in (("LEFT", np.eye(4)), ("RIGHT", inverse(step)))
     )
     notes = () if len(chosen) == 1 else (f"taken at {name}; give the size for another",)
@@ -179,6 +186,11 @@ def read_zed(path: Path, text: str, size: tuple[int, int] | None) -> Calibration
 
 
 _TURNS = ("rx", "cv", "rz")
+
+
+def _zed_values(parser: ConfigParser, side: str, name: str) -> dict[str, str]:
+    """Of one camera; the lens has a part of its own in files of ZED X."""
+    return {**_section(parser, f"{side}_DISTO"), **_section(parser, f"{side}_CAM_{name}")}
 
 
 def _section(parser: ConfigParser, name: str) -> dict[str, str]:
@@ -194,7 +206,8 @@ def _key(key: str) -> str:
 
 def _zed_camera(part: Values, name: str, bTc: FloatArray) -> RawCamera:
     matrix = intrinsic_matrix(*part.named(_FOCAL))
-    parameters = part.named(("k1", "k2", "p1", "p2", "k3"), 0.0)
+    parameters = part.named(_SINGLE, 0.0)
+    parameters = parameters if parameters[5:].any() else parameters[:5]
     label = f"{part.path.name}: {part.where[:-2]}"
     return checked_camera(RawCamera(*_ZED_SIZES[name], matrix, parameters, bTc, label))
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,26 +16,17 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse, pose
 
-_MATRICES = (
-    ("M1", "M2"),
-    ("K1", "K2"),
-    ("cameraMatrix1", "cameraMatrix2"),
-    ("camera_matrix_1", "camera_matrix_2"),
-    ("camera_matrix1", "camera_matrix2"),
-    ("cameraMatrixL", "cameraMatrixR"),
-    ("K_left", "K_right"),
-    ("K_l", "K_r"),
-    ("left_camera_matrix", "right_camera_matrix"),
-)
+_SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
+_MATRICES = ("m", "k", "kk", "mtx", "cameramatrix", "cammatrix", "intrinsicmatrix", "intrinsics")
 _DISTORTIONS = (
-    ("D1", "D2"),
-    ("distCoeffs1", "distCoeffs2"),
-    ("dist_coeffs_1", "dist_coeffs_2"),
-    ("distCoeffsL", "distCoeffsR"),
-    ("D_left", "D_right"),
-    ("distCoeffs_l", "distCoeffs_r"),
-    ("D_l", "D_r"),
-    ("left_distortion_coefficients", "right_distortion_coefficients"),
+    *("d", "kc", "dist", "distcoeffs", "distcoefs", "distortion", "distortions"),
+    *("distortioncoefficients", "distortioncoeffs"),
+)
+"""What people call them, in small letters without marks; beside that a side, on either end."""
+
+_STEPS = (
+    *(("R", "T"), ("rot", "trans"), ("Rot", "Trans")),
+    *(("rotation_matrix", "translation_vector"), ("rotationMatrix", "translationVector")),
 )
 _SINGLE = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M")
 _SINGLE_DISTORTION = (
@@ -48,14 +42,63 @@ _FORMAT = "OpenCV stereo calibration"
 
 def is_opencv_pair(tree: Tree) -> bool:
     """Whether it holds intrinsics or extrinsics of two cameras by OpenCV's usual names."""
-    intrinsic = any(pair[0] in tree and pair[1] in tree for pair in _MATRICES)
-    return intrinsic or ({"R", "T"} <= tree.keys() and "distortion_model" not in tree)
+    flat = _flat(tree)
+    inner, step = _pair(flat, _MATRICES), _step(flat)
+    return inner is not None or (step is not None and "distortion_model" not in tree)
 
 
 def is_half(tree: Tree) -> bool:
     """Whether it holds either intrinsics or extrinsics of a pair, and the rest is elsewhere."""
-    intrinsic = any(pair[0] in tree for pair in _MATRICES)
-    return intrinsic != ({"R", "T"} <= tree.keys())
+    flat = _flat(tree)
+    return (_pair(flat, _MATRICES) is not None) != (_step(flat) is not None)
+
+
+def has_intrinsics(tree: Tree) -> bool:
+    """Whether it holds the intrinsics of two cameras."""
+    return _pair(_flat(tree), _MATRICES) is not None
+
+
+def _flat(tree: Tree) -> Tree:
+    """The same with what two parts ``left`` and ``right`` hold under names with these words."""
+    inner = [k for k, v in tree.items() if isinstance(v, Mapping) and _plain(k) in _WORDS]
+    deeper = {f"{key} {name}": value for key in inner for name, value in tree[key].items()}
+    return {**tree, **deeper} if len(inner) == 2 else tree
+
+
+_WORDS = {f"{before}{side}" for pair in _SIDES[1:3] for side in pair for before in ("", "camera")}
+_WORDS |= {f"{before}{side}" for side in "012" for before in ("cam", "camera")}
+
+
+def _plain(key: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
+def _pair(tree: Tree, stems: Sequence[str]) -> tuple[str, str] | None:
+    """The keys of two cameras' values whose names are one of the stems beside the side."""
+    known = {_plain(key): key for key, value in tree.items() if _is_row(value)}
+    for a, b in _SIDES:
+        for stem in stems:
+            for names in _forms(stem, a, b):
+                if names[0] in known and names[1] in known:
+                    return known[names[0]], known[names[1]]
+    return None
+
+
+def _forms(stem: str, a: str, b: str) -> tuple[tuple[str, str], ...]:
+    inside = (("cam", "camera"), ("",))[stem.startswith("cam")]
+    behind = [(f"{stem}{word}{a}", f"{stem}{word}{b}") for word in ("", *inside)]
+    before = [(f"{word}{a}{stem}", f"{word}{b}{stem}") for word in ("", *inside)]
+    return (*behind, *before)
+
+
+def _is_row(value: Any) -> bool:
+    """Whether a value is a row or matrix of numbers, as lens and matrix are, and no single one."""
+    return isinstance(value, np.ndarray | list) and np.size(np.asarray(value, object)) > 0
+
+
+def _step(tree: Tree) -> tuple[str, str] | None:
+    """The keys of rotation and translation from the first camera's axes to the second's."""
+    return next((names for names in _STEPS if set(names) <= tree.keys()), None)
 
 
 def is_opencv_single(tree: Tree) -> bool:
@@ -93,16 +136,17 @@ def read_opencv_pair(path: Path, tree: Tree, size: tuple[int, int] | None) -> Ca
     Raises:
         CalibrationError: a matrix or the size is missing, or not what it should be.
     """
-    part = Values(path, tree)
-    matrices, distortions = _pair(part, _MATRICES), _pair(part, _DISTORTIONS)
-    if matrices is None or distortions is None or not {"R", "T"} <= tree.keys():
+    flat = _flat(tree)
+    part, step = Values(path, flat), _step(flat)
+    matrices, distortions = _pair(flat, _MATRICES), _pair(flat, _DISTORTIONS)
+    if matrices is None or distortions is None or step is None:
         lacking = "R and T" if matrices and distortions else "matrices of two cameras"
         raise CalibrationError(
             f"{path} has no {lacking}; a stereo pair needs M1, D1, M2, D2, R and T "
             "(intrinsics.yml and extrinsics.yml beside each other will do)"
         )
     width, height = size or _stated_size(part) or (0, 0)
-    poses = np.eye(4), inverse(_second_from_first(part))
+    poses = np.eye(4), inverse(_second_from_first(part, *step))
     models = [_model(part, distortions[k], matrices[k], k) for k in (0, 1)]
     first, second = (
         checked_camera(
@@ -124,16 +168,12 @@ def read_opencv_pair(path: Path, tree: Tree, size: tuple[int, int] | None) -> Ca
     return Calibration(str(path), _FORMAT, (first, second), True, None, notes)
 
 
-def _pair(part: Values, names: tuple[tuple[str, str], ...]) -> tuple[str, str] | None:
-    return next((pair for pair in names if pair[0] in part and pair[1] in part), None)
-
-
-def _second_from_first(part: Values) -> FloatArray:
-    turn = part.numbers("R")
-    rotation = cv2.Rodrigues(turn)[0] if len(turn) == 3 else part.matrix("R", 3, 3)
-    moved = pose(np.asarray(rotation, np.float64), part.numbers("T", 3))
-    made = Values(part.path, {"R and T": moved})
-    return made.motion("R and T")
+def _second_from_first(part: Values, turned: str, moved: str) -> FloatArray:
+    turn = part.numbers(turned)
+    rotation = cv2.Rodrigues(turn)[0] if len(turn) == 3 else part.matrix(turned, 3, 3)
+    step = pose(np.asarray(rotation, np.float64), part.numbers(moved, 3))
+    name = f"{turned} and {moved}"
+    return Values(part.path, {name: step}).motion(name)
 
 
 def _model(part: Values, distortion: str, matrix: str, k: int) -> tuple[str, FloatArray]:
@@ -143,7 +183,8 @@ def _model(part: Values, distortion: str, matrix: str, k: int) -> tuple[str, Flo
     if xi in part:
         return "omni", np.append(part.number(xi), coefficients)
     stated = part.text("distortion_model")
-    if stated in _FISHEYE_NAMES or (not stated and matrix[0] == "K" and len(coefficients) == 4):
+    fisheye = matrix.rpartition(" ")[2][0] == "K" and len(coefficients) == 4
+    if stated in _FISHEYE_NAMES or (not stated and fisheye):
         return "equidistant", coefficients
     return "radtan", coefficients
 

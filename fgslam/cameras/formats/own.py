@@ -20,12 +20,12 @@ from fgslam.core.settings import RigView
 FORMAT = "calib.json of fgslam"
 CORRECTIONS = "corrections"
 
-_OWN = {"baseline_m", "baseline", "rectified", "fx"}
+OWN = {"baseline_m", "baseline", "rectified", "fx"}
 
 
 def is_rectified(tree: Tree) -> bool:
     """Whether it is a ``calib.json`` of rectified cameras."""
-    return not is_raw(tree) and bool(_OWN & tree.keys())
+    return not is_raw(tree) and bool(OWN & tree.keys())
 
 
 def is_raw(tree: Tree) -> bool:

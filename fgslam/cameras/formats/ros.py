@@ -27,13 +27,28 @@ _FORMAT = "ROS camera_info"
 
 
 def is_camera_info(tree: Tree) -> bool:
-    """Whether it is a camera_info, as camera_calibration writes it."""
-    return {"camera_matrix", "distortion_model"} <= tree.keys() and "image_width" in tree
+    """Whether it is a camera_info, as camera_calibration or an echo of the topic writes it."""
+    return {"camera_matrix", "distortion_model", "image_width"} <= as_file(tree).keys()
+
+
+def as_file(tree: Tree) -> Tree:
+    """The message as ``rostopic echo`` and ``ros2 topic echo`` write it, with a file's keys."""
+    for letters in ("DKRP", "dkrp"):
+        if tree.keys() >= {*letters, "distortion_model", "width", "height"}:
+            named = {name: tree[letter] for name, letter in zip(_NAMES, letters, strict=True)}
+            return {**tree, **named, "image_width": tree["width"], "image_height": tree["height"]}
+    return tree
+
+
+_NAMES = (
+    *("distortion_coefficients", "camera_matrix"),
+    *("rectification_matrix", "projection_matrix"),
+)
 
 
 def read_camera_info(path: Path, tree: Tree) -> Calibration:
     """The calibration of one camera alone."""
-    camera, _, _ = _camera(Values(path, tree))
+    camera, _, _ = _camera(Values(path, as_file(tree)))
     return Calibration(str(path), _FORMAT, (camera,))
 
 
@@ -46,7 +61,7 @@ def read_camera_info_pair(files: tuple[Path, Path], trees: tuple[Tree, Tree]) ->
         CalibrationError: a value is missing or malformed, a distortion model is not known, or the
             files are not of one rectified pair.
     """
-    parts = [Values(path, tree) for path, tree in zip(files, trees, strict=True)]
+    parts = [Values(path, as_file(tree)) for path, tree in zip(files, trees, strict=True)]
     (left, r_left, p_left), (right, r_right, p_right) = map(_camera, parts)
     if left.size != right.size:
         raise CalibrationError(
@@ -86,7 +101,7 @@ def _camera(part: Values) -> tuple[RawCamera, FloatArray, FloatArray]:
     matrix = part.matrix("camera_matrix", 3, 3)
     given = part.tree.get("distortion_coefficients")
     given = given.get("data") if isinstance(given, dict) else given
-    empty = isinstance(given, np.ndarray | list) and not len(given)  # CameraInfo.msg: none
+    empty = isinstance(given, np.ndarray | list) and not np.size(given)  # CameraInfo.msg: none
     none = np.zeros(5 if lens == "radtan" else 4)
     coefficients = none if empty else part.numbers("distortion_coefficients")
     width, height = part.size("image_width", "image_height")

@@ -1,8 +1,9 @@
-"""Settings files of other SLAM programs: ORB-SLAM, stella_vslam, VINS and camodocal, SVO."""
+"""Settings files of other SLAM programs: ORB-SLAM, stella_vslam, VINS, camodocal, OKVIS, SVO."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -211,6 +212,51 @@ def read_vins(path: Path, tree: Tree) -> Calibration:
             raise part.refuse(f"cam{k}_calib names {beside}, which is no camera of camodocal")
         cameras.append(_camodocal(beside, own, part.motion(f"body_T_cam{k}")))
     return Calibration(str(path), "VINS-Fusion configuration", tuple(cameras))
+
+
+# --------------------------------------------------------------------------------------------
+# OKVIS
+
+
+_OKVIS = {
+    "radialtangential": "radtan",
+    "radialtangential8": "radtan",
+    "equidistant": "equidistant",
+    "none": "radtan",
+}
+
+
+def is_okvis(tree: Tree) -> bool:
+    """Whether it is a configuration of OKVIS."""
+    cameras = tree.get("cameras")
+    return isinstance(cameras, list) and bool(cameras) and "T_SC" in _as_tree(cameras[0])
+
+
+def _as_tree(value: Any) -> Tree:
+    return value if isinstance(value, dict) else {}
+
+
+def read_okvis(path: Path, tree: Tree) -> Calibration:
+    """Its cameras; the body is the IMU, ``T_SC`` a camera's pose in it.
+
+    Raises:
+        CalibrationError: a value is missing or impossible, or the distortion is not known.
+    """
+    parts = [Values(path, _as_tree(c), f"cameras[{k}].") for k, c in enumerate(tree["cameras"])]
+    return Calibration(str(path), "OKVIS configuration", tuple(map(_okvis_camera, parts)))
+
+
+def _okvis_camera(part: Values) -> RawCamera:
+    model = part.text("distortion_type", "none")
+    if model not in _OKVIS:
+        raise part.refuse(f"distortion_type {model} is not known; known: {', '.join(_OKVIS)}")
+    parameters = np.zeros(4) if model == "none" else part.numbers("distortion_coefficients")
+    matrix = intrinsic_matrix(*part.numbers("focal_length", 2), *part.numbers("principal_point", 2))
+    size = part.size("image_dimension", "image_dimension")
+    name = f"{part.path.name}: {part.where[:-1]}"
+    return checked_camera(
+        RawCamera(*size, matrix, parameters, part.motion("T_SC"), name, _OKVIS[model])
+    )
 
 
 # --------------------------------------------------------------------------------------------

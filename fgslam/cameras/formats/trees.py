@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -15,7 +16,7 @@ import yaml
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_text
+from fgslam.core.files import read_text, require_file
 from fgslam.core.geometry import is_rigid, pose, rotation_from_quaternion
 from fgslam.core.yaml_text import PlainLoader
 
@@ -24,6 +25,8 @@ Tree: TypeAlias = Mapping[str, Any]
 
 _MATRICES = ("opencv-matrix", "opencv-nd-matrix")
 _TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])")
+_ARCHIVE = ".npz"
+_LARGEST_ARCHIVE = 100_000_000  # bytes; points of a board may be in it
 _DEEPEST = 20  # levels of nesting: no calibration has ten
 
 
@@ -42,17 +45,41 @@ for _tag in _MATRICES:
 
 
 def read_tree(path: Path) -> Tree | None:
-    """Keys and values of a file; None where it is none of YAML, JSON and XML.
+    """Keys and values of a file; None where it is none of YAML, JSON, XML and NumPy's archive.
 
     Raises:
         CalibrationError: it cannot be read, or is meant to be one of them and is malformed.
     """
+    if path.suffix.lower() == _ARCHIVE:
+        return _of_archive(path)
     text = read_text(path, CalibrationError).lstrip("\ufeff \t\r\n")
     if text.startswith("{"):
         return _of_json(path, text)
     if text.startswith("<"):
         return _of_xml(path)
     return _of_yaml(path, text)
+
+
+def _of_archive(path: Path) -> Tree:
+    """The arrays of ``numpy.savez``; what is no array of numbers is left out."""
+    require_file(path, CalibrationError, "restore the file", _LARGEST_ARCHIVE)
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            arrays = {key: _loaded(found, key) for key in found.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as cause:
+        reason = " ".join(str(cause).split())
+        raise CalibrationError(f"{path} is no archive of NumPy ({reason}); save it again") from None
+    return {key: value for key, value in arrays.items() if value is not None}
+
+
+def _loaded(archive: Any, key: str) -> Any:
+    try:
+        value = archive[key]
+    except ValueError:  # Python's objects
+        return None
+    if value.dtype.kind not in "fiu":
+        return str(value) if value.ndim == 0 else None
+    return float(value) if value.ndim == 0 else np.asarray(value, np.float64)
 
 
 def _of_json(path: Path, text: str) -> Tree:
@@ -65,7 +92,7 @@ def _of_json(path: Path, text: str) -> Tree:
 
 
 def _of_yaml(path: Path, text: str) -> Tree | None:
-    lines = text.splitlines()
+    lines = text.rstrip().removesuffix("\n---").splitlines()  # as echoes of a message end
     if text.startswith("%YAML"):
         # OpenCV writes a directive that is no YAML, and reads "key:value" without a space.
         lines = [_TIGHT.sub(r"\1: ", line) for line in lines if not line.startswith("%YAML")]

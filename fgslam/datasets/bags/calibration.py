@@ -15,11 +15,11 @@ from fgslam.cameras.rig import StereoRig
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera
+from fgslam.core.sides import differ_in_number
 from fgslam.datasets.bags.frames import FrameTree, view_axes
 from fgslam.datasets.bags.topics import Chosen, FileCameras
 from fgslam.datasets.calibrated import loaded_rig, mounted, numbered, read_rig
 from fgslam.datasets.settings import BagSettings
-from fgslam.datasets.sides import differ_in_number
 
 _BODIES = ("base_link", "base_footprint")
 """The robot itself, where odometry does not name its frame (REP 105)."""

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fgslam.core.errors import DatasetError
+from fgslam.core.sides import camera_pairs
 from fgslam.datasets.bags import messages as kinds
 from fgslam.datasets.bags.files import Topic
-from fgslam.datasets.sides import camera_pairs
 
 IMAGES = (kinds.IMAGE, kinds.COMPRESSED)
 MOTIONS = (kinds.ODOMETRY, kinds.TWIST, kinds.TWIST_WITH_COVARIANCE, kinds.IMU)

@@ -16,6 +16,7 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_ca
 
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import pose
+from fgslam.core.sides import camera_pairs
 from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.loose_files import find_cameras, pair_files
@@ -26,7 +27,6 @@ from fgslam.datasets.settings import (
     LooseImagesSettings,
     RecordedOdometrySettings,
 )
-from fgslam.datasets.sides import camera_pairs
 from fgslam.datasets.stamps import written_stamps
 from fgslam.runs.bare_recording import bare_experiment
 

@@ -1,0 +1,252 @@
+"""One pair of cameras in files of further tools: each gives the rig of OpenCV's own files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.rig import load_rig
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import inverse, pose, so3_exp
+
+SIZE = (64, 48)
+K = [np.array([[40.0 + k, 0, 31.0 - k], [0, 40.5, 23.0 + k], [0, 0, 1.0]]) for k in (0, 1)]
+D = [np.array([-0.2, 0.05, 1e-3, -5e-4, 0.01]), np.array([-0.21, 0.06, -1e-3, 5e-4, 0.0])]
+RIGHT_FROM_LEFT = pose(so3_exp(np.array([0.005, 0.01, -0.003])), np.array([-0.12, 0.001, -5e-4]))
+R, T = RIGHT_FROM_LEFT[:3, :3], RIGHT_FROM_LEFT[:3, 3]
+
+
+def storage(path: Path, **values: FloatArray) -> Path:
+    file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for key, value in values.items():
+        file.write(key, np.ascontiguousarray(value))
+    file.release()
+    return path
+
+
+def as_json(path: Path, **values: Any) -> Path:
+    plain = json.dumps(values, default=lambda array: array.tolist())
+    path.write_text(plain, encoding="utf-8")
+    return path
+
+
+def archive(path: Path, **values: Any) -> Path:
+    np.savez(path, **values)
+    return path
+
+
+def two_files(root: Path) -> Path:
+    """Names that are not those of OpenCV's sample program; the folder holds both."""
+    storage(root / "camera_intrinsics.xml", M1=K[0], D1=D[0], M2=K[1], D2=D[1])
+    storage(root / "camera_extrinsics.xml", R=R, T=T)
+    return root
+
+
+def okvis(root: Path) -> Path:
+    first = pose(so3_exp(np.array([1.0, -0.5, 0.3])), np.array([0.1, 0.2, 0.3]))
+    places = (first, first @ inverse(RIGHT_FROM_LEFT))
+    cameras = [
+        {
+            "T_SC": place.ravel().tolist(),
+            "image_dimension": list(SIZE),
+            "distortion_coefficients": lens.tolist(),
+            "distortion_type": "radialtangential",
+            "focal_length": [float(matrix[0, 0]), float(matrix[1, 1])],
+            "principal_point": [float(matrix[0, 2]), float(matrix[1, 2])],
+        }
+        for place, lens, matrix in zip(places, D, K, strict=True)
+    ]
+    text = yaml.safe_dump({"cameras": cameras, "imu_params": {"a_max": 176.0}})
+    (root / "config.yaml").write_text("%YAML:1.0\n" + text, encoding="utf-8")
+    return root / "config.yaml"
+
+
+FILES: dict[str, Callable[[Path], Path]] = {
+    "two files of other names": two_files,
+    "one of the two": lambda root: two_files(root) / "camera_extrinsics.xml",
+    "words before": lambda root: storage(
+        root / "s.yml",
+        leftCameraMatrix=K[0],
+        leftDistCoeffs=D[0],
+        rightCameraMatrix=K[1],
+        rightDistCoeffs=D[1],
+        R=R,
+        T=T,
+    ),
+    "letters behind": lambda root: as_json(
+        root / "s.json", mtxL=K[0], distL=[D[0]], mtxR=K[1], distR=[D[1]], rot=R, trans=T[:, None]
+    ),
+    "parts": lambda root: as_json(
+        root / "s.json", left={"K": K[0], "D": D[0]}, right={"K": K[1], "D": D[1]}, R=R, T=T
+    ),
+    "NumPy": lambda root: archive(
+        root / "s.npz",
+        cameraMatrix1=K[0],
+        distCoeffs1=D[0],
+        cameraMatrix2=K[1],
+        distCoeffs2=D[1],
+        R=R,
+        T=T,
+        note="two webcams",
+        points=np.array([None, 1]),
+    ),
+    "OKVIS": okvis,
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_file_gives_the_same_rig(tmp_path: Path, name: str) -> None:
+    (tmp_path / "other").mkdir()
+    storage(tmp_path / "s.yml", M1=K[0], D1=D[0], M2=K[1], D2=D[1], R=R, T=T)
+    expected = load_rig(tmp_path / "s.yml", size=SIZE)
+    found = load_rig(FILES[name](tmp_path / "other"), size=SIZE)
+    for key in ("width", "height", "fx", "fy", "cx", "cy", "baseline"):
+        assert getattr(found, key) == pytest.approx(getattr(expected, key), abs=1e-6), key
+    assert found.remarks == ()
+
+
+# --------------------------------------------------------------------------------------------
+# ROS
+
+
+def camera_info(k: int, lens: FloatArray) -> dict[str, Any]:
+    return {
+        "width": SIZE[0],
+        "height": SIZE[1],
+        "distortion_model": "plumb_bob" if len(lens) else "",
+        "d": lens.tolist(),
+        "k": K[k].ravel().tolist(),
+        "r": np.eye(3).ravel().tolist(),
+        "p": [40.0, 0, 31.0, -40.0 * 0.12 * k, 0, 40.0, 23.0, 0, 0, 0, 1.0, 0],
+    }
+
+
+def as_calibrator(info: dict[str, Any]) -> dict[str, Any]:
+    keys = {"k": "camera_matrix", "d": "distortion_coefficients", "r": "rectification_matrix"}
+    rows = {"k": 3, "d": 1, "r": 3, "p": 3}
+    named = {
+        name: {"rows": rows[key], "cols": len(info[key]) // rows[key], "data": info[key]}
+        for key, name in {**keys, "p": "projection_matrix"}.items()
+    }
+    size = {"image_width": info["width"], "image_height": info["height"]}
+    return {**size, **named, "distortion_model": info["distortion_model"]}
+
+
+@pytest.mark.parametrize("letters", ["small, ROS 2", "capital, ROS 1"])
+def test_an_echo_of_the_topic_is_a_file(tmp_path: Path, letters: str) -> None:
+    for k, name in enumerate(("left", "right")):
+        info = camera_info(k, D[k])
+        (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(as_calibrator(info)))
+        if letters.startswith("capital"):
+            info = {key.upper() if len(key) == 1 else key: value for key, value in info.items()}
+        echo = {"header": {"frame_id": name}, **info, "binning_x": 0}
+        (tmp_path / f"echo_{name}.yaml").write_text(yaml.safe_dump(echo) + "---\n")
+    expected = load_rig(tmp_path / "left.yaml", tmp_path / "right.yaml")
+    found = load_rig(tmp_path / "echo_right.yaml")
+    assert (found.fx, found.cx, found.baseline) == (expected.fx, expected.cx, expected.baseline)
+    assert found.baseline == pytest.approx(0.12)
+
+
+def test_files_named_by_the_side_belong_together_and_no_lens_is_one(tmp_path: Path) -> None:
+    for k, name in enumerate(("left", "right")):
+        values = as_calibrator(camera_info(k, np.zeros(0)))
+        (tmp_path / f"bumblebee_{name}.yaml").write_text(yaml.safe_dump(values))
+    for given in (tmp_path, tmp_path / "bumblebee_right.yaml"):
+        assert load_rig(given).baseline == pytest.approx(0.12)
+    shutil.copy(tmp_path / "bumblebee_left.yaml", tmp_path / "spare_left.yaml")
+    with pytest.raises(CalibrationError, match=r"spare_left\.yaml: one camera alone"):
+        load_rig(tmp_path / "spare_left.yaml")
+
+
+# --------------------------------------------------------------------------------------------
+# Others
+
+
+def test_middlebury_is_in_millimetres_and_its_centres_may_differ(tmp_path: Path) -> None:
+    lines = [
+        "cam0=[3997.684 0 1176.728; 0 3997.684 1011.728; 0 0 1]",
+        "cam1=[3997.684 0 1307.839; 0 3997.684 1011.728; 0 0 1]",
+        *("doffs=131.111", "baseline=193.001", "width=2964", "height=1988", "ndisp=280"),
+    ]
+    (tmp_path / "calib.txt").write_text("\n".join(lines), encoding="utf-8")
+    calibration = read_calibration_file(tmp_path / "calib.txt")
+    assert load_rig(tmp_path / "calib.txt").baseline == pytest.approx(0.193001)
+    point = np.array([0.1, 0.0, 2.0])
+    columns = [
+        camera.project((point - camera.bTc[:3, 3])[None])[0, 0] for camera in calibration.cameras
+    ]
+    expected = 0.193001 * 3997.684 / point[2] - 131.111  # as Middlebury defines doffs
+    assert columns[0] - columns[1] == pytest.approx(expected)
+    (tmp_path / "calib.txt").write_text("\n".join([*lines[:3], *lines[4:]]) + "\nbaseline=x")
+    with pytest.raises(CalibrationError, match=r"baseline is .*expected 1 finite number"):
+        load_rig(tmp_path / "calib.txt")
+
+
+def zed(lens: str, apart: bool) -> str:
+    lines = []
+    for side in ("LEFT", "RIGHT"):
+        lines += [f"[{side}_CAM_SVGA]", "fx=370", "fy=370", "cx=480", "cy=300"]
+        lines += [f"[{side}_DISTO]"] if apart else []
+        lines += lens.split()
+    return "\n".join([*lines, "[STEREO]", "Baseline=120", *["CV_SVGA=0", "RX_SVGA=0", "RZ_SVGA=0"]])
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_all_terms_of_a_zeds_lens_count(tmp_path: Path, apart: bool) -> None:
+    """ZED X has eight, in a part of their own; five were read, and that part was not."""
+    lens = "k1=0.9 k2=-0.3 p1=0.001 p2=0.002 k3=0.02 k4=1.2 k5=-0.1 k6=0.05"
+    (tmp_path / "SN1.conf").write_text(zed(lens, apart), encoding="utf-8")
+    found = read_calibration_file(tmp_path / "SN1.conf", size=(960, 600))
+    assert found.cameras[1].bTc[0, 3] == pytest.approx(0.12)
+    expected = [0.9, -0.3, 0.001, 0.002, 0.02, 1.2, -0.1, 0.05]
+    assert all(camera.distortion.tolist() == expected for camera in found.cameras)
+
+
+def test_a_camchain_that_contradicts_itself_is_told(tmp_path: Path) -> None:
+    step = RIGHT_FROM_LEFT.copy()
+    chain = {
+        f"cam{k}": {
+            "camera_model": "pinhole",
+            "distortion_model": "radtan",
+            "distortion_coeffs": D[k][:4].tolist(),
+            "intrinsics": [40.0, 40.0, 31.0, 23.0],
+            "resolution": list(SIZE),
+            "T_cam_imu": (step if k else np.eye(4)).tolist(),
+        }
+        for k in (0, 1)
+    }
+    chain["cam1"]["T_cn_cnm1"] = step.tolist()
+    file = tmp_path / "camchain.yaml"
+    file.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    assert load_rig(file).remarks == ()
+    step[0, 3] = -0.1
+    chain["cam1"]["T_cn_cnm1"] = step.tolist()
+    file.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    rig = load_rig(file)
+    assert rig.baseline == pytest.approx(0.1, abs=1e-4)
+    assert "T_cn_cnm1 and T_cam_imu contradict each other by 0.020 m" in rig.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("stereoParams.mat", "stereoParametersToOpenCV"),
+        ("calib.pkl", r"numpy\.savez"),
+        ("calib.npz", "is no archive of NumPy"),
+        ("calib.yaml", r"baseline, fx are keys of fgslam's calib\.json; write it so"),
+    ],
+)
+def test_what_is_not_read_says_what_to_do(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / name).write_text("fx: 40\nbaseline: 0.1\n", encoding="utf-8")
+    with pytest.raises(CalibrationError, match=words):
+        load_rig(tmp_path / name)
