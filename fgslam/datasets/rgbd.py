@@ -10,7 +10,6 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from fgslam.cameras.assembly import at_size
@@ -18,13 +17,20 @@ from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.trees import read_tree
 from fgslam.cameras.raw_cameras import RawCamera
-from fgslam.cameras.rectification import MapArray, View, pixel_grid, sampling_maps
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines, shown_in
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.depth_view import (
+    BASELINE_M,
+    Depth,
+    DepthFrames,
+    Undistorted,
+    depth_sigma_px,
+    require_one_camera,
+)
 from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, sized
 from fgslam.datasets.layouts import colour_and_depth
 from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
@@ -33,12 +39,7 @@ from fgslam.datasets.recording import Recording, recording_identity, select_fram
 from fgslam.datasets.settings import RgbdSettings
 from fgslam.datasets.stamps import stamps_of
 from fgslam.datasets.tables import read_tum_table, trajectory_at_frames
-from fgslam.datasets.virtual_view import seen_from_the_left
 
-BASELINE_M = 0.08
-"""Of the camera that is made up: about that of depth cameras, so that both see much the same."""
-
-_FOUND_AGAIN_PX = 0.15  # by which SIFT finds a point again in a view made of the same image
 _TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
 _NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
 # Where 16 bits are only assumed to be millimetres: farther than RealSense, Kinect and Orbbec see.
@@ -67,20 +68,13 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
     size = first_size(colour for colour, _ in pairs)
     if size is None:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
-    for name, asked in (
-        ("fov_deg", settings.fov_deg),
-        ("view", settings.view != "perspective"),
-        ("unit_m", settings.unit_m != 1.0),
-    ):
-        if asked:
-            raise DatasetError(f"{root}: dataset.{name} is for two cameras; leave it out")
+    require_one_camera(settings)
     camera, known = _camera(root, settings, size)
     rig = _rig(camera, settings)
     scale, said = _scale(root, pairs, settings)
     chosen = select_frames(len(pairs), settings)
-    images = _Images(pairs, rig, _Undistorted.of(camera), scale)
+    images = DepthFrames(_Files(pairs, size, scale).read, rig, Undistorted.of(camera))
     truth = root / "groundtruth.txt"
-    own = settings.scale * rig.fx * BASELINE_M * settings.depth_sigma_m
     return Recording(
         name=root.resolve().name,
         rig=rig,
@@ -91,7 +85,7 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,
-        disparity_sigma_px=round(float(np.hypot(own, _FOUND_AGAIN_PX)), 3),
+        disparity_sigma_px=depth_sigma_px(settings.scale * rig.fx, settings.depth_sigma_m),
     )
 
 
@@ -276,57 +270,16 @@ def _rig(camera: RawCamera, settings: RgbdSettings) -> CameraRig:
 
 
 @dataclass(frozen=True, eq=False)
-class _Undistorted:
-    """Where each pixel of an undistorted image is in the camera's own."""
-
-    columns: MapArray
-    rows: MapArray
-
-    @staticmethod
-    def of(camera: RawCamera) -> _Undistorted | None:
-        """None where there is nothing to mend."""
-        if camera.model == "radtan" and not np.any(camera.distortion):
-            return None
-        view = View(camera.matrix, (camera.width, camera.height))
-        return _Undistorted(*sampling_maps(camera, np.eye(3), view, pixel_grid(view.size)))
-
-    def apply(self, image: Image, nearest: bool) -> Image:
-        """The image, with its pixels between others blended, or, of depth, the nearest."""
-        how = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-        return np.asarray(cv2.remap(image, self.columns, self.rows, how))
-
-
-@dataclass(frozen=True, eq=False)
-class _Images:
-    """Frames as a stereo pair: the colour camera on the right, the view made by depth left."""
+class _Files:
+    """Images of the files, and depths in metres by their unit."""
 
     pairs: tuple[tuple[Path, Path], ...]
-    rig: CameraRig
-    undistorted: _Undistorted | None
+    size: tuple[int, int]
     scale: float
 
-    def load(self, index: int) -> tuple[Image, ...]:
-        """(right, left) in grey. Raises FrameError."""
-        return tuple(
-            np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-            for image in self.load_colour(index)
-        )
-
-    def load_colour(self, index: int) -> tuple[Image, ...]:
-        """The same in red, green, blue."""
-        size = (self.rig.width, self.rig.height)
+    def read(self, index: int) -> tuple[Image, Depth, str]:
+        """Of a frame the colours, depths in metres, and the depth's file. Raises FrameError."""
         colour_file, depth_file = self.pairs[index]
-        colour = sized(read_colour_image(colour_file), f"image {colour_file}", *size)
+        colour = sized(read_colour_image(colour_file), f"image {colour_file}", *self.size)
         depth = read_depth_image(depth_file)
-        if depth.shape != colour.shape[:2]:
-            raise FrameError(
-                f"image {depth_file} is {depth.shape[1]}x{depth.shape[0]}, its colour image "
-                f"{size[0]}x{size[1]}; depth must be registered to colour"
-            )
-        if self.undistorted is not None:
-            colour = self.undistorted.apply(colour, nearest=False)
-            depth = self.undistorted.apply(depth, nearest=True)
-        metres = depth.astype(np.float32) / np.float32(self.scale)
-        known = np.isfinite(metres) & (metres > 0.0)
-        shift = self.rig.fx * self.rig.baseline / np.where(known, metres, np.inf)
-        return colour, seen_from_the_left(colour, shift.astype(np.float32), known)
+        return colour, depth.astype(np.float32) / np.float32(self.scale), str(depth_file)

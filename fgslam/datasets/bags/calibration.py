@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from fgslam.cameras.assembly import at_size
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
@@ -17,8 +18,9 @@ from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera
 from fgslam.core.sides import differ_in_number
 from fgslam.datasets.bags.frames import FrameTree, view_axes
-from fgslam.datasets.bags.topics import Chosen, FileCameras
+from fgslam.datasets.bags.topics import Chosen, FileCameras, is_registered
 from fgslam.datasets.calibrated import loaded_rig, mounted, numbered, read_rig
+from fgslam.datasets.depth_view import BASELINE_M, require_one_camera
 from fgslam.datasets.settings import BagSettings
 
 _BODIES = ("base_link", "base_footprint")
@@ -67,20 +69,31 @@ def file_cameras(settings: BagSettings) -> FileCameras:
     return FileCameras(file.name, tuple(camera.topic for camera in cameras))
 
 
-def rig_of_bag(
-    settings: BagSettings, stated: Stated, chosen: Chosen
-) -> tuple[StereoRig, Chosen, tuple[str, ...]]:
-    """The rig on the robot, the topics with sides as calibrated, and what was noticed.
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """The rig on the robot, the right camera, topics with sides as calibrated, what was noticed."""
+
+    rig: StereoRig
+    camera: RawCamera
+    chosen: Chosen
+    notes: tuple[str, ...]
+
+
+def rig_of_bag(settings: BagSettings, stated: Stated, chosen: Chosen) -> Placed:
+    """The rig of the topics that are chosen, or of one of them and its depth.
 
     Raises:
         CalibrationError: nothing says where the cameras are, or what does is malformed.
     """
-    found = _of_file(settings, stated, chosen) or _of_topics(settings, stated, chosen)
+    if chosen.depth:
+        found = _of_depth(settings, stated, chosen)
+    else:
+        found = _of_file(settings, stated, chosen) or _of_topics(settings, stated, chosen)
     notes = (*found.notes, *found.rig.remarks)
     if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
-        return mounted(found.rig, settings), found.chosen, notes
+        return Placed(mounted(found.rig, settings), found.cameras[1], found.chosen, notes)
     rig, said = _on_robot(found, stated)
-    return rig, found.chosen, (*notes, *said)
+    return Placed(rig, found.cameras[1], found.chosen, (*notes, *said))
 
 
 def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | None:
@@ -110,6 +123,50 @@ def _of_numbers(rig: StereoRig, cameras: list[RawCamera], chosen: Chosen) -> _Fo
     return _Found(rig, by_side, placed)
 
 
+def _of_depth(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
+    """The camera whose depth is recorded, by the file or its camera_info, and one made up."""
+    require_one_camera(settings)
+    notes = _unregistered(settings, stated, chosen)
+    camera = _one_camera(settings, stated, chosen)
+    (fx, _, cx), (_, fy, cy) = camera.matrix[:2].tolist()
+    rig = StereoRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M)
+    return _Found(rig, (camera, camera), chosen, notes)
+
+
+def _unregistered(settings: BagSettings, stated: Stated, chosen: Chosen) -> tuple[str, ...]:
+    """What to tell where depth may not be registered. Raises CalibrationError: nobody chose it."""
+    colour, depth = (stated.frames[topic] for topic in (chosen.right, chosen.left))
+    if not colour or not depth or colour == depth or is_registered(chosen.left):
+        return ()
+    text = f"{chosen.left} is in the frame {depth}, {chosen.right} in {colour}"
+    if settings.topics:
+        return (f"{text}: it is taken as registered to colour, as it was chosen by --topics",)
+    raise CalibrationError(
+        f"{settings.path}: {text}: depth must be registered to colour; record the driver's aligned "
+        "or registered depth, or choose: --topics COLOUR,DEPTH"
+    )
+
+
+def _one_camera(settings: BagSettings, stated: Stated, chosen: Chosen) -> RawCamera:
+    if settings.camera_file is not None:
+        found = read_calibration_file(Path(settings.camera_file), size=stated.size)
+        alone = replace(found, cameras=found.cameras[:1], view=None)
+        return at_size(alone, stated.size, settings.resized).cameras[0]
+    # Registered depth has the colour camera's calibration.
+    topics = (chosen.right_info, chosen.left_info)
+    topic = next((name for name in topics if name is not None), None)
+    if topic is None:
+        raise CalibrationError(
+            f"{settings.path}: no camera_info belongs to {chosen.right}; give its calibration by "
+            "--camera FILE"
+        )
+    values = _as_sent(stated.infos[topic], stated.size)
+    _require_calibrated(settings, topic, values)
+    values = _without_distortion(values) if _is_rectified(chosen.right) else values
+    found = read_camera_info(Path(f"{settings.path}:{topic}"), values)
+    return at_size(found, stated.size, settings.resized).cameras[0]
+
+
 # --------------------------------------------------------------------------------------------
 # By camera_info, and by tf_static where that has no baseline
 
@@ -120,11 +177,7 @@ def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
     if left is None or right is None:
         raise CalibrationError(_lacking(settings.path, chosen, left is None, right is None))
     for topic, values in zip(topics, (left, right), strict=True):
-        if not values["camera_matrix"]["data"][0]:
-            raise CalibrationError(
-                f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are "
-                "0); calibrate it, and give the calibration of both by --camera FILE"
-            )
+        _require_calibrated(settings, str(topic), values)
     left, right = (_as_sent(values, stated.size) for values in (left, right))
     if all(_is_rectified(topic) for topic in (chosen.left, chosen.right)):
         left, right = (_without_distortion(values) for values in (left, right))
@@ -144,6 +197,14 @@ def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
         )
     found = read_camera_info_pair(named, (left, right))
     return _Found(read_rig(settings, found, stated.size), found.cameras, chosen, notes)
+
+
+def _require_calibrated(settings: BagSettings, topic: str, values: Info) -> None:
+    if not values["camera_matrix"]["data"][0]:
+        raise CalibrationError(
+            f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are 0); "
+            "calibrate it, and give the calibration of all cameras by --camera FILE"
+        )
 
 
 def _shift(info: Info) -> float:

@@ -140,8 +140,8 @@ def _pixels(
 ) -> npt.NDArray[Any]:
     """The rows of the image, ``planes`` times its height, without their padding."""
     wide = encoding.endswith("16") or encoding.startswith("16")
-    kind = np.dtype(np.uint16 if wide else np.uint8)
-    if wide and message.is_bigendian:
+    kind = np.dtype(np.float32 if encoding == "32FC1" else np.uint16 if wide else np.uint8)
+    if kind.itemsize > 1 and message.is_bigendian:
         kind = kind.newbyteorder(">")
     data = np.frombuffer(memoryview(message.data), np.uint8)
     height = int(planes * int(message.height))
@@ -154,6 +154,49 @@ def _pixels(
         )
     rows = data[: height * step].reshape(height, step)[:, :used]
     return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="), copy=False)
+
+
+# --------------------------------------------------------------------------------------------
+# Depth
+
+
+_PACKED_DEPTH = "compressedDepth"
+_HEADER = 12  # bytes before the image: a kind, and two numbers by which floats are coded
+
+
+def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
+    """Depths (height, width) in metres of an Image or CompressedImage; 0 or NaN where unknown.
+
+    Integers are millimetres, floats metres (REP 118); the transport of compressed depth codes
+    floats by their inverse.
+
+    Raises:
+        FrameError: it is no depth, or its data are incomplete.
+    """
+    if hasattr(message, "encoding"):
+        floats = message.encoding == "32FC1"
+        if not floats and message.encoding not in ("16UC1", "mono16"):
+            raise FrameError(
+                f"{where}: encoding {message.encoding!r} is no depth: 16UC1 or 32FC1 is"
+            )
+        pixels = _pixels(message, message.encoding, 1, where)
+        return pixels if floats else _of_millimetres(pixels)
+    data = bytes(memoryview(message.data))
+    packed = _PACKED_DEPTH in message.format
+    if "rvl" in message.format.lower():
+        raise FrameError(f"{where}: depth in the format RVL is not read; record it as PNG, or raw")
+    stored = decode_stored(data[_HEADER:] if packed else data, where)
+    if stored.dtype != np.uint16 or stored.ndim != 2:
+        raise FrameError(f"{where}: its images of {stored.dtype} are no depth; record them as PNG")
+    if packed and message.format.startswith("32FC1"):
+        a, b = np.frombuffer(data[4:_HEADER], "<f4")
+        with np.errstate(divide="ignore"):
+            return np.where(stored > 0, a / (stored.astype(np.float32) - b), np.float32(np.nan))
+    return _of_millimetres(stored)
+
+
+def _of_millimetres(pixels: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    return pixels.astype(np.float32) * np.float32(1e-3)
 
 
 # --------------------------------------------------------------------------------------------

@@ -20,10 +20,11 @@ from fgslam.datasets.bags.files import BagFiles, MessagesByPlace, bag_files, pat
 from fgslam.datasets.bags.frames import FrameTree
 from fgslam.datasets.bags.motion import odometry_source
 from fgslam.datasets.bags.topics import Chosen, choose_topics
+from fgslam.datasets.depth_view import Depth, DepthFrames, Undistorted, depth_sigma_px
 from fgslam.datasets.images import bits_held, sized
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
-from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
+from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings, RgbdSettings
 
 T = TypeVar("T")
 
@@ -43,14 +44,21 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     source = _Images(files, index, chosen)
     height, width = source.first(chosen.right).shape
     stated = Stated(index.infos, index.frames, index.tree, (width, height))
-    rig, chosen, notes = rig_of_bag(settings, stated, chosen)
+    placed = rig_of_bag(settings, stated, chosen)
+    rig, chosen = placed.rig, placed.chosen
     rows, unpaired = _paired(index, chosen, settings)
     stamps = NANOSECONDS * index.stamps[chosen.right][rows[:, 0]].astype(np.float64)
     used = select_frames(len(rows), settings)
     views = (chosen.right, chosen.left, *chosen.views[2:])
     places = np.column_stack([index.places[v][rows[:, k]] for k, v in enumerate(views)])
     held = source.use_bits(places[:, 0])
-    images = _Pairs(source, places, rig)
+    images: _Pairs | DepthFrames = _Pairs(source, places, rig)
+    sigma = None
+    if chosen.depth:
+        pairs = _WithDepth(source, places, rig.image_size)
+        images = DepthFrames(pairs.read, rig, Undistorted.of(placed.camera))
+        sigma = depth_sigma_px(settings.scale * rig.fx, RgbdSettings.depth_sigma_m)
+        unpaired = tuple(_of_depth(note) for note in unpaired)
     return Recording(
         name=where.resolve().stem,
         rig=rig.plain(),
@@ -58,12 +66,17 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         timestamps=stamps[used],
         identity=recording_identity([], [f for path in paths for f in bag_files(path)]),
         ground_truth=None,
-        notes=(*files.notes, *chosen.notes, *index.notes, *unpaired, *held, *notes),
+        notes=(*files.notes, *chosen.notes, *index.notes, *unpaired, *held, *placed.notes),
         indices=used,
         load_images=images.load,
         load_colour=images.load_colour,
         odometry_source=odometry_source(chosen.motion, index.motions, odometry),
+        disparity_sigma_px=sigma,
     )
+
+
+def _of_depth(note: str) -> str:
+    return note.replace("right images", "colour images").replace("left images", "depth images")
 
 
 # --------------------------------------------------------------------------------------------
@@ -210,6 +223,10 @@ class _Images:
                 f"{where}: message without a field of its type ({fault}); copy the bag again"
             ) from None
 
+    def load_depth(self, place: int) -> Depth:
+        """Depths in metres. Raises FrameError."""
+        return self._made(place, messages.depth_of)
+
     def first(self, topic: str) -> Image:
         """The first image of a topic that can be read. Raises DatasetError without any."""
         fault: FrameError | None = None
@@ -219,6 +236,21 @@ class _Images:
             except FrameError as error:
                 fault = error
         raise DatasetError(f"not one image of {topic} can be read: {fault}")
+
+
+@dataclass(frozen=True, eq=False)
+class _WithDepth:
+    """Images of one camera and their depths by frame."""
+
+    images: _Images
+    places: IntArray
+    size: tuple[int, int]
+
+    def read(self, index: int) -> tuple[Image, Depth, str]:
+        """Image, depths in metres, and the name of the depth's message. Raises FrameError."""
+        colour, depth = self.places[index].tolist()
+        image = sized(self.images.load_colour(colour), f"message {colour}", *self.size)
+        return image, self.images.load_depth(depth), f"message {depth}"
 
 
 @dataclass(frozen=True, eq=False)

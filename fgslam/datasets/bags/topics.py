@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.sides import camera_pairs
@@ -32,6 +32,7 @@ class Chosen:
         motion: of odometry, or None.
         transforms: of tf_static; where the bag has none, of tf, which says again what stays.
         notes: what else could have been taken.
+        depth: whether left is the depth of right, in place of a second camera.
         numbers: which cameras of the calibration file left, right[, top] are, so that it tells the
             sides; empty: the topics do.
     """
@@ -45,6 +46,7 @@ class Chosen:
     notes: tuple[str, ...]
     numbers: tuple[int, ...] = ()
     top: str | None = None
+    depth: bool = False
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -79,7 +81,10 @@ def choose_topics(
     images = [topic for topic in named if topic.kind in IMAGES]
     motions = [topic for topic in named if topic.kind in MOTIONS]
     if images:
-        views = _Views(*_as_named([topic.name for topic in images], cameras, where))
+        named_views = [topic.name for topic in images]
+        views = _depth_as_named(named_views, used) or _Views(
+            *_as_named(named_views, cameras, where)
+        )
     else:
         views = _by_file(used, cameras, where) or _by_names(used, cameras, where)
     left, right, *top = views.topics
@@ -88,7 +93,8 @@ def choose_topics(
     of_frames = tuple(topic.name for topic in used if topic.kind in kinds.TRANSFORMS)
     transforms = tuple(name for name in of_frames if name.endswith("tf_static")) or of_frames
     third = top[0] if top else None
-    return Chosen(left, right, *infos, motion, transforms, views.notes, views.numbers, third)
+    made = Chosen(left, right, *infos, motion, transforms, views.notes, views.numbers, third)
+    return replace(made, depth=views.depth)
 
 
 def _named(topics: Sequence[Topic], wanted: Sequence[str], where: str) -> list[Topic]:
@@ -115,6 +121,7 @@ class _Views:
     topics: tuple[str, ...]
     numbers: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+    depth: bool = False
 
 
 def _as_named(
@@ -177,6 +184,8 @@ def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Vie
     by_view = _by_view(views)
     pairs = sorted(camera_pairs(by_view), key=lambda pair: (_rank(pair[0]), pair))
     if not pairs:
+        if (with_depth := _colour_and_depth(topics)) is not None:
+            return with_depth
         raise DatasetError(_no_pair(topics, views, where))
     used, *others = pairs
     third = [pair for pair in others if pair[0] == used[1] and len(cameras.topics) == 3][:1]
@@ -190,6 +199,58 @@ def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Vie
         notes.insert(0, f"{text}: topics are told by their names")
     numbers = (0, 1, 2) if third else ()
     return _Views(tuple(by_view[name] for name in names), numbers, tuple(notes))
+
+
+_REGISTERED = re.compile(r"aligned|regist|to_(rgb|colou?r)", re.IGNORECASE)
+_COLOUR = re.compile(r"rgb|colou?r", re.IGNORECASE)
+_DEPTHS = ("", "/compressedDepth", _TRANSPORT)
+"""Endings of topics of depth, plain before compressed."""
+
+
+def _colour_and_depth(topics: Sequence[Topic]) -> _Views | None:
+    """A camera's images and their depth; None where there is no depth, or no image."""
+    images = [topic.name for topic in topics if topic.kind in IMAGES]
+    depths = sorted((name for name in images if _is_depth(name, images)), key=_depth_rank)
+    by_view = _by_view([name for name in images if not _is_depth(name, images)])
+    colours = sorted(by_view, key=lambda v: (not _COLOUR.search(v), _rank(v), v))
+    colours = [view for view in colours if not _NO_VIEW.search(_own_part(view, images))]
+    if not depths or not colours:
+        return None
+    note = f"{depths[0]} is the depth of {colours[0]} (--topics COLOUR,DEPTH chooses others)"
+    return _Views((depths[0], by_view[colours[0]]), notes=(note,), depth=True)
+
+
+def is_registered(topic: str) -> bool:
+    """Whether the name of a topic of depth says that it is registered to colour."""
+    return _REGISTERED.search(topic) is not None
+
+
+def _depth_as_named(names: Sequence[str], topics: Sequence[Topic]) -> _Views | None:
+    """The user's two topics, where one of them is of depth."""
+    images = [topic.name for topic in topics if topic.kind in IMAGES]
+    depths = [name for name in names if _is_depth(name, images)]
+    others = [name for name in names if name not in depths]
+    one_each = len(depths) == 1 and len(others) == 1
+    return _Views((depths[0], others[0]), depth=True) if one_each else None
+
+
+def _is_depth(name: str, images: Sequence[str]) -> bool:
+    return "depth" in _own_part(name, images).lower()
+
+
+def _own_part(name: str, images: Sequence[str]) -> str:
+    """A topic's name without the camera's, which all images share: it may be depth_camera."""
+    common = 0
+    for words in zip(*(image.split("/")[:-1] for image in images), strict=False):
+        if len(set(words)) > 1:
+            break
+        common += 1
+    return "/".join(name.split("/")[common:])
+
+
+def _depth_rank(name: str) -> tuple[bool, int, int, str]:
+    ending = max((k for k, e in enumerate(_DEPTHS) if name.endswith(e)), default=0)
+    return not is_registered(name), ending, len(name), name
 
 
 def _rank(view: str) -> int:
@@ -230,7 +291,8 @@ def _infos(topics: Sequence[Topic], left: str, right: str) -> tuple[str | None, 
 
 
 def _info_beside(image_topic: str) -> str:
-    return image_topic.removesuffix(_TRANSPORT).rpartition("/")[0] + "/camera_info"
+    plain = image_topic.removesuffix(_DEPTHS[1]).removesuffix(_TRANSPORT)
+    return plain.rpartition("/")[0] + "/camera_info"
 
 
 def _motion(topics: Sequence[Topic]) -> Topic | None:
