@@ -30,10 +30,12 @@ def two_views(
     wrong_share: float = 0.0,
     leg_m: float = 2.0,
     tilts: tuple[FloatArray, FloatArray] | None = None,
+    lift_m: float = 0.0,
 ) -> TwoViews:
     """Points around both cameras, some of the matches swapped among each other.
 
-    ``tilts`` are (2,) roll and pitch in radians of the start's and the target's camera.
+    ``tilts`` are (2,) roll and pitch in radians of the start's and the target's camera, ``lift_m``
+    by how much the latter is higher.
     """
     rng = np.random.default_rng(seed)
     direction, rotation = rng.uniform(-np.pi, np.pi, 2)
@@ -41,7 +43,7 @@ def two_views(
     points = rng.uniform(-4.0, 4.0, (count, 2))
     height = rng.uniform(-1.0, 1.5, count)
     a = _seen(np.zeros(3), points, height, None if tilts is None else tilts[0])
-    b = _seen(target, points, height, None if tilts is None else tilts[1])
+    b = _seen(target, points, height - lift_m, None if tilts is None else tilts[1])
     swapped = rng.permutation(count)[: int(wrong_share * count)]
     b[swapped] = b[np.roll(swapped, 1)]
     angles = np.hstack([a, b])

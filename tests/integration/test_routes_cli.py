@@ -113,6 +113,19 @@ def test_teaching_that_is_stopped_leaves_the_route_so_far_or_none(
         assert len(PathMemory.load(tmp_path / "route.fgpath")) >= 1
 
 
+def test_a_mirrored_recording_is_told(
+    taught: Path, tmp_path: Path, capfd: Capture, monkeypatch: Patch
+) -> None:
+    (tmp_path / "back").mkdir()
+    for k in range(3):
+        mirrored = np.ascontiguousarray(seen_at(0.2 + 0.9 * k)[:, ::-1])
+        PictureFile.fromarray(mirrored).save(tmp_path / "back" / f"view_{k}.png")
+    back = ("follow", taught, tmp_path / "back", "--out", tmp_path / "run")
+    assert main(monkeypatch, *back) == 2
+    said = " ".join(capfd.readouterr().err.splitlines()[-1:])
+    assert said.endswith("as if they were mirrored left to right: mirror them back")
+
+
 def textured_room_camera() -> object:
     from fgslam.cameras.omni.panoramas import Equirectangular
 

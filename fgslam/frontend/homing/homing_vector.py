@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.special import ndtr
+from scipy.stats import chi2
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.homing import BearingMatches, Refusal, RefusalReason, TwoViewVector
@@ -38,6 +39,10 @@ _CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views count
 _TURNED = 3.0  # times the median's limit: what is explained by the turn alone
 _SECTORS = 8  # of 45 degrees: what is seen in one has its errors in common, see `doubt`
 _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
+_LEVEL = float(chi2.ppf(0.95, 5))  # of the prior's strain: level cameras keep within
+_FREE = (np.deg2rad(5.0), 1.0)
+"""Prior of a camera that is carried: tilts at which nearly all features are still matched
+(docs/results/homing_vectors.md), and a height of a whole leg, up stairs or down to the ground."""
 
 
 def estimate_homing_vector(
@@ -92,7 +97,9 @@ class HomingSearch:
             return Refusal(RefusalReason.TOO_FEW_INLIERS, text) if alone is None else alone
         refined = self.refined(candidates)
         at_target = self.turn_at_target(refined[0])
-        return self._judged(refined) if at_target is None else at_target
+        if at_target is not None:
+            return at_target
+        return self._judged(self._carried(refined, candidates) or refined)
 
     def _judged(self, refined: list[Refined]) -> TwoViewVector | Refusal:
         s, best = self._settings, refined[0]
@@ -185,15 +192,29 @@ class HomingSearch:
     # ----------------------------------------------------------------------------------------
     # Refining and judging
 
-    def refined(self, candidates: FloatArray) -> list[Refined]:
+    def refined(
+        self, candidates: FloatArray, refinement: HomingRefinement | None = None
+    ) -> list[Refined]:
         """The candidates (c, 2) after least squares, the best score first, each solution once."""
-        found = self._refinement.refine(candidates[:, 0], candidates[:, 1])
+        found = (refinement or self._refinement).refine(candidates[:, 0], candidates[:, 1])
         found.sort(key=lambda r: -self._score_of(r))
         out: list[Refined] = []
         for solution in found:
             if all(_apart(solution, known) > _SAME for known in out):
                 out.append(solution)
         return out
+
+    def _carried(self, level: list[Refined], candidates: FloatArray) -> list[Refined]:
+        """Solutions without the plane, where the matches contradict it; none where they do not.
+
+        Tried only where the best solution strains the prior; it must lead as over any rival, as
+        freedom explains wrong matches, too.
+        """
+        if self._refinement.strain(level[0]) <= _LEVEL:
+            return []
+        free = self._refinement.held_by(_FREE)
+        found = self.refined(np.vstack([candidates, level[0].parameters[:2]]), free)
+        return [] if self._undecided(found[0], level[0]) else found
 
     def _score_of(self, solution: Refined) -> float:
         return float(self._score(solution.inliers[:, None], solution.residuals[:, None])[0])

@@ -10,6 +10,7 @@ would pull towards what explains less (Kanatani 1996).
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,13 +120,21 @@ class HomingRefinement:
         noisy += [_outer(a, d * matches.sigma[:, k + 2, None]) for k, d in enumerate(by_b)]
         self._noisy = np.concatenate(noisy)
         self._bearings = matches.bearing_a, matches.bearing_b
-        tilt_sigma, height_sigma = prior
-        held = np.maximum([*[tilt_sigma] * 4, height_sigma], _LEAST_SIGMA)
-        self._prior = np.concatenate([np.zeros(2), 1.0 / held**2])  # theta and psi are free
+        self._prior = _information_of(prior)
         right = right_probability(matches) if right is None else right
         self._odds = right / (1.0 - right)
         self._sigmas = inlier_sigmas
         self._least_parallax = least_parallax
+
+    def held_by(self, prior: tuple[float, float]) -> HomingRefinement:
+        """The same matches under a prior that is nowhere tighter, as of the constructor."""
+        out = copy(self)
+        out._prior = np.minimum(self._prior, _information_of(prior))
+        return out
+
+    def strain(self, solution: Refined) -> float:
+        """Sum of the squared tilts and height over those of the prior."""
+        return float(self._prior @ solution.parameters**2)
 
     def refine(self, directions: FloatArray, rotations: FloatArray) -> list[Refined]:
         """Gauss-Newton from hypotheses (c,), side by side; inliers are chosen anew each time."""
@@ -207,6 +216,12 @@ class HomingRefinement:
         by *= np.sqrt(weights / view.variance)[:, None, None]
         flat = by.reshape(count, 7, -1)
         return np.asarray(flat @ flat.transpose(0, 2, 1))
+
+
+def _information_of(prior: tuple[float, float]) -> FloatArray:
+    """(7,) of the parameters, of deviations of tilts and height; theta and psi are free."""
+    held = np.maximum([*[prior[0]] * 4, prior[1]], _LEAST_SIGMA)
+    return np.concatenate([np.zeros(2), 1.0 / held**2])
 
 
 def _told(weights: FloatArray, residuals: FloatArray) -> FloatArray:

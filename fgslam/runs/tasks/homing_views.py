@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +16,7 @@ from fgslam.cameras.omni.mirrors import RadialCamera
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.errors import CalibrationError, OutputError
+from fgslam.core.errors import CalibrationError, FrameError, OutputError
 from fgslam.core.files import make_subfolder
 from fgslam.core.homing import (
     BearingMatches,
@@ -44,6 +45,9 @@ _CLEARLY_OFF = 0.025
 (docs/datasets/mirror_images.md); this is an error of 1.4 degrees at the rim, more within."""
 _LEAST_OFF_PX = 3.0
 _UNEVEN = 1.25  # columns over rows a degree, or the reverse, that no one means
+_BLACK = 16.0  # mean of red, green and blue; a film's black is up to that
+_BESIDE = 0.01  # of the width: so many black columns are no dark corner
+_STEEP = 0.01  # of the steps between columns are larger than any around a real panorama's end
 
 
 def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
@@ -56,13 +60,16 @@ def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
     return replace(recording, notes=recording.notes + camera_notes(recording))
 
 
-def camera_notes(recording: OmniRecording) -> tuple[str, ...]:
-    """Notes where mirror or panoramas are clearly not as stated, or what a file does not state."""
+def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ...]:
+    """Notes where mirror or panoramas are clearly not as stated, or what a file does not state.
+
+    The latter only of a camera that is stated here, not of one that a route brings along.
+    """
     camera = recording.camera
     if isinstance(camera, Equirectangular):
-        return _panorama_notes(camera)
+        return (*_panorama_notes(camera), *_side_notes(recording))
     if isinstance(camera, LensCamera):
-        return (_lens_note(camera),)
+        return (_lens_note(camera),) if stated else ()
     return _mirror_notes(recording, camera) if isinstance(camera, RadialCamera) else ()
 
 
@@ -89,10 +96,52 @@ def _panorama_notes(camera: Equirectangular) -> tuple[str, ...]:
     )
 
 
+def _side_notes(recording: OmniRecording) -> tuple[str, ...]:
+    """A note where the pictures do not go on from their last column to the first one.
+
+    In whole panoramas these are neighbours; here the step between them is larger than nearly all
+    others, or what is beside the picture proper is black.
+    """
+    ends = [_ends(image.mean(axis=2)) for image in _first_pictures(recording)]
+    if not ends:
+        return ()
+    black, step = np.median(ends, axis=0)
+    if black > _BESIDE * recording.camera.width:
+        what = f"{black:.0f} columns of the pictures are black at the sides"
+    elif step > 0.0:
+        what = "the right and left ends of the pictures do not meet"
+    else:
+        return ()
+    return (
+        f"{recording.name}: {what}: they are no panoramas of all 360 degrees from end to end, so "
+        "directions are wrong; cut off what is beside them, or give the camera that took them",
+    )
+
+
+def _ends(grey: FloatArray) -> tuple[int, float]:
+    """Black columns at both sides of a picture (h, w), and how unusual the step around it is.
+
+    That is by how many grey levels it exceeds nearly all steps between two columns.
+    """
+    lit = np.flatnonzero(grey.max(axis=0) > _BLACK)
+    if not len(lit):
+        return 0, 0.0
+    black = grey.shape[1] - int(lit[-1] - lit[0] + 1)
+    steps = np.abs(np.diff(grey)).mean(axis=0)
+    around = float(np.abs(grey[:, -1] - grey[:, 0]).mean())
+    return black, around - float(np.quantile(steps, 1.0 - _STEEP))
+
+
+def _first_pictures(recording: OmniRecording) -> Iterator[Image]:
+    """As many as a check needs, without damaged ones."""
+    for k in range(min(_PICTURES, len(recording))):
+        with suppress(FrameError):
+            yield recording.image(k)
+
+
 def _mirror_notes(recording: OmniRecording, camera: RadialCamera) -> tuple[str, ...]:
     """A note where the rim in the first pictures lies clearly off, or cannot be found at all."""
-    count = min(_PICTURES, len(recording))
-    circles = [c for k in range(count) if (c := _rim(camera, recording, k)) is not None]
+    circles = [c for k in _first_pictures(recording) if (c := _rim(camera, k)) is not None]
     if not circles:
         return (
             f"the mirror's rim is not found in {recording.names[0]}, so its centre is unchecked",
@@ -110,9 +159,8 @@ def _mirror_notes(recording: OmniRecording, camera: RadialCamera) -> tuple[str, 
     )
 
 
-def _rim(camera: RadialCamera, recording: OmniRecording, place: int) -> MirrorCircle | None:
+def _rim(camera: RadialCamera, image: Image) -> MirrorCircle | None:
     """The rim near where it should be, else around any circle: its holder's, say, is concentric."""
-    image = recording.image(place)
     found = _circle(image, (camera.frame.centre, camera.outer_radius))
     if found is not None:
         return found

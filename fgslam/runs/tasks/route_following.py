@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.planar import wrap
 from fgslam.datasets.omni_recording import OmniRecording
@@ -20,7 +20,8 @@ from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.api import PathFollower
 from fgslam.homing.command import SURE, DriveCommand, MetricPlace
 from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.settings import HomingBehaviourSettings
+from fgslam.homing.picture_sides import PictureSides
+from fgslam.homing.settings import DRIVING, HomingBehaviourSettings
 from fgslam.report.content import Column, TextTable
 from fgslam.report.figures.homing import Line, curve_figure
 from fgslam.report.figures.traces import Figure
@@ -65,6 +66,7 @@ COLUMNS = (
 )
 _RATE_HZ = 10.0  # of images without times
 _JUMP_DEG = 30.0
+_SIDES_ASKED = 12  # pictures of a recording, at most, that are looked at from all sides
 _NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+(\.\d+)?)?")
 
 
@@ -74,7 +76,8 @@ def open_following(config: FollowConfig, opening: Opening) -> Task[RunResult]:
     recording = open_omni(config.dataset)
     if config.taught_camera:
         recording = _with_taught_camera(config, path, recording)
-    recording = replace(recording, notes=recording.notes + camera_notes(recording))
+    notes = camera_notes(recording, stated=not config.taught_camera)
+    recording = replace(recording, notes=recording.notes + notes)
     ground = provenance_of(recording) | {"log": {"route": config.route, "images": len(path)}}
     return Task(ground, lambda context: _run(config, path, recording, context))
 
@@ -128,6 +131,7 @@ def _follow(
     behaviour = HomingBehaviourSettings(steering=config.steering)
     commands: dict[int, DriveCommand] = {}
     left_out: dict[int, str] = {}
+    sides = PictureSides(recording.camera, path, DRIVING, config.seed)
     with PathFollower(
         recording.camera, path, behaviour=behaviour, seed=config.seed, by="looks"
     ) as follower:
@@ -135,11 +139,26 @@ def _follow(
             if context.stopped():
                 break
             try:
-                commands[i] = follower.step(recording.image(i), _time(recording, i))
+                image = recording.image(i)
+                _require_right_side(sides, i, image, recording)
+                commands[i] = follower.step(image, _time(recording, i))
             except FrameError as error:
                 left_out[i] = str(error)
             context.progress("following", i + 1, len(recording))
     return commands, left_out
+
+
+def _require_right_side(
+    sides: PictureSides, i: int, image: Image, recording: OmniRecording
+) -> None:
+    """Raises CalibrationError where pictures, some all along, fit the route only otherwise."""
+    if sides.settled or i % max(1, len(recording) // _SIDES_ASKED):
+        return
+    mistake = sides.look(image)
+    if mistake is not None:
+        raise CalibrationError(
+            f"{recording.name}: the pictures fit the route only as if they were {mistake}"
+        )
 
 
 def _time(recording: OmniRecording, i: int) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirr
 from fgslam.core.arrays import Image
 from fgslam.datasets.omni_settings import OmniPathSettings, PanoramasSettings
 from fgslam.runs.tasks.homing_views import open_checked
+from tests import textured_room
 
 SIZE = (320, 240)
 CENTRE = (162.0, 118.0)
@@ -79,3 +81,35 @@ def test_panoramas_have_no_mirror_but_rows_as_fine_as_columns(tmp_path: Path) ->
     for camera, rows in ((EquirectangularSettings(), 160), (limits, 120)):
         assert cv2.imwrite(str(tmp_path / "m1.png"), picture()[:rows])
         assert open_checked(PanoramasSettings(path=str(tmp_path), camera=camera)).notes == ()
+
+
+def beside(image: Image, columns: int) -> Image:
+    """The same size, narrower by black columns at both sides."""
+    height, width = image.shape[:2]
+    out = np.zeros_like(image)
+    out[:, columns:-columns] = cv2.resize(image, (width - 2 * columns, height))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda image: image, None),
+        (lambda image: np.roll(image, 77, axis=1), None),
+        (lambda image: image[:, 90:-90], "the right and left ends of the pictures do not meet"),
+        (lambda image: beside(image, 40), "80 columns of the pictures are black at the sides"),
+    ],
+)
+def test_pictures_whose_ends_do_not_meet_are_no_whole_panoramas(
+    tmp_path: Path, change: Callable[[Image], Image], said: str | None
+) -> None:
+    """Damaged ones are not asked."""
+    for k in range(3):
+        seen = textured_room.picture(np.array([0.5 * k, 0.4, 0.0]))[:, :-1]
+        assert cv2.imwrite(str(tmp_path / f"m{k}.png"), change(seen))
+    (tmp_path / "m1.png").write_bytes((tmp_path / "m1.png").read_bytes()[:900])
+    limits = EquirectangularSettings(top_elevation_deg=54.0, bottom_elevation_deg=-54.0)
+    found = open_checked(PanoramasSettings(path=str(tmp_path), camera=limits)).notes
+    ends = [note for note in found if "no panoramas of all 360 degrees" in note]
+    assert len(ends) == (said is not None)
+    assert all(f": {said}: " in note for note in ends)

@@ -93,6 +93,23 @@ def test_tilted_cameras_are_estimated() -> None:
     assert np.median(free) < 0.3 * np.median(level)
 
 
+def test_a_camera_that_is_lifted_on_the_way_is_told_from_the_plane() -> None:
+    """As far up or down as on, tilted by a degree: held to the plane 2 of 20 had an answer."""
+    errors = []
+    for seed in range(20):
+        tilts = np.deg2rad(np.random.default_rng(seed + 1000).normal(size=(2, 2)))
+        lift = 0.3 if seed % 2 else -0.3
+        views = two_views(
+            seed, 60, np.deg2rad(0.3), 0.3, leg_m=0.3, tilts=(tilts[0], tilts[1]), lift_m=lift
+        )
+        doubtful = dataclasses.replace(views.matches, quality=np.full(60, 0.4))
+        vector = answer(dataclasses.replace(views, matches=doubtful))
+        if isinstance(vector, TwoViewVector):
+            errors.append(abs(error(views, vector)[0]))
+    assert len(errors) >= 8
+    assert np.rad2deg(np.median(errors)) < 2.0
+
+
 def test_a_lead_in_one_sector_leaves_doubt_and_the_same_lead_all_around_does_not() -> None:
     """Eight equal matches fewer for the other solution: 8 of 1 sigma each, or one of 8."""
     bearing = np.repeat(np.deg2rad(22.5 + 45.0 * np.arange(8)), 8)
