@@ -13,6 +13,7 @@ import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError, FgslamError, OutputError
@@ -86,6 +87,18 @@ def remove_unfinished_files(folder: Path) -> None:
     for path in folder.rglob(".*.partial*"):
         if is_unfinished_file(path) and not _is_being_written(path):
             _remove_quietly(path)
+
+
+def remove_left_behind(path: Path) -> None:
+    """Removes what a process that was killed while writing ``path`` left beside it.
+
+    For files outside run folders that take long to write; of this process nothing is touched.
+    """
+    own = f".{path.name[:_KEPT]}.{os.getpid()}-"
+    for other in path.parent.glob(f".{escape(path.name[:_KEPT])}.*.partial*"):
+        mine = other.name.startswith(own)
+        if not mine and is_unfinished_file(other) and not _is_being_written(other):
+            _remove_quietly(other)
 
 
 def _is_being_written(path: Path) -> bool:

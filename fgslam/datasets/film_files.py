@@ -12,7 +12,7 @@ from PIL import Image as Pillow
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import OutputError
-from fgslam.core.files import replacing
+from fgslam.core.files import remove_left_behind, replacing
 
 _GIF_FPS = 10.0  # what viewers show at least; more only makes the file larger
 _GIF_WIDTH = 720
@@ -42,6 +42,7 @@ def write_film(path: Path, frames: Iterable[Image], fps: float) -> int:
     """
     require_film_suffix(path)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
+    remove_left_behind(path)
     with replacing(path) as partial:
         count = write(partial, frames, fps)
         if not count:

@@ -19,7 +19,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Trajectory
-from fgslam.core.files import replacing
+from fgslam.core.files import remove_left_behind, replacing
 from fgslam.core.measurements import Increment, moved_pixels
 from fgslam.core.sensors import CameraRig, vertical_of
 from fgslam.evaluation.trajectory import to_estimate_world
@@ -69,6 +69,8 @@ def watched(config: Experiment, live: bool, file: Path | None) -> Iterator[Watch
     """
     rerun = _usable(config, live, file)
     stream = rerun.RecordingStream(f"fgslam {config.name}")
+    if file is not None:
+        remove_left_behind(file)
     with nullcontext() if file is None else replacing(file) as partial:
         _connect(rerun, stream, live, partial)
         try:

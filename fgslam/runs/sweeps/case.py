@@ -21,6 +21,7 @@ from fgslam.runs.crews import Failed, Here
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import METRICS_FILE, versions
 from fgslam.runs.run import opener_of
+from fgslam.runs.slam_comparison import judged_apart
 from fgslam.runs.trial import TrialTask, perform_trial
 
 _ABOUT = ("name", "task", "status", "remarks", "estimators")
@@ -77,13 +78,14 @@ class CaseTask:
         """The configuration, and settings of the estimators. Raises ConfigError."""
         choice = Choice(self.names, self.overrides)
         config = make_experiment(self.values, self.where, choice.of_experiment)
+        _require_no_map_saved(config, self.where)
         if not config.estimators:
             if self.names is not None:
                 raise ConfigError(
                     f"{self.where}: task {config.task_name} has no estimators; leave them out"
                 )
             return config, ()
-        names = self.names or tuple(settings.title for settings in config.estimators)
+        names = self.names or tuple(settings.title for settings in _own(config))
         return config, choose(config, Choice(names, choice.of_estimators.overrides))
 
     def key(self, identity: str) -> str:
@@ -93,6 +95,22 @@ class CaseTask:
         values = {name: value for name, value in values.items() if name not in ("name", "output")}
         text = json.dumps([values, identity, dict(self.made_with)], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _require_no_map_saved(config: Experiment, where: str) -> None:
+    """Many cases would write one file. Raises ConfigError."""
+    if isinstance(config, ExperimentConfig) and config.map.save is not None:
+        raise ConfigError(
+            f"{where}: map.save: a sweep saves no map; leave it out, or --set map.save=null, and "
+            "save one with fgslam run"
+        )
+
+
+def _own(config: Experiment) -> tuple[Any, ...]:
+    """The configuration's estimators whose replay means something, as a run of it compares."""
+    if not isinstance(config, ExperimentConfig):
+        return config.estimators
+    return judged_apart(config, config.estimators) or config.estimators
 
 
 def with_estimators(config: Experiment, estimators: tuple[Any, ...]) -> Experiment:

@@ -24,7 +24,6 @@ Setting: TypeAlias = int | float | bool | str
 
 SEED = "seed"
 MOST_CASES = 1_000_000
-_MAP_FILE = "map.save"
 _RANGE = re.compile(r"\s*(\d+):(\d+)(?::(\d+))?\s*")
 _PATHS = ("path", "camera_file", "odometry_file", "load")
 _OPENING, _CLOSING, _QUOTES = "[{", "]}", "'\""
@@ -201,10 +200,6 @@ class Grid(Sequence[Case]):
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ConfigError(f"two experiments are called {twice[0]}; give one another name")
-        if any(axis.key == _MAP_FILE for axis in self.axes):
-            raise ConfigError(
-                f"{_MAP_FILE}: a sweep saves no map; leave it out, and save one with fgslam run"
-            )
         if len(self) > MOST_CASES:
             raise ConfigError(f"{len(self):,} cases; a sweep has at most {MOST_CASES:,}")
 

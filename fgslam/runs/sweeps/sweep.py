@@ -18,7 +18,7 @@ from fgslam.runs.config_models import Experiment
 from fgslam.runs.crews import NOT_BEGUN, Crew
 from fgslam.runs.dask_crew import LocalCrew, crew_at
 from fgslam.runs.engine import Opening, RunResult, Status
-from fgslam.runs.folder import REPORT_FILE, ExistingFolder, versions
+from fgslam.runs.folder import REPORT_FILE, ExistingFolder, digest_of, versions
 from fgslam.runs.owner import Owner
 from fgslam.runs.run import opener_of
 from fgslam.runs.sweeps.case import CaseResult, CaseTask, perform_case
@@ -222,11 +222,16 @@ def _ground(config: Experiment) -> dict[str, Any]:
 
 
 def _identity(config: Experiment, progress: Progress) -> str:
-    """Digest of the recording; empty where it is simulated. Raises FgslamError."""
+    """Digests of the recording and of the map that is given; empty where all is simulated.
+
+    Raises FgslamError.
+    """
     if isinstance(getattr(config, "dataset", None), SimulatedMeasurementsSettings):
         return ""
     task = opener_of(config)(config, Opening(Path("no such run"), False, progress))
-    return str((task.provenance.get("dataset") or {}).get("identity", ""))
+    recording = str((task.provenance.get("dataset") or {}).get("identity", ""))
+    given = getattr(getattr(config, "map", None), "load", None)
+    return recording if given is None else f"{recording} {digest_of([Path(given)])}"
 
 
 @dataclass(slots=True, eq=False)

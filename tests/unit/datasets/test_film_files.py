@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -41,6 +44,21 @@ def test_what_cannot_be_written_leaves_no_file(tmp_path: Path, name: str, frames
     with pytest.raises(OutputError, match="cannot write"):
         write_film(tmp_path / name, greys(frames), 10.0)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_was_killed_leaves_nothing_once_it_is_written_again(tmp_path: Path) -> None:
+    killed, alive = subprocess.Popen([sys.executable, "-c", ""]), os.getppid()
+    killed.wait()
+    left = tmp_path / f".a.mp4.{killed.pid}-0.partial.mp4"
+    others = [
+        tmp_path / f".a.mp4.{alive}-0.partial.mp4",
+        tmp_path / f".b.mp4.{killed.pid}-0.partial.mp4",
+        tmp_path / f".a.mp4.{os.getpid()}-0.partial.mp4",
+    ]
+    for path in (left, *others):
+        path.write_bytes(b"\0")
+    write_film(tmp_path / "a.mp4", greys(3), 10.0)
+    assert set(tmp_path.iterdir()) == {tmp_path / "a.mp4", *others}
 
 
 def test_a_film_for_which_there_is_no_room_is_no_film(tmp_path: Path) -> None:

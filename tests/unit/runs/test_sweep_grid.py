@@ -9,13 +9,16 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError, OutputError
+from fgslam.runs.engine import Task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.owner import OWNER_NAME, Owner
+from fgslam.runs.sweeps import sweep
 from fgslam.runs.sweeps.case import CaseTask
 from fgslam.runs.sweeps.folder import JOURNAL_FILE, Plan, begin_sweep
 from fgslam.runs.sweeps.grid import Axis, Grid, Source, make_axes, read_axes, read_source
 
 VALUES = {"name": "drive", "dataset": {"kind": "simulated_measurements", "stop": 5}}
+IMAGES: dict[str, Any] = {"dataset": {"kind": "rendered_lab"}}
 
 
 @pytest.mark.parametrize(
@@ -77,8 +80,6 @@ def test_the_last_axis_turns_fastest_and_experiments_slowest() -> None:
 
 
 def test_grids_that_cannot_be_told_apart_or_done_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"map\.save: a sweep saves no map; leave it out"):
-        Grid((), read_axes(["map.save=a.fgmap,b.fgmap"]))
     one = Source("x", VALUES, "x")
     with pytest.raises(ConfigError, match="two experiments are called x"):
         Grid((one, one), ())
@@ -143,3 +144,34 @@ def test_estimators_are_chosen_and_have_settings_of_their_own() -> None:
     assert chosen[0].update_every == 3
     with pytest.raises(ConfigError, match="no estimator 'isam3'"):
         task(names=("isam3",)).settled()
+
+
+def test_dead_reckoning_is_left_out_of_the_configuration_s_own_where_nothing_was_measured() -> None:
+    still = {"odometry": {"kind": "constant_velocity"}, "compare": ["odometry", "isam2"]}
+    _, own = task(**IMAGES | still).settled()
+    assert [one.title for one in own] == ["landmark_kalman", "isam2"]
+    with pytest.raises(ConfigError, match="--estimators odometry: the run had no odometry"):
+        task(names=("odometry",), **IMAGES | still).settled()
+
+
+@pytest.mark.parametrize("where", ["as an axis", "in the experiment"])
+def test_a_map_that_every_case_would_overwrite_is_refused(where: str) -> None:
+    axis = ("map.save=a.fgmap",) if where == "as an axis" else ()
+    saving = task(*axis, **IMAGES, **({} if axis else {"map": {"save": "a.fgmap"}}))
+    with pytest.raises(ConfigError, match=r"x: map\.save: a sweep saves no map; leave it out"):
+        saving.settled()
+    assert task("map.save=null", **IMAGES, map={"save": "a.fgmap"}).settled()[1]
+
+
+def test_results_in_a_map_that_was_replaced_are_not_taken_up_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, opened = tmp_path / "place.fgmap", Task({"dataset": {"identity": "d"}}, lambda _: None)
+    monkeypatch.setattr(sweep, "opener_of", lambda _: lambda *_: opened)
+    values = VALUES | IMAGES | {"map": {"load": str(place)}}
+    plan = Plan(Grid((Source("x", values, "x"),), ()), None)
+    keys = []
+    for content in (b"one", b"another", b"one"):
+        place.write_bytes(content)
+        keys += sweep._checked(plan, sweep.UNWATCHED)[0]
+    assert keys[0] == keys[2] != keys[1]
