@@ -122,6 +122,7 @@ def frames_of(
     _require_sound(arrays, where)
     loops, relocalised = _loops(arrays, header["version"], where, first)
     sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
+    _require_ahead(arrays, sensor, where)
     corrections = _corrections(arrays, header["version"], sensor, where)
     settled = _settled(arrays, header["version"], corrections, where)
     biases = _biases(arrays, header["version"], where)
@@ -236,6 +237,21 @@ def _require_sound(arrays: StateArrays, where: str) -> None:
     require_covariances(LOG, "odometry_covariance", moved, where, definite=False)
     ids, start = arrays["observation_id"], arrays["observation_start"]
     require_single(LOG, "observation_id", ids, start, where)
+
+
+def _require_ahead(arrays: StateArrays, sensor: Sensor, where: str) -> None:
+    """Raises MeasurementLogError where most disparities or ranges are not positive.
+
+    Single ones are noise about what is far away.
+    """
+    measured = arrays["measurement"][:, 2]
+    if len(measured) and not np.median(measured) > 0.0:
+        what = "disparities" if isinstance(sensor, CameraRig) else "ranges"
+        swapped = ": left and right are swapped" if isinstance(sensor, CameraRig) else ""
+        raise MeasurementLogError(
+            f"{where}: {int((measured <= 0.0).sum())} of {len(measured)} {what} are not positive"
+            f"{swapped}, or it is damaged; run again"
+        )
 
 
 def _require_consistent(arrays: StateArrays, where: str) -> None:

@@ -42,7 +42,7 @@ def increment(k: int, rng: np.random.Generator, seen: int, with_odometry: bool) 
         odometry=Odometry(motion, step @ step.T) if with_odometry else None,
         observations=Observations(
             rng.permutation(1000)[:seen].astype(np.int64),
-            rng.standard_normal((seen, 3)),
+            rng.standard_normal((seen, 3)) + np.array([0.0, 0.0, 9.0]),
             covariance,
             np.where(rng.random((seen, 3, 2)) < 0.2, np.nan, rng.standard_normal((seen, 3, 2))),
             rng.random(seen) < 0.5,
@@ -454,6 +454,15 @@ def test_values_that_no_run_measures_are_refused(
     with pytest.raises(MeasurementLogError, match=re.escape(words)) as caught:
         MeasurementLog.load(spoilt(file, name, at, value))
     assert str(caught.value).startswith(f"{file}: ")
+
+
+def test_a_log_in_which_most_lies_behind_the_cameras_is_refused(file: Path) -> None:
+    behind = load_arrays(file)["measurement"] * (1.0, 1.0, -1.0)
+    some = np.where(np.arange(20)[:, None] < 9, behind, load_arrays(file)["measurement"])
+    assert len(MeasurementLog.load(spoilt(file, "measurement", ..., some)))
+    words = "20 of 20 disparities are not positive: left and right are swapped, or it is damaged"
+    with pytest.raises(MeasurementLogError, match=words):
+        MeasurementLog.load(spoilt(file, "measurement", ..., behind))
 
 
 def test_an_identity_that_one_frame_sees_twice_is_refused(file: Path) -> None:
