@@ -85,7 +85,9 @@ def encoded_png(image: Image) -> bytes:
 
 
 def read_depth_image(path: Path) -> npt.NDArray[Any]:
-    """A depth image (height, width), uint16 or float, as it is stored.
+    """A depth image (height, width), uint16 or float, as it is stored; 0 where unknown.
+
+    The largest integer is no depth: 7-Scenes and saturated sensors mark with it what is unknown.
 
     Raises:
         FrameError: absent, incomplete, no image, or of colours or 8 bits.
@@ -96,7 +98,14 @@ def read_depth_image(path: Path) -> npt.NDArray[Any]:
             f"image {path} is no depth image: {image.dtype} of {image.ndim} dimensions; 16 bits or "
             "floats of one channel are needed"
         )
-    return image
+    return without_unknown(image)
+
+
+def without_unknown(depth: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Depths with 0 for the largest value of 16 bits."""
+    if depth.dtype != np.uint16:
+        return depth
+    return np.where(depth == np.iinfo(np.uint16).max, np.uint16(0), depth)
 
 
 def decode_grey(data: bytes, name: str, bits: int = 16) -> Image:

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size
+from fgslam.cameras.assembly import at_size, in_metres
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
@@ -18,7 +18,7 @@ from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera
 from fgslam.core.sides import differ_in_number
 from fgslam.datasets.bags.frames import FrameTree, view_axes
-from fgslam.datasets.bags.topics import Chosen, FileCameras, is_registered
+from fgslam.datasets.bags.topics import Chosen, FileCameras, is_registered, of_two_sensors
 from fgslam.datasets.calibrated import loaded_rig, mounted, numbered, read_rig
 from fgslam.datasets.depth_view import BASELINE_M, require_one_camera
 from fgslam.datasets.settings import BagSettings
@@ -100,7 +100,7 @@ def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | 
     if settings.camera_file is None:
         return None
     file, numbers = Path(settings.camera_file), chosen.numbers
-    cameras = read_calibration_file(file, size=stated.size).cameras
+    cameras = in_metres(read_calibration_file(file, size=stated.size), settings.unit_m).cameras
     if numbers:
         rig = loaded_rig(settings, file, size=stated.size, cameras=numbers, pair=False)
         return _of_numbers(rig, [cameras[k] for k in numbers], chosen)
@@ -136,9 +136,12 @@ def _of_depth(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
 def _unregistered(settings: BagSettings, stated: Stated, chosen: Chosen) -> tuple[str, ...]:
     """What to tell where depth may not be registered. Raises CalibrationError: nobody chose it."""
     colour, depth = (stated.frames[topic] for topic in (chosen.right, chosen.left))
-    if not colour or not depth or colour == depth or is_registered(chosen.left):
+    apart = of_two_sensors(chosen.left, chosen.right)
+    same = not colour or not depth or colour == depth or is_registered(chosen.left)
+    if same and not apart:
         return ()
     text = f"{chosen.left} is in the frame {depth}, {chosen.right} in {colour}"
+    text = f"{chosen.left} and {chosen.right} are of two sensors" if apart else text
     if settings.topics:
         return (f"{text}: it is taken as registered to colour, as it was chosen by --topics",)
     raise CalibrationError(
@@ -196,7 +199,8 @@ def _of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found:
             right_info=chosen.left_info,
         )
     found = read_camera_info_pair(named, (left, right))
-    return _Found(read_rig(settings, found, stated.size), found.cameras, chosen, notes)
+    cameras = in_metres(found, settings.unit_m).cameras
+    return _Found(read_rig(settings, found, stated.size), cameras, chosen, notes)
 
 
 def _require_calibrated(settings: BagSettings, topic: str, values: Info) -> None:
@@ -239,7 +243,8 @@ def _by_tree(
     ]
     source, form = f"{named[0]} and {named[1].name}", "camera_info with tf_static"
     pair = Calibration(source, form, tuple(cameras), sided=True)
-    rig = read_rig(settings, pair, stated.size)
+    # A unit is that of camera_info; transforms are in metres (REP 103).
+    rig = read_rig(replace(settings, unit_m=1.0), pair, stated.size)
     note = f"camera_info has no baseline: by tf_static {right} is {rig.baseline:.4g} m from {left}"
     return _Found(rig, pair.cameras, chosen, (note, *filter(None, [said])))
 

@@ -11,7 +11,13 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError
-from fgslam.datasets.images import decode_colour, decode_grey, decode_stored, of_8_bits
+from fgslam.datasets.images import (
+    decode_colour,
+    decode_grey,
+    decode_stored,
+    of_8_bits,
+    without_unknown,
+)
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
@@ -196,7 +202,7 @@ def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
 
 
 def _of_millimetres(pixels: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    return pixels.astype(np.float32) * np.float32(1e-3)
+    return without_unknown(pixels).astype(np.float32) * np.float32(1e-3)
 
 
 # --------------------------------------------------------------------------------------------

@@ -220,6 +220,15 @@ def _colour_and_depth(topics: Sequence[Topic]) -> _Views | None:
     return _Views((depths[0], by_view[colours[0]]), notes=(note,), depth=True)
 
 
+_SENSOR = re.compile(r"/device_\d+/(sensor_\d+)/")  # of a file of RealSense's viewer
+
+
+def of_two_sensors(topic: str, other: str) -> bool:
+    """Whether RealSense's viewer recorded the topics of two sensors, whose views differ."""
+    one, two = (_SENSOR.match(name) for name in (topic, other))
+    return one is not None and two is not None and one[1] != two[1]
+
+
 def is_registered(topic: str) -> bool:
     """Whether the name of a topic of depth says that it is registered to colour."""
     return _REGISTERED.search(topic) is not None
@@ -282,17 +291,19 @@ def _list(topics: Sequence[Topic]) -> str:
 def _infos(topics: Sequence[Topic], left: str, right: str) -> tuple[str | None, str | None]:
     """camera_info beside each image topic; else the only pair of camera_info that there is."""
     names = {topic.name for topic in topics if topic.kind == kinds.CAMERA_INFO}
-    beside = [_info_beside(topic) for topic in (left, right)]
-    found = [name if name in names else None for name in beside]
+    beside = [_infos_beside(topic) for topic in (left, right)]
+    found = [next((name for name in near if name in names), None) for near in beside]
     pairs = camera_pairs(names)
     if found == [None, None] and len(pairs) == 1:
         return pairs[0]
     return found[0], found[1]
 
 
-def _info_beside(image_topic: str) -> str:
+def _infos_beside(image_topic: str) -> tuple[str, str]:
     plain = image_topic.removesuffix(_DEPTHS[1]).removesuffix(_TRANSPORT)
-    return plain.rpartition("/")[0] + "/camera_info"
+    # RealSense's viewer records .../image/data beside .../info/camera_info.
+    viewer = plain.removesuffix("/image/data") + "/info/camera_info"
+    return plain.rpartition("/")[0] + "/camera_info", viewer
 
 
 def _motion(topics: Sequence[Topic]) -> Topic | None:

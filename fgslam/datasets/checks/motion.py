@@ -16,6 +16,7 @@ from fgslam.datasets.recording import OdometrySource, Recording
 from fgslam.datasets.tables import rows_at
 
 _STAMP_TOLERANCE_S = 1e-3
+_NONE = 1e-9  # metres, and of a rotation: rounding
 _MAX_JUMP = 8.0
 _STEPS_AROUND = 3
 _SMALLEST_JUMP_M = 0.05  # below it a standing camera's truth trembles, whatever its rate
@@ -44,9 +45,21 @@ def check_odometry(sequence: Sequence) -> tuple[Finding, ...]:
         return (Finding(Level.INFO, "odometry", text),)
     covered = Finding(Level.INFO, "odometry", f"covers {share(steps - len(missing), steps)} steps")
     if not missing:
-        return (covered,)
+        return (covered, *_frozen(sequence))
     text = f"none before frames {listed(missing)}; constant velocity stands in there"
     return (covered, Finding(Level.WARNING, "odometry", text))
+
+
+def _frozen(sequence: Sequence) -> tuple[Finding, ...]:
+    """A warning where every step is none, to the last digit: of a source that stands still."""
+    given = [sequence.odometry(i) for i in range(1, len(sequence))]
+    if not given or any(s is None or np.abs(s.motion - np.eye(4)).max() > _NONE for s in given):
+        return ()
+    text = (
+        f"states no motion in any of {len(given)} steps; if the robot moved, it is of another "
+        "source: choose a topic or file, or set odometry.kind to constant_velocity"
+    )
+    return (Finding(Level.WARNING, "odometry", text),)
 
 
 def check_truth(sequence: Sequence) -> tuple[Finding, ...]:

@@ -141,6 +141,31 @@ def test_registered_depth_is_taken_and_other_depth_only_by_name(tmp_path: Path) 
     assert "as it was chosen by --topics" in opened(bag, topics=(COLOUR, own)).notes[0]
 
 
+def test_what_realsenses_viewer_records(tmp_path: Path) -> None:
+    """Depth is that of the first infrared camera; the colour sensor sees from another place."""
+    sensor = "/device_0/sensor_0"
+    names = (f"{sensor}/Infrared_1/image/data", f"{sensor}/Depth_0/image/data")
+    written = [
+        (t.replace("/image/camera_info", "/info/camera_info"), *rest)
+        for t, *rest in walk(names=names)
+    ]
+    assert len(opened(write_bag(tmp_path / "infra.bag", written))) == 3
+    colour = [(t.replace("sensor_0/Infra", "sensor_1/Infra"), *rest) for t, *rest in written]
+    with pytest.raises(CalibrationError, match=r"are of two sensors: depth must be registered"):
+        opened(write_bag(tmp_path / "colour.bag", colour))
+
+
+def test_the_largest_integer_is_no_depth(tmp_path: Path) -> None:
+    def marked(metres: FloatArray) -> dict[str, Any]:
+        millimetres = (1000.0 * metres).round().astype(np.uint16)
+        millimetres[:, :16] = 65535
+        return raw_image(millimetres, "16UC1")
+
+    right, left = opened(write_bag(tmp_path / "a.mcap", walk(marked))).frame(0).images
+    assert np.array_equal(left[:, 26:], right[:, 16:-10])
+    assert left[:, 8:16].std() < 0.2 * right[:, 8:16].std(), "unknown, not at infinity"
+
+
 def test_the_colour_camera_is_where_tf_static_has_it(tmp_path: Path) -> None:
     place = pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.array([0.2, -0.1, 0.5]))
     stamps = START_NS + PERIOD_NS * np.arange(3)

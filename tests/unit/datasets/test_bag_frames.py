@@ -95,6 +95,21 @@ def test_one_frame_for_both_cameras_is_the_left_ones(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.rig.bTc, expected, rtol=0.0, atol=1e-9)
 
 
+def test_a_unit_is_that_of_camera_info_and_frames_are_in_metres(tmp_path: Path) -> None:
+    """Both cameras in the left one's frame: its distance from the right one is in millimetres."""
+    far = [
+        (t, s, k, f | {"p": f["p"] * ([1, 1, 1, 1000] * 3)} if k.endswith("Info") else f)
+        for t, s, k, f in stereo(4)
+    ]
+    messages = in_frames(far, {"/cam": LEFT}) + moving() + tf_static(robot())
+    recording = opened(write_bag(tmp_path / "a.bag", messages), unit_m=0.001)
+    expected = ON_MAST @ AHEAD @ shifted(BASELINE)
+    np.testing.assert_allclose(recording.rig.bTc, expected, rtol=0.0, atol=1e-9)
+    own = in_frames(without_baseline(stereo(4)), FRAMES) + tf_static(robot())
+    recording = opened(write_bag(tmp_path / "b.bag", own), unit_m=0.001)
+    assert recording.rig.baseline == pytest.approx(BASELINE, abs=1e-9)
+
+
 def test_a_gyroscope_turns_in_its_own_frame(tmp_path: Path) -> None:
     stamps = [START_NS + k * PERIOD_NS // 10 for k in range(40)]
     turns = in_frames(gyroscope(stamps, np.array([0.1, 0.0, 0.0])), {"/imu": "imu"})

@@ -26,6 +26,7 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibrat
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
 from fgslam.datasets.bags.reader import open_bag
+from fgslam.datasets.checks.motion import check_odometry
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
@@ -352,6 +353,16 @@ def test_poses_of_odometry(tmp_path: Path, ending: str) -> None:
     assert np.array_equal(recording.rig.bTc[:3, 2], [1.0, 0.0, 0.0])
     assert "taken to look straight ahead" in recording.notes[-1]
     assert "; odometry; " in bare_experiment(path).said
+
+
+def test_odometry_that_never_moves_is_told(tmp_path: Path) -> None:
+    stamps = [START_NS + k * PERIOD_NS // 2 for k in range(9)]
+    bag = write_bag(tmp_path / "a.mcap", stereo() + odometry(stamps, np.ones((9, 4))))
+    found = check_odometry(opened(bag))
+    assert "states no motion in any of 3 steps; if the robot moved" in found[-1].text
+    moving = np.column_stack([np.linspace(0.0, 0.1, 9), np.zeros((9, 3))])
+    bag = write_bag(tmp_path / "b.mcap", stereo() + odometry(stamps, moving))
+    assert len(check_odometry(opened(bag))) == 1
 
 
 def test_a_twist_is_speed_and_yaw_rate(tmp_path: Path) -> None:
