@@ -9,6 +9,8 @@ import numpy as np
 
 from fgslam.core.errors import ConfigError, FgslamError
 
+_LATEST_S = 1e11  # three thousand years: of a clock since 1970 in seconds, but not in milliseconds
+
 
 def is_finite_number(value: object) -> bool:
     """Whether a value is a finite real number; truth values are none."""
@@ -17,15 +19,25 @@ def is_finite_number(value: object) -> bool:
 
 
 def later_time(time: object, last: float | None, what: str, error: type[FgslamError]) -> float:
-    """The time in seconds; raises ``error`` where it is none, or not after ``last`` (None: any)."""
+    """The time in seconds; raises ``error`` where it is none, or not after ``last`` (None: any).
+
+    Nanoseconds and milliseconds of a clock since 1970 are none.
+    """
     try:
         if isinstance(time, str):
             raise TypeError("text")
         seconds = float(time)  # type: ignore[arg-type]  # what is no number raises
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{what}: the time stamp {time!r} is not a number; give seconds") from None
+        large = hasattr(time, "__len__") and not isinstance(time, str)  # an image, say
+        given = f"of type {type(time).__name__}" if large else repr(time)
+        raise error(f"{what}: the time stamp {given} is not a number; give seconds") from None
     if not math.isfinite(seconds):
         raise error(f"{what}: the time stamp {seconds} is not finite; give seconds")
+    if abs(seconds) > _LATEST_S:
+        raise error(
+            f"{what}: the time stamp {seconds:.0f} is no time in seconds; divide nanoseconds by "
+            "1e9, milliseconds by 1e3"
+        )
     if last is not None and not seconds > last:
         raise error(
             f"{what}: the time stamp {seconds:.9f} s does not come after {last:.9f} s; give images "

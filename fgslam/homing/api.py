@@ -23,7 +23,7 @@ from fgslam.core.errors import (
     SessionError,
     StoredMapError,
 )
-from fgslam.core.homing import Refusal, TwoViewVector
+from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector
 from fgslam.core.settings import make_settings
 from fgslam.frontend.features.images import colour_image
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
@@ -66,7 +66,7 @@ class HomingVector:
         """
         self._camera = _require_camera(camera, "HomingVector")
         require_seed(seed, "HomingVector")
-        self._features = features or OmniFeatureSettings()
+        self._features = _require_features(features, "HomingVector")
         self._settings = make_settings(HomingVectorSettings, settings, "HomingVector")
         self._seed = seed
         self._extractor = OmniFeatureExtractor(camera, self._features)
@@ -123,18 +123,31 @@ def teach(
     Raises:
         CalibrationError: ``camera`` is none.
         FrameError: an image is not this camera's.
-        StoredMapError: there is no image, or not one name an image.
+        StoredMapError: there is no image, not one name an image, or, but for a drive's, an image
+            is dark or shows nothing.
+        ConfigError: ``features`` are no settings.
     """
     size = (_require_camera(camera, "teach").width, camera.height)
-    front_end = replace(DRIVING, features=features or DRIVING.features)
+    front_end = replace(DRIVING, features=_require_features(features, "teach"))
     given = (colour_image(image, size, f"image {k}") for k, image in enumerate(images))
     if select:
         return _selected(given, camera, front_end, names)
     extractor = OmniFeatureExtractor(camera, front_end.features)
-    found = with_neighbours_votes([extractor.extract(image) for image in given], front_end)
+    found = [_recognisable(image, k, extractor) for k, image in enumerate(given)]
     if not found:
         raise StoredMapError("path: no target image; give at least one")
-    return PathMemory.of(found, names, camera)
+    return PathMemory.of(with_neighbours_votes(found, front_end), names, camera)
+
+
+def _recognisable(image: Image, number: int, extractor: OmniFeatureExtractor) -> OmniFeatures:
+    """Features of a target image. Raises StoredMapError where nobody could find it again."""
+    features = extractor.extract(image)
+    refusal = unusable(image, features)
+    if refusal is not None:
+        raise StoredMapError(
+            f"path: image {number} cannot be recognised ({refusal.details}); leave it out"
+        )
+    return features
 
 
 def _selected(
@@ -145,6 +158,7 @@ def _selected(
 ) -> PathMemory:
     teacher = Teacher(camera, front_end)
     passed_over: tuple[int, str, Image] | None = None
+    k = -1
     for k, image in enumerate(images):
         if names is not None and k >= len(names):
             raise StoredMapError(f"path: {len(names)} names for more images; give one an image")
@@ -152,6 +166,8 @@ def _selected(
         if k >= teacher.next:
             teacher.take(*passed_over)
             passed_over = None
+    if names is not None and len(names) != k + 1:
+        raise StoredMapError(f"path: {len(names)} names for {k + 1} images; give one an image")
     if passed_over is not None:  # the last one is the path's end
         teacher.take(*passed_over)
     return teacher.finish().memory
@@ -194,7 +210,7 @@ class PathFollower:
 
         Raises:
             CalibrationError: ``camera`` is none.
-            ConfigError: there is no such estimator, or no such way to follow.
+            ConfigError: there is no such estimator, or no such way to follow, or settings are none.
             StoredMapError: ``path`` is none.
         """
         if not isinstance(path, PathMemory):
@@ -207,7 +223,9 @@ class PathFollower:
         if by not in ("tracks", "looks"):
             raise ConfigError(f"PathFollower: by is {by!r}; give 'tracks' or 'looks'")
         settings = homing_settings_of(estimator)
-        behaviour = behaviour or HomingBehaviourSettings()
+        behaviour = HomingBehaviourSettings() if behaviour is None else behaviour
+        for given, kind in ((behaviour, HomingBehaviourSettings), (front_end, FrontEndSettings)):
+            _require_kind(given, kind, "PathFollower")
         chain = HomingChain(
             make_front_end(camera, front_end, seed),
             path.images,
@@ -304,3 +322,18 @@ def _require_camera(camera: OmniCamera, who: str) -> OmniCamera:
             "fgslam.load_camera(file), or give keys of one to it"
         )
     return camera
+
+
+def _require_features(settings: OmniFeatureSettings | None, who: str) -> OmniFeatureSettings:
+    chosen = OmniFeatureSettings() if settings is None else settings
+    _require_kind(chosen, OmniFeatureSettings, who)
+    return chosen
+
+
+def _require_kind(settings: object, kind: type, who: str) -> None:
+    """Raises ConfigError where settings are of another kind."""
+    if not isinstance(settings, kind):
+        raise ConfigError(
+            f"{who}: settings are a {type(settings).__name__}; give a {kind.__module__}."
+            f"{kind.__name__}, or None for the defaults"
+        )

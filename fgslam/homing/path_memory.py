@@ -79,7 +79,9 @@ class PathMemory:
         Raises:
             StoredMapError: there is not one name an image.
         """
-        chosen = tuple(str(k) for k in range(len(images))) if names is None else tuple(names)
+        chosen = (
+            tuple(str(k) for k in range(len(images))) if names is None else tuple(map(str, names))
+        )
         if len(chosen) != len(images):
             raise StoredMapError(
                 f"path: {len(chosen)} names for {len(images)} images; give one name an image"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -74,6 +75,10 @@ def test_views_and_grey_images_are_accepted_and_left_alone() -> None:
     np.testing.assert_array_equal(wide, before)
 
 
+def _follower(**settings: Any) -> fg.PathFollower:
+    return fg.PathFollower(CAMERA, fg.teach([picture(0)], CAMERA), **settings)
+
+
 WRONG: dict[str, tuple[Callable[[], object], type[FgslamError], str]] = {
     "camera": (lambda: fg.HomingVector("x.txt"), CalibrationError, "load_camera"),  # type: ignore[arg-type]
     "setting": (lambda: fg.HomingVector(CAMERA, sample=3), ConfigError, "did you mean samples"),
@@ -96,6 +101,29 @@ WRONG: dict[str, tuple[Callable[[], object], type[FgslamError], str]] = {
     ),
     "nothing taught": (lambda: fg.teach([], CAMERA), StoredMapError, "at least one"),
     "names": (lambda: fg.teach([picture(0)], CAMERA, names=["a", "b"]), StoredMapError, "2 names"),
+    "image for time": (
+        lambda: _follower().step(0.0, picture(0)),  # type: ignore[arg-type]
+        EstimatorError,
+        "the time stamp of type ndarray is not a number",
+    ),
+    "names of a drive": (
+        lambda: fg.teach([picture(0)], CAMERA, names=["a", "b"], select=True),
+        StoredMapError,
+        "2 names for 1 images",
+    ),
+    "dark target": (
+        lambda: fg.teach([picture(0), 0 * picture(0)], CAMERA), StoredMapError, "image 1 cannot"
+    ),
+    "features": (
+        lambda: fg.teach([picture(0)], CAMERA, features="sift"),  # type: ignore[arg-type]
+        ConfigError,
+        "settings are a str; give a fgslam.frontend.features.settings.OmniFeatureSettings",
+    ),
+    "front-end": (
+        lambda: _follower(front_end={}),
+        ConfigError,
+        "settings are a dict",
+    ),
     "path": (
         lambda: fg.PathFollower(CAMERA, [picture(0)]),  # type: ignore[arg-type]
         StoredMapError,
@@ -130,7 +158,7 @@ def test_an_unknown_estimator_is_refused_with_the_nearest_name(path: fg.PathMemo
         fg.PathFollower(CAMERA, path, "homing_grap")
 
 
-@pytest.mark.parametrize("time", [float("nan"), float("inf"), 0.5, 0.4, "1.0", None])
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), 0.5, 0.4, "1.0", None, 17e17])
 def test_wrong_times_are_refused_and_change_nothing(path: fg.PathMemory, time: float) -> None:
     tried, fresh = fg.PathFollower(CAMERA, path), fg.PathFollower(CAMERA, path)
     for follower in (tried, fresh):
