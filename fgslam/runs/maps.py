@@ -262,16 +262,20 @@ def _about_alignment(found: Alignment, first: str, second: str) -> list[str]:
 
 def _in_common(a: SavedMap, b: SavedMap, first: str, second: str) -> list[str]:
     """A line about the evidence that both maps hold; none where there is none."""
+    from fgslam.frontend.places.map_fusion import shared_frames, shared_moments
+
     if a.evidence is None or b.evidence is None:
         older = first if a.evidence is None else second
         return [
             f"{older} does not say which frames are in it (an older fgslam's): what both hold may "
             "be the same evidence, so no covariance shrinks; make the map again"
         ]
-    common = len(np.intersect1d(a.evidence, b.evidence))
-    if not common:
-        return []
-    return [
-        f"{common} of the {len(b.evidence)} frames of {second} are in {first}, too: they count "
-        "once (covariance intersection)"
-    ]
+    once = "they count once (covariance intersection)"
+    if common := shared_frames(a, b):
+        return [f"{common} of the {len(b.evidence)} frames of {second} are in {first}, too: {once}"]
+    if moments := shared_moments(a, b):
+        return [
+            f"{moments} poses of {second} have times of poses of {first}, though no image is the "
+            f"same: one recording read in two ways, by all appearances; {once}"
+        ]
+    return []

@@ -17,6 +17,7 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.places.map_alignment import Alignment
 
 _MEDIAN_OF_CHI_SQUARE_3 = 2.366
+_SINCE_A_START_S = 1e8  # three years: below, a time stamp may count from any recording's start
 _SHARES = 21  # weightings tried by covariance intersection: from all of a to all of b
 
 Counts = TypeVar("Counts", IntArray, BoolArray)
@@ -27,9 +28,10 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
 
     Landmarks in both keep a's identity. Of maps without a frame in common, position and covariance
     are the two weighted by their own parts of the covariances, the alignment's uncertainty part of
-    b's, and hits and misses add up. Maps that share frames, or do not say which they hold, are
-    fused without counting anything twice (covariance intersection, Julier and Uhlmann 1997), with
-    the larger counts. A ``b`` without a frame that a lacks leaves ``a`` as it is.
+    b's, and hits and misses add up. Maps that share frames or moments, or do not say which frames
+    they hold, are fused without counting anything twice (covariance intersection, Julier and
+    Uhlmann 1997), with the larger counts. A ``b`` without a frame that a lacks leaves ``a`` as it
+    is.
 
     Permanent is what either holds so, and all views are kept. Others of b get identities after a's
     last. The trajectory is both drives, where b's came later, else a's alone; a session is not
@@ -37,7 +39,8 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
     """
     if adds_nothing(b, a):
         return a
-    alone, moved = shared_frames(a, b) == 0, _moved(b, alignment)
+    alone = shared_frames(a, b) == 0 and not shared_moments(a, b)
+    moved = _moved(b, alignment)
     count = np.add if alone else np.maximum
     mine, yours = alignment.pairs[:, 0], alignment.pairs[:, 1]
     rest = np.setdiff1d(np.arange(len(b)), yours)
@@ -64,6 +67,19 @@ def shared_frames(a: SavedMap, b: SavedMap) -> int | None:
     if a.evidence is None or b.evidence is None:
         return None
     return len(np.intersect1d(a.evidence, b.evidence))
+
+
+def shared_moments(a: SavedMap, b: SavedMap) -> int:
+    """How many poses both maps have of one moment by the world's clock.
+
+    One recording whose images were read in two ways (another calibration, compression or size) has
+    no frame in common with itself, and shows the same all the same.
+    """
+    by_clock = [
+        saved.trajectory.timestamps[saved.trajectory.timestamps > _SINCE_A_START_S]
+        for saved in (a, b)
+    ]
+    return len(np.intersect1d(*by_clock))
 
 
 def adds_nothing(b: SavedMap, a: SavedMap) -> bool:

@@ -178,6 +178,23 @@ def test_maps_that_grew_from_one_another_count_what_they_share_once() -> None:
     assert back is other
 
 
+@pytest.mark.parametrize(("start", "counted_once"), [(1.6e9, True), (0.0, False)])
+def test_one_recording_read_in_two_ways_counts_once(
+    start: float, counted_once: bool, tmp_path: Path
+) -> None:
+    """Told by the moments, where they are of the world's clock: its images differ."""
+    saved, _ = Place(0).visit(np.eye(4))
+    drive = replace(saved.trajectory, timestamps=start + saved.trajectory.timestamps)
+    one = replace(saved, trajectory=drive)
+    assert saved.evidence is not None
+    save_map(one, tmp_path / "a.fgmap")
+    save_map(replace(one, evidence=saved.evidence + 1), tmp_path / "b.fgmap")
+    lines = merge_files(tmp_path / "a.fgmap", tmp_path / "b.fgmap", tmp_path / "both.fgmap")
+    assert any("12 poses of" in line and "count once" in line for line in lines) == counted_once
+    hits = load_map(tmp_path / "both.fgmap").hits
+    assert np.array_equal(hits, saved.hits if counted_once else 2 * saved.hits)
+
+
 def test_a_map_that_does_not_say_its_frames_shrinks_nothing(tmp_path: Path) -> None:
     place = Place(2)
     a, _ = place.visit(np.eye(4))
