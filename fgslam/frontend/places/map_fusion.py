@@ -75,11 +75,9 @@ def shared_moments(a: SavedMap, b: SavedMap) -> int:
     One recording whose images were read in two ways (another calibration, compression or size) has
     no frame in common with itself, and shows the same all the same.
     """
-    by_clock = [
-        saved.trajectory.timestamps[saved.trajectory.timestamps > _SINCE_A_START_S]
-        for saved in (a, b)
-    ]
-    return len(np.intersect1d(*by_clock))
+    ours, theirs = a.trajectory.timestamps, b.trajectory.timestamps
+    common = np.intersect1d(ours, theirs)
+    return int(np.count_nonzero(common > _SINCE_A_START_S))
 
 
 def adds_nothing(b: SavedMap, a: SavedMap) -> bool:
