@@ -32,6 +32,20 @@ def depth_sigma_px(focal_px: float, sigma_m: float) -> float:
     return round(float(np.hypot(focal_px * BASELINE_M * sigma_m, _FOUND_AGAIN_PX)), 3)
 
 
+_WORDS = (
+    ("left and right images", "colour and depth"),
+    ("right images", "colour images"),
+    ("left images", "depth images"),
+)
+
+
+def in_words(note: str) -> str:
+    """A note on the pairs of two cameras for those of colour and depth."""
+    for theirs, own in _WORDS:
+        note = note.replace(theirs, own)
+    return note
+
+
 def require_one_camera(settings: CalibratedSettings) -> None:
     """Raises DatasetError where something is asked for that two cameras alone have."""
     for name, asked in (

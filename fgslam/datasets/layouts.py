@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +10,13 @@ from pathlib import Path
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
 from fgslam.core.sides import camera_pairs
-from fgslam.datasets.loose_files import IMAGE_SUFFIXES, find_cameras, natural, one_camera
+from fgslam.datasets.loose_files import (
+    IMAGE_SUFFIXES,
+    find_cameras,
+    images_in,
+    natural,
+    one_camera,
+)
 
 _DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
 _RUN_CONFIG = "config.yaml"
@@ -101,6 +108,8 @@ def _fitting_files(given: Path) -> tuple[str, ...]:
             "file, or an experiment's .yaml"
         )
     fitting = tuple(kind for kind, layout in LAYOUTS.items() if _all_end(files, layout))
+    if not fitting and (remedy := _REMEDIES.get(files[0].suffix.lower())):
+        raise DatasetError(f"{given} is not read: {remedy}")
     if not fitting:
         known = "; ".join(
             f"{layout.name}: {', '.join(layout.endings)}"
@@ -112,6 +121,22 @@ def _fitting_files(given: Path) -> tuple[str, ...]:
             f"({known}); give the recording's folder"
         )
     return fitting
+
+
+_UNPACK = "unpack it, and give the folder"
+_REMEDIES = {
+    **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz"), _UNPACK),
+    **dict.fromkeys(
+        (".svo", ".svo2"),
+        "only the maker's program can; export it as a film of both views side by side (ZED's SVO "
+        "export), with the calibration SN*.conf by --camera",
+    ),
+    **dict.fromkeys(
+        (".oni", ".klg", ".sens", ".h5", ".hdf5"),
+        "export its images to folders, as rgb/ and depth/, or left/ and right/",
+    ),
+}
+"""What to do with files of recordings that others' programs alone can read."""
 
 
 def _all_end(files: list[Path], layout: Layout) -> bool:
@@ -325,8 +350,21 @@ def colour_and_depth(folder: Path) -> tuple[Path, Path] | None:
     return None if colour is None or depth is None else (colour, depth)
 
 
+def colour_and_depth_files(folder: Path) -> tuple[list[Path], list[Path]] | None:
+    """Colour and depth images of a folder that holds both; None where it does not.
+
+    Depth is called so in its names, as in Replica (frame000000.jpg, depth000000.png) and 7-Scenes;
+    numbers are those of the colour images.
+    """
+    found = images_in(folder)
+    depths = [path for path in found if "depth" in path.stem.lower()]
+    colours = [path for path in found if "depth" not in path.stem.lower()]
+    numbers = [[re.findall(r"\d+", path.stem) for path in files] for files in (colours, depths)]
+    return (colours, depths) if depths and numbers[0] == numbers[1] else None
+
+
 def _lacking_of_rgbd(folder: Path) -> tuple[str, ...]:
-    if colour_and_depth(folder):
+    if colour_and_depth(folder) or colour_and_depth_files(folder):
         return ()
     return _absent(folder, ("depth",)) or ("rgb, or color",)
 

@@ -29,10 +29,11 @@ from fgslam.datasets.depth_view import (
     DepthFrames,
     Undistorted,
     depth_sigma_px,
+    in_words,
     require_one_camera,
 )
 from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, sized
-from fgslam.datasets.layouts import colour_and_depth
+from fgslam.datasets.layouts import colour_and_depth, colour_and_depth_files
 from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
@@ -109,20 +110,29 @@ def _pairs(
         (rows, partners), notes = pair_stamps(colour_at, depth_at, tolerance, names)
         named = zip(rows.tolist(), partners.tolist(), strict=True)
         pairs = tuple((colours[i], depths[j]) for i, j in named)
-        words = tuple(n.replace("right", "colour").replace("left", "depth") for n in notes)
+        words = tuple(map(in_words, notes))
         return pairs, NANOSECONDS * colour_at[rows].astype(np.float64), words, lists
-    folders = colour_and_depth(root)
-    if folders is None:
-        raise DatasetError(f"{root} has no folders of colour and depth images (rgb/ and depth/)")
-    files = [tuple(images_in(folder)) for folder in folders]
-    for folder, found in zip(folders, files, strict=True):
-        if not found:
-            raise DatasetError(f"{folder} holds no image; restore it")
-    cameras = CameraFiles(files[1], files[0], root, interleaved=False)
+    colour_files, depth_files = _both(root)
+    cameras = CameraFiles(depth_files, colour_files, root, interleaved=False)
     pairs, notes = pair_files(cameras, settings.pairing_tolerance_ms)
     colours = [colour for colour, _ in pairs]
-    stamps, assumed, used = stamps_of(colours, (folders[0], root), None, files[0])
-    return pairs, stamps, (*notes, *assumed), used
+    places = (colours[0].parent, root)
+    stamps, assumed, used = stamps_of(colours, places, None, colour_files)
+    return pairs, stamps, (*map(in_words, notes), *assumed), used
+
+
+def _both(root: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
+    """Files of colour and of depth, in two folders or in one."""
+    folders = colour_and_depth(root)
+    if folders is None:
+        mixed = colour_and_depth_files(root)
+        if mixed is None:
+            raise DatasetError(f"{root} has no folders of colour and depth images (rgb/, depth/)")
+        return tuple(mixed[0]), tuple(mixed[1])
+    for folder in folders:
+        if not images_in(folder):
+            raise DatasetError(f"{folder} holds no image; restore it")
+    return tuple(images_in(folders[0])), tuple(images_in(folders[1]))
 
 
 def _listed(path: Path) -> tuple[IntArray, list[Path]]:

@@ -20,7 +20,13 @@ from fgslam.datasets.bags.files import BagFiles, MessagesByPlace, bag_files, pat
 from fgslam.datasets.bags.frames import FrameTree
 from fgslam.datasets.bags.motion import odometry_source
 from fgslam.datasets.bags.topics import Chosen, choose_topics
-from fgslam.datasets.depth_view import Depth, DepthFrames, Undistorted, depth_sigma_px
+from fgslam.datasets.depth_view import (
+    Depth,
+    DepthFrames,
+    Undistorted,
+    depth_sigma_px,
+    in_words,
+)
 from fgslam.datasets.images import bits_held, sized
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
@@ -58,7 +64,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         pairs = _WithDepth(source, places, rig.image_size)
         images = DepthFrames(pairs.read, rig, Undistorted.of(placed.camera))
         sigma = depth_sigma_px(settings.scale * rig.fx, RgbdSettings.depth_sigma_m)
-        unpaired = tuple(_of_depth(note) for note in unpaired)
+        unpaired = tuple(map(in_words, unpaired))
     return Recording(
         name=where.resolve().stem,
         rig=rig.plain(),
@@ -73,10 +79,6 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         odometry_source=odometry_source(chosen.motion, index.motions, odometry),
         disparity_sigma_px=sigma,
     )
-
-
-def _of_depth(note: str) -> str:
-    return note.replace("right images", "colour images").replace("left images", "depth images")
 
 
 # --------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import colour_and_depth, recognise_layout
 from fgslam.datasets.loose_images import open_loose_images
 from fgslam.datasets.recording import Recording
+from fgslam.datasets.rgbd import open_rgbd
 from fgslam.datasets.settings import (
     BagSettings,
     KittiRawSettings,
     LooseImagesSettings,
     RecordedOdometrySettings,
+    RgbdSettings,
 )
 
 NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
@@ -111,6 +114,40 @@ def test_depth_registered_to_colour_comes_before_depth_as_measured(tmp_path: Pat
     for name in ("color", "depth", "aligned_depth"):
         (tmp_path / name).mkdir()
     assert colour_and_depth(tmp_path) == (tmp_path / "color", tmp_path / "aligned_depth")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("frame{:06d}.jpg", "depth{:06d}.png"), ("frame-{:06d}.color.png", "frame-{:06d}.depth.png")],
+)
+def test_colour_and_depth_in_one_folder(tmp_path: Path, names: tuple[str, str]) -> None:
+    """As Replica and 7-Scenes have them; the largest integer is no depth there."""
+    depth = np.full((HEIGHT, WIDTH), 240, np.uint16)  # 0.24 m: 10 px at 30 px and 0.08 m
+    depth[:, :8] = 65535
+    for k in (9, 10):
+        save(tmp_path / names[0].format(k), np.dstack([np.full((HEIGHT, WIDTH), k, np.uint8)] * 3))
+        save(tmp_path / names[1].format(k), depth)
+    lens = {"width": WIDTH, "height": HEIGHT, "fx": 30, "fy": 30, "ppx": 15.5, "ppy": 11.5}
+    (tmp_path / "camera.json").write_text(json.dumps(lens), encoding="utf-8")
+    assert recognise_layout(tmp_path)["kind"] == "rgbd"
+    recording = open_rgbd(RgbdSettings(path=str(tmp_path), depth_scale=1000.0))
+    right, left = recording.frame(1).images
+    assert abs(int(right[0, 0]) - 10) <= 1
+    assert np.array_equal(left[:, 18:], right[:, 8:-10])
+    assert recording.notes[-1].endswith("its median is 0.24 m")
+    (tmp_path / names[1].format(9)).rename(tmp_path / names[1].format(11))
+    with pytest.raises(DatasetError):
+        recognise_layout(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("walk.zip", "unpack it"), ("walk.svo2", "as a film of both views"), ("a.klg", "to folders")],
+)
+def test_files_of_others_say_what_to_do(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / name).write_bytes(b"PK")
+    with pytest.raises(DatasetError, match=f"is not read: .*{words}"):
+        recognise_layout(tmp_path / name)
 
 
 def test_kitti_360(tmp_path: Path) -> None:
