@@ -14,6 +14,7 @@ from fgslam.cameras.formats import (
     middlebury,
     opencv,
     own,
+    published,
     ros,
     slam_settings,
 )
@@ -31,7 +32,7 @@ KNOWN = (
     "known: calib.json of fgslam, Kalibr's camchain, OpenCV's stereo files (M1, D1, M2, D2, R, T), "
     "left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, EuRoC's sensor.yaml, settings "
     "of ORB-SLAM, stella_vslam, VINS, OKVIS and SVO, Middlebury's calib.txt, files of Basalt, OAK, "
-    "ZED, RealSense and OCamCalib"
+    "ZED, RealSense, MRPT, DSO and OCamCalib"
 )
 
 
@@ -66,6 +67,9 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (slam_settings.is_multicol, _without_size(slam_settings.read_multicol)),
     (slam_settings.is_okvis, _without_size(slam_settings.read_okvis)),
     (slam_settings.is_svo, _without_size(slam_settings.read_svo)),
+    (published.is_cityscapes, published.read_cityscapes),
+    (published.is_openloris, _without_size(published.read_openloris)),
+    (published.is_rgbd, _without_size(published.read_rgbd)),
     (opencv.is_opencv_pair, opencv.read_opencv_pair),
     (opencv.is_opencv_single, opencv.read_opencv_single),
 )
@@ -77,7 +81,10 @@ _TEXTS = (
     (kitti.is_kitti, lambda path, _, size: kitti.read_kitti(path, size)),
     (middlebury.is_middlebury, lambda path, *_: middlebury.read_middlebury(path)),
     (makers.is_zed, makers.read_zed),
+    (published.is_mrpt, lambda path, text, _: published.read_mrpt(path, text)),
+    (published.is_dso, lambda path, *_: published.read_dso(path)),
     (makers.is_ocamcalib, lambda path, *_: makers.read_ocam(path)),
+    (published.is_numbers, published.read_numbers),
 )
 """The same of files that are no keys and values."""
 
@@ -232,7 +239,8 @@ def _of_folder(folder: Path, size: Size | None) -> Calibration:
         raise CalibrationError(f"{folder}: has right.yaml but no left.yaml; a pair needs both")
     found = tuple(_rigs(shown_in(folder), size))
     by_name = tuple(one for one in found if one.source.endswith("camchain.yaml"))
-    found = by_name if len(by_name) == 1 else found
+    kalibr_alone = all(one.format == by_name[0].format for one in found) if by_name else False
+    found = by_name if len(by_name) == 1 and kalibr_alone else found
     if len(found) == 1:
         return found[0]
     if found:

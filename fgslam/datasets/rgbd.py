@@ -15,6 +15,7 @@ import numpy as np
 from fgslam.cameras.assembly import at_size
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.formats.published import rgbd_part
 from fgslam.cameras.formats.trees import read_tree
 from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
@@ -48,7 +49,7 @@ _FARTHEST_GUESSED_M = 10.0
 _NEAREST_OF_TUM_M = 0.4  # nearer than Kinect sees in its near mode, of which TUM's layout is
 _ENDS = (1.0, 99.0)  # percentiles of depth that are its nearest and farthest: few pixels are wrong
 _SAMPLES = 5  # depth images, over the whole recording
-_SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor")
+_SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor", "png_depth_scale", "scale")
 _TUM_CAMERAS = {
     "1": (517.3, 516.5, 318.6, 255.3),
     "2": (520.9, 521.0, 325.1, 249.7),
@@ -167,7 +168,7 @@ def _scale(
         raise DatasetError(
             f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
             "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, "
-            "10000 for tenths of them, 1 for metres"
+            "10000 for tenths of them, 5000 as in TUM's, 1 for metres"
         )
     assumed = ", which nothing states" if guessed else ""
     said = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
@@ -212,7 +213,8 @@ def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
     files = _own_files(root) if named is None else [Path(named)]
     tree = read_tree(files[0]) if len(files) == 1 and files[0].is_file() else None
     for key in _SCALES:
-        given = (tree or {}).get(key)
+        inner = rgbd_part(tree or {}).get(key)
+        given = (tree or {}).get(key) if inner is None and key != "scale" else inner
         value = float(given) if is_finite_number(given) else 0.0  # type: ignore[arg-type]
         if value > 0.0:
             return 1.0 / value if value < 1.0 else value
@@ -261,8 +263,21 @@ def _camera(
     return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
 
 
+_TEXTS = ("calibration.txt", "intrinsics.txt", "camera-intrinsics.txt", "cam_K.txt")
+
+
 def _own_files(root: Path) -> list[Path]:
-    return [p for p in shown_in(root) if p.suffix in (".json", ".yaml", ".yml", ".xml")]
+    """The folder's files that may be a camera; of several those that are one."""
+    suffixes = (".json", ".yaml", ".yml", ".xml")
+    found = [p for p in shown_in(root) if p.suffix in suffixes or p.name in _TEXTS]
+    return found if len(found) < 2 else [path for path in found if _is_camera(path)]
+
+
+def _is_camera(path: Path) -> bool:
+    try:
+        return bool(read_calibration_file(path).cameras)
+    except CalibrationError:
+        return False
 
 
 def _of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:

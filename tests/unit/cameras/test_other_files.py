@@ -71,6 +71,24 @@ def okvis(root: Path) -> Path:
     return root / "config.yaml"
 
 
+def mrpt(root: Path) -> Path:
+    """The pose there is that of the right camera in the left one."""
+    lTr = inverse(RIGHT_FROM_LEFT)
+    rows = " ;".join(" ".join(f"{v:.13e}" for v in row) for row in lTr[:3, :3])
+    lines = []
+    for side, matrix, lens in zip(("LEFT", "RIGHT"), K, D, strict=True):
+        numbers = " ".join(f"{v:e}" for v in lens)
+        lines += [f"[CAMERA_PARAMS_{side}]", f"resolution = [{SIZE[0]} {SIZE[1]}]"]
+        lines += [f"fx = {matrix[0, 0]}  // +/- 0.100", f"fy = {matrix[1, 1]}"]
+        lines += [f"cx = {matrix[0, 2]}", f"cy = {matrix[1, 2]}"]
+        lines += [f"dist = [{numbers}]   // The order is: [K1 K2 T1 T2 K3]"]
+    moved = " ".join(f"{v:.13e}" for v in lTr[:3, 3])
+    lines += ["[CAMERA_PARAMS_LEFT2RIGHT_POSE]", f"translation_only = [{moved}]"]
+    lines += [f"rotation_matrix_only = [{rows} ]"]
+    (root / "camera_params.txt").write_text("\n".join(lines), encoding="utf-8")
+    return root / "camera_params.txt"
+
+
 FILES: dict[str, Callable[[Path], Path]] = {
     "two files of other names": two_files,
     "one of the two": lambda root: two_files(root) / "camera_extrinsics.xml",
@@ -101,6 +119,7 @@ FILES: dict[str, Callable[[Path], Path]] = {
         points=np.array([None, 1]),
     ),
     "OKVIS": okvis,
+    "MRPT": mrpt,
 }
 
 
@@ -250,3 +269,92 @@ def test_what_is_not_read_says_what_to_do(tmp_path: Path, name: str, words: str)
     (tmp_path / name).write_text("fx: 40\nbaseline: 0.1\n", encoding="utf-8")
     with pytest.raises(CalibrationError, match=words):
         load_rig(tmp_path / name)
+
+
+# --------------------------------------------------------------------------------------------
+# Published with recordings
+
+
+@pytest.mark.parametrize("given", ["", "undistorted_calib_0.txt", "undistorted_calib_1.txt"])
+def test_two_cameras_of_dso_and_their_step_are_a_pair(tmp_path: Path, given: str) -> None:
+    """As in 4Seasons, whose fisheye pair beside it is another calibration."""
+    for k in (0, 1):
+        camera = f"Pinhole 40 40 {31 - k} 23 0.0\n64 48\ncrop\n64 48\n"
+        (tmp_path / f"undistorted_calib_{k}.txt").write_text(camera, encoding="utf-8")
+    np.savetxt(tmp_path / "undistorted_calib_stereo.txt", RIGHT_FROM_LEFT)
+    found = read_calibration_file(tmp_path / given)
+    assert [camera.matrix[0, 2] for camera in found.cameras] == [31.0, 30.0]
+    assert np.allclose(inverse(found.cameras[1].bTc), RIGHT_FROM_LEFT)
+    fisheye = "KannalaBrandt 0.625 0.8 0.5 0.5 0.1 0.02 0.003 0.0004\n64 48\nnone\n64 48\n"
+    (tmp_path / "left.txt").write_text(fisheye, encoding="utf-8")
+    one = read_calibration_file(tmp_path / "left.txt").cameras[0]
+    assert (one.model, one.distortion.tolist()) == ("equidistant", [0.1, 0.02, 0.003, 0.0004])
+    assert one.matrix[0].tolist() == pytest.approx([40.0, 0.0, 31.5])
+    chain = {"camera_model": "pinhole", "intrinsics": [40, 40, 31, 23], "resolution": [64, 48]}
+    both = {"cam0": chain, "cam1": chain | {"T_cn_cnm1": RIGHT_FROM_LEFT.tolist()}}
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(both), encoding="utf-8")
+    with pytest.raises(CalibrationError, match=r"several .*\(camchain\.yaml, undistorted_calib_0"):
+        read_calibration_file(tmp_path)
+
+
+def test_cityscapes_is_a_rectified_pair(tmp_path: Path) -> None:
+    inner = {"fx": 40.0, "fy": 40.5, "u0": 31.0, "v0": 23.0}
+    outer = {"baseline": 0.209, "pitch": 0.03, "x": 1.7}
+    rig = load_rig(as_json(tmp_path / "c.json", intrinsic=inner, extrinsic=outer), size=SIZE)
+    assert (rig.fx, rig.cx, rig.baseline, rig.rectifier) == (40.0, 31.0, 0.209, None)
+
+
+OPENLORIS = """%YAML:1.0
+d400_depth_optical_frame:
+   model: pinhole
+   width: 64
+   height: 48
+d400_color_optical_frame:
+   sensor_type: camera
+   width: 64
+   height: 48
+   model: pinhole
+   intrinsics: !!opencv-matrix
+      rows: 1
+      cols: 4
+      dt: d
+      data: [ 40., 31., 40.5, 23. ]
+   distortion_model: radial-tangential
+   distortion_coefficients: !!opencv-matrix
+      rows: 1
+      cols: 5
+      dt: d
+      data: [ 0., 0., 0., 0., 0. ]
+"""
+ONE = {
+    "calibration.txt": "40 40.5 31 23\n",
+    "DROID": "40 40.5 31 23 0 0 0 0\n",
+    "cam_K.txt": "[[40 0 31]\n [0 40.5 23]\n [0 0 1]]\n",
+    "intrinsic_color.txt": "40 0 31 0\n0 40.5 23 0\n0 0 1 0\n0 0 0 1\n",
+    "sensors.yaml": OPENLORIS,
+    "cam_params.json": json.dumps(
+        {"camera": {"w": 64, "h": 48, "fx": 40, "fy": 40.5, "cx": 31, "cy": 23, "scale": 6553.5}}
+    ),
+    "splatam.yaml": "camera_params: {image_width: 64, image_height: 48, fx: 40, fy: 40.5, "
+    "cx: 31, cy: 23, png_depth_scale: 5000}",
+}
+
+
+@pytest.mark.parametrize("name", ONE)
+def test_one_camera_beside_its_depth(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text(ONE[name], encoding="utf-8")
+    found = read_calibration_file(tmp_path / name, size=SIZE).cameras
+    assert len(found) == 1
+    assert found[0].matrix.tolist() == [[40.0, 0.0, 31.0], [0.0, 40.5, 23.0], [0.0, 0.0, 1.0]]
+    assert found[0].size == SIZE
+    assert not found[0].distortion.any()
+
+
+@pytest.mark.parametrize(
+    "text", ["1 0 0 0.1\n0 1 0 0\n0 0 1 0\n0 0 0 1", "0 0.1\n1 0.2", "5 1 2 3"]
+)
+def test_numbers_that_are_no_camera(tmp_path: Path, text: str) -> None:
+    """A pose, times, and focal lengths of five pixels."""
+    (tmp_path / "a.txt").write_text(text, encoding="utf-8")
+    with pytest.raises(CalibrationError, match="holds no keys and values"):
+        read_calibration_file(tmp_path / "a.txt", size=SIZE)
