@@ -16,6 +16,16 @@ _CAMERA_NUMBER = re.compile(
     r"(?:(?<=cam)|(?<=camera)|(?<=infra)|(?<=infrared))[_-]?(\d+)(?!\d)", re.IGNORECASE
 )
 _NUMBER = re.compile(r"(\d+)")
+_NO_VIEW = re.compile(
+    r"depth|dispar|theora|mask|debug|segment|semantic|label|heat|thumb|normals"
+    r"|(?<![a-z])(?:disp|flow)(?![a-z])",
+    re.IGNORECASE,
+)
+
+
+def is_view(name: str) -> bool:
+    """Whether a name of a topic, folder or file may be that of a camera's images; not of depth."""
+    return _NO_VIEW.search(name) is None
 
 
 def camera_pairs(names: Iterable[str], any_number: bool = True) -> tuple[tuple[str, str], ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
-from fgslam.core.sides import camera_pairs
+from fgslam.core.sides import camera_pairs, is_view
 from fgslam.datasets.loose_files import (
     IMAGE_SUFFIXES,
     find_cameras,
@@ -222,7 +222,8 @@ def _recordings_in(folder: Path) -> str:
     """Folders of a known layout in this one, at most two levels deep, in words; perhaps none."""
     level = [folder]
     for _ in range(2):
-        level = [path for above in level for path in shown_in(above) if path.is_dir()]
+        inside = [path for above in level for path in shown_in(above)]
+        level = [path for path in inside if path.is_dir() and is_view(path.name)]
         level = level[:_LOOKED_INTO]
         found = [str(path) for path in level if _has_layout(path)]
         if found:
@@ -364,8 +365,10 @@ def colour_and_depth_files(folder: Path) -> tuple[list[Path], list[Path]] | None
 
 
 def _lacking_of_rgbd(folder: Path) -> tuple[str, ...]:
-    if colour_and_depth(folder) or colour_and_depth_files(folder):
-        return ()
+    folders = colour_and_depth(folder)
+    if folders or colour_and_depth_files(folder):
+        deeper = [path.name for path in folders or () if not images_in(path) and shown_in(path)]
+        return tuple(f"images right in {name}" for name in deeper)
     return _absent(folder, ("depth",)) or ("rgb, or color",)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
-from fgslam.core.sides import camera_pairs, differ_in_number, without_side
+from fgslam.core.sides import camera_pairs, differ_in_number, is_view, without_side
 from fgslam.datasets.time_names import time_parts
 
 if TYPE_CHECKING:
@@ -80,7 +80,8 @@ def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles
     """The files of a left and a right camera; None where there is no such pair.
 
     Two folders side by side (left and right, image_0 and image_1, cam0 and cam1), or one folder in
-    which names differ in the side alone, or end in the camera's number (12_0 and 12_1).
+    which names differ in the side alone, or end in the camera's number (12_0 and 12_1), or have it
+    behind the word image (image_0_12 and image_1_12).
 
     Args:
         root: the folder.
@@ -92,42 +93,48 @@ def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles
             used, others = folders
             left, right = (tuple(images_in(folder)) for folder in used)
             return CameraFiles(left, right, root, interleaved=False, others=others)
-        files = images_in(root)
+        files = [path for path in images_in(root) if is_view(path.stem)]
     named = {path.name: path for path in files}
     pairs = camera_pairs(named, any_number=False)
     if not pairs:
-        return _by_last_number(files, root)
+        return next(filter(None, (_by_number(files, root, split) for split in _NUMBERED)), None)
     left, right = (tuple(sorted({named[p[k]] for p in pairs}, key=natural)) for k in (0, 1))
     return CameraFiles(left, right, root, interleaved=True)
 
 
-def _by_last_number(files: Sequence[Path], root: Path) -> CameraFiles | None:
-    """Both cameras by the last number of the names, where that is one of two for all of them."""
-    ends = {path: int(match[2]) for path in files if (match := _NUMBERED.match(path.stem))}
+def _by_number(files: Sequence[Path], root: Path, split: re.Pattern[str]) -> CameraFiles | None:
+    """Both cameras by a number in the names, where that is one of two for all of them."""
+    ends = {path: int(match[2]) for path in files if (match := split.match(path.stem))}
     numbers = sorted(set(ends.values()))
     if len(ends) < len(files) or len(files) < _FEWEST_NUMBERED or len(numbers) != 2:
         return None
     if numbers[1] != numbers[0] + 1 or numbers[0] not in (0, 1):
         return None
     left, right = (tuple(path for path in files if ends[path] == n) for n in numbers)
-    if len({_moment(p.stem) for p in left} & {_moment(p.stem) for p in right}) * 2 < len(left):
+    moments = [{_moment(path.stem, split) for path in paths} for paths in (left, right)]
+    if len(moments[0] & moments[1]) * 2 < len(left):
         return None
     return CameraFiles(left, right, root, interleaved=True)
 
 
-_NUMBERED = re.compile(r"(.*\d)[_-](\d+)$")
+_NUMBERED = (
+    re.compile(r"(.*\d)[_-](\d+)()$"),
+    re.compile(r"(.*?(?:image|img)[_-]?)(\d+)([_-].*\d.*)$", re.IGNORECASE),
+)
+"""A name with the camera's number at its end, or in it: what is before and behind."""
+
 _FEWEST_NUMBERED = 4  # files: of two pairs
 
 
-def _moment(stem: str) -> str:
-    """A name without the camera's number at its end."""
-    return re.sub(r"[_-]\d+$", "", stem)
+def _moment(stem: str, split: re.Pattern[str]) -> str:
+    """A name without the camera's number."""
+    return split.sub(r"\1\3", stem)
 
 
 def _two_folders(root: Path) -> tuple[tuple[Path, Path], tuple[tuple[str, str], ...]] | None:
     """Folders of images whose names differ in the side, and further pairs of them."""
     with_images = {}
-    for folder in (path for path in shown_in(root) if path.is_dir()):
+    for folder in (path for path in shown_in(root) if path.is_dir() and is_view(path.name)):
         for place in (folder, folder / _INSIDE):
             if place.is_dir() and (found := images_in(place)):
                 if not _of_both_cameras(found):
@@ -170,7 +177,7 @@ def pair_files(found: CameraFiles, tolerance_ms: float | None = TOLERANCE_MS) ->
         return named
     times = None if found.interleaved else _times(found)
     if times is None:
-        named = _by_names(found, (_by_moment,))
+        named = _by_names(found, _MOMENTS)
     elif tolerance_ms is not None:
         named = _by_time(found, times, tolerance_ms)
     return _by_order(found) if named is None else named
@@ -201,7 +208,14 @@ def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pair
             "not match: which belong together cannot be told; name both of a pair alike"
         )
     note = f"left and right images are paired by their order: {why}"
-    return tuple(zip(found.right, found.left, strict=True)), (note,)
+    numbers = [[_numbers(path.stem) for path in files] for files in (found.right, found.left)]
+    alike = numbers[0] == numbers[1] and all(numbers[0])
+    return tuple(zip(found.right, found.left, strict=True)), () if alike else (note,)
+
+
+def _numbers(stem: str) -> list[int]:
+    """The numbers of a name: frame000012 and depth000012 are of one moment."""
+    return [int(n) for n in re.findall(r"\d+", stem)]
 
 
 def _times(found: CameraFiles) -> tuple[IntArray, IntArray] | None:
@@ -240,10 +254,9 @@ def _by_time(found: CameraFiles, times: tuple[IntArray, IntArray], tolerance_ms:
     return tuple((found.right[i], found.left[j]) for i, j in chosen), (note, *notes)
 
 
-def _by_moment(stem: str) -> object:
-    return natural(Path(_moment(stem)))
-
-
+_MOMENTS: tuple[Callable[[str], object], ...] = (
+    *(lambda stem, split=split: natural(Path(_moment(stem, split))) for split in _NUMBERED),
+)
 _KEYS: tuple[Callable[[str], object], ...] = (
     lambda stem: natural(Path(stem)),
     lambda stem: natural(Path(without_side(stem))),

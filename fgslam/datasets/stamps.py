@@ -14,7 +14,10 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines
 from fgslam.datasets.time_names import counts_by_one, time_parts
 
-LISTS = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "data.csv")
+LISTS = (
+    *("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "data.csv"),
+    "right_images.txt",
+)
 """Names of lists of times, the first that is there counts."""
 
 _ASSUMED_FPS = 10.0
@@ -199,16 +202,26 @@ def _listed(
 def _by_name(
     path: Path, rows: Sequence[Sequence[str]], images: Sequence[Path]
 ) -> tuple[FloatArray, float]:
-    """By the column that names the images, which is the first one or the second."""
-    for names, times in ((0, 1), (1, 0)):
-        known = {_stem(row[names]): row[times] for row in rows}
+    """By the column that names the images, one of the first three; another one is the time."""
+    columns = range(min(3, *(len(row) for row in rows)))
+    for names in columns:
+        known = {_stem(row[names]): row for row in rows}
         keys = [image.stem if image.stem in known else _stem(image.stem) for image in images]
-        if all(key in known and _is_number(known[key]) for key in keys):
-            return _numbers([known[key] for key in keys])
+        if all(key in known for key in keys):
+            others = (k for k in columns if k != names)
+            columns_of_times = ([known[key][k] for key in keys] for k in others)
+            times = [texts for texts in columns_of_times if all(map(_is_number, texts))]
+            if times:
+                return _numbers(next((t for t in times if not _counts(t)), times[0]))
     raise DatasetError(
         f"{path}: neither column names all images ({images[0].name} to {images[-1].name}); each "
         "line must be: name or number of the image, seconds"
     )
+
+
+def _counts(texts: Sequence[str]) -> bool:
+    """Whether they number the images in their order."""
+    return all(text.isdecimal() for text in texts) and counts_by_one([int(t) for t in texts])
 
 
 def _stem(word: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fgslam.core.errors import DatasetError
-from fgslam.core.sides import camera_pairs
+from fgslam.core.sides import camera_pairs, is_view
 from fgslam.datasets.bags import messages as kinds
 from fgslam.datasets.bags.files import Topic
 
@@ -16,7 +16,6 @@ MOTIONS = (kinds.ODOMETRY, kinds.TWIST, kinds.TWIST_WITH_COVARIANCE, kinds.IMU)
 """The first that a bag has is its odometry."""
 
 _TRANSPORT = "/compressed"
-_NO_VIEW = re.compile(r"depth|dispar|theora|mask|debug|segment|heat|thumb", re.IGNORECASE)
 _TRUTH = re.compile(r"truth|(?<![a-z])gt(?![a-z])|vicon|mocap|optitrack", re.IGNORECASE)
 _PREFERRED = ("image_raw", "image_rect", "image_rect_raw", "image", "image_mono")
 """Last parts of topics, grey and raw ones first; others after them."""
@@ -180,7 +179,7 @@ def _by_view(names: Sequence[str]) -> dict[str, str]:
 
 def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Views:
     """The preferred pair; with a file of three cameras the one that the next number names, too."""
-    views = [t.name for t in topics if t.kind in IMAGES and not _NO_VIEW.search(t.name)]
+    views = [t.name for t in topics if t.kind in IMAGES and is_view(t.name)]
     by_view = _by_view(views)
     pairs = sorted(camera_pairs(by_view), key=lambda pair: (_rank(pair[0]), pair))
     if not pairs:
@@ -213,7 +212,7 @@ def _colour_and_depth(topics: Sequence[Topic]) -> _Views | None:
     depths = sorted((name for name in images if _is_depth(name, images)), key=_depth_rank)
     by_view = _by_view([name for name in images if not _is_depth(name, images)])
     colours = sorted(by_view, key=lambda v: (not _COLOUR.search(v), _rank(v), v))
-    colours = [view for view in colours if not _NO_VIEW.search(_own_part(view, images))]
+    colours = [view for view in colours if is_view(_own_part(view, images))]
     if not depths or not colours:
         return None
     note = f"{depths[0]} is the depth of {colours[0]} (--topics COLOUR,DEPTH chooses others)"

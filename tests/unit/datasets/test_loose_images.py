@@ -42,7 +42,8 @@ NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
     "letters": lambda k: (f"frame{k}-L.png", f"frame{k}-R.png"),
     "cam0, cam1 in one": lambda k: (f"cam0_{k}.png", f"cam1_{k}.png"),
     "WebP, capitals": lambda k: (f"Left Camera/im {k}.WEBP", f"Right Camera/im {k}.WEBP"),
-    "other names": lambda k: (f"left/a{k}.png", f"right/b{k}.png"),
+    "the same numbers": lambda k: (f"left/a{k}.png", f"right/b{k}.png"),
+    "other names": lambda k: (f"left/a{k}.png", f"right/b{k + 1}.png"),
 }
 
 
@@ -115,6 +116,12 @@ LISTS: dict[str, tuple[str, list[str], str]] = {
     "seconds": ("times.txt", ["0.0", "0.2", "0.4"], ""),
     "name and time": ("times.txt", ["3 0.4", "1 0.0", "2 0.2"], ""),
     "time and file": ("times.csv", ["time,file", "5.0,1.png", "5.2,2.png", "5.4,right/3.png"], ""),
+    "number, time and file": (
+        "right_images.txt",
+        ["# id timestamp image_name", *(f"{k} 9.{2 * k} right/{k + 1}.png" for k in range(3))],
+        "",
+    ),
+    "file, time and exposure": ("times.txt", [f"{k} 5.{2 * k} 7" for k in (1, 2, 3)], ""),
     "nanoseconds": ("timestamps.txt", [str(STAMP + k * 200_000_000) for k in range(3)], "nano"),
     "milliseconds": ("times.txt", ["0", "200", "400"], "milli"),
     "dates": ("timestamps.txt", [f"2011-09-26 13:02:25.{k}00000001" for k in (1, 3, 5)], ""),

@@ -35,6 +35,8 @@ NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
     "letters behind cam": lambda k: (f"camL_{k}.png", f"camR_{k}.png"),
     "infra in one folder": lambda k: (f"infra1_{k}.png", f"infra2_{k}.png"),
     "RealSense's viewer": lambda k: (f"{k}_Infrared_1.png", f"{k}_Infrared_2.png"),
+    "UZH-FPV": lambda k: (f"image_0_{k}.png", f"image_1_{k}.png"),
+    "Hamlyn": lambda k: (f"image01/{k}.png", f"image02/{k}.png"),
     "New College": lambda k: (f"{k}-left.pnm", f"{k}-right.pnm"),
 }
 
@@ -60,6 +62,10 @@ def codes(recording: Recording) -> list[tuple[int, ...]]:
 @pytest.mark.parametrize("name", NAMES)
 def test_names_that_data_sets_give(tmp_path: Path, name: str) -> None:
     root = images(tmp_path / "walk", NAMES[name])
+    for folder in ("depth01", "depth02"):  # no cameras, though they come first
+        save(root / folder / "0.png", picture(0))
+    save(root / "mask_left.png", picture(0))
+    save(root / "mask_right.png", picture(0))
     assert recognise_layout(root)["kind"] == "loose_images"
     assert codes(opened(root)) == [(10, 60), (11, 61), (12, 62)]
 
@@ -114,6 +120,14 @@ def test_depth_registered_to_colour_comes_before_depth_as_measured(tmp_path: Pat
     for name in ("color", "depth", "aligned_depth"):
         (tmp_path / name).mkdir()
     assert colour_and_depth(tmp_path) == (tmp_path / "color", tmp_path / "aligned_depth")
+
+
+def test_colour_and_depth_of_several_cameras_name_the_folder(tmp_path: Path) -> None:
+    """As Virtual KITTI 2 has them: rgb/ holds folders of two cameras."""
+    images(tmp_path / "rgb", lambda k: (f"Camera_0/{k}.png", f"Camera_1/{k}.png"))
+    images(tmp_path / "depth", lambda k: (f"Camera_0/{k}.png", f"Camera_1/{k}.png"))
+    with pytest.raises(DatasetError, match=r"in it has \S*/rgb: give that folder"):
+        recognise_layout(tmp_path)
 
 
 @pytest.mark.parametrize(
