@@ -27,7 +27,7 @@ from fgslam.datasets.depth_view import (
     depth_sigma_px,
     in_words,
 )
-from fgslam.datasets.images import bits_held, sized
+from fgslam.datasets.images import bits_held, mosaic_note, sized
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings, RgbdSettings
@@ -201,10 +201,10 @@ class _Images:
         self._bits = 16
 
     def use_bits(self, places: IntArray) -> tuple[str, ...]:
-        """Finds how many bits images of these places hold; a note where fewer than 16."""
+        """Finds how many bits images of these places hold; what to tell of them."""
         stored = lambda k: self._made(int(places[k]), messages.stored_of)  # noqa: E731 - short
         self._bits, notes = bits_held(len(places), stored)
-        return notes
+        return (*notes, *mosaic_note(len(places), lambda k: self.load(int(places[k]))))
 
     def load(self, place: int) -> Image:
         """A grey image. Raises FrameError."""

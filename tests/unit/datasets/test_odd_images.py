@@ -13,7 +13,7 @@ import pytest
 from PIL import Image as PictureFile
 
 from fgslam.core.errors import FrameError
-from fgslam.datasets.images import decode_grey, read_grey_image
+from fgslam.datasets.images import decode_grey, mosaic_note, read_grey_image
 
 GREY = np.add.outer(np.arange(60), 2 * np.arange(80)).astype(np.uint8)
 
@@ -54,6 +54,18 @@ def test_of_sixteen_bits_the_upper_eight_are_kept() -> None:
 def test_a_jpeg_of_four_colours_is_as_bright_as_its_grey() -> None:
     data = encoded(PictureFile.fromarray(GREY).convert("CMYK"), "JPEG", quality=95)
     assert np.abs(decode_grey(data, "a.jpg").astype(int) - GREY).max() < 12
+
+
+@pytest.mark.parametrize(("blue", "told"), [(1.0, False), (0.6, True)])
+def test_a_mosaic_of_colours_is_told(blue: float, told: bool) -> None:
+    """Brighter in the rows and columns of one colour; of grey things, or in noise, it is none."""
+    generator = np.random.default_rng(3)
+    mosaic = 2.0 * GREY.clip(0, 100) + generator.normal(0.0, 2.0, GREY.shape)
+    mosaic[1::2, ::2] *= blue
+    image = mosaic.clip(0, 255).astype(np.uint8)
+    assert bool(mosaic_note(5, lambda _: image)) == told
+    noise = generator.integers(0, 255, GREY.shape).astype(np.uint8)
+    assert mosaic_note(1, lambda _: noise) == ()
 
 
 @pytest.mark.parametrize("size", [(60_000, 60_000), (30_000, 30_000), (1, 2**31 - 1), (0, 10)])
