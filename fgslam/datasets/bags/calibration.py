@@ -49,12 +49,16 @@ class Stated:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A rig, its cameras left and right, the topics as calibrated, what was noticed."""
+    """A rig, its cameras left and right, the topics as calibrated, what was noticed.
+
+    ``on_body``: the file's body is another thing than a camera, as an IMU, whatever its axes.
+    """
 
     rig: StereoRig
     cameras: tuple[RawCamera, ...]
     chosen: Chosen
     notes: tuple[str, ...] = ()
+    on_body: bool = False
 
 
 def file_cameras(settings: BagSettings) -> FileCameras:
@@ -101,15 +105,16 @@ def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | 
         return None
     file, numbers = Path(settings.camera_file), chosen.numbers
     cameras = in_metres(read_calibration_file(file, size=stated.size), settings.unit_m).cameras
+    on_body = not any(np.array_equal(camera.bTc, np.eye(4)) for camera in cameras)
     if numbers:
         rig = loaded_rig(settings, file, size=stated.size, cameras=numbers, pair=False)
-        return _of_numbers(rig, [cameras[k] for k in numbers], chosen)
+        return replace(_of_numbers(rig, [cameras[k] for k in numbers], chosen), on_body=on_body)
     rig = loaded_rig(settings, file, size=stated.size)
     if differ_in_number(chosen.left, chosen.right):
         rig = numbered(rig)
     order = (0, 1) if rig.rectifier is None else rig.rectifier.order
     right, left = (rig.sources[order.index(k)] for k in (0, 1))
-    return _Found(rig, (cameras[left], cameras[right]), chosen)
+    return _Found(rig, (cameras[left], cameras[right]), chosen, on_body=on_body)
 
 
 def _of_numbers(rig: StereoRig, cameras: list[RawCamera], chosen: Chosen) -> _Found:
@@ -310,11 +315,7 @@ def _on_robot(found: _Found, stated: Stated) -> tuple[StereoRig, tuple[str, ...]
     try:
         bTf = stated.tree.pose(frame, body)
     except CalibrationError as fault:
-        reason = f" ({fault})" if stated.tree else ""
-        if not body_is_camera(found.rig.bTc):
-            return found.rig, ()
-        ahead = replace(found.rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
-        return ahead, (*stated.tree.notes, f"{_LOOKS_AHEAD[0]}{reason}: {_LOOKS_AHEAD[1]}")
+        return _unconnected(found, stated.tree, body, f" ({fault})" if stated.tree else "")
     fTc, said = view_axes(stated.tree, left, right, body)
     bTc = bTf @ fTc @ inverse(found.cameras[camera].bTc) @ found.rig.bTc
     x, y, z = (round(float(v), 3) + 0.0 for v in bTc[:3, 3])
@@ -323,6 +324,19 @@ def _on_robot(found: _Found, stated: Stated) -> tuple[StereoRig, tuple[str, ...]
         f"motion {found.chosen.motion.name} is"
     )
     return replace(found.rig, bTc=bTc), (*stated.tree.notes, note, *filter(None, [said]))
+
+
+def _unconnected(
+    found: _Found, tree: FrameTree, body: str, reason: str
+) -> tuple[StereoRig, tuple[str, ...]]:
+    """The same where no transform leads to the camera: as calibrated, else by its frame's axes."""
+    if found.on_body or not body_is_camera(found.rig.bTc):
+        return found.rig, ()
+    if "optical" in body:  # axes of a camera (REP 103), as RealSense's gyroscope has
+        said = f"{body} has a camera's axes, and is taken as turned like the camera{reason}"
+        return found.rig, (*tree.notes, said)
+    ahead = replace(found.rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+    return ahead, (*tree.notes, f"{_LOOKS_AHEAD[0]}{reason}: {_LOOKS_AHEAD[1]}")
 
 
 def _body(named: str, tree: FrameTree) -> str:

@@ -242,8 +242,11 @@ def _depth_as_named(names: Sequence[str], topics: Sequence[Topic]) -> _Views | N
     return _Views((depths[0], others[0]), depth=True) if one_each else None
 
 
+_OF_DEPTHAI = re.compile(r"/stereo/image_raw(/|$)")  # beside its colour camera's images
+
+
 def _is_depth(name: str, images: Sequence[str]) -> bool:
-    return "depth" in _own_part(name, images).lower()
+    return "depth" in _own_part(name, images).lower() or _OF_DEPTHAI.search(name) is not None
 
 
 def _own_part(name: str, images: Sequence[str]) -> str:

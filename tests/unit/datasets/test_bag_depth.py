@@ -103,6 +103,7 @@ FORMS = {
         in_metres,
         ("/depth_cam/image_raw", "/depth_cam/depth/image_raw"),
     ),
+    "DepthAI": (".db3", in_millimetres, ("/oak/rgb/image_raw", "/oak/stereo/image_raw")),
 }
 
 

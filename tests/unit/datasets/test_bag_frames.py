@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -152,6 +153,29 @@ def test_what_the_frames_do_not_connect_is_said_and_the_camera_looks_ahead(tmp_p
     recording = opened(write_bag(tmp_path / "a.bag", messages))
     np.testing.assert_array_equal(recording.rig.bTc, AHEAD)
     assert "tf_static has no frame base_link; it has left_optical, mast, ri" in recording.notes[-1]
+
+
+@pytest.mark.parametrize("by", ["calibration", "frame"])
+def test_a_gyroscope_may_have_the_axes_of_a_camera(tmp_path: Path, by: str) -> None:
+    """As RealSense's: its frame is optical, or a calibration's T_cam_imu is hardly turned."""
+    stamps = [START_NS + k * PERIOD_NS // 4 for k in range(16)]
+    frames = {"/imu": "imu_optical" if by == "frame" else "imu"}
+    messages = stereo(4) + in_frames(gyroscope(stamps, np.array([0.0, 0.3, 0.0])), frames)
+    iTc = pose(so3_exp(np.array([0.01, -0.02, 0.015])), np.array([0.005, 0.01, 0.012]))
+    lens = {"camera_model": "pinhole", "distortion_model": "none", "resolution": [WIDTH, HEIGHT]}
+    lens["intrinsics"] = [CALIBRATION[name] for name in ("fx", "fy", "cx", "cy")]
+    chain = {
+        f"cam{k}": lens | {"T_cam_imu": inverse(iTc @ shifted(k * BASELINE)).tolist()}
+        for k in (0, 1)
+    }
+    file = tmp_path / "camchain.yaml"
+    file.write_text(json.dumps(chain), encoding="utf-8")
+    given = {} if by == "frame" else {"camera_file": str(file)}
+    recording = opened(write_bag(tmp_path / "a.mcap", messages), **given)
+    expected = np.eye(4) if by == "frame" else iTc @ shifted(BASELINE)
+    np.testing.assert_allclose(recording.rig.bTc, expected, rtol=0.0, atol=1e-6)
+    said = any("imu_optical has a camera's axes" in note for note in recording.notes)
+    assert said == (by == "frame")
 
 
 def test_without_tf_static_what_stays_in_tf_counts(tmp_path: Path) -> None:
