@@ -111,8 +111,8 @@ def _disagreement(left: float, size: float) -> str:
     return (
         "the gyroscope does not turn as the images do (off by "
         f"{np.degrees(left):.2g} of {np.degrees(size):.2g} degrees a step) and is not used; give a "
-        "calibration that says where it sits (T_BS, T_cam_imu), or correct its axes "
-        "or its unit, radians/s"
+        "calibration that says where it sits (T_BS, T_cam_imu), or correct its axes or its unit, "
+        "radians/s (where something large moves through most of these images, they are wrong)"
     )
 
 

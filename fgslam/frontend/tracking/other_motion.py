@@ -114,9 +114,9 @@ class OtherMotion:
         return (
             f"in {len(frames)} frames, from {frames[0]} to {frames[-1]}, something else moves "
             f"rigidly, with up to {100.0 * most:.0f} % as many matches as the pose follows: "
-            "something large passes, and where it fills more of the view than the scene, the pose "
-            "is in doubt, for it follows what passes (leave these frames out: --start, --stop; "
-            "odometry tells which is which)",
+            "something large passes. Without odometry that tells which is which the pose is in "
+            "doubt where that fills more of the view than the scene, for it may follow what passes "
+            "(leave these frames out: --start, --stop)",
         )
 
     def _share(
