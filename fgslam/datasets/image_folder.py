@@ -38,6 +38,7 @@ from fgslam.datasets.tables import (
 TRUTH_LEFT = "gt_left_cam.txt"
 TRUTH_RIGHT = "gt_right_cam.txt"
 _DEFAULT_NOISE = RecordedOdometrySettings()
+_LAST_NUMBER = 2.0**53  # beyond it a float is no single whole number
 
 
 def open_image_folder(
@@ -137,14 +138,15 @@ def _cameras(root: Path, settings: ImageFolderSettings, listed: list[dict[int, P
 def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
     """Image numbers (n,) and stamps (n,) in seconds."""
     table = read_table(path, ("image number", "time"))
-    numbers = table.column(0).astype(np.int64)
-    wrong = np.flatnonzero((numbers != table.column(0)) | (numbers < 0))
+    stated = table.column(0)
+    wrong = np.flatnonzero((stated != np.floor(stated)) | (stated < 0) | (stated > _LAST_NUMBER))
     if len(wrong):
         line = table.lines[wrong[0]]
         raise DatasetError(
             f"{path}, line {line}: the image number {table.values[wrong[0], 0]:g} is not a whole "
             "number from 0; the line must be: number, seconds"
         )
+    numbers = stated.astype(np.int64)
     _require_unique(table, numbers)
     require_increasing(table, table.column(1))
     return numbers, table.column(1)

@@ -160,11 +160,10 @@ def _entries(path: Path) -> list[_Entry]:
     entries, comment = [], ""
     for number, line in enumerate(text.splitlines(), 1):
         values, _, beside = line.replace("%", "#").partition("#")  # MATLAB's comments, too
-        if beside and not values.strip():
-            comment = beside.strip(" \t#")
-        elif line.strip():
-            entries.append(_Entry(number, comment, values.replace(",", " ").split()))
-            comment = ""
+        words = values.replace(",", " ").split()
+        if words:
+            entries.append(_Entry(number, comment, words))
+        comment = "" if words else beside.strip(" \t#") or comment
     return entries
 
 

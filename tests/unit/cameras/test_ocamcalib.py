@@ -62,6 +62,7 @@ def test_calibration_file_is_read_in_full(calibration: OCamCalibration) -> None:
 def test_comments_stand_beside_values_too(calibration: OCamCalibration, tmp_path: Path) -> None:
     noted = text(centre="545.872616, 674.318875  # row, column", affine="0.999 0.003 0.002 % c d e")
     assert read(tmp_path, noted.replace("#ROI", "% ROI")) == calibration
+    assert read(tmp_path, noted.replace("#", "#\n#")) == calibration  # an empty one is none
 
 
 def test_pixels_are_exact_where_the_inverse_polynomial_is_not(calibration: OCamCalibration) -> None:

@@ -294,6 +294,7 @@ BAD_RECORDINGS = [
     (times("0 0.0\n1 soon\n"), DatasetError, ["line 2", "'soon'", "not a number"]),
     (times("0 0.0\n1 nan\n"), DatasetError, ["line 2", "nan", "not finite"]),
     (times("0 0.0\n0 1.0\n"), DatasetError, ["line 2", "image number 0", "twice"]),
+    (times("0 0.0\n1e300 1.0\n"), DatasetError, ["line 2", "1e+300 is not a whole number"]),
     (times("0 0.0\n1.5 1.0\n"), DatasetError, ["line 2", "1.5", "whole number"]),
     (calibrated(fx=float("nan")), CalibrationError, ["calib.json", "fx is nan", "correct"]),
     (calibrated(cx=float("inf")), CalibrationError, ["cx is inf"]),
