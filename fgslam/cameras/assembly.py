@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.cameras.corrected import correction_values
-from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
+from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView, checked_camera
 from fgslam.cameras.rectification import (
     WIDEST_CYLINDER_DEG,
     Rectifier,
@@ -427,7 +427,7 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
             "dataset.resized=true, --scale of fgslam camera, scale=True of load_rig"
         )
     cameras = tuple(
-        c.scaled(size) if c.width else replace(c, width=size[0], height=size[1])
+        c.scaled(size) if c.width else checked_camera(replace(c, width=size[0], height=size[1]))
         for c in calibration.cameras
     )
     view = calibration.view if not other else None

@@ -13,6 +13,14 @@ from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse, is_rigid
 from fgslam.core.settings import RigView
 
+_ZERO = 1e-6
+_MOST_OBLONG = 10.0  # a pixel's sides; interlaced and anamorphic images have two
+_LARGEST_SIDE = 100_000  # pixels; as images
+_FARTHEST_M = 1e6
+_PLACES = 8  # across the image, at which a lens is tried
+_NARROWEST = 1e-4  # radians: a telescope's
+_LEAST_SHARE = 0.2
+"""Of the angle that a pixel is off the axis without distortion, what any lens leaves of it."""
 _WALK = 400  # places between the centre and the border at which a ray is asked for
 
 
@@ -140,7 +148,77 @@ def checked_camera(camera: RawCamera) -> RawCamera:
         )
     if not is_rigid(camera.bTc):
         raise CalibrationError(f"{camera.name}: its pose is not a rigid motion; correct the file")
+    if np.abs(camera.bTc[:3, 3]).max() > _FARTHEST_M:
+        raise CalibrationError(
+            f"{camera.name}: it is {np.abs(camera.bTc[:3, 3]).max():g} m from its body or the "
+            "other camera; correct the file"
+        )
+    fault = _matrix_fault(camera.matrix) or _size_fault(camera) or _view_fault(camera)
+    if fault:
+        raise CalibrationError(f"{camera.name}: {fault}; correct the file")
     return camera
+
+
+def checked_view(view: StatedView, source: str) -> StatedView:
+    """The stated rectification itself.
+
+    Raises:
+        CalibrationError: its matrix is none of a camera's, the message names ``source``.
+    """
+    fault = _matrix_fault(view.matrix)
+    if fault:
+        raise CalibrationError(f"{source}: of the rectified images: {fault}; correct the file")
+    return view
+
+
+def _matrix_fault(matrix: FloatArray) -> str | None:
+    """What no camera's intrinsics are, in words; None where they may be one's."""
+    (fx, skew, _), (other, fy, _), last = matrix
+    if not min(fx, fy) > 0.0:
+        return f"focal lengths {fx:g}, {fy:g} must be positive"
+    if np.abs(last - (0.0, 0.0, 1.0)).max() > _ZERO:
+        return f"its matrix must be fx s cx, 0 fy cy, 0 0 1 by rows; it is {_rows(matrix)}"
+    if not max(fx / fy, fy / fx) < _MOST_OBLONG:
+        return f"focal lengths {fx:g} and {fy:g} are no camera's, pixels are nearly square"
+    if not (abs(skew) < fx and abs(other) < fy):  # OCamCalib has both
+        return f"its matrix is no camera's, pixels have nearly right angles: {_rows(matrix)}"
+    return None
+
+
+def _size_fault(camera: RawCamera) -> str | None:
+    if max(camera.size) > _LARGEST_SIDE:
+        return f"no image is {camera.width}x{camera.height} pixels large"
+    return None
+
+
+def _view_fault(camera: RawCamera) -> str | None:
+    """What such images cannot show, in words; None where they may, or the size is not known."""
+    if camera.width == 0:
+        return None
+    half = np.array(camera.size) / 2.0
+    steps = np.linspace(-1.0, 1.0, _PLACES)
+    offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * half
+    centre = camera.matrix[:2, 2]
+    with np.errstate(all="ignore"):  # what overflows has no ray
+        rays = camera.unproject(np.vstack([centre, centre + offset]))
+        straight = np.hypot(*(offset / np.diag(camera.matrix)[:2]).T)
+    angle = np.arctan2(np.linalg.norm(np.cross(rays[0], rays[1:]), axis=1), rays[1:] @ rays[0])
+    seen = np.isfinite(angle)
+    if not seen.any():
+        return f"its lens model has no ray for any of {camera.width}x{camera.height} pixels"
+    if np.median(angle[seen]) < _NARROWEST or (
+        camera.model != "ocam" and np.median((angle / np.arctan(straight))[seen]) < _LEAST_SHARE
+    ):
+        shown = np.rad2deg(2.0 * angle[seen].max())
+        return (
+            f"focal lengths and lens model show {shown:.2g} degrees in {camera.width}x"
+            f"{camera.height} pixels"
+        )
+    return None
+
+
+def _rows(matrix: FloatArray) -> str:
+    return ", ".join(" ".join(f"{value:g}" for value in row) for row in matrix)
 
 
 def _either(sizes: tuple[int, ...]) -> str:

@@ -31,7 +31,7 @@ UNREADABLE = (
     EOFError,
     KeyError,
     TypeError,
-    NotImplementedError,
+    RuntimeError,  # encrypted; NotImplementedError is one, too
     MemoryError,
     SyntaxError,
     tokenize.TokenError,
@@ -91,7 +91,7 @@ class ArrayFile:
             raise self.error(f"{path}: cannot be read ({error.strerror}); {self.give}") from None
         try:
             with np.load(path, allow_pickle=False) as file:
-                _require_plain(file)
+                require_plain(file)
                 return {name: file[name] for name in (file.files if names is None else names)}
         except UNREADABLE as error:
             cause = " ".join(str(error).split()) or type(error).__name__
@@ -151,8 +151,11 @@ class ArrayFile:
         return int(start[-1])
 
 
-def _require_plain(file: Any) -> None:
-    """Raises ValueError for what no archive of arrays holds: other files, far more than it is."""
+def require_plain(file: Any) -> None:
+    """Raises ValueError for what no open archive of arrays holds: other files, far more than it is.
+
+    ValueError is one of :data:`UNREADABLE`, as is what reading the arrays may raise.
+    """
     members = file.zip.infolist()
     foreign = [one.filename for one in members if not one.filename.endswith(".npy")]
     if foreign:

@@ -19,7 +19,14 @@ from fgslam.core.errors import FgslamError
 from fgslam.datasets.images import read_grey_image
 from fgslam.runs.config import load_experiment
 from scripts.fuzz import calls, pictures, texts
-from scripts.fuzz.archives import BEARINGS, MAP, MEASUREMENTS, ROUTE, ROUTE_MAP
+from scripts.fuzz.archives import (
+    BEARINGS,
+    MAP,
+    MEASUREMENTS,
+    ROUTE,
+    ROUTE_MAP,
+    calibration_archive,
+)
 from scripts.fuzz.damage import Rng, require_one_line
 
 HANGS_AFTER_S = 10
@@ -69,6 +76,7 @@ KINDS = (
     Kind("route_values", ROUTE.of_odd_values, ROUTE.load),
     Kind("joined_bytes", ROUTE_MAP.of_damaged_bytes, ROUTE_MAP.load, ROUTE_MAP.is_same),
     Kind("joined_values", ROUTE_MAP.of_odd_values, ROUTE_MAP.load),
+    Kind("calibration_archive", calibration_archive, lambda path: fg.load_rig(path)),
 )
 
 

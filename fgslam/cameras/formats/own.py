@@ -10,7 +10,13 @@ import numpy as np
 
 from fgslam.cameras.formats.trees import Tree, Values, intrinsic_matrix
 from fgslam.cameras.lenses import LENSES
-from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView, checked_camera
+from fgslam.cameras.raw_cameras import (
+    Calibration,
+    RawCamera,
+    StatedView,
+    checked_camera,
+    checked_view,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import is_rigid, pose
@@ -87,7 +93,9 @@ def _stated_view(part: Values, cameras: int) -> StatedView | None:
     size = part.size("width", "height")
     if min(size) <= 0:
         raise part.refuse(f"width and height are {size[0]} and {size[1]}; correct the file")
-    return StatedView(tuple(rotations), part.matrix("matrix", 3, 3), size, cast(RigView, kind))
+    matrix = part.matrix("matrix", 3, 3)
+    view = StatedView(tuple(rotations), matrix, size, cast(RigView, kind))
+    return checked_view(view, str(part.path))
 
 
 def _camera(part: Values) -> RawCamera:

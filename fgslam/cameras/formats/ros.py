@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.formats.trees import Tree, Values
-from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView, checked_camera
+from fgslam.cameras.raw_cameras import (
+    Calibration,
+    RawCamera,
+    StatedView,
+    checked_camera,
+    checked_view,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose, reorthonormalise
@@ -76,7 +82,7 @@ def read_camera_info_pair(files: tuple[Path, Path], trees: tuple[Tree, Tree]) ->
             f"{files[0]}: its projection_matrix differs from that of {files[1].name}, so the two "
             "are not of one rectified pair; calibrate them as a stereo pair"
         )
-    offset = -(p_right[0, 3] - p_left[0, 3]) / p_right[0, 0]
+    offset = -(p_right[0, 3] - p_left[0, 3]) / (p_right[0, 0] or np.inf)
     if p_right[0, 0] <= 0.0 or offset == 0.0:
         raise CalibrationError(
             f"{files[1]}: projection_matrix states no baseline (its fourth number is "
@@ -86,8 +92,8 @@ def read_camera_info_pair(files: tuple[Path, Path], trees: tuple[Tree, Tree]) ->
         replace(left, bTc=pose(r_left, np.array([-offset, 0.0, 0.0]))),
         replace(right, bTc=pose(r_right, np.zeros(3))),
     )
-    view = StatedView((r_left, r_right), p_right[:, :3], left.size)
     source = f"{files[0]} and {files[1].name}"
+    view = checked_view(StatedView((r_left, r_right), p_right[:, :3], left.size), source)
     return Calibration(source, f"{_FORMAT}, a pair", cameras, True, view)
 
 

@@ -9,7 +9,13 @@ import numpy as np
 
 from fgslam.cameras.formats.kalibr import ocam_matrix
 from fgslam.cameras.formats.trees import Tree, Values, intrinsic_matrix, read_tree
-from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView, checked_camera
+from fgslam.cameras.raw_cameras import (
+    Calibration,
+    RawCamera,
+    StatedView,
+    checked_camera,
+    checked_view,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import pose
 
@@ -106,7 +112,7 @@ def _stated_pair(
         )
         for name, rotation, x in zip((left, right), rotations, (-offset, 0.0), strict=True)
     )
-    view = StatedView((rotations[0], rotations[1]), matrix, size)
+    view = checked_view(StatedView((rotations[0], rotations[1]), matrix, size), str(part.path))
     return Calibration(str(part.path), kind, cameras, True, view)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,6 +12,7 @@ import cv2
 import numpy as np
 import yaml
 
+from fgslam.core.array_files import UNREADABLE, require_plain
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
@@ -65,8 +65,9 @@ def _of_archive(path: Path) -> Tree:
     require_file(path, CalibrationError, "restore the file", _LARGEST_ARCHIVE)
     try:
         with np.load(path, allow_pickle=False) as found:
+            require_plain(found)
             arrays = {key: _loaded(found, key) for key in found.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as cause:
+    except UNREADABLE as cause:
         reason = " ".join(str(cause).split())
         raise CalibrationError(f"{path} is no archive of NumPy ({reason}); save it again") from None
     return {key: value for key, value in arrays.items() if value is not None}

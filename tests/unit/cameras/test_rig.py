@@ -209,6 +209,30 @@ def test_rows_of_numbers_as_opencv_5_writes_them(tmp_path: Path) -> None:
         StereoRig.load(tmp_path, (WIDTH, HEIGHT))
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"K1": [[30.0, 0.0, 0.0], [0.0, 30.0, 0.0], [80.0, 60.0, 1.0]]}, "0 0 1 by rows; it is"),
+        ({"K1": [[3e9, 0.0, 80.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]]}, "nearly square"),
+        ({"K1": [[30.0, 80.0, 0.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]]}, "nearly right angles"),
+        ({"K1": [[3e9, 0.0, 80.0], [0.0, 3e9, 60.0], [0.0, 0.0, 1.0]]}, "show 3.* degrees in 160x"),
+        ({"D1": [1e4, 0.0, 0.0, 0.0, 0.0]}, "lens model show .* degrees in 160x"),
+        ({"D1": [-1e300, 0.0, 0.0, 0.0, 0.0]}, "has no ray for any of 160x120 pixels"),
+        ({"T": [-1e300, 0.0, 0.0]}, "it is 1e[+]300 m from"),
+        ({"size": [1e12, 120]}, "no image is 1000000000000x120 pixels large"),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused(
+    tmp_path: Path, wrong: dict[str, list[float]], words: str
+) -> None:
+    """A transposed matrix, lost points of numbers, millimetres of a wrong power."""
+    plain = np.array([[30.0, 0.0, 80.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]])
+    whole = {"K1": plain, "K2": plain, "D1": np.zeros(5), "D2": np.zeros(5), "R": np.eye(3)}
+    np.savez(tmp_path / "rig.npz", **whole | {"T": [-0.1, 0.0, 0.0], "size": [160, 120]} | wrong)
+    with pytest.raises(CalibrationError, match=words):
+        StereoRig.load(tmp_path / "rig.npz")
+
+
 def test_camera_info_is_rectified_as_it_says(tmp_path: Path) -> None:
     rig = StereoRig.load(write_camera_info(tmp_path))
     stated = yaml.safe_load((tmp_path / "right.yaml").read_text())["projection_matrix"]["data"]

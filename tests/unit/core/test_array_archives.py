@@ -28,6 +28,15 @@ def test_a_foreign_member_is_named(tmp_path: Path) -> None:
         load_arrays(path)
 
 
+def test_an_encrypted_array_is_told(tmp_path: Path) -> None:
+    path = archive(tmp_path)
+    data = bytearray(path.read_bytes())
+    data[data.rindex(b"PK\x01\x02") + 8] |= 1  # the flag in the directory of the archive
+    path.write_bytes(data)
+    with pytest.raises(MeasurementLogError, match="is encrypted"):
+        load_arrays(path)
+
+
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_an_array_that_is_there_twice_is_not_chosen_from(tmp_path: Path) -> None:
     path = archive(tmp_path)
