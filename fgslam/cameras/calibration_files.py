@@ -70,6 +70,7 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (published.is_cityscapes, published.read_cityscapes),
     (published.is_openloris, _without_size(published.read_openloris)),
     (published.is_rgbd, _without_size(published.read_rgbd)),
+    (published.is_nerfstudio, _without_size(published.read_nerfstudio)),
     (opencv.is_opencv_pair, opencv.read_opencv_pair),
     (opencv.is_opencv_single, opencv.read_opencv_single),
 )
@@ -82,6 +83,7 @@ _TEXTS = (
     (middlebury.is_middlebury, lambda path, *_: middlebury.read_middlebury(path)),
     (makers.is_zed, makers.read_zed),
     (published.is_mrpt, lambda path, text, _: published.read_mrpt(path, text)),
+    (published.is_colmap, lambda path, text, _: published.read_colmap(path, text)),
     (published.is_dso, lambda path, *_: published.read_dso(path)),
     (makers.is_ocamcalib, lambda path, *_: makers.read_ocam(path)),
     (published.is_numbers, published.read_numbers),

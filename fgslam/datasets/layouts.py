@@ -335,10 +335,16 @@ def _lacking_of_video(folder: Path) -> tuple[str, ...]:
     return () if films_in(folder) else ("one film, or one of a left and one of a right camera",)
 
 
-_COLOUR_FOLDERS = ("rgb", "color", "colour", "image", "images")
+_COLOUR_FOLDERS = (
+    *("rgb", "color", "colour", "image", "images"),
+    *("rgbs", "colors", "rgb_images", "color_images"),
+)
 
 
-_DEPTH_FOLDERS = ("aligned_depth", "aligned_depth_to_color", "depth_aligned", "depth")
+_DEPTH_FOLDERS = (
+    *("aligned_depth", "aligned_depth_to_color", "depth_aligned", "depth"),
+    *("depths", "depth_images", "depth_image"),
+)
 """Of several the first: beside one that is registered to colour, depth is as it was measured."""
 
 

@@ -73,7 +73,7 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
     require_one_camera(settings)
     camera, known = _camera(root, settings, size)
     rig = _rig(camera, settings)
-    scale, said = _scale(root, pairs, settings)
+    scale, said = _scale(root, pairs, settings, size)
     chosen = select_frames(len(pairs), settings)
     images = DepthFrames(_Files(pairs, size, scale).read, rig, Undistorted.of(camera))
     truth = root / "groundtruth.txt"
@@ -152,10 +152,13 @@ def _listed(path: Path) -> tuple[IntArray, list[Path]]:
 
 
 def _scale(
-    root: Path, pairs: tuple[tuple[Path, Path], ...], settings: RgbdSettings
+    root: Path,
+    pairs: tuple[tuple[Path, Path], ...],
+    settings: RgbdSettings,
+    size: tuple[int, int],
 ) -> tuple[float, tuple[str, ...]]:
     """Units a metre, and the depth that follows from it in words. Raises DatasetError."""
-    seen, of_integers = _some_depths(root, pairs)
+    seen, of_integers = _some_depths(root, pairs, size)
     stated = settings.depth_scale or _stated_scale(root, settings)
     doubt: tuple[str, ...] = ()
     if stated is None and of_integers:
@@ -221,7 +224,9 @@ def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
     return None
 
 
-def _some_depths(root: Path, pairs: tuple[tuple[Path, Path], ...]) -> tuple[FloatArray, bool]:
+def _some_depths(
+    root: Path, pairs: tuple[tuple[Path, Path], ...], size: tuple[int, int]
+) -> tuple[FloatArray, bool]:
     """Known depths (n,) of some images, in their own units, and whether these are integers."""
     images = []
     for row in np.unique(np.linspace(0, len(pairs) - 1, _SAMPLES).astype(int)).tolist():
@@ -231,6 +236,13 @@ def _some_depths(root: Path, pairs: tuple[tuple[Path, Path], ...]) -> tuple[Floa
             continue
     if not images:
         raise DatasetError(f"{root}: not one depth image can be read; restore them")
+    if all(depth.shape != size[::-1] for depth in images):  # a few may be damaged
+        own = f"{images[0].shape[1]}x{images[0].shape[0]}"
+        raise DatasetError(
+            f"{root}: depth images are {own} pixels, colour images {size[0]}x{size[1]}; depth must "
+            f"be registered to colour. Where it is, as in ScanNet, resize the colour images to "
+            f"{own}, and say --set dataset.resized=true"
+        )
     known = [depth[np.isfinite(depth) & (depth > 0)] for depth in images]
     seen = np.concatenate(known).astype(np.float64)
     if len(seen) == 0:

@@ -100,7 +100,7 @@ def _dates(names: Sequence[str]) -> FloatArray | None:
     What follows the seconds is their fraction, unless it counts the images: by one, or with fewer
     than three digits and no point. Neither are six digits from 000000 on that count by one.
     """
-    found = [match for name in names if (match := _DATE_IN_NAME.search(name))]
+    found = _dates_in(names)
     if len(names) < 2 or len(found) < len(names):
         return None
     try:
@@ -115,6 +115,16 @@ def _dates(names: Sequence[str]) -> FloatArray | None:
     stamps = np.array(whole) + parts
     steps = np.diff(stamps)
     return stamps if steps.min() > 0.0 and np.median(steps) >= _FASTEST_S else None
+
+
+def _dates_in(names: Sequence[str]) -> list[re.Match[str]]:
+    """The first date in each name; the second where that is the drive's, the same in all."""
+    found = [match for name in names if (match := _DATE_IN_NAME.search(name))]
+    if len({match.groups()[:6] for match in found}) > 1:
+        return found
+    after = [_DATE_IN_NAME.search(match.string, match.end(6)) for match in found]
+    second = [match for match in after if match]
+    return second if len(second) == len(names) else found
 
 
 def _fractions(found: Sequence[re.Match[str]]) -> list[float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from fgslam.core.geometry import (
 )
 
 _PAIRS = ((0, 1), (2, 3))  # of the odometry data: left and right camera, grey, else colour
+_RECTIFIED = "P_rect_"
 RAW = ("P_rect_00", "P_rect_01")
 RAW_COLOUR = ("P_rect_02", "P_rect_03")
 Size = tuple[int, int]
@@ -26,7 +28,7 @@ Size = tuple[int, int]
 
 def is_kitti(text: str) -> bool:
     """Whether a text is a calib.txt or a calib_cam_to_cam.txt."""
-    return text.startswith("P0:") or "\nP0:" in text or "P_rect_00:" in text
+    return re.search(r"^(P0|P_rect_\d+):", text, re.M) is not None
 
 
 def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = None) -> Calibration:
@@ -39,8 +41,10 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
         CalibrationError: a line is missing or malformed, or the pair is not rectified.
     """
     lines = _lines(path)
-    raw = RAW[0] in lines or RAW_COLOUR[0] in lines
-    keys = keys or (RAW if raw else _beside(path))
+    rectified = sorted(name for name in lines if name.startswith(_RECTIFIED))
+    raw = bool(rectified)
+    stated = (rectified[0], rectified[1]) if len(rectified) == 2 else RAW  # DrivingStereo: 101, 103
+    keys = keys or (stated if raw else _beside(path))
     left, right = (_projection(path, lines, key) for key in keys)
     if not np.allclose(left[:, :3], right[:, :3]):
         raise CalibrationError(
@@ -48,7 +52,11 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
             "rectified; use the calibration that came with the sequence"
         )
     offset = _baseline(path, left, right, keys)
-    width, height = (_stated_size(path, lines, keys[0][-2:]) if raw else None) or size or (0, 0)
+    width, height = (
+        (_stated_size(path, lines, keys[0].removeprefix(_RECTIFIED)) if raw else None)
+        or size
+        or (0, 0)
+    )
     ahead = BODY_FORWARD_LEFT_UP_FROM_CAMERA
     cameras = tuple(
         checked_camera(

@@ -304,6 +304,15 @@ def test_cityscapes_is_a_rectified_pair(tmp_path: Path) -> None:
     assert (rig.fx, rig.cx, rig.baseline, rig.rectifier) == (40.0, 31.0, 0.209, None)
 
 
+def test_drivingstereo_numbers_its_cameras_otherwise(tmp_path: Path) -> None:
+    lines = ["calib_time: 2018-07-09", "S_rect_101: 64 48", "S_rect_103: 64 48"]
+    for number, shift in ((101, 0.0), (103, -40.0 * 0.54)):
+        lines.append(f"P_rect_{number}: 40 0 31 {shift} 0 40 23 0 0 0 1 0")
+    (tmp_path / "2018-07-09.txt").write_text("\n".join(lines), encoding="utf-8")
+    rig = load_rig(tmp_path / "2018-07-09.txt")
+    assert (rig.image_size, rig.cx, rig.baseline) == (SIZE, 31.0, pytest.approx(0.54))
+
+
 OPENLORIS = """%YAML:1.0
 d400_depth_optical_frame:
    model: pinhole
@@ -332,6 +341,10 @@ ONE = {
     "cam_K.txt": "[[40 0 31]\n [0 40.5 23]\n [0 0 1]]\n",
     "intrinsic_color.txt": "40 0 31 0\n0 40.5 23 0\n0 0 1 0\n0 0 0 1\n",
     "sensors.yaml": OPENLORIS,
+    "cameras.txt": "# CAMERA_ID, MODEL\n1 PINHOLE 64 48 40 40.5 31.5 23.5\n",
+    "transforms.json": json.dumps(
+        {"w": 64, "h": 48, "fl_x": 40, "fl_y": 40.5, "cx": 31.5, "cy": 23.5, "k1": 0, "frames": []}
+    ),
     "cam_params.json": json.dumps(
         {"camera": {"w": 64, "h": 48, "fx": 40, "fy": 40.5, "cx": 31, "cy": 23, "scale": 6553.5}}
     ),

@@ -175,6 +175,7 @@ def named(k: int, form: str, places: int = 3) -> str:
         ("%Y%m%d_%H%M%S_#_{}", 6),
         ("{}_%Y%m%d%H%M%S#", 3),
         ("IMG_{}_%Y-%m-%d %H.%M.%S,#", 2),
+        ("2026-11-23-23-10-50_%Y-%m-%d-%H-%M-%S-#_{}", 3),
     ],
 )
 def test_names_that_are_dates(tmp_path: Path, form: str, places: int) -> None:

@@ -261,3 +261,7 @@ def test_depth_that_is_not_registered_or_no_depth(tmp_path: Path) -> None:
     with pytest.raises(FrameError, match="is no depth image: uint8 of 2 dimensions"):
         recording.frame(1)
     assert recording.frame(2).images[0][0, 0] == 13
+    for depth in depths:
+        save(depth, np.full((12, 16), 10000, np.uint16))
+    with pytest.raises(DatasetError, match=r"16x12 pixels, colour images 32x24; .* resize the col"):
+        opened(root)
