@@ -211,6 +211,9 @@ def _unknown(folder: Path) -> str:
             "gyroscope, too: images of a left and a right camera by the names of folders or files "
             "(of a mirror or panoramas: fgslam teach)"
         )
+    for path in shown_in(folder):
+        if path.is_file() and (remedy := _REMEDIES.get(path.suffix.lower())):
+            return f"{folder} has none of the known layouts, and {path.name} is not read: {remedy}"
     missing = "; ".join(_with_lacking(folder, layout) for layout in LAYOUTS.values())
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
 

@@ -160,8 +160,9 @@ def test_colour_and_depth_in_one_folder(tmp_path: Path, names: tuple[str, str]) 
 )
 def test_files_of_others_say_what_to_do(tmp_path: Path, name: str, words: str) -> None:
     (tmp_path / name).write_bytes(b"PK")
-    with pytest.raises(DatasetError, match=f"is not read: .*{words}"):
-        recognise_layout(tmp_path / name)
+    for given in (tmp_path / name, tmp_path):
+        with pytest.raises(DatasetError, match=f"{name} is not read: .*{words}"):
+            recognise_layout(given)
 
 
 def test_kitti_360(tmp_path: Path) -> None:
