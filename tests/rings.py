@@ -17,9 +17,8 @@ from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.recordings import Frame
 from fgslam.frontend.places.closures import difference
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings, LoopSettings, LostSettings
-from fgslam.frontend.stereo import StereoMatcher
 from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.factory import make_estimator, make_places, make_tracker
+from fgslam.slam.factory import make_estimator, make_places, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -99,7 +98,7 @@ def pipeline_of(
         tracker.database.load(arrival.saved)
         tracker.keeps_map = not arrival.extends
     return SlamPipeline(
-        stereo=StereoMatcher(RIG, settings.stereo, settings.appearance),
+        stereo=make_stereo(RIG, settings),
         tracker=tracker,
         motion=RingMotion(poses, drift_deg),
         estimator=solving,

@@ -57,7 +57,7 @@ class Found:
 
     Attributes:
         sequence: the recording.
-        frames: with all features.
+        frames: with features of all images that are asked for them.
         seconds: (n, cameras) of CPU that the extractor took for each image.
         raw: seconds of CPU a frame that OpenCV's SIFT takes for all its images.
     """
@@ -72,6 +72,7 @@ def find(config: ExperimentConfig) -> Found:
     """Features of all frames, and CPU times of finding them, of SIFT alone among them."""
     say(f"finding the features of {config.name}")
     sequence, extract = open_sequence(config), make_extractor(config.frontend)
+    described = 1 if config.frontend.stereo.by_patches(sequence.rig.cameras) else None
     sift = config.frontend.sift
     alone = cv2.SIFT.create(
         sift.max_features, sift.octave_layers, sift.contrast_threshold, EDGE_THRESHOLD,
@@ -80,7 +81,7 @@ def find(config: ExperimentConfig) -> Found:
     frames, seconds, raw = [], [], []
     for i in range(len(sequence)):
         frame = sequence.frame(i)
-        each = [_timed(extract, (image,)) for image in frame.images]
+        each = [_timed(extract, (image,)) for image in frame.images[:described]]
         features = tuple(found[0] for found, _ in each)
         frames.append(FeatureFrame(i, frame, features, "", 0.0, 0.0))
         seconds.append([spent for _, spent in each])

@@ -29,7 +29,7 @@ from fgslam.runs.tasks.localisation_queries import submap_features
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.tasks.truth import truth_in_map
 from fgslam.slam.arrival import trusted
-from fgslam.slam.factory import make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.slam.factory import make_relocaliser, make_stereo, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 
 SEEDS = (0, 1, 2, 3)
@@ -128,7 +128,7 @@ def _queries(
     experiment = config.as_experiment()
     sequence = open_sequence(experiment)
     truth = truth_in_map(given.saved, sequence, experiment).poses
-    stereo = make_stereo_matcher(sequence.rig, config.frontend)
+    stereo = make_stereo(sequence.rig, config.frontend)
     longest = max(FRAMES)
     held: list[FeatureFrame] = []
     stream = make_stream(sequence, config.frontend)()
@@ -137,7 +137,7 @@ def _queries(
             held.append(found)
             if len(held) < longest:
                 continue
-            features = {1: stereo.match(held[-1].features)}
+            features = {1: stereo.match(held[-1].frame, held[-1].features).whole}
             features[longest] = _submap(config, sequence, held)
             yield Query(held[-1].i, truth[held[-1].i], features), sequence.rig
             held = []
@@ -248,8 +248,8 @@ def link_frames(data: Path = DATA, overrides: Iterable[str] = (), every: int = 1
     config = experiment("euroc_v101", [*_VAGUE, *overrides], data)
     found = find_features(config)
     sequence, frontend = found.sequence, config.frontend
-    stereo = make_stereo_matcher(sequence.rig, frontend)
-    seen = [stereo.match(frame.features) for frame in found.frames]
+    stereo = make_stereo(sequence.rig, frontend)
+    seen = [stereo.match(frame.frame, frame.features).whole for frame in found.frames]
     if sequence.ground_truth is None:
         raise ValueError("a recording without truth has no true pairs")
     truth = sequence.ground_truth.poses

@@ -33,7 +33,7 @@ from fgslam.frontend.settings import FrontendSettings, LostSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.runs.config import load_config
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_pipeline, make_places, make_stereo_matcher, make_tracker
+from fgslam.slam.factory import make_pipeline, make_places, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 
@@ -106,7 +106,7 @@ def drive() -> Driven:
     config = load_config(EXPERIMENTS / "lab_loop.yaml", [f"dataset.stop={FRAMES}"])
     sequence, frontend = open_sequence(config), config.frontend
     extractor = SiftExtractor(frontend.sift, frontend.appearance.mode)
-    stereo = make_stereo_matcher(sequence.rig, frontend)
+    stereo = make_stereo(sequence.rig, frontend)
     pipeline = make_pipeline(sequence.rig, frontend, config.odometry, config.estimator)
     queries, frontend_s = [], []
     for i in range(len(sequence)):
@@ -121,7 +121,7 @@ def drive() -> Driven:
         )
         frontend_s.append(time.process_time() - start)
         if i % EVERY == 0:
-            queries.append(stereo.match(found))
+            queries.append(stereo.match(frame, found).whole)
     landmarks, database = pipeline.estimator.landmarks(), pipeline.tracker.database
     assert sequence.ground_truth is not None
     return Driven(

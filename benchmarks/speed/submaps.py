@@ -224,7 +224,7 @@ def asked(course: Course, session: Session, mapped: FloatArray) -> dict[str, flo
     other = Course(course.frames, course.round_m, course.seed + 100)
     for of, there in ((course, meant), (other, None)):
         for k, found in enumerate(of.features(seen)):
-            features = session.pipeline.stereo.match_all(found.features, None)
+            features = session.pipeline.stereo.match(None, found.features)
             start = time.process_time()
             number, position = submaps.recognise(features, lost=True)
             cpu.append(time.process_time() - start)

@@ -62,6 +62,7 @@ _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baselin
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
 _EXACT = "exact"  # of a rig: written where it is
 _VIEW = "view"  # of a rig: written where it is cylindrical
+_PLACES = "places"  # of a rig: written where the reference alone tells them
 
 
 def arrays_of(
@@ -74,6 +75,8 @@ def arrays_of(
         about[_EXACT] = True
     if isinstance(sensor, CameraRig) and sensor.cylindrical:
         about[_VIEW] = sensor.view
+    if isinstance(sensor, CameraRig) and sensor.places != "all":
+        about[_PLACES] = sensor.places
     out = LOG.header(version, sensor=about, motion=motion_model) | {
         SENSOR_POSE: sensor.bTc,
         "frame_index": np.array([s.index for s in frames], np.int64),
@@ -196,7 +199,8 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     sensor = header.get("sensor")
     keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
     given = set(sensor if isinstance(sensor, dict) else ())
-    if keys is None or given - ({_EXACT, _VIEW} if keys is _RIG else set()) != {"kind", *keys}:
+    may = {_EXACT, _VIEW, _PLACES} if keys is _RIG else set()
+    if keys is None or given - may != {"kind", *keys}:
         raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
     if not isinstance(header.get("motion"), dict):
         raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")

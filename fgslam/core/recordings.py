@@ -38,6 +38,18 @@ class Frame:
         return int.from_bytes(content.digest(), "little", signed=True)
 
 
+def clearance(margin: npt.NDArray[np.float32], places: FloatArray) -> FloatArray:
+    """How far (n,) places (n, 2) (column, row) are from what shows nothing, pixels.
+
+    Args:
+        margin: (height, width) of the image, as in :class:`Frame`.
+        places: those outside the image are judged by its nearest pixel.
+    """
+    height, width = margin.shape
+    column, row = np.rint(places).astype(np.int64).T
+    return np.asarray(margin[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
+
+
 @runtime_checkable
 class Sequence(Protocol):
     """A recording: calibrated frames in time order, perhaps with odometry and ground truth.

@@ -19,7 +19,7 @@ from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.cylindrical import on_fisheye, turns_of_cylinder
 from fgslam.core.features import Features
 from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig, partial_map, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, partial_map, rig_map, vertical_to_horizontal
 
 TERMS = (
     "column",  # principal point
@@ -344,6 +344,8 @@ class RigCorrection(Brief):
         for pattern in np.unique(shown, axis=0):
             rows, seen = (shown == pattern).all(axis=1), np.flatnonzero(pattern).tolist()
             if len(seen) > 1:
-                fuse = partial_map(seen, rig.cameras, vertical_to_horizontal(rig))
+                every = len(seen) == rig.cameras
+                ratio = vertical_to_horizontal(rig)
+                fuse = rig_map(rig) if every else partial_map(seen, rig.cameras, ratio)
                 off[rows] = moved[rows][:, seen].reshape(-1, 2 * len(seen)) @ fuse.T
         return dataclasses.replace(observed, measurement=observed.measurement - off)

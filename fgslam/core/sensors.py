@@ -7,14 +7,14 @@ docs/derivations/stereo_measurement.md and docs/derivations/range_bearing.md.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
-from fgslam.core.settings import RigView
+from fgslam.core.settings import RigPlaces, RigView
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -36,6 +36,8 @@ class CameraRig(Brief):
             what one leaves (:data:`fgslam.core.rig_correction.SHARED`).
         view: ``perspective``, or of a pair ``cylindrical`` (:mod:`fgslam.core.cylindrical`):
             column and row are angles, focal lengths pixels a radian.
+        places: ``all`` images tell the measured column and row, by least squares; or the
+            ``reference`` alone, where the others are measured by shifts from it.
     """
 
     width: int
@@ -49,6 +51,7 @@ class CameraRig(Brief):
     bTc: FloatArray
     exact: bool = False
     view: RigView = "perspective"
+    places: RigPlaces = field(default="all", repr=False)
 
     @property
     def cylindrical(self) -> bool:
@@ -189,6 +192,12 @@ def measurement_map(kind: str, cameras: int, ratio: float) -> FloatArray:
         out[2, 5] = (1.0 - weight) * ratio
         out[2, 1] = -out[2, 5]
     return out
+
+
+def rig_map(rig: CameraRig) -> FloatArray:
+    """:func:`measurement_map` of what a rig measures, by ``rig.places``."""
+    kind = "fused" if rig.places == "all" else "paper"
+    return measurement_map(kind, rig.cameras, vertical_to_horizontal(rig))
 
 
 def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:

@@ -20,6 +20,9 @@ STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 RigView: TypeAlias = Literal["perspective", "cylindrical"]
 """How images are laid out when they are rectified."""
 
+RigPlaces: TypeAlias = Literal["all", "reference"]
+"""The images that a measured column and row are of."""
+
 
 def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
     """Settings of one class from keys and values, as a caller of the library gives them.

@@ -12,6 +12,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.recordings import Frame, clearance
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, vertical_to_horizontal
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
@@ -21,12 +22,16 @@ PATCH_PX = 15  # side of a patch
 GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
 DEFORMATION = 0.05  # sigma of a patch's stretching between two images
 ALIGNMENTS_ACROSS = 3  # in another camera's image, from a disparity known to a pixel or two
+SHIFT_SHARE = 0.9
+"""Sigma of a patch's shift to another image over that of a SIFT coordinate (pixel_sigma). Rows of
+both images disagree by 0.09 to 0.19 px, those of SIFT's matches by 0.16 to 0.27."""
+
 _MIN_CORRELATION = 0.8
 """Of a patch with what it is in another image, gain and offset taken out. Of patches whose partner
 is elsewhere, or is none, two or three in a hundred reach it by chance."""
 
 _BLOCK_PX = 9  # of the images of half the size: about a patch
-_LARGEST_SHARE = 0.25  # of the image's width: the largest disparity looked for, where none is set
+_LARGEST_SHARE = 0.5  # of the image's width: the largest disparity looked for, where none is set
 _UNIQUE_PERCENT = 10  # by which the best block must beat any other
 _BELOW_ZERO = 2  # pixels of half the size that disparities may be too small, by the calibration
 _FRACTIONS = 16.0  # of a pixel, in which OpenCV states disparities
@@ -48,18 +53,16 @@ class PatchStereo:
         self._blocks.setDisp12MaxDiff(1)  # the same from either image
 
     def match(
-        self,
-        images: tuple[Image, ...],
-        found: Features,
-        correction: RigCorrection | None = None,
+        self, frame: Frame, found: Features, correction: RigCorrection | None = None
     ) -> StereoFeatures:
         """The features that all images show, measured in each.
 
         Args:
-            images: right, left[, top].
+            frame: the images, right, left[, top], and where they show nothing.
             found: features of the right one.
             correction: of the rig; None where its calibration is taken as stated.
         """
+        images = frame.images
         coarse = self._coarse(images, found.xy)
         known = np.isfinite(coarse)
         found, coarse = found.select(known), coarse[known]
@@ -70,9 +73,11 @@ class PatchStereo:
             seen, alike = across(self._rig, images[camera], camera, patches, found.xy, coarse)
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
+            if frame.margins:
+                good &= clearance(frame.margins[camera], seen) > PATCH_PX // 2
         rest = (found.scale, found.orientation, found.descriptors)
         views = tuple(Features(seen, *rest).select(good) for seen in pixels)
-        return self._stereo.measured(views, 1.0, correction)[0]
+        return self._stereo.measured(views, self._stereo.by_reference(SHIFT_SHARE), correction)[0]
 
     def _coarse(self, images: tuple[Image, ...], places: FloatArray) -> FloatArray:
         """Disparities (n,) at places (n, 2) of the right image, to a pixel or two; NaN unknown."""

@@ -39,6 +39,14 @@ class StereoSettings:
         float,
         Field(gt=0.0, description="largest difference of horizontal and vertical disparity"),
     ] = 1.0
+    others: Annotated[
+        Literal["auto", "sift", "patches"],
+        Field(
+            description="the other cameras: `sift` in all images; `patches` of the reference "
+            "image's features, aligned there, if `measurement: fused`; `auto`: patches with two "
+            "cameras"
+        ),
+    ] = "auto"
     measurement: Annotated[
         Literal["fused", "paper"],
         Field(
@@ -57,6 +65,14 @@ class StereoSettings:
             description="sigma of a depth camera's disparity; null: by pixel_sigma",
         ),
     ] = None
+
+    def by_patches(self, cameras: int) -> bool:
+        """Whether patches measure the other images; the paper's measurement is of SIFT.
+
+        Three images average the errors of SIFT's places, which patches share.
+        """
+        wanted = self.others == "patches" or (self.others == "auto" and cameras == 2)
+        return wanted and self.measurement == "fused"
 
     @property
     def largest_disparity_px(self) -> float:

@@ -7,6 +7,7 @@ partner is ambiguous. Two-camera rigs use the same code without the last step.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -15,10 +16,19 @@ from fgslam.core.cylindrical import size_distances
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.sensors import CameraRig, measurement_map, partial_map, vertical_to_horizontal
+from fgslam.core.sensors import (
+    CameraRig,
+    measurement_map,
+    partial_map,
+    rig_map,
+    vertical_to_horizontal,
+)
 from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
+
+Linear: TypeAlias = tuple[FloatArray, FloatArray]
+"""A map (3, 2 * cameras) from pixels to (column, row, disparity), and their covariance (3, 3)."""
 
 
 class StereoMatcher:
@@ -33,7 +43,9 @@ class StereoMatcher:
         self._appearance = appearance
         self._angle = np.deg2rad(settings.orientation_deg)
         self._vertical_to_horizontal = vertical_to_horizontal(rig)
-        self._map = measurement_map(settings.measurement, rig.cameras, self._vertical_to_horizontal)
+        paper = settings.measurement == "paper"
+        ratio = self._vertical_to_horizontal
+        self._map = measurement_map("paper", rig.cameras, ratio) if paper else rig_map(rig)
 
     def match(
         self, features: tuple[Features, ...], correction: RigCorrection | None = None
@@ -74,13 +86,13 @@ class StereoMatcher:
     def measured(
         self,
         found: tuple[Features, ...],
-        share: float,
+        linear: Linear,
         correction: RigCorrection | None = None,
     ) -> tuple[StereoFeatures, BoolArray]:
         """Stereo features of points found row by row in all images, and which (n,) can be right.
 
         The latter lie on the epipolar lines and at one depth, by the gates of :meth:`match`.
-        ``share``: sigma of their coordinates over that of SIFT's.
+        ``linear`` is the map to measurements (:meth:`equally`, :meth:`by_reference`).
         """
         straight = found if correction is None else correction.straightened(found)
         s, right, left = self._settings, straight[0].xy, straight[1].xy
@@ -94,7 +106,21 @@ class StereoMatcher:
             good &= np.abs(vertical - horizontal) <= s.disparity_agreement_px
         kept = np.flatnonzero(good)
         every = (kept,) * len(found)
-        return self._measure(found, straight, every, share), np.asarray(good)
+        return self._measure(found, straight, every, linear), np.asarray(good)
+
+    def equally(self, share: float) -> Linear:
+        """By images alike good; ``share``: a coordinate's sigma over that of SIFT's."""
+        return self._map, share**2 * self._independent(self._map)
+
+    def by_reference(self, share: float) -> Linear:
+        """As :meth:`equally`; the other images' places are shifts from the first one's.
+
+        The error of that place is in all coordinates alike, and none of the disparity's. ``share``:
+        sigma of a shift over that of a SIFT coordinate.
+        """
+        shifts = self._map[:, 2:]
+        covariance = share**2 * (shifts @ shifts.T) + np.diag([1.0, 1.0, 0.0])
+        return self._map, self._with_depth(self._settings.pixel_sigma**2 * covariance)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:
         """Pairs of right and left features, ascending in the right ones."""
@@ -155,7 +181,7 @@ class StereoMatcher:
         features: tuple[Features, ...],
         straight: tuple[Features, ...],
         matches: tuple[IntArray | None, ...],
-        share: float = 1.0,
+        linear: Linear | None = None,
     ) -> StereoFeatures:
         """Matched features (n,) of each camera, None for one that does not show them."""
         seen = [(camera, m) for camera, m in enumerate(matches) if m is not None]
@@ -165,11 +191,10 @@ class StereoMatcher:
             pixels[:, camera] = features[camera].xy[index]
         used = [straight[camera].xy[index] for camera, index in seen]
         cameras = [camera for camera, _ in seen]
-        linear = self._map
-        if len(cameras) < len(features):
-            linear = partial_map(cameras, len(features), self._vertical_to_horizontal)
-        measurement = np.concatenate(used, axis=1) @ linear.T
-        covariance = np.tile(share**2 * self._covariance(linear), (len(pixels), 1, 1))
+        if linear is None:
+            linear = self._linear(cameras, len(features))
+        measurement = np.concatenate(used, axis=1) @ linear[0].T
+        covariance = np.tile(linear[1], (len(pixels), 1, 1))
         scale, orientation = _average([(features[camera], index) for camera, index in seen])
         position = triangulate(self._rig, measurement)
         return StereoFeatures(
@@ -184,9 +209,19 @@ class StereoMatcher:
             distance=size_distances(self._rig, position) if self._rig.cylindrical else None,
         )
 
-    def _covariance(self, linear: FloatArray) -> FloatArray:
-        """Of (column, row, disparity) (3, 3) by the map from pixels, or of a measured depth."""
-        covariance = self._settings.pixel_sigma**2 * (linear @ linear.T)
+    def _linear(self, seen: list[int], cameras: int) -> Linear:
+        """The map from the pixels of SIFT features in the images ``seen``, all equally good."""
+        linear = self._map
+        if len(seen) < cameras:
+            linear = partial_map(seen, cameras, self._vertical_to_horizontal)
+        return linear, self._independent(linear)
+
+    def _independent(self, linear: FloatArray) -> FloatArray:
+        """Covariance (3, 3) by a map of coordinates with independent errors as those of SIFT."""
+        return self._with_depth(self._settings.pixel_sigma**2 * (linear @ linear.T))
+
+    def _with_depth(self, covariance: FloatArray) -> FloatArray:
+        """Of (column, row, disparity) (3, 3), with that of a measured depth where one is."""
         if self._settings.disparity_sigma_px is not None:
             covariance[2, :] = covariance[:, 2] = 0.0
             covariance[2, 2] = self._settings.disparity_sigma_px**2

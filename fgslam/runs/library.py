@@ -27,7 +27,7 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import run_experiment
 from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, crew_of, make_plan, run_sweep
-from fgslam.slam.factory import chosen_estimator, is_settings
+from fgslam.slam.choices import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
 

@@ -16,18 +16,15 @@ from fgslam.core.checks import require_seed
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
 from fgslam.core.geometry import so3_log
+from fgslam.core.recordings import Frame
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.report.point_cloud import MapPoints, write_map
-from fgslam.slam.factory import (
-    chosen_frontend,
-    make_extractor,
-    make_relocaliser,
-    make_stereo_matcher,
-)
+from fgslam.slam.choices import chosen_frontend
+from fgslam.slam.factory import make_describer, make_relocaliser, make_stereo
 from fgslam.slam.inputs import checked_images
 from fgslam.slam.submaps.whole import LandmarkBook
 
@@ -122,14 +119,15 @@ class Map:
             raise MapError("the map holds no landmark; make it anew")
         frontend = chosen_frontend(frontend)
         checked = checked_images(images, rig)
-        extract = make_extractor(frontend)
         with one_blas_thread():
             relocaliser = make_relocaliser(rig, frontend)
             sure = self.saved.permanent | valid_of(self.saved)
             landmarks = self.saved.landmarks.select(sure)
             relocaliser.learn(landmarks, self.saved.appearances.of(landmarks.ids))
-            features = tuple(extract(image) for image in checked)
-            stereo = make_stereo_matcher(rig, frontend).match(features)
+            describer = make_describer(rig, frontend)
+            found = describer.describe(0, Frame(0, 0.0, checked))
+            describer.close()
+            stereo = make_stereo(rig, frontend).match(found.frame, found.features).whole
             return relocaliser.locate(stereo, np.random.default_rng(seed))
 
     def __len__(self) -> int:

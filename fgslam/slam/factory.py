@@ -6,12 +6,10 @@ An estimator is imported when its kind is made: a filter needs no solver of grap
 from __future__ import annotations
 
 import dataclasses
-import difflib
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
+from collections.abc import Callable
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from fgslam.backend.protocol import Estimator, FullEstimator
 from fgslam.backend.settings import (
@@ -42,6 +40,7 @@ from fgslam.datasets.settings import (
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.patch_stereo import PatchStereo
+from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.carrying import LandmarkCarrier
@@ -51,9 +50,14 @@ from fgslam.frontend.tracking.key_frames import KeyFrameTracker
 from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over, trusted
-from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FeatureStream
+from fgslam.slam.choices import is_settings
+from fgslam.slam.feature_stream import (
+    FeatureExtractor,
+    FeatureFrame,
+    FeatureStream,
+    FrameDescriber,
+)
 from fgslam.slam.motion import (
-    MOTION_MEMBERS,
     ConstantVelocityMotion,
     MotionModel,
     OdometryMotion,
@@ -68,11 +72,26 @@ if TYPE_CHECKING:
 _LOCATING_STREAM = 12  # of random numbers, beside those of the recording
 
 
+def as_measured(rig: CameraRig, settings: FrontendSettings) -> CameraRig:
+    """The rig as the front-end measures with it: which images tell a place."""
+    by_patches = settings.stereo.by_patches(rig.cameras)
+    return dataclasses.replace(rig, places="reference") if by_patches else rig
+
+
 def make_stream(
     sequence: Sequence, settings: FrontendSettings, ahead: bool = True
 ) -> FeatureStream:
     """Features of the sequence's frames, found ahead of the loop; its images alone if not so."""
-    return FeatureStream(sequence, make_extractor(settings) if ahead else None)
+    extract = make_extractor(settings) if ahead else None
+    return FeatureStream(sequence, extract, settings.stereo.by_patches(sequence.rig.cameras))
+
+
+def make_describer(
+    rig: CameraRig, settings: FrontendSettings, extract: FeatureExtractor | None = None
+) -> FrameDescriber:
+    """What finds the features of single frames, by an own extractor or SIFT."""
+    by_patches = settings.stereo.by_patches(rig.cameras)
+    return FrameDescriber(extract or make_extractor(settings), by_patches)
 
 
 def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
@@ -81,8 +100,15 @@ def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
 
 
 def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMatcher:
-    """Stereo matcher of the rig."""
-    return StereoMatcher(rig, settings.stereo, settings.appearance)
+    """Stereo matcher of the rig, for features of all images."""
+    return StereoMatcher(as_measured(rig, settings), settings.stereo, settings.appearance)
+
+
+def make_stereo(rig: CameraRig, settings: FrontendSettings) -> RigStereo:
+    """What measures a frame's features in all images of the rig."""
+    matcher = make_stereo_matcher(rig, settings)
+    patches = PatchStereo(rig, matcher, settings.stereo.largest_disparity_px)
+    return RigStereo(matcher, patches, settings.stereo.by_patches(rig.cameras))
 
 
 def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
@@ -101,9 +127,7 @@ def make_key_frames(
     """Tracking between key frames; None where every frame is one."""
     if settings.tracking == "sift":
         return None
-    stereo = make_stereo_matcher(rig, settings)
-    across = PatchStereo(rig, stereo, settings.stereo.largest_disparity_px)
-    return KeyFrameTracker(tracker, LandmarkCarrier(rig, stereo), across)
+    return KeyFrameTracker(tracker, LandmarkCarrier(rig, make_stereo_matcher(rig, settings)))
 
 
 def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> MotionModel:
@@ -217,6 +241,7 @@ def make_pipeline(
         seed: of place recognition's samples.
         arrival: where the run begins in a saved map; None begins with an empty one.
     """
+    rig = as_measured(rig, frontend)
     prior = None if arrival is None else arrival.prior
     estimator = made_or_given(rig, estimator_settings, frontend.ego_motion, prior)
     measured_odometry = not isinstance(odometry, ConstantVelocitySettings)
@@ -227,7 +252,7 @@ def make_pipeline(
         tracker.database.load(arrival.saved)
         tracker.keeps_map = not arrival.extends
     return SlamPipeline(
-        stereo=make_stereo_matcher(rig, frontend),
+        stereo=make_stereo(rig, frontend),
         tracker=tracker,
         motion=make_motion(rig, odometry),
         estimator=estimator,
@@ -298,11 +323,11 @@ def make_locator(
     """Locates the frames of a recording in a saved map, each alone and without a prior."""
     relocaliser = make_relocaliser(rig, settings)
     relocaliser.learn(*trusted(saved, settings.database.valid_hits))
-    stereo = make_stereo_matcher(rig, settings)
+    stereo = make_stereo(rig, settings)
 
     def locate(found: FeatureFrame) -> Relocalisation:
         rng = np.random.default_rng([seed, _LOCATING_STREAM, found.i])
-        return relocaliser.locate(stereo.match(found.features), rng)
+        return relocaliser.locate(stereo.match(found.frame, found.features).whole, rng)
 
     return locate
 
@@ -321,129 +346,3 @@ def require_support(estimator: Estimator, measured_odometry: bool, loops: bool =
             "choose another estimator; one of your own names in `supports` all that it is handed, "
             "used or not"
         )
-
-
-_ESSENTIAL = ("kind", "supports", "predict", "landmarks", "update", "estimate")
-"""What the loop needs of an estimator; the protocol's other members serve resuming and tests."""
-
-
-def estimator_kinds() -> tuple[str, ...]:
-    """Names of the estimators, the simplest first."""
-    return tuple(str(settings.kind) for settings in _classes())
-
-
-def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
-    """True if the value is the settings of an estimator of this package."""
-    return isinstance(value, _classes())
-
-
-def _classes() -> tuple[type[Any], ...]:
-    return _members(EstimatorSettings)
-
-
-def _members(tagged: Any) -> tuple[type[Any], ...]:
-    """Settings classes of a tagged union."""
-    union, _ = get_args(tagged)
-    return get_args(union)
-
-
-def chosen_estimator(
-    estimator: str | EstimatorSettings | Estimator,
-) -> EstimatorSettings | Estimator:
-    """Settings of the estimator that is named, or what was given.
-
-    Raises:
-        ConfigError: there is no such kind, or the object lacks members of an estimator.
-    """
-    if isinstance(estimator, str):
-        return _named(estimator)
-    if is_settings(estimator):
-        return estimator
-    if isinstance(estimator, type):
-        raise ConfigError(
-            f"estimator: {estimator.__name__} is a class; give an object of it, made for this rig"
-        )
-    lacking = [name for name in _ESSENTIAL if not hasattr(estimator, name)]
-    if lacking:
-        raise ConfigError(
-            f"estimator: {type(estimator).__name__} lacks {', '.join(lacking)}; give a kind "
-            f"({', '.join(estimator_kinds())}), its settings, or an object with the members of "
-            "fgslam.Estimator"
-        )
-    _require_supports(estimator)
-    return cast("Estimator", estimator)
-
-
-def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> FrontendSettings:
-    """Settings of the front-end as given; None: the defaults; a mapping: what differs from these.
-
-    Raises:
-        ConfigError: a key of the mapping is not known, or its value is not usable.
-    """
-    if isinstance(given, FrontendSettings):
-        return given
-    adapter: TypeAdapter[FrontendSettings] = TypeAdapter(FrontendSettings)
-    try:
-        return adapter.validate_python(dict(given or {}))
-    except (ValidationError, TypeError, ValueError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        what = "not a mapping" if first is None else f"{_dotted(first['loc'])}: {first['msg']}"
-        raise ConfigError(
-            f"frontend: {what}; give settings by group, e.g. "
-            '{"stereo": {"max_disparity_px": 80}}, as in the settings reference'
-        ) from None
-
-
-def chosen_odometry(
-    given: OdometrySettings | MotionModel | None,
-) -> OdometrySettings | MotionModel:
-    """Settings of the odometry, or a motion model, as given; None: the default settings.
-
-    Raises:
-        ConfigError: it is neither.
-    """
-    if given is None:
-        return RecordedOdometrySettings()
-    if _is_odometry_settings(given):
-        return given
-    lacking = [name for name in MOTION_MEMBERS if not hasattr(given, name)]
-    if lacking or isinstance(given, type):
-        why = f"lacks {', '.join(lacking)}" if lacking else "is a class"
-        name = given.__name__ if isinstance(given, type) else type(given).__name__
-        raise ConfigError(
-            f"odometry: {name} {why}; give settings, e.g. "
-            "fgslam.datasets.settings.ConstantVelocitySettings(), or an object with the members of "
-            "fgslam.MotionModel"
-        )
-    return given
-
-
-def _is_odometry_settings(value: object) -> TypeGuard[OdometrySettings]:
-    return isinstance(value, _members(OdometrySettings))
-
-
-def _dotted(location: tuple[int | str, ...]) -> str:
-    return ".".join(map(str, location))
-
-
-def _require_supports(estimator: object) -> None:
-    supports = getattr(estimator, "supports", None)
-    known = isinstance(supports, set | frozenset) and all(
-        isinstance(one, MeasurementType) for one in supports
-    )
-    if not known:
-        raise ConfigError(
-            f"estimator: supports of {type(estimator).__name__} is {supports!r}; give a frozenset "
-            "of fgslam.core.measurements.MeasurementType"
-        )
-
-
-def _named(kind: str) -> EstimatorSettings:
-    known = estimator_kinds()
-    if kind not in known:
-        close = difflib.get_close_matches(kind, known, n=1, cutoff=0.4)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise ConfigError(f"estimator: no kind {kind!r}; {hint}known: {', '.join(known)}")
-    adapter: TypeAdapter[Any] = TypeAdapter(EstimatorSettings)
-    settings: EstimatorSettings = adapter.validate_python({"kind": kind})
-    return settings

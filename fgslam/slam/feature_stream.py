@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import zip_longest
+from itertools import islice, zip_longest
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -18,7 +18,7 @@ import numpy.typing as npt
 from fgslam.core.arrays import BoolArray, Image
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.features import Features
-from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.recordings import Frame, Sequence, clearance
 from fgslam.frontend.features.own_descriptors import as_bytes
 
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
@@ -32,13 +32,12 @@ _SUPPORT = 3.0
 class FeatureFrame:
     """A frame with its features, or the reason why it has none.
 
-    Where SIFT runs on key frames only, a frame has none until it is found to be one, and then those
-    of its reference image alone.
+    Where SIFT runs on key frames only, a frame has none until it is found to be one.
 
     Attributes:
         i: position in the sequence.
         frame: the images, or None when they could not be read.
-        features: of right, left[, top], or of right; empty when there is no image.
+        features: of right alone, or of right, left[, top]; empty when there is no image.
         problem: what was wrong with the frame, in words; empty when nothing was.
         load_ms: time spent reading, in its own thread.
         sift_ms: the images' SIFT times, added up over threads.
@@ -76,9 +75,13 @@ class FeatureExtractor(Protocol):
 class FrameDescriber:
     """Finds the features of single frames, the images of each in parallel threads."""
 
-    def __init__(self, extract: FeatureExtractor) -> None:
-        """Takes any extractor; threads start with the first frame."""
+    def __init__(self, extract: FeatureExtractor, reference_only: bool = False) -> None:
+        """Takes any extractor; threads start with the first frame.
+
+        With ``reference_only`` no other image's features are found: patches tell the rest.
+        """
         self._extract = extract
+        self._reference_only = reference_only
         self._pool: ThreadPoolExecutor | None = None
         self._reference: tuple[Frame, _Timed] | None = None
 
@@ -91,6 +94,8 @@ class FrameDescriber:
         frame = found.frame
         if frame is None or found.features:
             return found
+        if self._reference_only:
+            return self.of_reference(found)
         if self._pool is None:
             self._pool = ThreadPoolExecutor(len(frame.images))
         timed, known = partial(_timed, self._extract), self._known(frame)
@@ -127,10 +132,16 @@ def undescribed(i: int, frame: Frame | None) -> FeatureFrame:
 class FeatureStream:
     """Iterates over a sequence's frames in order, features found in parallel ahead of time."""
 
-    def __init__(self, sequence: Sequence, extract: FeatureExtractor | None) -> None:
-        """Takes any extractor; it must be safe to call from several threads. None: only images."""
+    def __init__(
+        self, sequence: Sequence, extract: FeatureExtractor | None, reference_only: bool = False
+    ) -> None:
+        """Takes any extractor; it must be safe to call from several threads. None: only images.
+
+        With ``reference_only`` no other image's features are found: patches tell the rest.
+        """
         self._sequence = sequence
         self._extract = extract
+        self._images = 1 if reference_only else None
 
     def __call__(self, start: int = 0) -> Generator[FeatureFrame, None, None]:
         """Yields frames ``start`` and after; stops its threads when closed."""
@@ -169,7 +180,7 @@ class FeatureStream:
         if self._extract is None:
             return _Pending(i, frame, "", load_ms, [])
         timed = partial(_timed, self._extract)
-        tasks = [pool.submit(timed, *view) for view in _views(frame)]
+        tasks = [pool.submit(timed, *view) for view in islice(_views(frame), self._images)]
         return _Pending(i, frame, "", load_ms, tasks)
 
 
@@ -194,10 +205,7 @@ def _timed(extract: FeatureExtractor, image: Image, margin: _Margin) -> tuple[Fe
 
 def _clear(found: Features, margin: npt.NDArray[np.float32]) -> BoolArray:
     """Which features (n,) are clear of what shows nothing: that would be seen in every image."""
-    height, width = margin.shape
-    column, row = np.rint(found.xy).astype(np.int64).T
-    at = margin[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
-    return np.asarray(at > _SUPPORT * found.scale)
+    return np.asarray(clearance(margin, found.xy) > _SUPPORT * found.scale)
 
 
 def _checked(found: Features) -> Features:

@@ -24,7 +24,7 @@ from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.frontend.camera_watch import CameraWatch
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import unmeasured
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
@@ -84,16 +84,17 @@ class SlamPipeline:
         key_frames: tracking between key frames; None where every frame is one.
         watch: says which frames' images cannot be used; None uses all.
         submaps: landmarks far from the robot, on disk; None where all are in memory.
-        describe: finds the features of all images of a frame that came without.
+        describe: finds the features of a frame that came without: of all images, or of the
+            reference image where patches tell the rest (`frontend.stereo.others`).
         describe_reference: of the first frame, and of one that carried landmarks have placed,
-            those of its reference image alone: patches tell the rest.
+            those of its reference image alone.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
         rewound: the last frame's features could not be found, and it left no trace; but what a
             closure before it ended has ended, and sub-maps that came back are in memory.
     """
 
-    stereo: StereoMatcher
+    stereo: RigStereo
     tracker: LandmarkTracker
     motion: MotionModel
     estimator: Estimator
@@ -253,7 +254,7 @@ class SlamPipeline:
     def _described(
         self, found: FeatureFrame, carried: CarriedFrame | None, before: _Before
     ) -> FeatureFrame:
-        """The frame with features; of all images where carried landmarks do not place it.
+        """The frame with features; of its reference image where carried landmarks place it.
 
         Whatever an extractor of the user's raises, the loop is then as it was before the frame.
         """
@@ -276,10 +277,7 @@ class SlamPipeline:
         tried, self._tried = self._tried, None
         if tried and tried[0].frame is found.frame and tried[0].features is found.features:
             return tried[1]
-        if self.key_frames is not None and len(found.features) == 1:
-            images, features = found.frame.images, found.features[0]
-            return self.key_frames.stereo.match(images, features, self._correction())
-        return self.stereo.match_all(found.features, self._correction())
+        return self.stereo.match(found.frame, found.features, self._correction())
 
     def _correction(self) -> RigCorrection | None:
         return None if self.calibration is None else self.calibration.found.applied

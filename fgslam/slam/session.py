@@ -28,19 +28,11 @@ from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.arrival import Arrival, MapStart
 from fgslam.slam.camera_remarks import camera_remarks
-from fgslam.slam.factory import (
-    chosen_estimator,
-    chosen_frontend,
-    chosen_odometry,
-    is_settings,
-    make_extractor,
-    make_locator,
-    make_pipeline,
-)
+from fgslam.slam.choices import chosen_estimator, chosen_frontend, chosen_odometry, is_settings
+from fgslam.slam.factory import as_measured, make_describer, make_locator, make_pipeline
 from fgslam.slam.feature_stream import (
     FeatureExtractor,
     FeatureFrame,
-    FrameDescriber,
     undescribed,
 )
 from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
@@ -109,8 +101,8 @@ class Session:
                 ignored. Or an own object with the members of
                 :class:`fgslam.slam.motion.MotionModel`, for this session alone.
             features: an own extractor, from a grey image (height, width) uint8 to
-                :class:`~fgslam.core.features.Features`; it is called from several threads. None
-                for SIFT.
+                :class:`~fgslam.core.features.Features`; it is called from several threads, with two
+                cameras for the right image alone (``frontend.stereo.others``). None for SIFT.
             seed: of everything random: samples of place recognition.
             beginning: a saved map: with the first frame's place in it, or to be located in by the
                 first frames. Those before the first one that could be located have no pose.
@@ -138,9 +130,10 @@ class Session:
         self._movable = beginning is None and own
         if isinstance(beginning, MapStart):
             beginning = self._begun(beginning, chosen, seed)
-        self._describer = FrameDescriber(checked_extractor(features) or make_extractor(frontend))
+        self._describer = make_describer(rig, frontend, checked_extractor(features))
         self.pipeline = self._made(beginning)
-        self.recorder = RunRecorder(MeasurementLog(rig, description_of(self.pipeline.motion)))
+        sensor = as_measured(rig, frontend)
+        self.recorder = RunRecorder(MeasurementLog(sensor, description_of(self.pipeline.motion)))
         self._join_log()
         self._left_out = _LeftOut()
         self._seen = FirstImages()

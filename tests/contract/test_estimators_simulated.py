@@ -32,9 +32,8 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
-from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.factory import make_estimator, make_tracker
+from fgslam.slam.factory import make_estimator, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -167,7 +166,7 @@ def live_run(
     stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
     odometry = camera_odometry(rng)
     pipeline = SlamPipeline(
-        stereo=StereoMatcher(RIG, frontend.stereo, frontend.appearance),
+        stereo=make_stereo(RIG, frontend),
         tracker=make_tracker(RIG, frontend),
         motion=OdometryMotion(RIG.bTc, "recorded", stand_in),
         estimator=at_origin(settings),

@@ -37,8 +37,8 @@ from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import (
     CameraRig,
     Sensor,
-    measurement_map,
     pixel_model,
+    rig_map,
     vertical_to_horizontal,
 )
 
@@ -272,8 +272,7 @@ def pixels_of(rig: CameraRig, measured: FloatArray) -> FloatArray:
 
 def fused(rig: CameraRig, of_pixels: FloatArray) -> FloatArray:
     """(k, 3, n) of measurements, by displacements of their pixels (k, 2 * cameras, n)."""
-    fuse = measurement_map("fused", rig.cameras, vertical_to_horizontal(rig))
-    return np.asarray(fuse @ of_pixels)
+    return np.asarray(rig_map(rig) @ of_pixels)
 
 
 def shared_covariance(correction: RigCorrection) -> FloatArray:

@@ -27,8 +27,8 @@ from fgslam.core.rig_correction import displacements
 from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import (
     CameraRig,
-    measurement_map,
     pixel_model,
+    rig_map,
     vertical_to_horizontal,
 )
 
@@ -143,7 +143,7 @@ class RigAlignment:
         self._keep(np.isfinite(self._pixels).all(axis=(1, 2)))
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
-        self._fuse = measurement_map("fused", rig.cameras, ratio)
+        self._fuse = rig_map(rig)
 
     def evidence(self, correction: FloatArray, prior: FloatArray) -> RigEvidence | None:
         """What the window says of the correction; None where it shows too little.

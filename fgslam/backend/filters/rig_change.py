@@ -16,7 +16,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import in_front, project, triangulate
 from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import displacements
-from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig, pixel_model, rig_map, vertical_to_horizontal
 
 _LEAST_SHARE = 0.5  # of a disparity that is left: below, it is no first-order change
 
@@ -39,7 +39,7 @@ class RigChange:
         ratio, cameras = vertical_to_horizontal(self.rig), self.rig.cameras
         pixels = measurement @ pixel_model(cameras, ratio).T
         moved = displacements(self.rig, pixels.reshape(-1, cameras, 2)) @ self.values
-        return np.asarray(measurement - moved @ measurement_map("fused", cameras, ratio).T)
+        return np.asarray(measurement - moved @ rig_map(self.rig).T)
 
     def moved(self, poses: FloatArray, positions: FloatArray) -> tuple[FloatArray, float]:
         """Landmarks (k, 3) in the world, each measured anew from a pose (k, 4, 4) that saw it.

@@ -143,7 +143,9 @@ class LandmarkCarrier:
             good &= alike >= _MIN_CORRELATION
         looks = (expected.scale[rows], expected.orientation[rows], expected.descriptors[rows])
         found = tuple(Features(seen, *looks).select(good) for seen in pixels)
-        features, consistent = self._stereo.measured(found, NOISE_SHARE, correction)
+        features, consistent = self._stereo.measured(
+            found, self._stereo.equally(NOISE_SHARE), correction
+        )
         good[good] = consistent
         self._points = _Points(self._points.ids[good], places[good], depths[good])
         self._patches = patches.select(good)

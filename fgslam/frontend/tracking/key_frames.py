@@ -18,7 +18,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, StateArra
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.frontend.patch_stereo import PATCH_PX, PatchStereo
+from fgslam.frontend.patch_stereo import PATCH_PX
 from fgslam.frontend.tracking.carrying import Carried, LandmarkCarrier
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
@@ -62,11 +62,8 @@ class CarriedFrame:
 class KeyFrameTracker:
     """A tracker that is asked for matches of SIFT features on key frames only."""
 
-    def __init__(
-        self, tracker: LandmarkTracker, carrier: LandmarkCarrier, stereo: PatchStereo
-    ) -> None:
-        """Takes the tracker whose landmarks are carried; ``stereo`` measures what SIFT finds."""
-        self.stereo = stereo
+    def __init__(self, tracker: LandmarkTracker, carrier: LandmarkCarrier) -> None:
+        """Takes the tracker whose landmarks are carried."""
         self._tracker = tracker
         self._carrier = carrier
         self._count = 0  # landmarks of the last key frame

@@ -30,14 +30,14 @@ from fgslam.core.saved_map import require_rig
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
 from fgslam.runs.tasks.slam_map_entry import GivenMap
 from fgslam.runs.tasks.truth import Sighted, TrueSights, TruthInMap, truth_in_map
 from fgslam.slam.arrival import trusted
-from fgslam.slam.factory import make_pipeline, make_relocaliser, make_stereo_matcher, make_stream
+from fgslam.slam.factory import make_pipeline, make_relocaliser, make_stereo, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import SlamPipeline
@@ -126,7 +126,7 @@ class Asker:
         if not len(self.landmarks):
             raise MapError(f"{given.path}: holds no trusted landmark; make the map anew")
         self._config, self._sequence = config, sequence
-        self._stereo: StereoMatcher = make_stereo_matcher(sequence.rig, frontend)
+        self._stereo: RigStereo = make_stereo(sequence.rig, frontend)
         self._relocaliser: Relocaliser = make_relocaliser(sequence.rig, frontend)
         self._relocaliser.learn(self.landmarks, looks)
         self._floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
@@ -159,7 +159,7 @@ class Asker:
         rng = np.random.default_rng([self._config.seed, _STREAM, frame, len(found)])
         start = time.perf_counter()
         if len(found) == 1:
-            features, spread = self._stereo.match(last.features), None
+            features, spread = self._stereo.match(last.frame, last.features).whole, None
         else:
             features, spread = submap_features(
                 self._sequence, found, self._config.frontend, self._config.odometry

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurements import Increment, SettledRig
 from fgslam.core.rig_correction import displacements, term_names
-from fgslam.core.sensors import measurement_map, pixel_model
+from fgslam.core.sensors import pixel_model, rig_map
+from fgslam.core.settings import RigPlaces
 from fgslam.slam.factory import make_estimator
 
 SETTINGS: dict[str, EstimatorSettings] = {
@@ -71,15 +73,17 @@ def last_steps(increments: list[Increment], kind: str, truth: FloatArray) -> flo
     return float(np.linalg.norm((step - exact)[:3, 3]))
 
 
-def test_measurements_follow_as_if_their_pixels_had_been_corrected_anew() -> None:
+@pytest.mark.parametrize("places", get_args(RigPlaces))
+def test_measurements_follow_as_if_their_pixels_had_been_corrected_anew(places: RigPlaces) -> None:
     rng = np.random.default_rng(1)
     exact = np.column_stack([rng.uniform(20.0, 300.0, (50, 2)), rng.uniform(5.0, 20.0, 50)])
     pixels = (exact @ pixel_model(3, 1.0).T).reshape(-1, 3, 2)
     wrong, known = yaw(1.0), yaw(0.7)
     raw = pixels + (displacements(RIG, pixels) @ wrong).reshape(pixels.shape)
     before = raw - (displacements(RIG, raw) @ known).reshape(pixels.shape)
-    measured = before.reshape(-1, 6) @ measurement_map("fused", 3, 1.0).T
-    anew = RigChange(RIG, wrong - known).measured(measured)
+    rig = dataclasses.replace(RIG, places=places)
+    measured = before.reshape(-1, 6) @ rig_map(rig).T
+    anew = RigChange(rig, wrong - known).measured(measured)
     assert np.abs(measured - exact).max() > 0.25
     np.testing.assert_allclose(anew, exact, rtol=0.0, atol=0.01)
 

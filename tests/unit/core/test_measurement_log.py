@@ -7,6 +7,7 @@ import json
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from fgslam.core.measurements import (
 )
 from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor
+from fgslam.core.settings import RigPlaces
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 
@@ -115,6 +117,14 @@ def test_a_log_says_whether_its_rig_is_exact(exact: bool, tmp_path: Path) -> Non
     loaded = MeasurementLog.load(tmp_path / "measurements.npz").rig
     assert isinstance(loaded, CameraRig)
     assert loaded.exact is exact
+
+
+@pytest.mark.parametrize("places", get_args(RigPlaces))
+def test_a_log_says_which_images_tell_a_place(places: RigPlaces, tmp_path: Path) -> None:
+    MeasurementLog(replace(RIG, places=places), {}).save(tmp_path / "measurements.npz")
+    loaded = MeasurementLog.load(tmp_path / "measurements.npz").rig
+    assert isinstance(loaded, CameraRig)
+    assert loaded.places == places
 
 
 def test_time_may_not_run_backwards(log: MeasurementLog, rng: np.random.Generator) -> None:

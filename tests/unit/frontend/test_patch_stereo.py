@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.recordings import Frame
 from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.patch_stereo import PatchStereo
-from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.settings import FrontendSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
+from fgslam.slam.factory import make_describer, make_stereo
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
 
 
@@ -19,7 +24,7 @@ def measured(images: tuple[Image, ...]) -> tuple[Features, StereoFeatures]:
     """Features of the first image, and those of them that all images show."""
     found = SiftExtractor(SiftSettings(), "descriptor").extract(images[0])
     matcher = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
-    return found, PatchStereo(RIG, matcher, np.inf).match(images, found)
+    return found, PatchStereo(RIG, matcher, np.inf).match(Frame(0, 0.0, images), found)
 
 
 def in_view(found: Features, disparity: float) -> int:
@@ -58,6 +63,44 @@ def test_what_another_image_does_not_show_is_left_out() -> None:
     assert len(seen) <= 0.02 * len(found)
 
 
+def test_what_lies_at_the_rim_of_another_image_is_left_out() -> None:
+    """Where it shows nothing within half a patch."""
+    images = pictures(HERE)
+    found = SiftExtractor(SiftSettings(), "descriptor").extract(images[0])
+    matcher = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
+    stereo = PatchStereo(RIG, matcher, np.inf)
+    clear = np.full(images[0].shape, 100.0, np.float32)
+    rim = clear.copy()
+    rim[:, :50] = 0.0
+    whole = stereo.match(Frame(0, 0.0, images, (clear,) * 3), found)
+    cut = stereo.match(Frame(0, 0.0, images, (clear, rim, clear)), found)
+    kept = np.rint(whole.pixels[:, 1, 0]) >= 50
+    assert 0 < kept.sum() < len(kept)
+    assert np.array_equal(cut.pixels, whole.pixels[kept])
+
+
+@pytest.mark.parametrize(("cameras", "others"), [(2, "auto"), (3, "auto"), (2, "sift")])
+def test_two_cameras_need_features_of_one_image(
+    cameras: int, others: Literal["auto", "sift"]
+) -> None:
+    rig = RIG if cameras == 3 else replace(RIG, vertical_baseline=None)
+    settings = FrontendSettings(stereo=StereoSettings(others=others))
+    describer = make_describer(rig, settings)
+    frame = Frame(0, 0.0, pictures(HERE)[:cameras])
+    found = describer.describe(0, frame)
+    describer.close()
+    one = cameras == 2 and others == "auto"
+    assert len(found.features) == (1 if one else cameras)
+    seen = make_stereo(rig, settings).match(frame, found.features)
+    truth = RIG.fx * RIG.baseline / WALL_M
+    assert len(seen) > 100
+    assert abs(float(np.median(seen.measurement[:, 2])) - truth) < 0.05
+    exact = np.array_equal(seen.measurement[:, :2], seen.pixels[:, 0])
+    assert exact == one
+    paper = replace(settings, stereo=replace(settings.stereo, measurement="paper"))
+    assert not paper.stereo.by_patches(cameras)
+
+
 def test_swapped_cameras_give_next_to_nothing() -> None:
     right, left, top = pictures(np.array([0.0, 0.0, 1.0]))
     found, seen = measured((left, right, top))
@@ -67,4 +110,4 @@ def test_swapped_cameras_give_next_to_nothing() -> None:
 def test_no_features_are_no_match() -> None:
     found = SiftExtractor(SiftSettings(), "descriptor").extract(np.zeros((240, 320), np.uint8))
     matcher = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
-    assert not len(PatchStereo(RIG, matcher, np.inf).match(pictures(HERE), found))
+    assert not len(PatchStereo(RIG, matcher, np.inf).match(Frame(0, 0.0, pictures(HERE)), found))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.rig_correction import RigCorrection, term_names
 from fgslam.core.sensors import CameraRig
+from fgslam.core.settings import RigPlaces
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher, measurement_map
@@ -376,6 +378,25 @@ def test_covariances_match_monte_carlo(kind: str, vertical: float | None) -> Non
         scale = np.sqrt(np.outer(np.diag(stated), np.diag(stated)))
         np.testing.assert_allclose(measured / scale, stated / scale, rtol=0, atol=0.03)
         np.testing.assert_allclose(np.diag(measured), np.diag(stated), rtol=0.03)
+
+
+@pytest.mark.parametrize("vertical", [0.25, None])
+@pytest.mark.parametrize("places", get_args(RigPlaces))
+def test_covariances_of_shifts_match_monte_carlo(places: RigPlaces, vertical: float | None) -> None:
+    """The other images' places are off as the first one's is, and by less of their own."""
+    rng = np.random.default_rng(12)
+    rig = dataclasses.replace(RIG, vertical_baseline=vertical, places=places)
+    matcher = StereoMatcher(rig, dataclasses.replace(GATES, pixel_sigma=0.3), PAPER)
+    at = np.array([RIGHT, (118.0, 80.0), (100.0, 80.0 + 18.0 * 2.5)][: rig.cameras])
+    drawn = at + 0.3 * rng.standard_normal((100_000, 1, 2))
+    drawn[:, 1:] += 0.4 * 0.3 * rng.standard_normal((len(drawn), rig.cameras - 1, 2))
+    images = tuple(features(drawn[:, camera]) for camera in range(rig.cameras))
+    linear = matcher.by_reference(0.4)
+    seen = matcher.measured(images, linear)[0].measurement
+    assert len(seen) == len(drawn)
+    assert abs(seen.mean(axis=0) - [100.0, 80.0, 18.0]).max() < 0.01
+    scale = np.sqrt(np.outer(np.diag(linear[1]), np.diag(linear[1])))
+    np.testing.assert_allclose(np.cov(seen.T) / scale, linear[1] / scale, rtol=0, atol=0.02)
 
 
 def test_empty_images_match_nothing() -> None:

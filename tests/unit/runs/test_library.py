@@ -154,7 +154,8 @@ def test_frames_that_a_recording_does_not_have_are_named(folder: Path) -> None:
 def test_an_estimator_brought_along_is_replayed_and_named(
     driven: tuple[fg.Slam, fg.Result],
 ) -> None:
-    from fgslam.slam.factory import chosen_estimator, made_or_given
+    from fgslam.slam.choices import chosen_estimator
+    from fgslam.slam.factory import made_or_given
 
     log = driven[0].log
     own = made_or_given(log.rig, chosen_estimator("ekf"))

@@ -10,7 +10,7 @@ from fgslam.core.errors import CalibrationError, ConfigError, MeasurementLogErro
 from fgslam.core.measurements import MeasurementType
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.library import replay
-from fgslam.slam.factory import chosen_estimator, chosen_frontend
+from fgslam.slam.choices import chosen_estimator, chosen_frontend
 from fgslam.slam.session import Session
 
 

@@ -223,7 +223,7 @@ def test_asking_where_a_frame_is_changes_nothing(driven: Driven) -> None:
     asked = [on_ring(k + 0.5) for k in range(0, ROUND, 3)]
     stereo, found = driven.pipeline.stereo, {}
     for seen in frames(asked):
-        features = stereo.match_all(seen.features, None)
+        features = stereo.match(None, seen.features)
         found[seen.i] = submaps.recognise(features, lost=True)
     known = {k: position for k, (number, position) in found.items() if number in numbers}
     assert len(known) >= 4, "the others are in memory, or looked past a sparse sub-map"
