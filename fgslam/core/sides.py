@@ -17,8 +17,8 @@ _CAMERA_NUMBER = re.compile(
 )
 _NUMBER = re.compile(r"(\d+)")
 _NO_VIEW = re.compile(
-    r"depth|dispar|theora|mask|debug|segment|semantic|label|heat|thumb|normals"
-    r"|(?<![a-z])(?:disp|flow)(?![a-z])",
+    r"depth|dispar|theora|segment|semantic"
+    r"|(?<![a-z])(?:mask|debug|label|heat|thumb|normals|(?:disp|flow)(?![a-z]))",
     re.IGNORECASE,
 )
 

@@ -16,7 +16,7 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_ca
 
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import pose
-from fgslam.core.sides import camera_pairs
+from fgslam.core.sides import camera_pairs, is_view
 from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.loose_files import find_cameras, pair_files
@@ -98,6 +98,13 @@ def test_what_has_no_partner_is_counted_or_refused(tmp_path: Path) -> None:
         (root / "left" / f"{k}.png").rename(root / "left" / f"a{k}.png")
     with pytest.raises(DatasetError, match="3 images of the left camera and 4 of the right one, a"):
         opened(root)
+
+
+def test_words_that_hold_another_are_none() -> None:
+    views = ("theatre_left", "overflow_R", "display_0", "unmasked", "image_02")
+    others = ("heat_map", "left_mask", "depth01", "flow_0", "disp_occ_1", "labels", "semantics")
+    assert all(map(is_view, views))
+    assert not any(map(is_view, others))
 
 
 def test_words_that_hold_a_side_are_none() -> None:
