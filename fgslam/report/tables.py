@@ -209,7 +209,7 @@ def write_metrics(
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
-    """The document that :func:`write_metrics` wrote.
+    """The metrics.json of a run of any task: :func:`write_metrics` wrote those of SLAM.
 
     Raises:
         DatasetError: the file is missing or is not one.
@@ -220,7 +220,7 @@ def read_metrics(path: Path) -> dict[str, Any]:
         raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
     except ValueError as error:
         raise DatasetError(f"{path} is not JSON ({error}); run the experiment again") from error
-    if not isinstance(document, dict) or "estimators" not in document:
+    if not isinstance(document, dict) or not document.keys() & {"estimators", "task"}:
         raise DatasetError(f"{path} holds no metrics; give the metrics.json of a run folder")
     return document
 

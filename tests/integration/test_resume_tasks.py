@@ -387,6 +387,8 @@ def test_killed_while_it_tidies_up_a_run_tracks_at_most_its_last_frame_again(
         found = content_of(folder)
         assert found.keys() == expected.keys(), moment.name
         assert [n for n in found if found[n] != expected[n]] == [], moment.name
+    with pytest.raises(OutputError, match=r"nothing to resume .* the run has finished"):
+        run(values, folder, "resume")
 
 
 def before_each_deletion(values: dict[str, Any], folder: Path, kept: Path) -> list[Path]:
