@@ -18,7 +18,7 @@ from fgslam.cameras.formats import (
     ros,
     slam_settings,
 )
-from fgslam.cameras.formats.trees import Tree, read_tree
+from fgslam.cameras.formats.trees import Tree, is_camera_text, read_tree
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.errors import CalibrationError
@@ -183,9 +183,11 @@ def _pairs_beside(folder: Path) -> list[tuple[Path, Path]]:
 
 
 def _tree_or_none(path: Path) -> Tree | None:
-    if path.suffix.lower() not in _TREES or not path.is_file():
+    if path.suffix.lower() not in (*_TREES, ".txt") or not path.is_file():
         return None
     try:
+        if path.suffix.lower() == ".txt" and not is_camera_text(read_text(path, CalibrationError)):
+            return None
         return read_tree(path)
     except CalibrationError:
         return None

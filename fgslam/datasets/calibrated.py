@@ -103,3 +103,10 @@ def mounted(rig: StereoRig, settings: CalibratedSettings) -> StereoRig:
         return rig
     lever_arm = settings.lever_arm_m or (0.0, 0.0, 0.0)
     return replace(rig, bTc=level_mounting(settings.camera_yaw_deg or 0.0, lever_arm))
+
+
+LOOKS_AHEAD = (
+    "it is taken to look straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say "
+    "otherwise)"
+)
+"""What is assumed of a camera where nothing says how it sits on the body that odometry moves."""

@@ -33,16 +33,19 @@ def find_odometry(root: Path, name: str | None) -> Path | None:
                 "it out"
             )
         return root / name
-    found: Iterable[Path] = [root / "odometry.txt", *sorted(root.glob("odom*.csv"))]
+    found: Iterable[Path] = (*(root / name for name in _POSES), *sorted(root.glob("odom*.csv")))
     candidates = [path for path in found if path.is_file()]
     if not candidates:  # wheels say more than a gyroscope
-        candidates = [path for path in sorted(root.glob("*.csv")) if _of_gyroscope(path)]
+        candidates = [path for path in sorted(root.glob("*.csv")) if is_of_gyroscope(path)]
     if len(candidates) > 1:
         raise DatasetError(
             f"{root} has several odometry files ({', '.join(p.name for p in candidates)}); name "
             "one in dataset.odometry_file"
         )
     return candidates[0] if candidates else None
+
+
+_POSES = ("odometry.txt", "odom.txt")  # the second of OpenLORIS
 
 
 def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> OdometrySource | None:
@@ -53,14 +56,15 @@ def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> Odom
     return recorded_motions(str(path), lambda: _read(path, settings), settings)
 
 
-def _of_gyroscope(path: Path) -> bool:
+def is_of_gyroscope(path: Path) -> bool:
+    """Whether a file is that of a gyroscope, by its name."""
     return path.is_file() and path.name.lower().startswith(("imu", "gyro"))
 
 
 def _read(path: Path, settings: RecordedOdometrySettings) -> AnyLog:
     if has_named_columns(path):
         return read_named_columns(path, settings)
-    if _of_gyroscope(path):
+    if is_of_gyroscope(path):
         return checked_rates(read_rates(path), settings)
     if path.suffix == ".csv":
         return read_speed_log(path, settings)

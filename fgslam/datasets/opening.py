@@ -69,7 +69,7 @@ def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings)
     if isinstance(settings, _WithOdometry):
         return _open_with_odometry(settings, odometry)
     if isinstance(settings, _FilmOrDepth):
-        return _open_film_or_depth(settings)
+        return _open_film_or_depth(settings, odometry)
     match settings:
         case KittiSettings():
             from fgslam.datasets.kitti import open_kitti
@@ -84,14 +84,14 @@ def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings)
 _FilmOrDepth: TypeAlias = VideoSettings | RgbdSettings
 
 
-def _open_film_or_depth(settings: _FilmOrDepth) -> Recording:
+def _open_film_or_depth(settings: _FilmOrDepth, odometry: RecordedOdometrySettings) -> Recording:
     if isinstance(settings, VideoSettings):
         from fgslam.datasets.stereo_video import open_video
 
         return open_video(settings)
     from fgslam.datasets.rgbd import open_rgbd
 
-    return open_rgbd(settings)
+    return open_rgbd(settings, odometry)
 
 
 _WithOdometry: TypeAlias = (

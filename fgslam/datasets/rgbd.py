@@ -24,6 +24,7 @@ from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines, shown_in
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.calibrated import LOOKS_AHEAD
 from fgslam.datasets.depth_view import (
     BASELINE_M,
     Depth,
@@ -36,12 +37,14 @@ from fgslam.datasets.depth_view import (
 from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, sized
 from fgslam.datasets.layouts import colour_and_depth, colour_and_depth_files
 from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
+from fgslam.datasets.odometry_files import file_odometry, find_odometry, is_of_gyroscope
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
-from fgslam.datasets.settings import RgbdSettings
+from fgslam.datasets.settings import RecordedOdometrySettings, RgbdSettings
 from fgslam.datasets.stamps import stamps_of
 from fgslam.datasets.tables import read_tum_table, trajectory_at_frames
 
+_DEFAULT_LIMITS = RecordedOdometrySettings()
 _TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
 _NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
 # Where 16 bits are only assumed to be millimetres: farther than RealSense, Kinect and Orbbec see.
@@ -58,8 +61,14 @@ _TUM_CAMERAS = {
 """fx, fy, cx, cy of the colour cameras, as TUM publishes them; their distortion is left out."""
 
 
-def open_rgbd(settings: RgbdSettings) -> Recording:
+def open_rgbd(
+    settings: RgbdSettings, odometry: RecordedOdometrySettings = _DEFAULT_LIMITS
+) -> Recording:
     """Open colour and depth images; the colour camera is the reference.
+
+    Args:
+        settings: where they are, and of which camera.
+        odometry: noise and limits of a file of odometry beside them.
 
     Raises:
         DatasetError: images are missing or do not pair, or depths are in another unit.
@@ -72,21 +81,24 @@ def open_rgbd(settings: RgbdSettings) -> Recording:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
     require_one_camera(settings)
     camera, known = _camera(root, settings, size)
-    rig = _rig(camera, settings)
+    odometry_file = find_odometry(root, settings.odometry_file)
+    rig, mounting = _rig(camera, settings, odometry_file)
     scale, said = _scale(root, pairs, settings, size)
     chosen = select_frames(len(pairs), settings)
     images = DepthFrames(_Files(pairs, size, scale).read, rig, Undistorted.of(camera))
     truth = root / "groundtruth.txt"
+    defining = (*lists, *([odometry_file] if odometry_file else []))
     return Recording(
         name=root.resolve().name,
         rig=rig,
         timestamps=stamps[chosen],
-        identity=recording_identity(lists, (path for pair in pairs for path in pair)),
+        identity=recording_identity(defining, (path for pair in pairs for path in pair)),
         ground_truth=_true_poses(truth, stamps[chosen]) if truth.is_file() else None,
-        notes=(*notes, *known, *said),
+        notes=(*notes, *known, *said, *mounting),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,
+        odometry_source=file_odometry(odometry_file, odometry),
         disparity_sigma_px=depth_sigma_px(settings.scale * rig.fx, settings.depth_sigma_m),
     )
 
@@ -275,7 +287,10 @@ def _camera(
     return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
 
 
-_TEXTS = ("calibration.txt", "intrinsics.txt", "camera-intrinsics.txt", "cam_K.txt")
+_TEXTS = (
+    *("calibration.txt", "intrinsics.txt", "camera-intrinsics.txt", "cam_K.txt"),
+    "camera_info.txt",
+)
 
 
 def _own_files(root: Path) -> list[Path]:
@@ -298,12 +313,20 @@ def _of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:
     return at_size(alone, size, resized).cameras[0]
 
 
-def _rig(camera: RawCamera, settings: RgbdSettings) -> CameraRig:
+def _rig(
+    camera: RawCamera, settings: RgbdSettings, odometry_file: Path | None
+) -> tuple[CameraRig, tuple[str, ...]]:
+    """The colour camera and the made one, on the body that odometry moves; what was assumed."""
     fx, fy, cx, cy = (float(camera.matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
+    # A gyroscope is in the camera's own box, wheels turn about another axis.
+    assumed = not stated and odometry_file is not None and not is_of_gyroscope(odometry_file)
     bTc = np.eye(4)
-    if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
+    if stated or assumed:
         bTc = level_mounting(settings.camera_yaw_deg or 0.0, settings.lever_arm_m or (0.0,) * 3)
-    return CameraRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M, None, bTc)
+    rig = CameraRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M, None, bTc)
+    text = f"nothing says where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
+    return rig, ((text,) if assumed else ())
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,6 +107,10 @@ class ImageFolderSettings(CalibratedSettings):
     ] = None
 
 
+OdometryFile = Annotated[
+    str | None,
+    Field(description="odometry inside the folder; null: odometry.txt, odom.txt or odom*.csv"),
+]
 PairingTolerance = Annotated[
     float,
     Field(gt=0.0, le=1000.0, description="largest time between the two images of a pair, ms"),
@@ -137,10 +141,7 @@ class LooseImagesSettings(CalibratedSettings):
             description="largest time between the images of a pair, where only times name them, ms",
         ),
     ] = 20.0
-    odometry_file: Annotated[
-        str | None,
-        Field(description="odometry inside the folder; null: odometry.txt or odom*.csv"),
-    ] = None
+    odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -184,6 +185,7 @@ class RgbdSettings(CalibratedSettings):
         ),
     ] = 1.425e-3
     pairing_tolerance_ms: PairingTolerance = 20.0
+    odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -25,6 +25,8 @@ Tree: TypeAlias = Mapping[str, Any]
 
 _MATRICES = ("opencv-matrix", "opencv-nd-matrix")
 _TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])")
+_CAMERA_INFO = re.compile(r"^distortion_model:", re.MULTILINE)
+_MESSAGE_END = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _ARCHIVE = ".npz"
 _LARGEST_ARCHIVE = 100_000_000  # bytes; points of a board may be in it
 _DEEPEST = 20  # levels of nesting: no calibration has ten
@@ -93,7 +95,7 @@ def _of_json(path: Path, text: str) -> Tree:
 
 
 def _of_yaml(path: Path, text: str) -> Tree | None:
-    lines = text.rstrip().removesuffix("\n---").splitlines()  # as echoes of a message end
+    lines = _first_message(text).splitlines()
     if text.startswith("%YAML"):
         # OpenCV writes a directive that is no YAML, and reads "key:value" without a space.
         lines = [_TIGHT.sub(r"\1: ", line) for line in lines if not line.startswith("%YAML")]
@@ -107,6 +109,18 @@ def _of_yaml(path: Path, text: str) -> Tree | None:
         reason = " ".join(str(cause).split())
         raise CalibrationError(f"{path} is not YAML: {reason}; correct the file") from None
     return _with_arrays(path, values) if isinstance(values, dict) else None
+
+
+def is_camera_text(text: str) -> bool:
+    """Whether a text may be a ROS camera_info, as ``rostopic echo`` writes it too."""
+    return _CAMERA_INFO.search(text) is not None
+
+
+def _first_message(text: str) -> str:
+    """The first message of an echo of a topic, each of which ends in a line of dashes."""
+    if text.startswith("%YAML") or not is_camera_text(text):
+        return text.rstrip().removesuffix("\n---")
+    return _MESSAGE_END.split(text.removeprefix("---\n"), maxsplit=1)[0]
 
 
 def _of_xml(path: Path) -> Tree:

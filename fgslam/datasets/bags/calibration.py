@@ -19,7 +19,7 @@ from fgslam.core.sensors import body_is_camera
 from fgslam.core.sides import differ_in_number
 from fgslam.datasets.bags.frames import FrameTree, view_axes
 from fgslam.datasets.bags.topics import Chosen, FileCameras, is_registered, of_two_sensors
-from fgslam.datasets.calibrated import loaded_rig, mounted, numbered, read_rig
+from fgslam.datasets.calibrated import LOOKS_AHEAD, loaded_rig, mounted, numbered, read_rig
 from fgslam.datasets.depth_view import BASELINE_M, require_one_camera
 from fgslam.datasets.settings import BagSettings
 
@@ -336,7 +336,7 @@ def _unconnected(
         said = f"{body} has a camera's axes, and is taken as turned like the camera{reason}"
         return found.rig, (*tree.notes, said)
     ahead = replace(found.rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
-    return ahead, (*tree.notes, f"{_LOOKS_AHEAD[0]}{reason}: {_LOOKS_AHEAD[1]}")
+    return ahead, (*tree.notes, f"{_UNKNOWN_PLACE}{reason}: {LOOKS_AHEAD}")
 
 
 def _body(named: str, tree: FrameTree) -> str:
@@ -344,8 +344,4 @@ def _body(named: str, tree: FrameTree) -> str:
     return named or next((body for body in _BODIES if body in tree), "")
 
 
-_LOOKS_AHEAD = (
-    "nothing says where the camera sits on the robot whose odometry is used",
-    "it is taken to look straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say "
-    "otherwise)",
-)
+_UNKNOWN_PLACE = "nothing says where the camera sits on the robot whose odometry is used"

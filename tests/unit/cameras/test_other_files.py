@@ -162,16 +162,20 @@ def as_calibrator(info: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("letters", ["small, ROS 2", "capital, ROS 1"])
-def test_an_echo_of_the_topic_is_a_file(tmp_path: Path, letters: str) -> None:
+@pytest.mark.parametrize(("ending", "messages"), [("yaml", 1), ("txt", 1), ("txt", 3)])
+def test_an_echo_of_the_topic_is_a_file(
+    tmp_path: Path, letters: str, ending: str, messages: int
+) -> None:
     for k, name in enumerate(("left", "right")):
         info = camera_info(k, D[k])
         (tmp_path / f"{name}.yaml").write_text(yaml.safe_dump(as_calibrator(info)))
         if letters.startswith("capital"):
             info = {key.upper() if len(key) == 1 else key: value for key, value in info.items()}
         echo = {"header": {"frame_id": name}, **info, "binning_x": 0}
-        (tmp_path / f"echo_{name}.yaml").write_text(yaml.safe_dump(echo) + "---\n")
+        text = messages * (yaml.safe_dump(echo) + "---\n")
+        (tmp_path / f"echo_{name}.{ending}").write_text(text)
     expected = load_rig(tmp_path / "left.yaml", tmp_path / "right.yaml")
-    found = load_rig(tmp_path / "echo_right.yaml")
+    found = load_rig(tmp_path / f"echo_right.{ending}")
     assert (found.fx, found.cx, found.baseline) == (expected.fx, expected.cx, expected.baseline)
     assert found.baseline == pytest.approx(0.12)
 

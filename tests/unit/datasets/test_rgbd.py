@@ -112,6 +112,25 @@ def test_the_layout_of_tum(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("name", ["odom.txt", "odometry.txt", "odom.csv"])
+def test_odometry_beside_colour_and_depth(tmp_path: Path, name: str) -> None:
+    root = tum(tmp_path / "walk")
+    head = "time,speed,yaw_rate\n" if name.endswith(".csv") else "#Time px py pz ox oy oz ow vx\n"
+    rows = [f"{1305031232.0 + 0.05 * k:.4f} {0.01 * k} 0 0 0 0 0 1 0.2" for k in range(20)]
+    if name.endswith(".csv"):
+        rows = [f"{1305031232.0 + 0.05 * k:.4f},0.2,0" for k in range(20)]
+    (root / name).write_text(head + "\n".join(rows), encoding="utf-8")
+    recording = opened(root)
+    step = recording.odometry(1)
+    assert step is not None
+    assert np.allclose(step.motion[:3, 3], [0.02, 0.0, 0.0], rtol=0.0, atol=1e-6)
+    assert np.allclose(recording.rig.bTc[:3, 2], [1.0, 0.0, 0.0])  # it looks where the body goes
+    assert recording.notes[-1].endswith("(dataset.camera_yaw_deg and lever_arm_m say otherwise)")
+    placed = opened(root, lever_arm_m=(0.1, 0.0, 0.5))
+    assert np.allclose(placed.rig.bTc[:3, 3], [0.1, 0.0, 0.5])
+    assert "straight ahead" not in placed.notes[-1]
+
+
 def test_the_noise_of_depth_is_part_of_the_experiment(tmp_path: Path) -> None:
     bare = bare_experiment(tum(tmp_path / "walk"))
     # 250 px * 0.08 m * 1.425 mm, and 0.15 px by which a point is found again.
