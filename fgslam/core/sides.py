@@ -6,7 +6,9 @@ import re
 from collections.abc import Iterable
 
 _WORD = re.compile(
-    r"(?:(?<![a-z])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image))(left|right)", re.IGNORECASE
+    r"(?:(?<![a-z])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image)|(?<=front)|(?<=back)|(?<=rear))"
+    r"(left|right)",
+    re.IGNORECASE,
 )
 _LETTER = re.compile(
     r"(?:(?<![a-z0-9])|(?<=cam)|(?<=camera)|(?<=img)|(?<=image))([lr])(?:(?![a-z0-9])|(?=cam))",

@@ -6,7 +6,7 @@ Needs no image library: layouts are recognised by it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -140,13 +140,19 @@ def _two_folders(root: Path) -> tuple[tuple[Path, Path], tuple[tuple[str, str], 
                 if not _of_both_cameras(found):
                     with_images[folder.name] = place
                 break
-    pairs = camera_pairs(with_images)
+    pairs = camera_pairs(with_images) or _with_a_second(with_images)
     if not pairs:
         return None
     words = [pair for pair in pairs if not re.search(r"\d", pair[0])]
     left, right = (words or list(pairs))[0]
     others = tuple(pair for pair in pairs if not {left, right} & set(pair))
     return (with_images[left], with_images[right]), others
+
+
+def _with_a_second(names: Iterable[str]) -> tuple[tuple[str, str], ...]:
+    """Names of a first and a second camera, of which the first one has no number: rgb and rgb2."""
+    known = set(names)
+    return tuple((name, f"{name}2") for name in sorted(known) if f"{name}2" in known)
 
 
 def _of_both_cameras(files: Sequence[Path]) -> bool:

@@ -1,4 +1,7 @@
-"""Names of files that are times, or differ in one alone: numbers of ten digits or more."""
+"""Names of files that are times, or differ in one alone.
+
+Times are numbers of ten digits or more, or a whole name of seconds to the microsecond (ETH3D).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 # Ten digits with zeros before them count images, as in KITTI's drives.
-_NAME = re.compile(r"^([1-9]\d{9,18})(?:\.(\d+)|[_-](\d{3,9}))?$")
+_NAME = re.compile(r"^([1-9]\d{9,18}|\d{1,9}(?=\.\d{6,9}$))(?:\.(\d+)|[_-](\d{3,9}))?$")
 _AMID = re.compile(r"(?<!\d)([1-9]\d{9,18})(?:\.(\d+)|[_-](\d{3,9})(?!\d))?(?!\d)")
 
 

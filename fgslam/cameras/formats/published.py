@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -298,12 +299,29 @@ def _is_matrix(rows: list[FloatArray]) -> bool:
 
 
 def read_numbers(path: Path, text: str, size: tuple[int, int] | None) -> Calibration:
-    """One camera; a lens is k1, k2, p1, p2 and perhaps k3."""
+    """One camera, or ETH3D's pair; a lens is k1, k2, p1, p2 and perhaps k3."""
+    camera = _camera_of_numbers(path, text, size)
+    files = tuple(path.with_name(name) for name in _ETH3D)
+    if path not in files or not all(file.is_file() for file in files):
+        return Calibration(str(path), "numbers of one camera", (camera,))
+    texts = [read_text(file, CalibrationError) for file in files[:2]]
+    first, second = (_camera_of_numbers(*each, size) for each in zip(files, texts, strict=False))
+    step = Values(files[2], {"the step": read_text(files[2], CalibrationError).split()})
+    cameras = (first, replace(second, bTc=step.motion("the step")))
+    return Calibration(str(files[0]), "cameras of ETH3D, a pair", cameras)
+
+
+_ETH3D = ("calibration.txt", "calibration2.txt", "extrinsics_1_2.txt")
+"""Both cameras of ETH3D's SLAM recordings, and the pose of the second one in the first one."""
+
+
+def _camera_of_numbers(path: Path, text: str, size: tuple[int, int] | None) -> RawCamera:
     rows = _rows(text) or []
+    if not (_is_line(rows) or _is_matrix(rows)):
+        raise CalibrationError(f"{path} is no camera: expected fx fy cx cy; restore the file")
     if _is_line(rows):
         matrix, lens = intrinsic_matrix(*rows[0][:4]), rows[0][4:]
     else:
         matrix, lens = np.array(rows)[:3, :3], np.zeros(0)
     lens = lens if len(lens) else np.zeros(4)
-    camera = RawCamera(*(size or (0, 0)), matrix, lens, np.eye(4), path.name)
-    return Calibration(str(path), "numbers of one camera", (checked_camera(camera),))
+    return checked_camera(RawCamera(*(size or (0, 0)), matrix, lens, np.eye(4), path.name))

@@ -181,7 +181,7 @@ def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Vie
     """The preferred pair; with a file of three cameras the one that the next number names, too."""
     views = [t.name for t in topics if t.kind in IMAGES and is_view(t.name)]
     by_view = _by_view(views)
-    pairs = sorted(camera_pairs(by_view), key=lambda pair: (_rank(pair[0]), pair))
+    pairs = sorted(camera_pairs(by_view), key=_pair_rank)
     if not pairs:
         if (with_depth := _colour_and_depth(topics)) is not None:
             return with_depth
@@ -262,6 +262,11 @@ def _own_part(name: str, images: Sequence[str]) -> str:
 def _depth_rank(name: str) -> tuple[bool, int, int, str]:
     ending = max((k for k, e in enumerate(_DEPTHS) if name.endswith(e)), default=0)
     return not is_registered(name), ending, len(name), name
+
+
+def _pair_rank(pair: tuple[str, str]) -> tuple[bool, int, tuple[str, str]]:
+    """Cameras that look ahead come first: those called left and right may look sideways (Spot)."""
+    return "front" not in pair[0].lower(), _rank(pair[0]), pair
 
 
 def _rank(view: str) -> int:

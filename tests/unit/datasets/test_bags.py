@@ -283,6 +283,18 @@ def test_of_four_cameras_some_must_be_chosen(tmp_path: Path) -> None:
     assert codes(far, 0) == (60, 160)
 
 
+def test_cameras_that_look_ahead_come_first(tmp_path: Path) -> None:
+    """Spot's others look sideways; a rank by endings would take those."""
+    names = ("back", "right", "left", "frontright", "frontleft")
+    images = {
+        f"/{name}/image{'' if 'front' in name else '_raw'}": 20 * k for k, name in enumerate(names)
+    }
+    file = camchain(tmp_path, dict.fromkeys(("left", "right"), ""))
+    recording = opened(write_bag(tmp_path / "a.bag", views(images)), camera_file=file)
+    assert codes(recording, 0) == (60, 80)
+    assert "also there: /left/image_raw with /right/image_raw" in recording.notes[0]
+
+
 def test_a_camera_info_without_baseline(tmp_path: Path) -> None:
     messages = [
         (t, s, k, camera_info(0.0) if k.endswith("CameraInfo") else f) for t, s, k, f in stereo(2)

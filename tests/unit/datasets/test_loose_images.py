@@ -112,6 +112,9 @@ def test_words_that_hold_a_side_are_none() -> None:
     assert camera_pairs(["camera_left", "camera_right", "imu"]) == (
         ("camera_left", "camera_right"),
     )
+    assert camera_pairs(["frontleft", "frontright", "back", "upleft"]) == (
+        ("frontleft", "frontright"),
+    )
     assert camera_pairs(["0001.png", "0002.png"], any_number=False) == ()
 
 

@@ -106,6 +106,21 @@ def test_further_pairs_of_folders_are_said(tmp_path: Path) -> None:
     assert "also there: lcam_front with rcam_front; leave one pair" in opened(root).notes[0]
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_first_and_second_camera_of_eth3d(tmp_path: Path, side: float) -> None:
+    """Which of the two is the left one, its calibration says."""
+    stamps = [f"{5096.154125 + 0.037 * k:.6f}.png" for k in range(3)]
+    root = images(tmp_path / "walk", lambda k: (f"rgb2/{stamps[k]}", f"rgb/{stamps[k]}"))
+    (root / "calib.json").unlink()
+    for name in ("calibration.txt", "calibration2.txt"):
+        (root / name).write_text("30 30 15.5 11.5\n")
+    (root / "extrinsics_1_2.txt").write_text(f"1 0 0 {0.2 * side}\n0 1 0 0\n0 0 1 0\n")
+    recording = opened(root)
+    assert recording.rig.baseline == pytest.approx(0.2)
+    assert codes(recording)[1] == ((11, 61) if side < 0.0 else (61, 11))
+    assert np.allclose(np.diff(recording.timestamps), 0.037, rtol=0.0, atol=1e-6)
+
+
 def test_a_pair_beside_colour_and_depth_is_chosen_by_the_user(tmp_path: Path) -> None:
     root = images(tmp_path, lambda k: (f"infra1/{k}.png", f"infra2/{k}.png"))
     for name in ("color", "depth"):
