@@ -35,6 +35,7 @@ _LARGEST_SHARE = 0.5  # of the image's width: the largest disparity looked for, 
 _UNIQUE_PERCENT = 10  # by which the best block must beat any other
 _BELOW_ZERO = 2  # pixels of half the size that disparities may be too small, by the calibration
 _FRACTIONS = 16.0  # of a pixel, in which OpenCV states disparities
+_AT_ONCE = 8192  # patches, some ten kilobytes each; OpenCV samples less than 32767 rows at once
 
 
 class PatchStereo:
@@ -44,7 +45,8 @@ class PatchStereo:
         """``stereo`` measures, by its gates; disparities up to ``largest_px`` are looked for."""
         self._rig = rig
         self._stereo = stereo
-        reach = 0.5 * min(largest_px, _LARGEST_SHARE * rig.width) + _BELOW_ZERO
+        limit = largest_px if np.isfinite(largest_px) else _LARGEST_SHARE * rig.width
+        reach = 0.5 * min(limit, rig.width) + _BELOW_ZERO
         self._margin = 16 * int(np.ceil(reach / 16.0))
         self._blocks = cv2.StereoBM.create(self._margin, _BLOCK_PX)
         self._blocks.setMinDisparity(-_BELOW_ZERO)
@@ -62,25 +64,41 @@ class PatchStereo:
             found: features of the right one.
             correction: of the rig; None where its calibration is taken as stated.
         """
-        images = frame.images
-        coarse = self._coarse(images, found.xy)
+        found = found.select(np.asarray(np.isfinite(found.xy).all(axis=1)))
+        coarse = self._coarse(frame.images, found.xy)
         known = np.isfinite(coarse)
         found, coarse = found.select(known), coarse[known]
-        patches = anchor(images[0], found.xy, PATCH_PX, GREY_NOISE, DEFORMATION)
-        good: BoolArray = np.ones(len(found.scale), np.bool_)
-        pixels = [found.xy]
-        for camera in range(1, len(images)):
-            seen, alike = across(self._rig, images[camera], camera, patches, found.xy, coarse)
+        pixels = np.empty((len(found.xy), len(frame.images), 2))
+        good: BoolArray = np.empty(len(found.xy), np.bool_)
+        for first in range(0, len(found.xy), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            pixels[some], good[some] = self._aligned(frame, found.xy[some], coarse[some])
+        rest = (found.scale, found.orientation, found.descriptors)
+        views = tuple(
+            Features(pixels[:, camera], *rest).select(good) for camera in range(len(frame.images))
+        )
+        return self._stereo.measured(views, self._stereo.by_reference(SHIFT_SHARE), correction)[0]
+
+    def _aligned(
+        self, frame: Frame, places: FloatArray, coarse: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Pixels (n, cameras, 2) of places (n, 2) in each image, and which all of them show."""
+        patches = anchor(frame.images[0], places, PATCH_PX, GREY_NOISE, DEFORMATION)
+        good: BoolArray = np.ones(len(places), np.bool_)
+        pixels = [places]
+        for camera in range(1, len(frame.images)):
+            image = frame.images[camera]
+            seen, alike = across(self._rig, image, camera, patches, places, coarse)
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
             if frame.margins:
                 good &= clearance(frame.margins[camera], seen) > PATCH_PX // 2
-        rest = (found.scale, found.orientation, found.descriptors)
-        views = tuple(Features(seen, *rest).select(good) for seen in pixels)
-        return self._stereo.measured(views, self._stereo.by_reference(SHIFT_SHARE), correction)[0]
+        return np.stack(pixels, axis=1), good
 
     def _coarse(self, images: tuple[Image, ...], places: FloatArray) -> FloatArray:
         """Disparities (n,) at places (n, 2) of the right image, to a pixel or two; NaN unknown."""
+        if min(images[0].shape) < 2 * _BLOCK_PX:
+            return np.full(len(places), np.nan)
         table = self._blocks.compute(*(self._prepared(image) for image in images[:2]))
         at = np.rint((places - 0.5) / 2.0).astype(np.int64)
         width = table.shape[1] - self._margin - _BELOW_ZERO

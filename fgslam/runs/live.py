@@ -100,7 +100,8 @@ class Slam(Session):
                 session alone.
             features: an own extractor, from a grey image (height, width) uint8 to
                 :class:`~fgslam.core.features.Features`, descriptors of any kind; it is called from
-                several threads. None for SIFT.
+                several threads, with two cameras for the right image alone
+                (``frontend.stereo.others``). None for SIFT.
             seed: of everything random: samples of place recognition.
             start_map: where to begin, as :meth:`fgslam.Map.load` gives it; None: an empty map.
             extend_map: False leaves the map as it is, and the session only localises in it

@@ -75,7 +75,7 @@ _LOCATING_STREAM = 12  # of random numbers, beside those of the recording
 def as_measured(rig: CameraRig, settings: FrontendSettings) -> CameraRig:
     """The rig as the front-end measures with it: which images tell a place."""
     by_patches = settings.stereo.by_patches(rig.cameras)
-    return dataclasses.replace(rig, places="reference") if by_patches else rig
+    return dataclasses.replace(rig, places="reference" if by_patches else "all")
 
 
 def make_stream(

@@ -28,6 +28,7 @@ class FirstImages:
         """No image yet."""
         self._frames = 0
         self._left: list[int] = []  # features, where they were sought
+        self._spread = np.zeros((0, 2))  # standard deviations of grey values, right and left
         self._brightest = 0
         self._uint16 = False
 
@@ -37,12 +38,17 @@ class FirstImages:
             return
         self._frames += 1
         self._left += [len(own) for own in found.features[1:2]]
+        spread = [float(image.std()) for image in found.frame.images[:2]]
+        self._spread = np.vstack([self._spread, spread])
         self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))
         self._uint16 |= uint16
 
     def left(self) -> str:
-        """How many features the left images have; empty where there was no image."""
-        return f"{np.mean(self._left):.0f} in the left image" if self._left else ""
+        """What the left images have: features, or contrast; empty where there was no image."""
+        if self._left or not self._frames:
+            return f"{np.mean(self._left):.0f} in the left image" if self._left else ""
+        right, left = self._spread.mean(axis=0)
+        return f"grey values vary by {right:.0f} in the right image, by {left:.0f} in the left one"
 
     def lost_bits(self) -> str:
         """That bits were given which are not used; empty where none were."""

@@ -7,7 +7,7 @@ a picture, the page. Numbers: queries answered, right, inexact and false ones, e
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -288,8 +288,22 @@ def _other_frontend(config: LocalisationConfig, given: GivenMap) -> tuple[str, .
     made, now = settings_of_map(given.saved).get("frontend"), config.as_values()["frontend"]
     if not isinstance(made, dict):
         return ()
-    other = [name for name in ("sift", "appearance", "stereo") if made.get(name) != now[name]]
+    other = settings_that_differ(made, now)
     if not other:
         return ()
     keys = " and ".join(f"frontend.{name}" for name in other)
     return (f"{keys} differs from that of the map's drive: fewer features will be recognised",)
+
+
+def settings_that_differ(made: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Groups of the front-end by which features are recognised, where they differ.
+
+    Only what both know counts: maps of other versions have fewer settings or more.
+    """
+    groups = ("sift", "appearance", "stereo")
+    then = {name: made.get(name) or {} for name in groups}
+    return [
+        name
+        for name in groups
+        if any(then[name][key] != now[name][key] for key in then[name].keys() & now[name].keys())
+    ]

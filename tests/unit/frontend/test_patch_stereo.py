@@ -16,7 +16,7 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.patch_stereo import PatchStereo
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.slam.factory import make_describer, make_stereo
+from fgslam.slam.factory import as_measured, make_describer, make_stereo
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
 
 
@@ -105,6 +105,49 @@ def test_swapped_cameras_give_next_to_nothing() -> None:
     right, left, top = pictures(np.array([0.0, 0.0, 1.0]))
     found, seen = measured((left, right, top))
     assert len(seen) <= 0.02 * len(found)
+
+
+def test_a_limit_beyond_half_the_width_is_looked_up_to() -> None:
+    rig = replace(RIG, vertical_baseline=None)
+    right, near = pictures(HERE)[0], 200
+    left = np.roll(right, near, axis=1)
+    left[:, :near] = 0
+    found = SiftExtractor(SiftSettings(), "descriptor").extract(right)
+    matcher = StereoMatcher(rig, StereoSettings(), AppearanceSettings())
+    seen = PatchStereo(rig, matcher, 250.0).match(Frame(0, 0.0, (right, left)), found)
+    assert len(seen) > 100
+    assert abs(float(np.median(seen.measurement[:, 2])) - near) < 0.01
+
+
+def test_an_image_may_have_more_features_than_opencv_samples_at_once() -> None:
+    rng, n = np.random.default_rng(0), 33_000
+    places = rng.uniform((40.0, 20.0), (280.0, 220.0), (n, 2))
+    places[0] = np.nan
+    found = Features(places, np.ones(n), np.zeros(n), np.zeros((n, 1), np.uint8))
+    rig = replace(RIG, vertical_baseline=None)
+    matcher = StereoMatcher(rig, StereoSettings(), AppearanceSettings())
+    seen = PatchStereo(rig, matcher, np.inf).match(Frame(0, 0.0, pictures(HERE)[:2]), found)
+    assert 0.9 * n < len(seen) < n
+
+
+def test_images_smaller_than_a_block_are_no_match() -> None:
+    rig = replace(RIG, width=16, height=16, vertical_baseline=None)
+    found = Features(np.full((1, 2), 8.0), np.ones(1), np.zeros(1), np.zeros((1, 1), np.uint8))
+    matcher = StereoMatcher(rig, StereoSettings(), AppearanceSettings())
+    images = (np.zeros((16, 16), np.uint8),) * 2
+    assert not len(PatchStereo(rig, matcher, np.inf).match(Frame(0, 0.0, images), found))
+
+
+def test_rows_that_may_be_far_apart_are_matched_by_sift() -> None:
+    assert StereoSettings(epipolar_px=2.0).by_patches(2)
+    assert not StereoSettings(epipolar_px=3.0).by_patches(2)
+    assert StereoSettings(epipolar_px=3.0, others="patches").by_patches(2)
+
+
+def test_a_rig_of_a_log_by_patches_may_measure_by_sift() -> None:
+    rig = replace(RIG, vertical_baseline=None, places="reference")
+    settings = FrontendSettings(stereo=StereoSettings(others="sift"))
+    assert as_measured(rig, settings).places == "all"
 
 
 def test_no_features_are_no_match() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,11 @@ def recording() -> fg.Recording:
     return fg.rendered_recording("lab", frames=FRAMES)
 
 
-def remarks(recording: fg.Recording, change: Callable[[Images], Images]) -> tuple[str, ...]:
-    with fg.Slam(recording.rig, "odometry") as slam:
+def remarks(
+    recording: fg.Recording, change: Callable[[Images], Images], cameras: int = 3
+) -> tuple[str, ...]:
+    pair = replace(recording.rig, vertical_baseline=None)
+    with fg.Slam(recording.rig if cameras == 3 else pair, "odometry") as slam:
         for t, images, odometry in recording:
             assert images is not None
             slam.track(t, change(images), odometry)
@@ -66,3 +70,15 @@ def test_images_without_stereo_matches_give_one_line(
     assert remark.startswith(f"no stereo matches in the first {FRAMES} frames: ")
     assert "\n" not in remark
     assert re.search(words, remark), remark
+
+
+def test_a_covered_camera_of_two_is_told_from_swapped_ones(recording: fg.Recording) -> None:
+    rng = np.random.default_rng(0)
+
+    def covered(images: Images) -> Images:
+        noise = np.clip(rng.normal(30.0, 2.0, images[0].shape), 0.0, 255.0)
+        return np.asarray(noise, np.uint8), images[1]
+
+    *_, remark = remarks(recording, covered, cameras=2)
+    assert remark.startswith(f"no stereo matches in the first {FRAMES} frames: ")
+    assert re.search(r"vary by \d\d in the right image, by 2 in the left one", remark), remark
