@@ -187,6 +187,16 @@ def _pair(cameras: Sequence[RawCamera]) -> Placed:
     return (lower, upper), _quarter_turn(upper_side=True), (text,)
 
 
+def is_stereo_pair(cameras: Sequence[RawCamera]) -> bool:
+    """Whether two cameras see the same from beside each other, or above."""
+    sources, turn, _ = _pair(cameras)
+    try:
+        _require_side_by_side([cameras[k] for k in sources], turn)
+    except CalibrationError:
+        return False
+    return True
+
+
 def _quarter_turn(upper_side: bool) -> FloatArray:
     """Turn (3, 3) of the view after which the camera above, or the one below, is the left one."""
     sign = 1.0 if upper_side else -1.0

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size, in_metres
+from fgslam.cameras.assembly import at_size, in_metres, is_stereo_pair
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
@@ -70,7 +71,15 @@ def file_cameras(settings: BagSettings) -> FileCameras:
         cameras = read_calibration_file(file).cameras
     except CalibrationError:
         return FileCameras(file.name)
-    return FileCameras(file.name, tuple(camera.topic for camera in cameras))
+    topics = tuple(camera.topic for camera in cameras)
+    return FileCameras(file.name, topics, _ahead(cameras) if len(cameras) > 3 else ())
+
+
+def _ahead(cameras: tuple[RawCamera, ...]) -> tuple[int, ...]:
+    """The only two cameras that form a stereo pair; () where there are several pairs, or none."""
+    numbers = combinations(range(len(cameras)), 2)
+    pairs = [pair for pair in numbers if is_stereo_pair([cameras[k] for k in pair])]
+    return pairs[0] if len(pairs) == 1 else ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +118,12 @@ def _of_file(settings: BagSettings, stated: Stated, chosen: Chosen) -> _Found | 
     if numbers:
         rig = loaded_rig(settings, file, size=stated.size, cameras=numbers, pair=False)
         return replace(_of_numbers(rig, [cameras[k] for k in numbers], chosen), on_body=on_body)
+    if len(cameras) > 3:
+        raise CalibrationError(
+            f"{file} holds {len(cameras)} cameras, and nothing says which of them {chosen.left} "
+            f"and {chosen.right} are; write those two: fgslam camera convert {file.name} "
+            "two.yaml --cameras 0,1"
+        )
     rig = loaded_rig(settings, file, size=stated.size)
     if differ_in_number(chosen.left, chosen.right):
         rig = numbered(rig)

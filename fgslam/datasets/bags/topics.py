@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from fgslam.core.errors import DatasetError
-from fgslam.core.sides import camera_pairs, is_view
+from fgslam.core.sides import camera_pairs, differ_in_number, is_view
 from fgslam.datasets.bags import messages as kinds
 from fgslam.datasets.bags.files import Topic
 
@@ -61,10 +61,13 @@ class FileCameras:
         file: its name; empty: there is none.
         topics: of each camera's images, empty where it states none; () where it cannot be read
             before the images' size is known.
+        ahead: of more than three cameras the only two that form a stereo pair; () where there are
+            several such pairs, or none.
     """
 
     file: str = ""
     topics: tuple[str, ...] = ()
+    ahead: tuple[int, ...] = ()
 
 
 def choose_topics(
@@ -138,7 +141,7 @@ def _as_named(
     if len(set(known)) == len(names):
         return tuple(names), known
     if len(names) == 2:
-        return tuple(names), ()
+        return tuple(names), _of_many(names, cameras)
     if not cameras.file or len(cameras.topics) not in (0, 3):
         known_of = f"{cameras.file} is of {len(cameras.topics)}" if cameras.file else "none"
         raise DatasetError(
@@ -146,6 +149,21 @@ def _as_named(
             f"cameras ({known_of}); give it by --camera FILE, or name two topics"
         )
     return tuple(names), (0, 1, 2)
+
+
+def _of_many(names: Sequence[str], cameras: FileCameras) -> tuple[int, ...]:
+    """Of a file of more than three cameras those that numbers in names tell; () where none do."""
+    numbers = _numbers_apart(names)
+    count = len(cameras.topics)
+    return numbers if count > 3 and numbers and max(numbers) < count else ()
+
+
+def _numbers_apart(names: Sequence[str]) -> tuple[int, ...]:
+    """The first number in which two names differ, of each; () where they differ in more."""
+    if not differ_in_number(*names):
+        return ()
+    words = zip(*(re.findall(r"\d+", name) for name in names), strict=False)
+    return next((tuple(map(int, both)) for both in words if len(set(both)) > 1), ())
 
 
 def _by_file(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Views | None:
@@ -156,13 +174,19 @@ def _by_file(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _View
     if len(found) < 2:
         return None
     listed = ", ".join(found.values())
-    if len(found) > 3:
-        raise DatasetError(
-            f"{where}: {cameras.file} names the topics of {len(found)} cameras, {listed}; say "
-            "which two or three form the rig: --topics"
-        )
     note = f"topics by rostopic of {cameras.file}: {listed}"
+    if len(found) > 3:
+        if not cameras.ahead or not found.keys() >= set(cameras.ahead):
+            raise DatasetError(
+                f"{where}: {cameras.file} names the topics of {len(found)} cameras, {listed}; say "
+                "which two or three form the rig: --topics"
+            )
+        found = {k: found[k] for k in cameras.ahead}
+        note += f"; {_AHEAD.format(' and '.join(found.values()))}"
     return _Views(tuple(found.values()), tuple(found), (note,))
+
+
+_AHEAD = "{} are the only two of them that form a stereo pair (--topics chooses others)"
 
 
 def _absolute(topic: str) -> str:
@@ -186,6 +210,8 @@ def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Vie
         if (with_depth := _colour_and_depth(topics)) is not None:
             return with_depth
         raise DatasetError(_no_pair(topics, views, where))
+    if cameras.ahead:
+        pairs = sorted(pairs, key=lambda pair: _numbers_apart(pair) != cameras.ahead)
     used, *others = pairs
     third = [pair for pair in others if pair[0] == used[1] and len(cameras.topics) == 3][:1]
     names = (*used, *(pair[1] for pair in third))
@@ -196,7 +222,7 @@ def _by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Vie
     if absent:
         text = f"no images here of {', '.join(absent)}, the rostopic in {cameras.file}"
         notes.insert(0, f"{text}: topics are told by their names")
-    numbers = (0, 1, 2) if third else ()
+    numbers = (0, 1, 2) if third else _of_many(used, cameras)
     return _Views(tuple(by_view[name] for name in names), numbers, tuple(notes))
 
 
