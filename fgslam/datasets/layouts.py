@@ -209,7 +209,8 @@ def _unknown(folder: Path) -> str:
         return (
             f"{alone} holds images of one camera only; a stereo pair is the least, beside a "
             "gyroscope, too: images of a left and a right camera by the names of folders or files "
-            "(of a mirror or panoramas: fgslam teach)"
+            "(of a mirror or panoramas: fgslam teach; where each shows both views side by side, "
+            "cut them into left/ and right/, or make a film of them, which is read as it is)"
         )
     for path in shown_in(folder):
         if path.is_file() and (remedy := _REMEDIES.get(path.suffix.lower())):

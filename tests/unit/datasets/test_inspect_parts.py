@@ -113,7 +113,9 @@ def test_images_of_one_camera_are_called_so(tmp_path: Path, inside: str) -> None
     (tmp_path / "gyro.csv").write_text("time,gyro_x,gyro_y,gyro_z\n0,0,0,0\n", encoding="utf-8")
     for k in range(4):
         save(tmp_path / inside / f"{k:06d}.png", picture(k))
-    with pytest.raises(DatasetError, match=r"holds images of one camera only; .* a gyroscope, too"):
+    with pytest.raises(
+        DatasetError, match=r"holds images of one camera only; .* a gyroscope, too.* side by"
+    ):
         recognise_layout(tmp_path)
 
 
