@@ -65,7 +65,7 @@ class Look:
     Attributes:
         index: the recording's number of the frame.
         features: number of features in right, left[, top].
-        pairs: number of right-left matches that our matcher accepts.
+        pairs: number of right-left matches of SIFT features by the gates of a run.
         stereo: what is left of these after the top camera, if any.
         left: ungated matches with the left image.
         top: the same with the top image, or None.
