@@ -22,10 +22,6 @@ PATCH_PX = 15  # side of a patch
 GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
 DEFORMATION = 0.05  # sigma of a patch's stretching between two images
 ALIGNMENTS_ACROSS = 3  # in another camera's image, from a disparity known to a pixel or two
-SHIFT_SHARE = 0.9
-"""Sigma of a patch's shift to another image over that of a SIFT coordinate (pixel_sigma). Rows of
-both images disagree by 0.09 to 0.19 px, those of SIFT's matches by 0.16 to 0.27."""
-
 _MIN_CORRELATION = 0.8
 """Of a patch with what it is in another image, gain and offset taken out. Of patches whose partner
 is elsewhere, or is none, two or three in a hundred reach it by chance."""
@@ -77,7 +73,7 @@ class PatchStereo:
         views = tuple(
             Features(pixels[:, camera], *rest).select(good) for camera in range(len(frame.images))
         )
-        return self._stereo.measured(views, self._stereo.by_reference(SHIFT_SHARE), correction)[0]
+        return self._stereo.measured(views, self._stereo.by_reference(), correction)[0]
 
     def _aligned(
         self, frame: Frame, places: FloatArray, coarse: FloatArray

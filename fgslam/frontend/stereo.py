@@ -6,7 +6,7 @@ partner is ambiguous. Two-camera rigs use the same code without the last step.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import dataclasses
 from typing import TypeAlias
 
 import numpy as np
@@ -20,6 +20,7 @@ from fgslam.core.sensors import (
     CameraRig,
     measurement_map,
     partial_map,
+    pixel_covariance,
     rig_map,
     vertical_to_horizontal,
 )
@@ -81,7 +82,7 @@ class StereoMatcher:
         without_top = self._measure(features, straight, (i[beside], j[beside], None))
         without_left = self._measure(features, straight, (n[above], None, k[above]))
         every = whole.join(without_top).join(without_left)
-        return replace(every, complete=np.arange(len(every)) < len(whole))
+        return dataclasses.replace(every, complete=np.arange(len(every)) < len(whole))
 
     def measured(
         self,
@@ -112,14 +113,10 @@ class StereoMatcher:
         """By images alike good; ``share``: a coordinate's sigma over that of SIFT's."""
         return self._map, share**2 * self._independent(self._map)
 
-    def by_reference(self, share: float) -> Linear:
-        """As :meth:`equally`; the other images' places are shifts from the first one's.
-
-        The error of that place is in all coordinates alike, and none of the disparity's. ``share``:
-        sigma of a shift over that of a SIFT coordinate.
-        """
-        shifts = self._map[:, 2:]
-        covariance = share**2 * (shifts @ shifts.T) + np.diag([1.0, 1.0, 0.0])
+    def by_reference(self) -> Linear:
+        """As :meth:`equally`; the other images' places are shifts from the first one's."""
+        by_shifts = dataclasses.replace(self._rig, places="reference")
+        covariance = self._map @ pixel_covariance(by_shifts) @ self._map.T
         return self._map, self._with_depth(self._settings.pixel_sigma**2 * covariance)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:

@@ -27,6 +27,7 @@ from fgslam.core.rig_correction import displacements
 from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import (
     CameraRig,
+    pixel_covariance,
     pixel_model,
     rig_map,
     vertical_to_horizontal,
@@ -84,7 +85,7 @@ class _Prediction:
 
     Attributes:
         local: (m, 3) points in the cameras that see them.
-        residual: (m, 2 * cameras) predicted less raw pixels, in sigmas.
+        residual: (m, 2 * cameras) predicted less raw pixels, whitened: of one sigma, independent.
         unit: (m, 2 * cameras, p) displacements of the predicted pixels.
         exact: (m, cameras, 2) those pixels.
     """
@@ -143,6 +144,7 @@ class RigAlignment:
         self._keep(np.isfinite(self._pixels).all(axis=(1, 2)))
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
+        self._white = np.linalg.inv(np.linalg.cholesky(pixel_covariance(rig)))
         self._fuse = rig_map(rig)
 
     def evidence(self, correction: FloatArray, prior: FloatArray) -> RigEvidence | None:
@@ -225,7 +227,8 @@ class RigAlignment:
         pixels = exact.reshape(-1, self._rig.cameras, 2)
         unit = displacements(self._rig, pixels)
         unit *= self._free
-        residual = (exact + unit @ state.correction - self._raw()) / self._sigma
+        off = exact + unit @ state.correction - self._raw()
+        residual = off @ self._white.T / self._sigma
         self._last = _Prediction(state, local, residual, unit, pixels)
         return self._last
 
@@ -268,10 +271,12 @@ class RigAlignment:
 
     def _normal(self, found: _Prediction) -> _Normal:
         state = found.state
-        local, residual, unit = found.local, found.residual, found.unit
+        local, residual, unit = found.local, found.residual, self._white @ found.unit
         squared = (residual**2).sum(axis=1)
         root = 1.0 / (self._sigma * np.sqrt(1.0 + squared / _KERNEL_WIDTH**2))
-        by_local = root[:, None, None] * (self._model @ projection_jacobian(self._rig, local))
+        by_local = root[:, None, None] * (
+            self._white @ self._model @ projection_jacobian(self._rig, local)
+        )
         by_pose = by_local @ point_pose_jacobian(local)
         by_point = by_local @ np.swapaxes(state.poses[:, :3, :3], 1, 2)[self._frame]
         joint = np.concatenate([by_pose, root[:, None, None] * unit], axis=2)

@@ -85,7 +85,7 @@ def test_what_is_near_hides_what_is_far_and_the_unknown_has_no_texture() -> None
 def test_the_disparity_has_the_noise_of_the_depth_and_is_independent_of_the_place() -> None:
     rig = CameraRig(64, 48, FOCAL, FOCAL, 31.5, 23.5, 0.1, None, np.eye(4), places="reference")
     settings = StereoSettings(disparity_sigma_px=0.2)
-    covariance = StereoMatcher(rig, settings, AppearanceSettings()).by_reference(0.9)[1]
+    covariance = StereoMatcher(rig, settings, AppearanceSettings()).by_reference()[1]
     sigma2 = settings.pixel_sigma**2
     assert np.allclose(covariance, np.diag([sigma2, sigma2, 0.04]), rtol=0.0, atol=1e-15)
 

@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.planar import wrap
 from fgslam.core.rig_correction import RigCorrection, term_names
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import SHIFT_SHARE, CameraRig
 from fgslam.core.settings import RigPlaces
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
@@ -386,12 +386,12 @@ def test_covariances_of_shifts_match_monte_carlo(places: RigPlaces, vertical: fl
     """The other images' places are off as the first one's is, and by less of their own."""
     rng = np.random.default_rng(12)
     rig = dataclasses.replace(RIG, vertical_baseline=vertical, places=places)
-    matcher = StereoMatcher(rig, dataclasses.replace(GATES, pixel_sigma=0.3), PAPER)
+    matcher = StereoMatcher(rig, dataclasses.replace(GATES, pixel_sigma=0.1), PAPER)
     at = np.array([RIGHT, (118.0, 80.0), (100.0, 80.0 + 18.0 * 2.5)][: rig.cameras])
-    drawn = at + 0.3 * rng.standard_normal((100_000, 1, 2))
-    drawn[:, 1:] += 0.4 * 0.3 * rng.standard_normal((len(drawn), rig.cameras - 1, 2))
+    drawn = at + 0.1 * rng.standard_normal((100_000, 1, 2))
+    drawn[:, 1:] += SHIFT_SHARE * 0.1 * rng.standard_normal((len(drawn), rig.cameras - 1, 2))
     images = tuple(features(drawn[:, camera]) for camera in range(rig.cameras))
-    linear = matcher.by_reference(0.4)
+    linear = matcher.by_reference()
     seen = matcher.measured(images, linear)[0].measurement
     assert len(seen) == len(drawn)
     assert abs(seen.mean(axis=0) - [100.0, 80.0, 18.0]).max() < 0.01
