@@ -98,13 +98,17 @@ def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly
     found = replace(found, calibration=_with_view(calibration, sources, rotations, view))
     remarks = (*calibration.notes, *told, *also)
     if calibration.sided and len(sources) == 2:
-        found = replace(found, order=(1 - sources[0], 1 - sources[1]))
+        found = replace(found, order=tuple(_GIVEN_AS[k] for k in sources))
         if sources == (0, 1) and not told:
             remarks = (*remarks, _swapped(chosen, found.rig))
     remarks = (*remarks, *implausible(calibration.source, found.rig))
     straight = found.order[:2] == (0, 1) and asked.is_default and _is_rectified(chosen, turn)
     kept = None if straight and found.correction is None else found
     return Assembly(found.rig, kept, sources, remarks)
+
+
+_GIVEN_AS = (1, 0, 2)
+"""Where the images of a sided file's left, right and third camera are among right, left, top."""
 
 
 def _corrected(calibration: Calibration) -> Callable[[CameraRig], FloatArray] | None:

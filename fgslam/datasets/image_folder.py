@@ -127,12 +127,18 @@ def _cameras(root: Path, settings: ImageFolderSettings, listed: list[dict[int, P
     chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
     size = first_size(listed[0].values())
     rig = loaded_rig(settings, path, size=size, cameras=chosen, pair=not three)
-    if three and rig.vertical_baseline is None:
+    if three and rig.vertical_baseline is None and not _outer_two(rig):
         raise CalibrationError(
             f"{path} knows two cameras, but {root} has a third one, top/; give a calibration of "
             "all three, or leave it out: --set dataset.use_top=false"
         )
     return mounted(rig if three else replace(rig, vertical_baseline=None), settings)
+
+
+def _outer_two(rig: StereoRig) -> bool:
+    """Whether these are two of three cameras in a line whose file says which images are theirs."""
+    known = None if rig.rectifier is None else rig.rectifier.calibration
+    return known is not None and known.sided and len(known.cameras) == 3
 
 
 def _read_times(path: Path) -> tuple[IntArray, FloatArray]:

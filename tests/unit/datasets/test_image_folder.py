@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from dataset_builders import (
     CALIBRATION,
+    HEIGHT,
+    WIDTH,
     curve,
     image_folder,
     picture,
@@ -14,8 +17,10 @@ from dataset_builders import (
     write_tum,
 )
 
+from fgslam.cameras.formats.own import raw_values
+from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, right_from_left_camera
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, right_from_left_camera
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.images import read_grey_image
@@ -334,6 +339,22 @@ def test_bad_recording_is_refused_in_one_line(
 def test_absent_recording(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="does not exist; check dataset"):
         opened(tmp_path / "nowhere")
+
+
+def test_of_three_cameras_in_a_line_the_outer_two_are_used(tmp_path: Path) -> None:
+    """As ``fgslam calibrate trinocular`` writes them: left, right and the one in top/."""
+    root = image_folder(tmp_path, top=True)
+    matrix = np.array([[30.0, 0.0, 15.5], [0.0, 30.0, 11.5], [0.0, 0.0, 1.0]])
+    cameras = tuple(
+        RawCamera(WIDTH, HEIGHT, matrix, np.zeros(4), pose(np.eye(3), np.array([x, 0.0, 0.0])))
+        for x in (0.0, 0.1, 0.3)
+    )
+    values = raw_values(Calibration("made", "made", cameras, sided=True))
+    (root / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+    recording = opened(root)
+    assert recording.rig.baseline == pytest.approx(0.3)
+    assert corners(recording, 1) == [111, 61]  # the third one is the right one of the two
+    assert "between the others, is not used" in recording.notes[0]
 
 
 def test_top_camera_needs_a_vertical_baseline(tmp_path: Path) -> None:
