@@ -78,6 +78,11 @@ class LensCamera:
         ring = ring or (0.0, circle)
         return cls(raw.width, raw.height, raw.model, *numbers, ring, up, ahead, clockwise)
 
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Principal point, column and row in pixels."""
+        return self.matrix[2], self.matrix[5]
+
     def rays(self, pixels: FloatArray) -> FloatArray:
         """(n, 3) unit rays; see :class:`fgslam.cameras.omni.camera.OmniCamera`."""
         seen = self._raw.unproject(self._within(np.asarray(pixels, np.float64)))

@@ -69,8 +69,13 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
     if isinstance(camera, Equirectangular):
         return (*_panorama_notes(camera), *_side_notes(recording))
     if isinstance(camera, LensCamera):
-        return (_lens_note(camera),) if stated else ()
-    return _mirror_notes(recording, camera) if isinstance(camera, RadialCamera) else ()
+        told = (_lens_note(camera),) if stated else ()
+        hole, rim = camera.ring
+        # A mirror reflects its camera in the middle; a lens has no rim that must be in the picture.
+        return (*told, *(_mirror_notes(recording, camera.centre, rim) if hole > 0.0 else ()))
+    if isinstance(camera, RadialCamera):
+        return _mirror_notes(recording, camera.frame.centre, camera.outer_radius)
+    return ()
 
 
 def _lens_note(camera: LensCamera) -> str:
@@ -139,33 +144,34 @@ def _first_pictures(recording: OmniRecording) -> Iterator[Image]:
             yield recording.image(k)
 
 
-def _mirror_notes(recording: OmniRecording, camera: RadialCamera) -> tuple[str, ...]:
+def _mirror_notes(
+    recording: OmniRecording, stated: tuple[float, float], radius: float
+) -> tuple[str, ...]:
     """A note where the rim in the first pictures lies clearly off, or cannot be found at all."""
-    circles = [c for k in _first_pictures(recording) if (c := _rim(camera, k)) is not None]
+    circles = [c for k in _first_pictures(recording) if (c := _rim(stated, radius, k)) is not None]
     if not circles:
         return (
             f"the mirror's rim is not found in {recording.names[0]}, so its centre is unchecked",
         )
     column, row = np.median([c.centre for c in circles], axis=0)
-    stated = camera.frame.centre
     away = float(np.hypot(column - stated[0], row - stated[1]))
-    if away <= max(_CLEARLY_OFF * camera.outer_radius, _LEAST_OFF_PX):
+    if away <= max(_CLEARLY_OFF * radius, _LEAST_OFF_PX):
         return ()
     return (
         f"the mirror lies {away:.1f} px off its stated centre ({stated[0]:.1f}, {stated[1]:.1f}): "
         f"its rim's is ({column:.1f}, {row:.1f}); bearings are wrong by up to "
-        f"{np.degrees(away / camera.outer_radius):.1f} degrees at the rim and more within: correct "
+        f"{np.degrees(away / radius):.1f} degrees at the rim and more within: correct "
         "dataset.camera or the calibration",
     )
 
 
-def _rim(camera: RadialCamera, image: Image) -> MirrorCircle | None:
+def _rim(stated: tuple[float, float], radius: float, image: Image) -> MirrorCircle | None:
     """The rim near where it should be, else around any circle: its holder's, say, is concentric."""
-    found = _circle(image, (camera.frame.centre, camera.outer_radius))
+    found = _circle(image, (stated, radius))
     if found is not None:
         return found
     around = _circle(image, None)
-    return None if around is None else _circle(image, (around.centre, camera.outer_radius))
+    return None if around is None else _circle(image, (around.centre, radius))
 
 
 def _circle(image: Image, near: tuple[tuple[float, float], float] | None) -> MirrorCircle | None:

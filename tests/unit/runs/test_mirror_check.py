@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -67,6 +68,29 @@ def test_a_mirror_off_its_place_is_reported_with_the_offset(
     assert reported is not None
     found = [float(number) for number in reported.groups()]
     np.testing.assert_allclose(found, [np.hypot(*off), *CENTRE], atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("off", "hole", "told"), [(0.0, 15.0, False), (6.0, 15.0, True), (6.0, 0.0, False)]
+)
+def test_the_rim_of_a_mirror_by_a_calibration_of_its_own_is_checked(
+    tmp_path: Path, off: float, hole: float, told: bool
+) -> None:
+    """A ring without a hole is that of a lens, whose image may end at the picture."""
+    assert cv2.imwrite(str(tmp_path / "m1.png"), picture())
+    lens = {
+        "camera_model": "omni",
+        "intrinsics": [0.92, 60.0, 60.0, CENTRE[0] + off, CENTRE[1]],
+        "distortion_model": "radtan",
+        "distortion_coeffs": [0.0] * 4,
+        "resolution": list(SIZE),
+    }
+    (tmp_path / "camchain.yaml").write_text(json.dumps({"cam0": lens}), encoding="utf-8")
+    camera = {"kind": "lens", "file": str(tmp_path / "camchain.yaml"), "ring_px": (hole, RADIUS)}
+    settings = OmniPathSettings.__pydantic_validator__.validate_python(
+        {"path": str(tmp_path), "camera": camera}
+    )
+    assert ("px off its stated centre" in " ".join(open_checked(settings).notes)) is told
 
 
 def test_a_rim_that_cannot_be_found_is_reported(tmp_path: Path) -> None:
