@@ -87,8 +87,8 @@ class PatchStereo:
             seen, alike = across(self._rig, image, camera, patches, places, coarse)
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
-            if frame.margins:
-                good &= clearance(frame.margins[camera], seen) > PATCH_PX // 2
+        for margin, seen in zip(frame.margins, pixels, strict=False):  # none: all are full
+            good &= clearance(margin, seen) > PATCH_PX // 2
         return np.stack(pixels, axis=1), good
 
     def _coarse(self, images: tuple[Image, ...], places: FloatArray) -> FloatArray:

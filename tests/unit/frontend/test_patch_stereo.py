@@ -63,8 +63,8 @@ def test_what_another_image_does_not_show_is_left_out() -> None:
     assert len(seen) <= 0.02 * len(found)
 
 
-def test_what_lies_at_the_rim_of_another_image_is_left_out() -> None:
-    """Where it shows nothing within half a patch."""
+def test_what_lies_at_the_rim_of_an_image_is_left_out() -> None:
+    """Where it shows nothing within half a patch: a rim is where it is in all images alike."""
     images = pictures(HERE)
     found = SiftExtractor(SiftSettings(), "descriptor").extract(images[0])
     matcher = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
@@ -77,6 +77,10 @@ def test_what_lies_at_the_rim_of_another_image_is_left_out() -> None:
     kept = np.rint(whole.pixels[:, 1, 0]) >= 50
     assert 0 < kept.sum() < len(kept)
     assert np.array_equal(cut.pixels, whole.pixels[kept])
+    own = stereo.match(Frame(0, 0.0, images, (rim, clear, clear)), found)
+    kept = np.rint(whole.pixels[:, 0, 0]) >= 50
+    assert 0 < kept.sum() < len(kept)
+    assert np.array_equal(own.pixels, whole.pixels[kept])
 
 
 @pytest.mark.parametrize(("cameras", "others"), [(2, "auto"), (3, "auto"), (2, "sift")])
