@@ -258,7 +258,10 @@ def _from_corner(part: Values, size: tuple[int, int], model: str) -> RawCamera:
     fx, fy = part.named(("f", "f") if "f" in part else ("fx", "fy"))
     cx, cy = part.named(("cx", "cy")) - 0.5
     fisheye = model == "OPENCV_FISHEYE"
-    lens = part.named(("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2"), 0.0)
+    terms = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    if not fisheye and part.named(("k4",), 0.0).any():
+        raise part.refuse(f"k4 of {model} is not known; calibrate without it")
+    lens = part.named(terms, 0.0)
     matrix, kind = intrinsic_matrix(fx, fy, cx, cy), "equidistant" if fisheye else "radtan"
     return checked_camera(RawCamera(*size, matrix, lens, np.eye(4), part.path.name, kind))
 

@@ -357,6 +357,16 @@ ONE = {
 }
 
 
+def test_further_radial_terms_of_nerfstudio_are_read_or_refused(tmp_path: Path) -> None:
+    path, given = tmp_path / "transforms.json", json.loads(ONE["transforms.json"])
+    path.write_text(json.dumps(given | {"k1": 0.1, "k3": -0.02}), encoding="utf-8")
+    (camera,) = read_calibration_file(path, size=SIZE).cameras
+    assert camera.distortion.tolist() == [0.1, 0.0, 0.0, 0.0, -0.02]
+    path.write_text(json.dumps(given | {"k4": 0.01}), encoding="utf-8")
+    with pytest.raises(CalibrationError, match="k4 of OPENCV is not known"):
+        read_calibration_file(path, size=SIZE)
+
+
 @pytest.mark.parametrize("name", ONE)
 def test_one_camera_beside_its_depth(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text(ONE[name], encoding="utf-8")
