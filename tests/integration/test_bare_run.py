@@ -81,11 +81,13 @@ def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
 def test_a_drone_that_turns_by_tens_of_degrees_a_frame_is_located(
     shared_data: Path, tmp_path: Path
 ) -> None:
-    """No odometry, and steps of 20 degrees and 0.3 m in the mean: no velocity foretells them."""
-    quiet = {**UNSEEN, "dataset.stop": 18}
+    """No odometry, and steps of 20 degrees and 0.3 m in the mean: no velocity foretells them.
+
+    By the default estimator: one Kalman filter a landmark reports 5 cm there, and errs by as much.
+    """
     path = shared_data / "euroc_v101_kf100"
-    run = fg.run(path, tmp_path / "run", {**quiet, "estimator.kind": "landmark_kalman"})
-    numbers = run.metrics["estimators"]["landmark_kalman"]
+    run = fg.run(path, tmp_path / "run", {**UNSEEN, "dataset.stop": 18})
+    numbers = run.metrics["estimators"][DEFAULT_ESTIMATOR]
     assert sum(run.metrics["status_counts"].values()) == 18
     assert set(run.metrics["status_counts"]) == {"first", "ok", "relocalised"}
-    assert numbers["ate_rmse_m"] < 0.04
+    assert numbers["ate_rmse_m"] < 0.02
