@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fgslam.core.arrays import Image
 from fgslam.core.estimates import Trajectory
-from fgslam.core.recordings import Sequence
+from fgslam.core.recordings import Frame, Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import run_task
@@ -93,6 +94,12 @@ def find_features(config: ExperimentConfig) -> FoundFeatures:
         return FoundFeatures(sequence, list(stream))
     finally:
         stream.close()
+
+
+def described(config: ExperimentConfig, frame: Frame) -> tuple[Image, ...]:
+    """The images of a frame that the run finds features in."""
+    images = frame.images
+    return images[:1] if config.frontend.stereo.by_patches(len(images)) else images
 
 
 def make_system(config: ExperimentConfig, sequence: Sequence) -> SlamPipeline:

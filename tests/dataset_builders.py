@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +13,9 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.datasets.loose_images import open_loose_images
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.settings import LooseImagesSettings, RecordedOdometrySettings
 
 WIDTH, HEIGHT = 32, 24
 CALIBRATION = {
@@ -39,6 +44,29 @@ def save(path: Path, image: Image) -> None:
 def write_calibration(root: Path, **changes: object) -> None:
     values = {**CALIBRATION, **changes}
     (root / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+
+
+def loose(
+    root: Path, names: Callable[[int], tuple[str, str]], numbers: Iterable[int] = range(3)
+) -> Path:
+    """Frame i of the numbers has corner pixels 10 + i (right) and 60 + i (left)."""
+    for i, k in enumerate(numbers):
+        left, right = names(k)
+        save(root / left, picture(60 + i))
+        save(root / right, picture(10 + i))
+    write_calibration(root)
+    return root
+
+
+def opened_loose(root: Path, **settings: Any) -> Recording:
+    return open_loose_images(
+        LooseImagesSettings(path=str(root), **settings), RecordedOdometrySettings()
+    )
+
+
+def codes(recording: Recording) -> list[tuple[int, ...]]:
+    frames = [recording.frame(i).images for i in range(len(recording))]
+    return [tuple(int(image[0, 0]) for image in images) for images in frames]
 
 
 def write_tum(path: Path, stamps: FloatArray, poses: FloatArray) -> None:

@@ -11,7 +11,7 @@ from typing import Literal, TypeVar
 import cv2
 import numpy as np
 
-from benchmarks.runs import experiment, make_system, say
+from benchmarks.runs import described, experiment, make_system, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.estimates import EgoMotionStatus
@@ -72,7 +72,6 @@ def find(config: ExperimentConfig) -> Found:
     """Features of all frames, and CPU times of finding them, of SIFT alone among them."""
     say(f"finding the features of {config.name}")
     sequence, extract = open_sequence(config), make_extractor(config.frontend)
-    described = 1 if config.frontend.stereo.by_patches(sequence.rig.cameras) else None
     sift = config.frontend.sift
     alone = cv2.SIFT.create(
         sift.max_features, sift.octave_layers, sift.contrast_threshold, EDGE_THRESHOLD,
@@ -81,7 +80,7 @@ def find(config: ExperimentConfig) -> Found:
     frames, seconds, raw = [], [], []
     for i in range(len(sequence)):
         frame = sequence.frame(i)
-        each = [_timed(extract, (image,)) for image in frame.images[:described]]
+        each = [_timed(extract, (image,)) for image in described(config, frame)]
         features = tuple(found[0] for found, _ in each)
         frames.append(FeatureFrame(i, frame, features, "", 0.0, 0.0))
         seconds.append([spent for _, spent in each])

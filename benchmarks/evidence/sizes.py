@@ -10,6 +10,7 @@ import numpy as np
 
 from benchmarks.runs import (
     FoundFeatures,
+    described,
     experiment,
     make_system,
     process,
@@ -82,11 +83,10 @@ def _row(width: int, frames: int) -> tuple[Cell, ...]:
 def _detect(config: ExperimentConfig, sequence: Sequence) -> Detected:
     """One image after the other, so that the thread's time is that of detection."""
     extract, frames, seconds = make_extractor(config.frontend), [], 0.0
-    described = 1 if config.frontend.stereo.by_patches(sequence.rig.cameras) else None
     for i in range(len(sequence)):
         frame = sequence.frame(i)
         start = time.thread_time()
-        found: list[Features] = [extract(image) for image in frame.images[:described]]
+        found: list[Features] = [extract(image) for image in described(config, frame)]
         seconds += time.thread_time() - start
         frames.append(FeatureFrame(i, frame, tuple(found), "", 0.0, 0.0))
     return Detected(FoundFeatures(sequence, frames), seconds)

@@ -229,7 +229,7 @@ def _of_two(first: Path, second: Path, size: Size | None) -> Calibration:
 # A folder
 
 
-_SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".npz", ".txt", ".conf")
+_SUFFIXES = (*_TREES, ".txt", ".conf")
 
 
 def _of_folder(folder: Path, size: Size | None) -> Calibration:
@@ -250,7 +250,7 @@ def _of_folder(folder: Path, size: Size | None) -> Calibration:
     if found:
         names = ", ".join(Path(one.source).name for one in found)
         raise CalibrationError(f"{folder}: holds several calibrations ({names}); name one")
-    own = [path for path in shown_in(folder) if path.suffix.lower() in _SUFFIXES[:5]]
+    own = [path for path in shown_in(folder) if path.suffix.lower() in _TREES]
     if len(own) == 1 and own[0].is_file():
         _require_readable(own[0], size)
     raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {KNOWN}")

@@ -60,9 +60,8 @@ _UPPER = np.triu_indices(3)
 _UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
-_EXACT = "exact"  # of a rig: written where it is
-_VIEW = "view"  # of a rig: written where it is cylindrical
-_PLACES = "places"  # of a rig: written where the reference alone tells them
+_DEFAULTS: dict[str, Any] = {"exact": False, "view": "perspective", "places": "all"}
+"""Of a rig: written where it is otherwise."""
 
 
 def arrays_of(
@@ -71,12 +70,9 @@ def arrays_of(
     """Frames as the arrays of a log's file of one version (:func:`version_of`)."""
     kind = "stereo" if isinstance(sensor, CameraRig) else "range_bearing"
     about = {"kind": kind} | {name: getattr(sensor, name) for name in _SENSOR_KEYS[kind]}
-    if isinstance(sensor, CameraRig) and sensor.exact:
-        about[_EXACT] = True
-    if isinstance(sensor, CameraRig) and sensor.cylindrical:
-        about[_VIEW] = sensor.view
-    if isinstance(sensor, CameraRig) and sensor.places != "all":
-        about[_PLACES] = sensor.places
+    if isinstance(sensor, CameraRig):
+        stated = {name: type(usual)(getattr(sensor, name)) for name, usual in _DEFAULTS.items()}
+        about |= {name: value for name, value in stated.items() if value != _DEFAULTS[name]}
     out = LOG.header(version, sensor=about, motion=motion_model) | {
         SENSOR_POSE: sensor.bTc,
         "frame_index": np.array([s.index for s in frames], np.int64),
@@ -199,8 +195,8 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     sensor = header.get("sensor")
     keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
     given = set(sensor if isinstance(sensor, dict) else ())
-    may = {_EXACT, _VIEW, _PLACES} if keys is _RIG else set()
-    if keys is None or given - may != {"kind", *keys}:
+    optional = set(_DEFAULTS) if keys is _RIG else set()
+    if keys is None or given - optional != {"kind", *keys}:
         raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
     if not isinstance(header.get("motion"), dict):
         raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")

@@ -205,18 +205,18 @@ SHIFT_SHARE = 0.9
 both images disagree by 0.09 to 0.19 px, those of SIFT's matches by 0.16 to 0.27."""
 
 
-def pixel_covariance(rig: CameraRig) -> FloatArray:
+def pixel_covariance(cameras: int, places: RigPlaces) -> FloatArray:
     """(2 * cameras, 2 * cameras) of (c, r) per camera, by the variance of a SIFT coordinate.
 
-    Where the reference alone tells the places (``rig.places``), its error is in all coordinates
-    alike, and the other images add that of the shift.
+    Where the reference alone tells the places (:attr:`CameraRig.places`), its error is in all
+    coordinates alike, and the other images add that of the shift.
     """
-    own = np.eye(2 * rig.cameras)
-    if rig.places == "all":
+    own = np.eye(2 * cameras)
+    if places == "all":
         return own
     own[2:] *= SHIFT_SHARE**2
     own[:2] = 0.0
-    return own + np.tile(np.eye(2), (rig.cameras, rig.cameras))
+    return own + np.tile(np.eye(2), (cameras, cameras))
 
 
 def partial_map(seen: Sequence[int], cameras: int, ratio: float) -> FloatArray:

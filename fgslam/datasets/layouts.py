@@ -286,17 +286,19 @@ def _image_folder_begun(folder: Path) -> bool:
     return pair or not _absent(folder, ("calib.json", "times.txt"))
 
 
-BAG_ENDINGS = (".bag", ".db3", ".mcap", ".zstd")
+_PLAIN_BAGS = (".bag", ".db3", ".mcap")
+_PACKED = ".zstd"
+BAG_ENDINGS = (*_PLAIN_BAGS, _PACKED)
 
 
 def is_bag(file: Path) -> bool:
     """Whether a file is a bag by its name."""
-    return file.suffix in BAG_ENDINGS[:3] or is_packed_bag(file)
+    return file.suffix in _PLAIN_BAGS or is_packed_bag(file)
 
 
 def is_packed_bag(file: Path) -> bool:
     """Whether it is one of ROS 2 that is compressed as a whole (compression mode file)."""
-    return file.suffix == ".zstd" and Path(file.stem).suffix in BAG_ENDINGS
+    return file.suffix == _PACKED and Path(file.stem).suffix in BAG_ENDINGS
 
 
 def _lacking_of_bag(folder: Path) -> tuple[str, ...]:

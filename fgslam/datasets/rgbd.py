@@ -142,10 +142,11 @@ def _both(root: Path) -> tuple[tuple[Path, ...], tuple[Path, ...]]:
         if mixed is None:
             raise DatasetError(f"{root} has no folders of colour and depth images (rgb/, depth/)")
         return tuple(mixed[0]), tuple(mixed[1])
-    for folder in folders:
-        if not images_in(folder):
+    found = [tuple(images_in(folder)) for folder in folders]
+    for folder, files in zip(folders, found, strict=True):
+        if not files:
             raise DatasetError(f"{folder} holds no image; restore it")
-    return tuple(images_in(folders[0])), tuple(images_in(folders[1]))
+    return found[0], found[1]
 
 
 def _listed(path: Path) -> tuple[IntArray, list[Path]]:

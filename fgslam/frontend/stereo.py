@@ -115,8 +115,8 @@ class StereoMatcher:
 
     def by_reference(self) -> Linear:
         """As :meth:`equally`; the other images' places are shifts from the first one's."""
-        by_shifts = dataclasses.replace(self._rig, places="reference")
-        covariance = self._map @ pixel_covariance(by_shifts) @ self._map.T
+        of_pixels = pixel_covariance(self._rig.cameras, "reference")
+        covariance = self._map @ of_pixels @ self._map.T
         return self._map, self._with_depth(self._settings.pixel_sigma**2 * covariance)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:

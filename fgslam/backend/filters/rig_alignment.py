@@ -144,7 +144,7 @@ class RigAlignment:
         self._keep(np.isfinite(self._pixels).all(axis=(1, 2)))
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
-        self._white = np.linalg.inv(np.linalg.cholesky(pixel_covariance(rig)))
+        self._white = np.linalg.inv(np.linalg.cholesky(pixel_covariance(rig.cameras, rig.places)))
         self._fuse = rig_map(rig)
 
     def evidence(self, correction: FloatArray, prior: FloatArray) -> RigEvidence | None:

@@ -21,6 +21,12 @@ from fgslam.core.geometry import inverse, pose
 _FOCAL = ("fx", "fy", "cx", "cy")
 
 
+def _motion_in(path: Path) -> FloatArray:
+    """The motion (4, 4) whose numbers are all of a file. Raises CalibrationError."""
+    name = "the step"
+    return Values(path, {name: read_text(path, CalibrationError).split()}).motion(name)
+
+
 # --------------------------------------------------------------------------------------------
 # MRPT's stereo calibration, published with the Malaga urban dataset
 
@@ -107,8 +113,7 @@ def read_dso(path: Path) -> Calibration:
     kind = "camera of DSO"
     if not (stem and all(file.is_file() for file in (first, second, step))):
         return Calibration(str(path), kind, (_dso_camera(path, np.eye(4)),))
-    moved = Values(step, {"the step": read_text(step, CalibrationError).split()})
-    places = np.eye(4), inverse(moved.motion("the step"))
+    places = np.eye(4), inverse(_motion_in(step))
     cameras = tuple(_dso_camera(f, T) for f, T in zip((first, second), places, strict=True))
     return Calibration(str(first), f"{kind}, a pair", cameras)
 
@@ -309,8 +314,7 @@ def read_numbers(path: Path, text: str, size: tuple[int, int] | None) -> Calibra
         return Calibration(str(path), "numbers of one camera", (camera,))
     texts = [read_text(file, CalibrationError) for file in files[:2]]
     first, second = (_camera_of_numbers(*each, size) for each in zip(files, texts, strict=False))
-    step = Values(files[2], {"the step": read_text(files[2], CalibrationError).split()})
-    cameras = (first, replace(second, bTc=step.motion("the step")))
+    cameras = (first, replace(second, bTc=_motion_in(files[2])))
     return Calibration(str(files[0]), "cameras of ETH3D, a pair", cameras)
 
 

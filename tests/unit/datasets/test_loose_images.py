@@ -12,7 +12,18 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_calibration, write_tum
+from dataset_builders import (
+    CALIBRATION,
+    HEIGHT,
+    WIDTH,
+    codes,
+    loose,
+    opened_loose,
+    picture,
+    save,
+    write_calibration,
+    write_tum,
+)
 
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import pose
@@ -20,12 +31,8 @@ from fgslam.core.sides import camera_pairs, is_view
 from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.loose_files import find_cameras, pair_files
-from fgslam.datasets.loose_images import open_loose_images
-from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
     KittiRawSettings,
-    LooseImagesSettings,
-    RecordedOdometrySettings,
 )
 from fgslam.datasets.stamps import written_stamps
 from fgslam.runs.bare_recording import bare_experiment
@@ -47,27 +54,6 @@ NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
 }
 
 
-def loose(root: Path, names: Callable[[int], tuple[str, str]], numbers: list[int]) -> Path:
-    """Frame i of the numbers has corner pixels 10 + i (right) and 60 + i (left)."""
-    for i, k in enumerate(numbers):
-        left, right = names(k)
-        save(root / left, picture(60 + i))
-        save(root / right, picture(10 + i))
-    write_calibration(root)
-    return root
-
-
-def opened(root: Path, **settings: Any) -> Recording:
-    return open_loose_images(
-        LooseImagesSettings(path=str(root), **settings), RecordedOdometrySettings()
-    )
-
-
-def codes(recording: Recording) -> list[tuple[int, ...]]:
-    frames = [recording.frame(i).images for i in range(len(recording))]
-    return [tuple(int(image[0, 0]) for image in images) for images in frames]
-
-
 # --------------------------------------------------------------------------------------------
 # Names and pairs
 
@@ -76,7 +62,7 @@ def codes(recording: Recording) -> list[tuple[int, ...]]:
 def test_any_names_in_natural_order(tmp_path: Path, name: str) -> None:
     root = loose(tmp_path / "walk", NAMES[name], [2, 9, 10, 100])
     assert recognise_layout(root) == {"kind": "loose_images", "path": str(root)}
-    recording = opened(root)
+    recording = opened_loose(root)
     assert codes(recording) == [(10, 60), (11, 61), (12, 62), (13, 63)]
     by_order = name == "other names"
     assert any("paired by their order" in note for note in recording.notes) == by_order
@@ -84,20 +70,20 @@ def test_any_names_in_natural_order(tmp_path: Path, name: str) -> None:
 
 def test_a_pattern_of_files(tmp_path: Path) -> None:
     root = loose(tmp_path, lambda k: (f"{k}_left.png", f"{k}_right.png"), [1, 2, 30])
-    assert len(opened(root / "?_*.png")) == 2
+    assert len(opened_loose(root / "?_*.png")) == 2
     assert "2 frames at 10 Hz" in bare_experiment(root / "?_*.png").said
 
 
 def test_what_has_no_partner_is_counted_or_refused(tmp_path: Path) -> None:
     root = loose(tmp_path, NAMES["left, right"], [1, 2, 3, 4])
     (root / "left" / "2.png").unlink()
-    recording = opened(root)
+    recording = opened_loose(root)
     assert codes(recording) == [(10, 60), (12, 62), (13, 63)]
     assert "1 right images have no partner of their name" in recording.notes[0]
     for k in (1, 3, 4):
         (root / "left" / f"{k}.png").rename(root / "left" / f"a{k}.png")
     with pytest.raises(DatasetError, match="3 images of the left camera and 4 of the right one, a"):
-        opened(root)
+        opened_loose(root)
 
 
 def test_words_that_hold_another_are_none() -> None:
@@ -143,7 +129,7 @@ def test_lists_of_times(tmp_path: Path, name: str) -> None:
     file, lines, unit = LISTS[name]
     root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
     (root / file).write_text("\n".join(lines), encoding="utf-8")
-    recording = opened(root)
+    recording = opened_loose(root)
     steps = recording.timestamps - recording.timestamps[0]
     assert np.allclose(steps, [0.0, 0.2, 0.4], rtol=0.0, atol=1e-6)
     assert any(f"taken as {unit}" in note for note in recording.notes) == bool(unit)
@@ -153,21 +139,23 @@ def test_times_by_place_count_images_without_a_partner(tmp_path: Path) -> None:
     """A list of one time a line is of all images of the right camera, and so is a rate."""
     root = loose(tmp_path, NAMES["left, right"], [0, 1, 2, 3])
     (root / "left" / "1.png").unlink()
-    np.testing.assert_allclose(opened(root, fps=10.0).timestamps, [0.0, 0.2, 0.3])
+    np.testing.assert_allclose(opened_loose(root, fps=10.0).timestamps, [0.0, 0.2, 0.3])
     (root / "times.txt").write_text("5.0\n5.5\n6.0\n7.0", encoding="utf-8")
-    np.testing.assert_allclose(opened(root).timestamps, [5.0, 6.0, 7.0])
+    np.testing.assert_allclose(opened_loose(root).timestamps, [5.0, 6.0, 7.0])
     (root / "times.txt").write_text("5.0\n6.0\n7.0", encoding="utf-8")
     with pytest.raises(DatasetError, match="has 3 times for 4 images"):
-        opened(root)
+        opened_loose(root)
 
 
 def test_names_that_are_times_and_no_times_at_all(tmp_path: Path) -> None:
     numbers = [STAMP + k * 50_000_000 for k in range(3)]
-    named = opened(loose(tmp_path / "a", NAMES["left, right"], numbers))
+    named = opened_loose(loose(tmp_path / "a", NAMES["left, right"], numbers))
     assert np.allclose(np.diff(named.timestamps), 0.05, rtol=0.0, atol=1e-6)
     root = loose(tmp_path / "b", NAMES["left, right"], [1, 2, 3])
-    assert "no list of times: taken as 10 frames a second" in opened(root).notes[0]
-    assert np.allclose(opened(root, fps=25.0).timestamps, [0.0, 0.04, 0.08], rtol=0.0, atol=1e-12)
+    assert "no list of times: taken as 10 frames a second" in opened_loose(root).notes[0]
+    assert np.allclose(
+        opened_loose(root, fps=25.0).timestamps, [0.0, 0.04, 0.08], rtol=0.0, atol=1e-12
+    )
 
 
 MINUTE = datetime(2026, 11, 23, 23, 59, 59, 900_000, UTC)  # frames 2 to 5 are of the next day
@@ -191,7 +179,7 @@ def named(k: int, form: str, places: int = 3) -> str:
 def test_names_that_are_dates(tmp_path: Path, form: str, places: int) -> None:
     left, right = (form.replace("{}", side) + ".png" for side in ("left", "right"))
     root = loose(tmp_path, lambda k: (named(k, left, places), named(k, right, places)), [*range(6)])
-    recording = opened(root)
+    recording = opened_loose(root)
     expected = MINUTE.timestamp() + 0.05 * np.arange(6)
     np.testing.assert_allclose(recording.timestamps, expected, rtol=0.0, atol=1e-6)
     assert "times are the dates in the names of the images" in recording.notes
@@ -207,14 +195,14 @@ def test_names_that_are_times_pair_by_them(tmp_path: Path) -> None:
     root = loose(tmp_path, lambda k: (late(k, "left", 0), late(k, "right", 3)), [*range(7)])
     (root / late(2, "left", 0)).unlink()
     (root / late(4, "right", 3)).unlink()
-    recording = opened(root)
+    recording = opened_loose(root)
     assert codes(recording) == [(10 + k, 60 + k) for k in (0, 1, 3, 5, 6)]
     assert "1 right images have no partner within 20 ms and are left out" in recording.notes
     assert any("differ in time by 3 ms in the median" in note for note in recording.notes)
     with pytest.raises(
         DatasetError, match=r"within 1 ms, the nearest differ by 3 ms; raise dataset"
     ):
-        opened(root, pairing_tolerance_ms=1.0)
+        opened_loose(root, pairing_tolerance_ms=1.0)
 
 
 @pytest.mark.parametrize(
@@ -224,7 +212,7 @@ def test_dates_that_are_no_times_of_images(tmp_path: Path, form: str) -> None:
     """A counter behind one date; no date; the camera between both."""
     name = lambda k: form.format(k=k) + ".png"  # noqa: E731 - one line
     root = loose(tmp_path, lambda k: (name(k).format("l"), name(k).format("r")), [*range(5)])
-    recording = opened(root)
+    recording = opened_loose(root)
     np.testing.assert_allclose(np.diff(recording.timestamps), 0.1, rtol=0.0, atol=1e-9)
     assert any("no list of times" in note for note in recording.notes)
 
@@ -305,7 +293,7 @@ def test_bad_lists_of_times(tmp_path: Path, lines: list[str], message: str) -> N
     root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
     (root / "times.txt").write_text("\n".join(lines), encoding="utf-8")
     with pytest.raises(DatasetError, match=message) as caught:
-        opened(root)
+        opened_loose(root)
     assert "\n" not in str(caught.value)
 
 
@@ -318,7 +306,7 @@ def test_colour_16_bits_and_grey_are_the_same_picture(tmp_path: Path) -> None:
     image = picture(11)
     save(root / "right" / "2.png", np.dstack([image, image, image]))
     save(root / "right" / "3.png", image.astype(np.uint16) << 8)
-    recording = opened(root)
+    recording = opened_loose(root)
     for i in (1, 2):
         assert np.array_equal(recording.frame(i).images[0], image)
 
@@ -331,7 +319,7 @@ def test_a_phone_that_was_turned_is_turned_back(tmp_path: Path) -> None:
     for side in ("left", "right"):
         (root / side / "1.png").unlink()
         (root / side / "1.jpg").write_bytes(turned_jpeg(stored, 6))
-    shown = opened(root).frame(0).images[0]
+    shown = opened_loose(root).frame(0).images[0]
     assert np.abs(shown.astype(int) - upright).max() < 12
 
 
@@ -346,7 +334,7 @@ def test_a_damaged_image_is_one_lost_frame(tmp_path: Path) -> None:
     root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
     file = root / "left" / "2.png"
     file.write_bytes(file.read_bytes()[:-30])
-    recording = opened(root)
+    recording = opened_loose(root)
     with pytest.raises(FrameError, match=r"2\.png is truncated"):
         recording.frame(1)
     assert recording.frame(2).images[1][0, 0] == 62
@@ -356,19 +344,19 @@ def test_a_calibration_of_another_size_and_none(tmp_path: Path) -> None:
     root = loose(tmp_path, NAMES["left, right"], [1])
     write_calibration(root, width=64, height=48)
     with pytest.raises(CalibrationError, match="for images of 64x48 pixels, the images have 32x24"):
-        opened(root)
+        opened_loose(root)
     (root / "calib.json").unlink()
     with pytest.raises(
         CalibrationError, match=r"give a calibration: .*calib\.json.* --camera FILE"
     ):
-        opened(root)
+        opened_loose(root)
 
 
 def test_odometry_beside_the_images(tmp_path: Path) -> None:
     root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
     poses = np.stack([pose(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(3)])
     write_tum(root / "odometry.txt", 0.1 * np.arange(3), poses)
-    step = opened(root).odometry(1)
+    step = opened_loose(root).odometry(1)
     assert step is not None
     assert step.motion[0, 3] == pytest.approx(0.1, abs=1e-9)
 
@@ -480,7 +468,7 @@ def test_images_of_two_cameras_are_of_the_first_two_of_three(
     root = loose(tmp_path / "walk", NAMES["cam0, cam1 in one"], [0, 1])
     (root / "calib.json").unlink()
     write_chain(root, *places)
-    recording = opened(root)
+    recording = opened_loose(root)
     assert recording.rig.baseline == pytest.approx(baseline)
     assert recording.rig.vertical_baseline is None
     assert codes(recording) == [(10, 60), (11, 61)]
@@ -497,6 +485,6 @@ def test_numbered_images_are_those_of_the_numbered_cameras(
     root = loose(tmp_path / "walk", NAMES[name], [0])
     (root / "calib.json").unlink()
     write_chain(root, (0.1, 0.0), (0.0, 0.0))
-    recording = opened(root)
+    recording = opened_loose(root)
     assert codes(recording) == [expected]
     assert ("lower number is the right one" in " ".join(recording.notes)) == (expected[0] == 60)

@@ -9,19 +9,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bags import stereo, write_bag
-from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, save, write_calibration
+from dataset_builders import (
+    CALIBRATION,
+    HEIGHT,
+    WIDTH,
+    codes,
+    loose,
+    opened_loose,
+    picture,
+    save,
+)
 
 from fgslam.core.errors import DatasetError
 from fgslam.datasets.bags.reader import open_bag
 from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import colour_and_depth, recognise_layout
-from fgslam.datasets.loose_images import open_loose_images
-from fgslam.datasets.recording import Recording
 from fgslam.datasets.rgbd import open_rgbd
 from fgslam.datasets.settings import (
     BagSettings,
     KittiRawSettings,
-    LooseImagesSettings,
     RecordedOdometrySettings,
     RgbdSettings,
 )
@@ -41,33 +47,15 @@ NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
 }
 
 
-def images(root: Path, names: Callable[[int], tuple[str, str]], frames: int = 3) -> Path:
-    """Frame k has corner pixels 10 + k (right) and 60 + k (left)."""
-    for k in range(frames):
-        for name, code in zip(names(k), (60, 10), strict=True):
-            save(root / name, picture(code + k))
-    write_calibration(root)
-    return root
-
-
-def opened(root: Path) -> Recording:
-    return open_loose_images(LooseImagesSettings(path=str(root)), RecordedOdometrySettings())
-
-
-def codes(recording: Recording) -> list[tuple[int, ...]]:
-    frames = [recording.frame(i).images for i in range(len(recording))]
-    return [tuple(int(image[0, 0]) for image in views) for views in frames]
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_names_that_data_sets_give(tmp_path: Path, name: str) -> None:
-    root = images(tmp_path / "walk", NAMES[name])
+    root = loose(tmp_path / "walk", NAMES[name])
     for folder in ("depth01", "depth02"):  # no cameras, though they come first
         save(root / folder / "0.png", picture(0))
     save(root / "mask_left.png", picture(0))
     save(root / "mask_right.png", picture(0))
     assert recognise_layout(root)["kind"] == "loose_images"
-    assert codes(opened(root)) == [(10, 60), (11, 61), (12, 62)]
+    assert codes(opened_loose(root)) == [(10, 60), (11, 61), (12, 62)]
 
 
 def test_names_with_a_time_in_them_are_times(tmp_path: Path) -> None:
@@ -77,16 +65,16 @@ def test_names_with_a_time_in_them_are_times(tmp_path: Path) -> None:
     def names(k: int) -> tuple[str, str]:
         return f"img_40123456789_{times[k]}_left.png", f"img_40123456789_{times[k]}_right.png"
 
-    recording = opened(images(tmp_path, names))
+    recording = opened_loose(loose(tmp_path, names))
     assert np.allclose(recording.timestamps, [float(t) for t in times], rtol=0.0, atol=1e-6)
     assert recording.notes == ()
-    counted = images(tmp_path / "b", lambda k: (f"a{10**9 + k}_L.png", f"a{10**9 + k}_R.png"))
-    assert "no list of times" in opened(counted).notes[0]
+    counted = loose(tmp_path / "b", lambda k: (f"a{10**9 + k}_L.png", f"a{10**9 + k}_R.png"))
+    assert "no list of times" in opened_loose(counted).notes[0]
 
 
 def test_folders_that_hold_a_pair_each_are_no_cameras(tmp_path: Path) -> None:
     """pair_000 and pair_001 are moments, not cameras; one of them alone is a recording."""
-    root = images(tmp_path / "set", lambda k: (f"pair_{k:03d}/left.png", f"pair_{k:03d}/right.png"))
+    root = loose(tmp_path / "set", lambda k: (f"pair_{k:03d}/left.png", f"pair_{k:03d}/right.png"))
     with pytest.raises(
         DatasetError, match=r"in it has .*pair_000 or .*pair_001 or .*pair_002: giv"
     ):
@@ -94,35 +82,35 @@ def test_folders_that_hold_a_pair_each_are_no_cameras(tmp_path: Path) -> None:
 
 
 def test_a_recording_further_inside_is_named(tmp_path: Path) -> None:
-    images(tmp_path / "run" / "stereo", lambda k: (f"left/{k}.png", f"right/{k}.png"))
+    loose(tmp_path / "run" / "stereo", lambda k: (f"left/{k}.png", f"right/{k}.png"))
     save(tmp_path / "run" / "mono" / "1.png", picture(1))
     with pytest.raises(DatasetError, match=r"in it has .*/run/stereo: give that folder"):
         recognise_layout(tmp_path)
 
 
 def test_further_pairs_of_folders_are_said(tmp_path: Path) -> None:
-    root = images(tmp_path, lambda k: (f"lcam_back/{k}.png", f"rcam_back/{k}.png"))
-    images(tmp_path, lambda k: (f"lcam_front/{k}.png", f"rcam_front/{k}.png"))
-    assert "also there: lcam_front with rcam_front; leave one pair" in opened(root).notes[0]
+    root = loose(tmp_path, lambda k: (f"lcam_back/{k}.png", f"rcam_back/{k}.png"))
+    loose(tmp_path, lambda k: (f"lcam_front/{k}.png", f"rcam_front/{k}.png"))
+    assert "also there: lcam_front with rcam_front; leave one pair" in opened_loose(root).notes[0]
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
 def test_first_and_second_camera_of_eth3d(tmp_path: Path, side: float) -> None:
     """Which of the two is the left one, its calibration says."""
     stamps = [f"{5096.154125 + 0.037 * k:.6f}.png" for k in range(3)]
-    root = images(tmp_path / "walk", lambda k: (f"rgb2/{stamps[k]}", f"rgb/{stamps[k]}"))
+    root = loose(tmp_path / "walk", lambda k: (f"rgb2/{stamps[k]}", f"rgb/{stamps[k]}"))
     (root / "calib.json").unlink()
     for name in ("calibration.txt", "calibration2.txt"):
         (root / name).write_text("30 30 15.5 11.5\n")
     (root / "extrinsics_1_2.txt").write_text(f"1 0 0 {0.2 * side}\n0 1 0 0\n0 0 1 0\n")
-    recording = opened(root)
+    recording = opened_loose(root)
     assert recording.rig.baseline == pytest.approx(0.2)
     assert codes(recording)[1] == ((11, 61) if side < 0.0 else (61, 11))
     assert np.allclose(np.diff(recording.timestamps), 0.037, rtol=0.0, atol=1e-6)
 
 
 def test_a_pair_beside_colour_and_depth_is_chosen_by_the_user(tmp_path: Path) -> None:
-    root = images(tmp_path, lambda k: (f"infra1/{k}.png", f"infra2/{k}.png"))
+    root = loose(tmp_path, lambda k: (f"infra1/{k}.png", f"infra2/{k}.png"))
     for name in ("color", "depth"):
         save(root / name / "0.png", picture(0))
     with pytest.raises(DatasetError, match="equally well: colour and depth; folder of images; say"):
@@ -139,8 +127,8 @@ def test_depth_registered_to_colour_comes_before_depth_as_measured(tmp_path: Pat
 
 def test_colour_and_depth_of_several_cameras_name_the_folder(tmp_path: Path) -> None:
     """As Virtual KITTI 2 has them: rgb/ holds folders of two cameras."""
-    images(tmp_path / "rgb", lambda k: (f"Camera_0/{k}.png", f"Camera_1/{k}.png"))
-    images(tmp_path / "depth", lambda k: (f"Camera_0/{k}.png", f"Camera_1/{k}.png"))
+    loose(tmp_path / "rgb", lambda k: (f"Camera_0/{k}.png", f"Camera_1/{k}.png"))
+    loose(tmp_path / "depth", lambda k: (f"Camera_0/{k}.png", f"Camera_1/{k}.png"))
     with pytest.raises(DatasetError, match=r"in it has \S*/rgb: give that folder"):
         recognise_layout(tmp_path)
 
