@@ -103,6 +103,14 @@ class BagFiles:
         wanted = [each for each in self._reader.connections if each.topic in topics]
         return self._reader.messages(wanted, start=start) if wanted else iter(())
 
+    def stated_in(self, topic: Topic) -> str:
+        """The frame in which a topic's first message is stated; empty where it cannot be read."""
+        try:
+            connection, _, raw = next(self.messages((topic.name,)))
+            return str(self.decoded(connection, raw).header.frame_id)
+        except (StopIteration, FrameError, *ANY_BROKEN):
+            return ""
+
     def decoded(self, connection: Connection, raw: bytes) -> Any:
         """The message's fields. Raises FrameError where they are damaged."""
         try:

@@ -45,7 +45,8 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     where = Path(settings.path)
     paths = paths_of(where)
     files = BagFiles(paths)
-    chosen = choose_topics(files.topics, settings.topics, str(where), file_cameras(settings))
+    cameras = file_cameras(settings)
+    chosen = choose_topics(files.topics, settings.topics, str(where), cameras, files.stated_in)
     index = _indexed(files, chosen)
     source = _Images(files, index, chosen)
     height, width = source.first(chosen.right).shape

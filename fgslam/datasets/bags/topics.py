@@ -10,13 +10,11 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.sides import camera_pairs, differ_in_number, is_view
 from fgslam.datasets.bags import messages as kinds
 from fgslam.datasets.bags.files import Topic
+from fgslam.datasets.bags.motion import MOTIONS, FrameOf, motion_of_bag
 
 IMAGES = (kinds.IMAGE, kinds.COMPRESSED)
-MOTIONS = (kinds.ODOMETRY, kinds.TWIST, kinds.TWIST_WITH_COVARIANCE, kinds.IMU)
-"""The first that a bag has is its odometry."""
 
 _TRANSPORT = "/compressed"
-_TRUTH = re.compile(r"truth|(?<![a-z])gt(?![a-z])|vicon|mocap|optitrack", re.IGNORECASE)
 _PREFERRED = ("image_raw", "image_rect", "image_rect_raw", "image", "image_mono")
 """Last parts of topics, grey and raw ones first; others after them."""
 
@@ -71,9 +69,20 @@ class FileCameras:
 
 
 def choose_topics(
-    topics: Sequence[Topic], wanted: Sequence[str], where: str, cameras: FileCameras
+    topics: Sequence[Topic],
+    wanted: Sequence[str],
+    where: str,
+    cameras: FileCameras,
+    frame_of: FrameOf = lambda _: "",
 ) -> Chosen:
     """The topics of two or three cameras and of their odometry.
+
+    Args:
+        topics: of the bag.
+        wanted: named by the user: images of each camera, and perhaps odometry.
+        where: the bag, in messages.
+        cameras: of the calibration file.
+        frame_of: the frame in which a topic states its first message.
 
     Raises:
         DatasetError: a wanted topic is not there or of no use, or the bag has no pair of cameras.
@@ -91,11 +100,12 @@ def choose_topics(
         views = _by_file(used, cameras, where) or _by_names(used, cameras, where)
     left, right, *top = views.topics
     infos = _infos(used, left, right)
-    motion = motions[0] if motions else _motion(used)
+    motion, others = (motions[0], ()) if motions else motion_of_bag(used, frame_of)
     of_frames = tuple(topic.name for topic in used if topic.kind in kinds.TRANSFORMS)
     transforms = tuple(name for name in of_frames if name.endswith("tf_static")) or of_frames
     third = top[0] if top else None
-    made = Chosen(left, right, *infos, motion, transforms, views.notes, views.numbers, third)
+    notes = (*views.notes, *others)
+    made = Chosen(left, right, *infos, motion, transforms, notes, views.numbers, third)
     return replace(made, depth=views.depth)
 
 
@@ -337,12 +347,3 @@ def _infos_beside(image_topic: str) -> tuple[str, str]:
     # RealSense's viewer records .../image/data beside .../info/camera_info.
     viewer = plain.removesuffix("/image/data") + "/info/camera_info"
     return plain.rpartition("/")[0] + "/camera_info", viewer
-
-
-def _motion(topics: Sequence[Topic]) -> Topic | None:
-    """Odometry: the preferred type, of it the topic whose name says so."""
-    found = [t for t in topics if t.kind in MOTIONS and not _TRUTH.search(t.name)]
-    key = {kind: k for k, kind in enumerate(MOTIONS)}
-    return min(
-        found, key=lambda t: (key[t.kind], "odom" not in t.name, len(t.name), t.name), default=None
-    )

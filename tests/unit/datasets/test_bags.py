@@ -15,6 +15,8 @@ from bags import (
     START_NS,
     camera_info,
     compressed_image,
+    gyroscope,
+    in_frames,
     odometry,
     raw_image,
     stereo,
@@ -420,11 +422,53 @@ def test_truth_is_no_odometry_and_another_clock_is_said(tmp_path: Path) -> None:
     poses = np.zeros((4, 4))
     stamps = [START_NS + k * PERIOD_NS for k in range(4)]
     truth = odometry(stamps, poses, "/ground_truth/state")
-    assert opened(write_bag(tmp_path / "a.bag", stereo(4) + truth)).odometry_source is None
+    recording = opened(write_bag(tmp_path / "a.bag", stereo(4) + truth))
+    assert recording.odometry_source is None
+    assert "not taken for odometry: /ground_truth/state (truth by its name)" in recording.notes[0]
     late = odometry([stamp + 10**12 for stamp in stamps], poses)
     other = opened(write_bag(tmp_path / "b.bag", stereo(4) + late))
     with pytest.raises(OdometryError, match="/odom covers none of the frames"):
         other.odometry(1)
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame", "reason"),
+    [
+        ("/odometry", "world", "in the global frame world"),
+        ("/mavros/local_position/odom", "map", "in the global frame map"),
+        ("/leica/pose", "odom", "truth by its name"),
+        ("/carla/car/odometry", "odom", "truth of a simulator, which /carla/car/odometry tells"),
+        ("/odometry", "odom", ""),
+        ("/wheel/odometry", "world", ""),
+    ],
+)
+def test_poses_that_no_wheel_states_are_told_and_used_only_when_named(
+    tmp_path: Path, topic: str, frame: str, reason: str
+) -> None:
+    stamps = [START_NS + k * PERIOD_NS for k in range(4)]
+    poses = in_frames(odometry(stamps, np.zeros((4, 4)), topic), {topic: frame})
+    bag = write_bag(tmp_path / "a.mcap", stereo(4) + poses)
+    recording = opened(bag)
+    assert (recording.odometry_source is None) == bool(reason)
+    text = f"not taken for odometry: {topic} ({reason}); --topics LEFT,RIGHT,ODOMETRY takes one"
+    assert (text in recording.notes) == bool(reason)
+    named = opened(bag, topics=("/cam/left/image_raw", "/cam/right/image_raw", topic))
+    assert named.odometry_source is not None
+
+
+def test_beside_pictures_of_objects_odometry_is_a_simulators_truth(tmp_path: Path) -> None:
+    stamps = [START_NS + k * PERIOD_NS for k in range(4)]
+    objects = [
+        (t.replace("image_raw", "segmentation"), *rest)
+        for t, *rest in stereo(4)
+        if "image_raw" in t
+    ]
+    poses = odometry(stamps, np.zeros((4, 4)), "/odometry")
+    turns = gyroscope(stamps, np.array([0.0, 0.0, 0.5]))
+    recording = opened(write_bag(tmp_path / "a.mcap", stereo(4) + objects + poses + turns))
+    reason = "/odometry (truth of a simulator, which /cam/left/segmentation tells)"
+    assert any(reason in note for note in recording.notes)
+    assert recording.odometry_source is not None  # the gyroscope's
 
 
 # --------------------------------------------------------------------------------------------
