@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from fgslam.cameras.assembly import at_size, in_metres
 from fgslam.cameras.calibration import level_mounting
@@ -12,7 +13,12 @@ from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rectification import Rectifier
 from fgslam.cameras.rig import StereoRig, asked_view, load_rig, rig_of
 from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
+from fgslam.core.sensors import CameraRig, body_is_camera
+from fgslam.datasets.odometry_files import is_of_gyroscope
 from fgslam.datasets.settings import CalibratedSettings
+
+Rig = TypeVar("Rig", bound=CameraRig)
 
 
 def calibrated_rig(
@@ -97,12 +103,29 @@ def read_rig(
     return rig_of(at_size(found, size, settings.resized), asked)
 
 
-def mounted(rig: StereoRig, settings: CalibratedSettings) -> StereoRig:
+def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:
     """The rig where the settings put it; as it is, where they name no place."""
     if settings.camera_yaw_deg is None and settings.lever_arm_m is None:
         return rig
     lever_arm = settings.lever_arm_m or (0.0, 0.0, 0.0)
     return replace(rig, bTc=level_mounting(settings.camera_yaw_deg or 0.0, lever_arm))
+
+
+def on_wheels(
+    rig: Rig, settings: CalibratedSettings, odometry_file: Path | None
+) -> tuple[Rig, tuple[str, ...]]:
+    """The rig on the body that a file's odometry moves, and what is assumed of its place there.
+
+    Where the calibration is of the cameras alone, they look straight ahead from its origin.
+    """
+    stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
+    # A gyroscope is in the camera's own box, wheels turn about another axis.
+    if stated or odometry_file is None or is_of_gyroscope(odometry_file):
+        return rig, ()
+    if not body_is_camera(rig.bTc):
+        return rig, ()
+    text = f"nothing says where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
+    return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (text,)
 
 
 LOOKS_AHEAD = (

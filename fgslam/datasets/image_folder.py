@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
-from fgslam.datasets.calibrated import loaded_rig, mounted
+from fgslam.datasets.calibrated import loaded_rig, mounted, on_wheels
 from fgslam.datasets.images import (
     RawImages,
     StereoFiles,
@@ -64,9 +64,10 @@ def open_image_folder(
     files = _files(folders, listed, numbers, rig)
     check_sizes(files, root)
     files, held = files.with_bits()
+    odometry_file = find_odometry(root, settings.odometry_file)
+    rig, mounting = on_wheels(rig, settings, odometry_file)
     images = RawImages(files, rig)
     truth = _read_truth(root, rig.baseline)
-    odometry_file = find_odometry(root, settings.odometry_file)
     defining = [
         *([_camera_file(root, settings)] if _camera_file(root, settings).is_file() else []),
         root / "times.txt",
@@ -81,6 +82,7 @@ def open_image_folder(
         ground_truth=None if truth is None else trajectory_at_frames(truth, stamps[chosen]),
         notes=(
             rig.remarks
+            + mounting
             + held
             + missing_notes(files, stamps)
             + _unlisted(folders, listed, numbers)

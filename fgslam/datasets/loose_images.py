@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
-from fgslam.datasets.calibrated import calibrated_rig, numbered
+from fgslam.datasets.calibrated import calibrated_rig, numbered, on_wheels
 from fgslam.datasets.images import RawImages, StereoFiles, check_sizes, first_size
 from fgslam.datasets.layouts import files_of
 from fgslam.datasets.loose_files import CameraFiles, find_cameras, pair_files
@@ -39,6 +39,7 @@ def open_loose_images(
     files, held = files.with_bits()
     chosen = select_frames(len(pairs), settings)
     odometry_file = find_odometry(root, settings.odometry_file)
+    rig, mounting = on_wheels(rig, settings, odometry_file)
     images = RawImages(files, rig)
     also = ", ".join(" with ".join(pair) for pair in cameras.others)
     others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
@@ -52,7 +53,7 @@ def open_loose_images(
             (p for pair in pairs for p in pair),
         ),
         ground_truth=None,
-        notes=(*rig.remarks, *held, *others, *unpaired, *assumed),
+        notes=(*rig.remarks, *mounting, *held, *others, *unpaired, *assumed),
         indices=chosen,
         load_images=images.load,
         load_colour=images.load_colour,

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.cameras.assembly import at_size
-from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.published import rgbd_part
 from fgslam.cameras.formats.trees import read_tree
@@ -24,7 +23,7 @@ from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines, shown_in
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.calibrated import LOOKS_AHEAD
+from fgslam.datasets.calibrated import mounted, on_wheels
 from fgslam.datasets.depth_view import (
     BASELINE_M,
     Depth,
@@ -37,7 +36,7 @@ from fgslam.datasets.depth_view import (
 from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, sized
 from fgslam.datasets.layouts import colour_and_depth, colour_and_depth_files
 from fgslam.datasets.loose_files import CameraFiles, images_in, pair_files
-from fgslam.datasets.odometry_files import file_odometry, find_odometry, is_of_gyroscope
+from fgslam.datasets.odometry_files import file_odometry, find_odometry
 from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import RecordedOdometrySettings, RgbdSettings
@@ -319,15 +318,8 @@ def _rig(
 ) -> tuple[CameraRig, tuple[str, ...]]:
     """The colour camera and the made one, on the body that odometry moves; what was assumed."""
     fx, fy, cx, cy = (float(camera.matrix[k]) for k in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
-    # A gyroscope is in the camera's own box, wheels turn about another axis.
-    assumed = not stated and odometry_file is not None and not is_of_gyroscope(odometry_file)
-    bTc = np.eye(4)
-    if stated or assumed:
-        bTc = level_mounting(settings.camera_yaw_deg or 0.0, settings.lever_arm_m or (0.0,) * 3)
-    rig = CameraRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M, None, bTc)
-    text = f"nothing says where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
-    return rig, ((text,) if assumed else ())
+    rig = CameraRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M, None, np.eye(4))
+    return on_wheels(mounted(rig, settings), settings, odometry_file)
 
 
 @dataclass(frozen=True, eq=False)

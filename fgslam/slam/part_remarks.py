@@ -1,4 +1,4 @@
-"""What a session says of frames that only a guess places beside the rest."""
+"""What a session says of frames that only a guess places beside the rest, or against odometry."""
 
 from __future__ import annotations
 
@@ -33,8 +33,12 @@ def left_out_note(count: int) -> str:
 
 
 def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
-    """Lines on frames that nothing measured, and on those located in parts of their own."""
-    return (*_of_bridged(recorder, parts), *_of_adrift(recorder, parts))
+    """Lines on frames that nothing measured, that lie in parts of their own, or off odometry."""
+    return (
+        *_of_bridged(recorder, parts),
+        *_of_adrift(recorder, parts),
+        *_of_contradicted(recorder),
+    )
 
 
 def _of_bridged(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
@@ -62,6 +66,23 @@ def _of_adrift(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
         f"{_named(numbers)}: located beside each other only, not in the first map; before is a gap "
         f"that neither landmarks nor odometry bridge; {known} of {n} frames "
         f"({100.0 * known / n:.0f} %) are located in the first map",
+    )
+
+
+def _of_contradicted(recorder: RunRecorder) -> tuple[str, ...]:
+    """A line where landmarks place most frames elsewhere than odometry does."""
+    again = recorder.column("status") == EgoMotionStatus.RELOCALISED.value
+    if 2 * int(again.sum()) <= len(recorder):  # the log is read only where it may be so
+        return ()
+    steps = [one.odometry for one in recorder.log]
+    moved = np.array([step is not None and step.measured for step in steps], np.bool_)
+    contradicted = int((again & moved).sum())
+    if 2 * contradicted <= int(moved.sum()):
+        return ()
+    return (
+        f"the odometry contradicts the images in {contradicted} of {int(moved.sum())} frames, "
+        "which are located without it: check its unit, its clock and where the camera sits on the "
+        "robot (dataset.camera_yaw_deg, dataset.lever_arm_m)",
     )
 
 

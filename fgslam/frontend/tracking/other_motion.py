@@ -111,12 +111,18 @@ class OtherMotion:
         if not self._doubted:
             return ()
         frames, most = sorted(self._doubted), max(self._doubted.values())
+        # The pose follows the fewer matches only where odometry, or the map, says so.
+        or_odometry = (
+            ", or the odometry is wrong (its unit or clock, the camera's place on the robot)"
+            if most > 1.0
+            else ""
+        )
         return (
             f"in {len(frames)} frames, from {frames[0]} to {frames[-1]}, something else moves "
             f"rigidly, with up to {100.0 * most:.0f} % as many matches as the pose follows: "
-            "something large passes. Without odometry that tells which is which the pose is in "
-            "doubt where that fills more of the view than the scene, for it may follow what passes "
-            "(leave these frames out: --start, --stop)",
+            f"something large passes{or_odometry}. Without odometry that tells which is which the "
+            "pose is in doubt where that fills more of the view than the scene, for it may follow "
+            "what passes (leave these frames out: --start, --stop)",
         )
 
     def _share(

@@ -25,8 +25,11 @@ from dataset_builders import (
     write_tum,
 )
 
+from fgslam.cameras.calibration_files import read_calibration_file
+from fgslam.cameras.formats.writing import write_calibration as write_file
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.core.geometry import pose
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose
+from fgslam.core.sensors import body_is_camera
 from fgslam.core.sides import camera_pairs, is_view
 from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import recognise_layout
@@ -359,6 +362,23 @@ def test_odometry_beside_the_images(tmp_path: Path) -> None:
     step = opened_loose(root).odometry(1)
     assert step is not None
     assert step.motion[0, 3] == pytest.approx(0.1, abs=1e-9)
+
+
+def test_a_camera_that_nothing_places_looks_along_the_wheels_way(tmp_path: Path) -> None:
+    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
+    (root / "odom.csv").write_text("0.0, 1.0, 0.0\n0.3, 1.0, 0.0\n", encoding="utf-8")
+    camera = tmp_path / "kalibr.yaml"  # of the cameras alone, no robot's
+    write_file(read_calibration_file(root / "calib.json"), camera)
+    recording = opened_loose(root, camera_file=str(camera))
+    np.testing.assert_array_equal(recording.rig.bTc, BODY_FORWARD_LEFT_UP_FROM_CAMERA)
+    assert "taken to look straight ahead from there" in recording.notes[0]
+    turned = opened_loose(root, camera_file=str(camera), camera_yaw_deg=90.0)
+    np.testing.assert_allclose(turned.rig.bTc[:3, 2], [0.0, 1.0, 0.0], atol=1e-12)
+    assert not any("straight ahead" in note for note in turned.notes)
+    (root / "odom.csv").rename(root / "imu.csv")  # whose axes are the camera's
+    alone = opened_loose(root, camera_file=str(camera))
+    assert body_is_camera(alone.rig.bTc)
+    assert not any("straight ahead" in note for note in alone.notes)
 
 
 # --------------------------------------------------------------------------------------------

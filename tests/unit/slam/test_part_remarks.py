@@ -7,7 +7,7 @@ from simulated import RIG
 
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment
+from fgslam.core.measurements import Increment, Odometry
 from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.slam.part_remarks import in_first_map, part_remarks
 from fgslam.slam.results import FrameRow, RunRecorder
@@ -23,12 +23,12 @@ class Apart(MapParts):
         self._frames = [int(not one) for one in connected]
 
 
-def recorded(statuses: list[str]) -> RunRecorder:
+def recorded(statuses: list[str], step: Odometry | None = None) -> RunRecorder:
     recorder = RunRecorder(MeasurementLog(RIG, {}))
     nothing = StereoFeatures.empty().observations(NONE, NONE, is_new=False)
     for i, status in enumerate(statuses):
         recorder.log.append(
-            Increment(10 * i, float(i), None, nothing, np.empty(0, np.bool_), NONE, NONE)
+            Increment(10 * i, float(i), step, nothing, np.empty(0, np.bool_), NONE, NONE)
         )
         recorder.rows.append(FrameRow(status, 0, 0, 0, 0, 0, 0.0, 0.0, 0, 0.0, ""))
     return recorder
@@ -59,3 +59,14 @@ def test_frames_beyond_a_gap_are_told() -> None:
 def test_a_frame_that_failed_is_not_counted() -> None:
     parts = Apart([True, True, False, True, True, True])
     assert in_first_map(recorded(STATUSES), parts) == 4
+
+
+def test_odometry_against_which_most_frames_are_located_is_told() -> None:
+    statuses = ["first", "relocalised", "ok", "relocalised", "relocalised"]
+    connected = Apart([True] * 5)
+    step = Odometry(np.eye(4), np.eye(6))
+    (remark,) = part_remarks(recorded(statuses, step), connected)
+    assert remark.startswith("the odometry contradicts the images in 3 of 5 frames")
+    assert "dataset.camera_yaw_deg" in remark
+    assert part_remarks(recorded(statuses), connected) == ()  # a guess alone was contradicted
+    assert part_remarks(recorded(STATUSES, step), connected) == ()
