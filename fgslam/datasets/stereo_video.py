@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -82,23 +84,49 @@ def _views(
     height, width = frames[0].load(0).shape[:2]
     if len(frames) == 2:
         left, right = frames
-        rig = calibrated_rig(settings, folder, (width, height))
+        rig, told = _rig(settings, folder, (width, height), (1, 1))
         if differ_in_number(left.name, right.name):
             rig = numbered(rig)
-        return lambda of_left, of_right: (right.load(of_right), left.load(of_left)), rig, ()
+        return lambda of_left, of_right: (right.load(of_right), left.load(of_left)), rig, told
     film = frames[0]
     fault: CalibrationError | None = None
     for name in [settings.views] if settings.views else _by_shape(width, height):
         columns, rows = _VIEWS[name]
         try:
-            rig = calibrated_rig(settings, folder, (width // columns, height // rows))
+            rig, told = _rig(settings, folder, (width // columns, height // rows), (columns, rows))
         except CalibrationError as error:
             fault = fault or error
             continue
         said = () if settings.views else (f"the film is taken as {name.replace('_', ' ')}",)
-        return _Halves(film, columns, rows).load, rig, said
+        return _Halves(film, columns, rows).load, rig, (*told, *said)
     _refuse_one_view(settings, folder, film.name, (width, height))
     raise fault or DatasetError(f"{folder}: no film")
+
+
+def _rig(
+    settings: VideoSettings, folder: Path, size: tuple[int, int], views: tuple[int, int]
+) -> tuple[StereoRig, tuple[str, ...]]:
+    """The rig of views of a size, or of a column or row more, and what was assumed then.
+
+    Most encoders take even sizes only, and leave out the last of an odd number; ``views`` are those
+    beside and above each other: of two the film's size is even.
+    """
+    try:
+        return calibrated_rig(settings, folder, size), ()
+    except CalibrationError:
+        uncut = [
+            (one, one + 1) if count == 1 and one % 2 == 0 else (one,)
+            for one, count in zip(size, views, strict=True)
+        ]
+        for whole in list(product(*uncut))[1:]:
+            with suppress(CalibrationError):
+                rig = calibrated_rig(settings, folder, whole)
+                return rig, (
+                    f"the film's views are {size[0]}x{size[1]}, calibrated for "
+                    f"{whole[0]}x{whole[1]}: its encoder is taken to have left out the last column "
+                    "or row of an odd number",
+                )
+        raise
 
 
 def _refuse_one_view(
@@ -155,7 +183,16 @@ class _Film:
         if self.grey:
             images = (_grey(images[0]), _grey(images[1]))
         size = self.rig.image_size
-        return self.rig.rectified(tuple(sized(i, f"frame {index}", *size) for i in images))
+        whole = (_with_last(image, size) for image in images)
+        return self.rig.rectified(tuple(sized(i, f"frame {index}", *size) for i in whole))
+
+
+def _with_last(image: Image, size: tuple[int, int]) -> Image:
+    """The image with the last column and row again that its encoder has left out."""
+    columns, rows = size[0] - image.shape[1], size[1] - image.shape[0]
+    if (columns, rows) not in ((1, 0), (0, 1), (1, 1)):
+        return image
+    return np.asarray(cv2.copyMakeBorder(image, 0, rows, 0, columns, cv2.BORDER_REPLICATE))
 
 
 def _grey(image: Image) -> Image:

@@ -245,6 +245,29 @@ def test_a_calibration_of_another_size_or_none(tmp_path: Path) -> None:
         opened(path)
 
 
+@pytest.mark.parametrize(
+    ("join", "kept"), [(np.hstack, "63x46"), (np.vstack, "62x47"), (None, "62x46")]
+)
+def test_the_row_and_column_that_encoders_leave_out_are_told_and_filled_in(
+    tmp_path: Path, join: Callable[[list[Image]], Image] | None, kept: str
+) -> None:
+    write_calibration(tmp_path, width=63, height=47, cx=31.0, cy=23.0)
+    left, right = view(40, (63, 47)), view(140, (63, 47))
+    if join is None:
+        film(tmp_path / "left.mp4", [left, left])
+        film(tmp_path / "right.mp4", [right, right])
+    else:
+        film(tmp_path / "a.mp4", [join([left, right])] * 2)
+    recording = opened(tmp_path)
+    assert recording.notes[0].startswith(f"the film's views are {kept}, calibrated for 63x47")
+    assert [image.shape for image in recording.frame(1).images] == [(47, 63)] * 2
+    assert np.abs(levels(recording, 1) - [140, 40]).max() <= _NEAR
+    assert np.ptp(recording.frame(1).images[0]) <= _NEAR
+    write_calibration(tmp_path, width=63, height=49, cx=31.0, cy=24.0)  # two rows are no last one
+    with pytest.raises(CalibrationError, match=f"images of 63x49 pixels, the images have {kept}"):
+        opened(tmp_path)
+
+
 def test_a_film_as_large_as_one_view_is_of_one_camera(tmp_path: Path) -> None:
     calibrated(tmp_path)
     path = film(tmp_path / "a.avi", [view(40), view(50)])
