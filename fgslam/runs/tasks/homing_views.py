@@ -13,6 +13,7 @@ import numpy as np
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import RadialCamera
+from fgslam.cameras.omni.ocamcalib import OCamCamera
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image, IntArray
@@ -61,9 +62,10 @@ def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
 
 
 def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ...]:
-    """Notes where mirror or panoramas are clearly not as stated, or what a file does not state.
+    """What the pictures show of the stated mirror or panoramas, and what a file does not state.
 
-    The latter only of a camera that is stated here, not of one that a route brings along.
+    The latter, and a mirror that is where it should be, only of a camera that is stated here, not
+    of one that a route brings along.
     """
     camera = recording.camera
     if isinstance(camera, Equirectangular):
@@ -72,10 +74,19 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
         told = (_lens_note(camera),) if stated else ()
         hole, rim = camera.ring
         # A mirror reflects its camera in the middle; a lens has no rim that must be in the picture.
-        return (*told, *(_mirror_notes(recording, camera.centre, rim) if hole > 0.0 else ()))
+        if hole > 0.0:
+            told = (*told, *_mirror_notes(recording, camera.centre, rim, stated))
+        return told
     if isinstance(camera, RadialCamera):
-        return _mirror_notes(recording, camera.frame.centre, camera.outer_radius)
+        told = (_OCAM_NOTE,) if stated and isinstance(camera, OCamCamera) else ()
+        return (*told, *_mirror_notes(recording, camera.frame.centre, camera.outer_radius, stated))
     return ()
+
+
+_OCAM_NOTE = (
+    "the picture's middle is taken to look down, as of a mirror above the camera; of a fisheye "
+    "that looks up dataset.camera.kind=lens and dataset.camera.middle=up say so"
+)
 
 
 def _lens_note(camera: LensCamera) -> str:
@@ -145,9 +156,9 @@ def _first_pictures(recording: OmniRecording) -> Iterator[Image]:
 
 
 def _mirror_notes(
-    recording: OmniRecording, stated: tuple[float, float], radius: float
+    recording: OmniRecording, stated: tuple[float, float], radius: float, always: bool
 ) -> tuple[str, ...]:
-    """A note where the rim in the first pictures lies clearly off, or cannot be found at all."""
+    """A note on where the rim is in the first pictures; of one in its place only where asked."""
     circles = [c for k in _first_pictures(recording) if (c := _rim(stated, radius, k)) is not None]
     if not circles:
         return (
@@ -156,7 +167,8 @@ def _mirror_notes(
     column, row = np.median([c.centre for c in circles], axis=0)
     away = float(np.hypot(column - stated[0], row - stated[1]))
     if away <= max(_CLEARLY_OFF * radius, _LEAST_OFF_PX):
-        return ()
+        found = f"the mirror's rim is found, {away:.1f} px from where it is stated"
+        return (found,) if always else ()
     return (
         f"the mirror lies {away:.1f} px off its stated centre ({stated[0]:.1f}, {stated[1]:.1f}): "
         f"its rim's is ({column:.1f}, {row:.1f}); bearings are wrong by up to "

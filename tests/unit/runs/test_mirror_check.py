@@ -12,10 +12,15 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.settings import EquirectangularSettings, HyperbolicMirrorSettings
+from fgslam.cameras.omni.settings import (
+    EquirectangularSettings,
+    HyperbolicMirrorSettings,
+    OCamCalibSettings,
+)
 from fgslam.core.arrays import Image
 from fgslam.datasets.omni_settings import OmniPathSettings, PanoramasSettings
-from fgslam.runs.tasks.homing_views import open_checked
+from fgslam.datasets.opening import open_omni
+from fgslam.runs.tasks.homing_views import camera_notes, open_checked
 from tests import textured_room
 
 SIZE = (320, 240)
@@ -51,10 +56,29 @@ def notes(
 
 
 @pytest.mark.parametrize("off", [(0.0, 0.0), (1.5, -1.5)])
-def test_a_mirror_in_its_place_is_not_worth_a_note(
+def test_of_a_mirror_in_its_place_is_told_where_its_rim_was_found(
     tmp_path: Path, off: tuple[float, float]
 ) -> None:
-    assert notes(tmp_path, picture(), (CENTRE[0] + off[0], CENTRE[1] + off[1])) == ()
+    (note,) = notes(tmp_path, picture(), (CENTRE[0] + off[0], CENTRE[1] + off[1]))
+    found = re.fullmatch(r"the mirror's rim is found, ([\d.]+) px from where it is stated", note)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(np.hypot(*off), abs=0.5)
+
+
+def test_of_a_camera_by_ocamcalib_is_told_that_it_is_taken_to_look_down(tmp_path: Path) -> None:
+    assert cv2.imwrite(str(tmp_path / "m1.png"), picture())
+    radii = np.linspace(15.0, RADIUS, 50)
+    angles = np.arctan2(-60.0 + 0.006 * radii**2, radii)
+    inverse = " ".join(map(str, np.polynomial.Polynomial.fit(angles, radii, 6).convert().coef))
+    lines = ("3 -60 0 0.006", f"7 {inverse}", f"{CENTRE[1]} {CENTRE[0]}", "1 0 0")
+    text = "\n".join([*lines, f"{SIZE[1]} {SIZE[0]}"])
+    (tmp_path / "calib_results.txt").write_text(text, encoding="utf-8")
+    camera = OCamCalibSettings(file=str(tmp_path / "calib_results.txt"), ring_px=(15.0, RADIUS))
+    recording = open_omni(OmniPathSettings(path=str(tmp_path), camera=camera))
+    told = camera_notes(recording)
+    assert told[0].startswith("the picture's middle is taken to look down")
+    assert len(told) == 2
+    assert camera_notes(recording, stated=False) == ()  # a route's own camera
 
 
 @pytest.mark.parametrize("holder", [False, True])
