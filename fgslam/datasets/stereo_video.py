@@ -114,11 +114,11 @@ def _rig(
     try:
         return calibrated_rig(settings, folder, size), ()
     except CalibrationError:
-        uncut = [
+        columns, rows = (
             (one, one + 1) if count == 1 and one % 2 == 0 else (one,)
             for one, count in zip(size, views, strict=True)
-        ]
-        for whole in list(product(*uncut))[1:]:
+        )
+        for whole in list(product(columns, rows))[1:]:
             with suppress(CalibrationError):
                 rig = calibrated_rig(settings, folder, whole)
                 return rig, (
