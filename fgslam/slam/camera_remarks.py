@@ -15,7 +15,8 @@ def camera_remarks(recorder: RunRecorder, watch: CameraWatch | None) -> tuple[st
             frames.setdefault(row.problem, []).append(number)
     lines = [
         f"{fault}: {len(which)} of {len(recorder)} frames, {_between(which)}, are not used; their "
-        "poses are predicted (mend the camera; frontend.watch_cameras: false uses them all)"
+        f"poses are predicted ({'swap their images' if 'swapped' in fault else 'mend the camera'}; "
+        "frontend.watch_cameras: false uses them all)"
         for fault, which in frames.items()
     ]
     return (*lines, *(() if watch is None else watch.remarks()))

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size, in_metres, is_stereo_pair
+from fgslam.cameras.assembly import at_size, implausible, in_metres, is_stereo_pair
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
@@ -266,6 +266,9 @@ def _by_tree(
     # A unit is that of camera_info; transforms are in metres (REP 103).
     rig = read_rig(replace(settings, unit_m=1.0), pair, stated.size)
     note = f"camera_info has no baseline: by tf_static {right} is {rig.baseline:.4g} m from {left}"
+    if doubted := implausible(source, rig.plain()):  # --unit, which that names, is another's
+        note += ", which no rig has: tf_static is in metres; give the calibration by --camera FILE"
+        rig = replace(rig, remarks=tuple(text for text in rig.remarks if text not in doubted))
     return _Found(rig, pair.cameras, chosen, (note, *filter(None, [said])))
 
 

@@ -210,6 +210,15 @@ def test_tf_static_gives_the_baseline_that_camera_info_lacks(tmp_path: Path) -> 
     assert int(recording.frame(1).images[0][0, 0]) == 11
 
 
+def test_a_tree_in_millimetres_is_doubted_with_a_mend_that_works(tmp_path: Path) -> None:
+    tree = tf_static([(LEFT, RIGHT, shifted(1000.0 * BASELINE))])
+    messages = in_frames(without_baseline(stereo(2)), FRAMES) + tree
+    recording = opened(write_bag(tmp_path / "a.bag", messages))
+    doubted = [note for note in recording.notes if "200 m from" in note]
+    assert doubted[0].endswith("tf_static is in metres; give the calibration by --camera FILE")
+    assert not any("--unit" in note for note in recording.notes)
+
+
 def test_cameras_that_the_frames_swap_are_taken_as_they_stand(tmp_path: Path) -> None:
     tree = tf_static([(LEFT, RIGHT, shifted(-BASELINE))])
     messages = in_frames(without_baseline(stereo(2)), FRAMES) + tree

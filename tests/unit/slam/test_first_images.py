@@ -50,6 +50,7 @@ def test_bits_that_are_given_and_lost_are_remarked(recording: fg.Recording) -> N
 def test_swapped_images_are_said_to_be_swapped(recording: fg.Recording) -> None:
     remark, *_ = remarks(recording, lambda images: (images[1], images[0], *images[2:]))
     assert remark.startswith("the images of the right and the left camera are swapped: 4 of 4")
+    assert "(swap their images; " in remark
 
 
 @pytest.mark.parametrize(
