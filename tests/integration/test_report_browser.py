@@ -252,6 +252,10 @@ def test_a_foreign_script_is_refused_by_the_page(browser: Browser) -> None:
 def test_a_phone_scrolls_the_table_and_not_the_page(browser: Browser, page: Path) -> None:
     browser.size(*PHONE, phone=True)
     browser.open(page)
+    browser.driver.execute_script(  # as a note with a long path in it
+        "document.querySelector('.subtitle').insertAdjacentHTML("
+        "'afterend', '<ul><li>/' + 'folder_'.repeat(20) + 'odometry.csv</li></ul>')"
+    )
     assert browser.js("innerWidth") == PHONE[0]
     assert browser.js("document.documentElement.scrollWidth") <= PHONE[0]
     plots = browser.js(
