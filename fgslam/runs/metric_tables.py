@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -47,9 +48,15 @@ def comparison_particulars(values: Mapping[str, Any], out: Path) -> tuple[tuple[
     return (*_reasons(values), *_remarks(values), ("results", str(out))) if values else ()
 
 
-def page_table(values: Mapping[str, Any]) -> TextTable:
-    """The table of the page, of metrics by marked title; values that are not known read `-`."""
-    return _table("comparison", "Comparison", _PAGE, values)
+def page_tables(values: Mapping[str, Any]) -> tuple[TextTable, ...]:
+    """The tables of the page, of metrics by marked title; values that are not known read `-`.
+
+    Three, for one of all columns is wider than a window.
+    """
+    return tuple(
+        _table(heading.partition(" ")[0].lower(), heading, columns, values)
+        for heading, columns in _PAGE.items()
+    )
 
 
 def ate_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> TextTable:
@@ -322,14 +329,14 @@ TRIAL_COLUMNS = (
     MetricColumn("NEES pose", ("nees_pose",), _pooled, _NO_TRUTH),
     MetricColumn("NEES landmarks", ("nees_landmark",), _pooled, _NO_LANDMARKS),
 )
-_PAGE = (
-    MetricColumn(
+_always = partial(MetricColumn, optional=False)
+_PAGE_ACCURACY = (
+    _always(
         "ATE (cm)",
         ("ate_rmse_m",),
         _cm,
         "absolute trajectory error of the final path: root mean square distance from the truth "
         "after SE3 alignment",
-        optional=False,
     ),
     MetricColumn(
         "ATE online (cm)",
@@ -337,33 +344,29 @@ _PAGE = (
         _cm,
         "the same of the path made of each pose as first estimated, at its own time",
     ),
-    MetricColumn(
+    _always(
         "RPE (cm)",
         ("rpe_trans_m",),
         _cm,
         "relative pose error from frame to frame, translation",
-        optional=False,
     ),
-    MetricColumn(
+    _always(
         "RPE (deg)",
         ("rpe_rot_deg",),
         _number(".3f"),
         "relative pose error from frame to frame, rotation",
-        optional=False,
     ),
-    MetricColumn(
+    _always(
         "end error (cm)",
         ("end_error_m",),
         _cm,
         "distance of the last pose from the true one, the first pose aligned",
-        optional=False,
     ),
-    MetricColumn(
+    _always(
         "drift (%)",
         ("drift_percent",),
         _number(".2f"),
         "end error over the length of the true path",
-        optional=False,
     ),
     MetricColumn(
         "landmark error (cm)",
@@ -371,23 +374,20 @@ _PAGE = (
         _cm,
         "root mean square distance of the landmarks from their true positions",
     ),
-    MetricColumn(
-        "landmarks", ("landmarks",), _whole, "number of landmarks in the final map", optional=False
-    ),
-    MetricColumn(
+)
+_PAGE_CONSISTENCY = (
+    _always(
         "NEES pose",
         ("nees_pose_per_dof",),
         _short,
         "normalised error squared of the poses per degree of freedom: 1 is right, more is "
         "overconfident, less is conservative",
-        optional=False,
     ),
-    MetricColumn(
+    _always(
         "verdict",
         ("nees_pose.verdict",),
         str,
         "whether the pose NEES lies in its 95 % chi-square band; one run counts as one sample",
-        optional=False,
     ),
     MetricColumn("in 2 sigma", ("coverage.all",), _number(".0%"), "pose errors within two sigma"),
     MetricColumn(
@@ -396,12 +396,11 @@ _PAGE = (
         _short,
         "NEES of each pose as first estimated, by its covariance of that time",
     ),
-    MetricColumn(
+    _always(
         "NEES landmarks",
         ("nees_landmark_per_dof",),
         _short,
         "normalised error squared of the landmarks per degree of freedom",
-        optional=False,
     ),
     MetricColumn(
         "NIS",
@@ -415,34 +414,37 @@ _PAGE = (
         _cm,
         "standard deviation of the last pose's position, as claimed",
     ),
-    MetricColumn(
+)
+_PAGE_COST = (
+    _always("landmarks", ("landmarks",), _whole, "number of landmarks in the final map"),
+    _always(
         "median (ms)",
         ("update_ms.median",),
         _number(".2f"),
         "time for a frame, median over the run",
-        optional=False,
     ),
-    MetricColumn(
+    _always(
         "p95 (ms)",
         ("update_ms.p95",),
         _number(".2f"),
         "time for a frame that 95 % stay below",
-        optional=False,
     ),
-    MetricColumn(
-        "worst (ms)", ("update_ms.max",), _number(".1f"), "longest time for a frame", optional=False
-    ),
+    _always("worst (ms)", ("update_ms.max",), _number(".1f"), "longest time for a frame"),
     MetricColumn(
         "growth",
         ("update_growth.ratio",),
         _number(".2f"),
         "median time of the last fifth of the frames over that of the second fifth: 1 is flat",
     ),
-    MetricColumn(
+    _always(
         "memory (MiB)",
         ("peak_memory_mb",),
         _whole,
         "largest resident memory of the process",
-        optional=False,
     ),
 )
+_PAGE = {
+    "Accuracy": _PAGE_ACCURACY,
+    "Consistency": _PAGE_CONSISTENCY,
+    "Time and memory": _PAGE_COST,
+}

@@ -32,7 +32,7 @@ from fgslam.report.run_results import (
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.metric_tables import marked, page_table
+from fgslam.runs.metric_tables import marked, page_tables
 from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
 
 _UP = np.array([0.0, -1.0, 0.0])
@@ -83,7 +83,6 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     places, closures = (None, []) if loops is None else read_closures(loops)
     synthetic = _SYNTHETIC if metrics.get("remark") else ""
     of_estimators = marked(metrics["estimators"], synthetic, say_failed=False)
-    comparison = page_table(of_estimators)
     estimators = tuple(
         replace(one, title=title) for one, title in zip(estimators, of_estimators, strict=True)
     )
@@ -93,7 +92,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         estimators=estimators,
         truth=truth_in_their_world(estimators, truth),
         notes=_notes(metrics),
-        tables=(comparison, *([places] if places and places.rows else [])),
+        tables=(*page_tables(of_estimators), *([places] if places and places.rows else [])),
         closures=tuple(closures),
         pictures=tuple(_pictures(pictures)),
         config_yaml=config_text,
