@@ -230,20 +230,29 @@ def _address(scheduler: str) -> str:
 
 
 class LocalCrew:
-    """Processes of this machine with one thread each, started when the first work is handed out.
+    """Processes of this machine with one thread each, which end with this process.
 
-    The scheduler listens on this machine's own address only. A worker that crashes is replaced.
-    Workers get no Ctrl-C, and end with this process.
+    They start when the crew is entered, so that they load what they need while the work is laid
+    out; the scheduler, which listens on this machine's own address only, with the first work. A
+    worker that crashes is replaced. Workers get no Ctrl-C.
     """
 
     lost = False
 
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
+    def __init__(self, jobs: int, module: str) -> None:
+        """``module`` is where the functions are that it will be given."""
+        self._jobs, self._workers = jobs, _LocalWorkers(module)
         self._stack = ExitStack()
         self._crew: DaskCrew | None = None
 
     def __enter__(self) -> LocalCrew:
+        with ExitStack() as stack:
+            folder = stack.enter_context(
+                tempfile.TemporaryDirectory(prefix="fgslam-workers-", ignore_cleanup_errors=True)
+            )
+            stack.callback(self._workers.close)
+            self._workers.start(self._jobs, folder)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -255,14 +264,14 @@ class LocalCrew:
         arguments: Sequence[Argument],
         stopped: Callable[[], bool],
     ) -> Iterator[tuple[int, Result | WorkerEnded[Argument]]]:
-        """As :meth:`DaskCrew.do`."""
+        """As :meth:`DaskCrew.do`; the crew has been entered."""
         if self._crew is None:
-            self._crew = self._stack.enter_context(_local_crew(self._jobs))
+            self._crew = self._stack.enter_context(_local_crew(self._workers))
         return self._crew.do(function, arguments, stopped)
 
 
 @contextmanager
-def _local_crew(jobs: int) -> Iterator[DaskCrew]:
+def _local_crew(workers: _LocalWorkers) -> Iterator[DaskCrew]:
     import dask
     from distributed import Client, LocalCluster
 
@@ -273,42 +282,59 @@ def _local_crew(jobs: int) -> Iterator[DaskCrew]:
     }
     with ExitStack() as stack:
         stack.enter_context(_quiet())
-        folder = stack.enter_context(
-            tempfile.TemporaryDirectory(prefix="fgslam-workers-", ignore_cleanup_errors=True)
-        )
         stack.enter_context(dask.config.set(rules))
         cluster = LocalCluster(n_workers=0, host=_HOST, dashboard_address=f"{_HOST}:0")
         stack.callback(cluster.close)
         client = Client(cluster, set_as_default=False)
         stack.callback(_close, client)
-        workers = _LocalWorkers(cluster.scheduler_address, folder, jobs)
         stack.callback(workers.close)
+        workers.work_for(cluster.scheduler_address)
         yield DaskCrew(client, workers.keep)
 
 
 class _LocalWorkers:
     """Processes of :mod:`fgslam.runs.dask_worker`."""
 
-    def __init__(self, scheduler: str, folder: str, count: int) -> None:
-        self._command = [sys.executable, "-m", "fgslam.runs.dask_worker", scheduler, folder]
+    def __init__(self, module: str) -> None:
+        """``module`` is loaded before there is work."""
+        self._module, self._folder, self._scheduler = module, "", ""
+        self._workers: list[tuple[subprocess.Popen[bytes], float]] = []
+        self._short_lives = 0
+
+    def start(self, count: int, folder: str) -> None:
+        """Starts so many, which load what they need and wait; ``folder`` is theirs."""
+        self._folder = folder
+        for _ in range(count):
+            self._workers.append(self._new())
+
+    def work_for(self, scheduler: str) -> None:
+        """Tells them the address they have waited for, and those that will replace them."""
+        self._scheduler = scheduler
+        for process, _ in self._workers:
+            self._tell(process)
+
+    def _new(self) -> tuple[subprocess.Popen[bytes], float]:
         own = {
             "PYTHONPATH": os.pathsep.join(sys.path),
-            "TMPDIR": folder,
+            "TMPDIR": self._folder,
             "DASK_LOGGING__DISTRIBUTED": "critical",
             "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",  # 100 looks a second
         }
-        self._environment = os.environ | dict.fromkeys(ONE_THREAD, "1") | own
-        self._workers = [self._start() for _ in range(count)]
-        self._short_lives = 0
-
-    def _start(self) -> tuple[subprocess.Popen[bytes], float]:
         process = subprocess.Popen(  # noqa: S603 - a module of this package
-            self._command,
-            env=self._environment,
+            [sys.executable, "-m", "fgslam.runs.dask_worker", self._folder, self._module],
+            env=os.environ | dict.fromkeys(ONE_THREAD, "1") | own,
             stdin=subprocess.PIPE,
+            bufsize=0,  # what an ended worker did not read is not tried again
             start_new_session=True,  # Ctrl-C is this process's to answer
         )
+        if self._scheduler:
+            self._tell(process)
         return process, time.monotonic()
+
+    def _tell(self, process: subprocess.Popen[bytes]) -> None:
+        if process.stdin is not None:
+            with suppress(BrokenPipeError):  # it has ended, and is replaced
+                process.stdin.write(f"{self._scheduler}\n".encode())
 
     def keep(self) -> None:
         """Replaces those that have ended. Raises OutputError where none can be started."""
@@ -323,14 +349,14 @@ class _LocalWorkers:
                     f"{process.returncode}, see above); try --jobs 1, or free some memory"
                 )
             _drop(process)
-            self._workers[k] = self._start()
+            self._workers[k] = self._new()
 
     def close(self) -> None:
         """Ends all at once: what they hold is kept elsewhere, or done again."""
         for process, _ in self._workers:
             process.kill()
-        for process, _ in self._workers:
-            _drop(process)
+        while self._workers:
+            _drop(self._workers.pop()[0])
 
 
 def _drop(process: subprocess.Popen[bytes]) -> None:

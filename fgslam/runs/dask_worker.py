@@ -3,22 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import os
+import queue
 import shutil
 import sys
 import threading
 
 
-def main() -> None:
-    """Works for the scheduler at the address given until standard input ends."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    asyncio.run(_work(sys.argv[1], sys.argv[2]))
+def main(folder: str, module: str) -> None:
+    """Works for the scheduler whose address is the first line of standard input, until that ends.
+
+    What takes a worker long, loading Dask and the module of the work, is done before it waits for
+    the address: while whoever started it still checks what there is to do.
+    """
+    addresses: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_follow_parent, args=(addresses, folder), daemon=True).start()
+    import distributed  # noqa: F401
+
+    importlib.import_module(module)
+    asyncio.run(_work(addresses.get(), folder))
 
 
-def _end_with_parent() -> None:
+def _follow_parent(addresses: queue.SimpleQueue[str], folder: str) -> None:
     """The pipe ends with the process at its other end, however that ends; nothing is lost here."""
+    addresses.put(sys.stdin.buffer.readline().decode().strip())
     sys.stdin.buffer.read()
-    shutil.rmtree(sys.argv[2], ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
     os._exit(0)
 
 
@@ -32,4 +43,4 @@ async def _work(scheduler: str, folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

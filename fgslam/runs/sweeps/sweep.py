@@ -93,7 +93,7 @@ def crew_of(jobs: int | None, scheduler: str | None) -> AbstractContextManager[C
         ConfigError: both are given.
     """
     if scheduler is None:
-        return LocalCrew(jobs or os.cpu_count() or 1)
+        return LocalCrew(jobs or os.cpu_count() or 1, perform_case.__module__)
     if jobs is not None:
         raise ConfigError("--jobs is for workers of this machine; leave it out with --scheduler")
     return crew_at(scheduler)
@@ -123,8 +123,8 @@ def run_sweep(
             written.
     """
     begin_sweep(folder, existing, plan)
-    keys, config = _checked(plan, watch)
-    with Owner(folder) as owner, crew as workers:
+    with crew as workers, Owner(folder) as owner:  # workers get ready while cases are checked
+        keys, config = _checked(plan, watch)
         begin_sweep(folder, existing, plan, owner)
         with Journal(folder / JOURNAL_FILE) as journal:
             work = _Work(plan, keys, journal, RunningMeans(plan.grid, metric), folder)
