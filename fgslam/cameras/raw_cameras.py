@@ -73,7 +73,9 @@ class RawCamera:
         centred = np.asarray(pixels, np.float64) - self.matrix[:2, 2]
         plane = centred @ np.linalg.inv(self.matrix[:2, :2]).T
         rays = self.lens.unproject(self.distortion, plane)
-        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        with np.errstate(over="ignore"):  # of absurd values in a file; where they lead is no ray
+            length = np.linalg.norm(rays, axis=1, keepdims=True)
+        return np.asarray(rays / np.where(np.isfinite(length), length, np.nan))
 
     def scaled(self, size: tuple[int, int]) -> RawCamera:
         """The same camera for its images resized to ``size`` (width, height).
@@ -188,6 +190,14 @@ def _matrix_fault(matrix: FloatArray) -> str | None:
 def _size_fault(camera: RawCamera) -> str | None:
     if max(camera.size) > _LARGEST_SIDE:
         return f"no image is {camera.width}x{camera.height} pixels large"
+    size, centre = np.array(camera.size), camera.matrix[:2, 2]
+    # Cropped images may have it outside, but hardly by more than their own size.
+    if camera.width and not ((centre >= -size) & (centre <= 2 * size)).all():
+        column, row = centre
+        return (
+            f"its principal point ({column:g}, {row:g}) is far from the image of "
+            f"{camera.width}x{camera.height} pixels"
+        )
     return None
 
 

@@ -18,8 +18,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.cylindrical import on_fisheye, turns_of_cylinder
 from fgslam.core.features import Features
-from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig, partial_map, rig_map, vertical_to_horizontal
+from fgslam.core.sensors import CameraRig
 
 TERMS = (
     "column",  # principal point
@@ -331,21 +330,3 @@ class RigCorrection(Brief):
         ]
         pairs = zip(features, moved, strict=True)
         return tuple(dataclasses.replace(found, xy=found.xy - off) for found, off in pairs)
-
-    def corrected(self, observed: Observations) -> Observations:
-        """The observations as an exact rig had measured them; their raw pixels stay.
-
-        Of three images two may show a landmark; NaN where fewer do.
-        """
-        rig, pixels = self.rig, observed.pixels[:, : self.rig.cameras]
-        moved = (displacements(rig, pixels) @ self.values).reshape(pixels.shape)
-        shown = np.isfinite(pixels).all(axis=2)
-        off = np.full((len(pixels), 3), np.nan)
-        for pattern in np.unique(shown, axis=0):
-            rows, seen = (shown == pattern).all(axis=1), np.flatnonzero(pattern).tolist()
-            if len(seen) > 1:
-                every = len(seen) == rig.cameras
-                ratio = vertical_to_horizontal(rig)
-                fuse = rig_map(rig) if every else partial_map(seen, rig.cameras, ratio)
-                off[rows] = moved[rows][:, seen].reshape(-1, 2 * len(seen)) @ fuse.T
-        return dataclasses.replace(observed, measurement=observed.measurement - off)

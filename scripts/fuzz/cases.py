@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import tempfile
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -100,7 +101,8 @@ def outcome(kind: Kind, seed: int) -> str:
     with tempfile.TemporaryDirectory(prefix="fgslam-fuzz-") as scratch:
         given = kind.make(rng, Path(scratch))
         try:
-            with _time_limit():
+            with _time_limit(), warnings.catch_warnings():
+                warnings.simplefilter("error", RuntimeWarning)  # NumPy's, of what was let through
                 found = kind.read(given)
         except FgslamError as error:
             try:

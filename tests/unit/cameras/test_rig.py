@@ -216,6 +216,10 @@ def test_rows_of_numbers_as_opencv_5_writes_them(tmp_path: Path) -> None:
         ({"K1": [[3e9, 0.0, 80.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]]}, "nearly square"),
         ({"K1": [[30.0, 80.0, 0.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]]}, "nearly right angles"),
         ({"K1": [[3e9, 0.0, 80.0], [0.0, 3e9, 60.0], [0.0, 0.0, 1.0]]}, "show 3.* degrees in 160x"),
+        (
+            {"K1": [[200.0, 0.0, -1e300], [0.0, 200.0, 60.0], [0.0, 0.0, 1.0]]},
+            r"principal point \(-1e\+300, 60\) is far from the image of 160x",
+        ),
         ({"D1": [1e4, 0.0, 0.0, 0.0, 0.0]}, "lens model show .* degrees in 160x"),
         ({"D1": [-1e300, 0.0, 0.0, 0.0, 0.0]}, "has no ray for any of 160x120 pixels"),
         ({"T": [-1e300, 0.0, 0.0]}, "it is 1e[+]300 m from"),
