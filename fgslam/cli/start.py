@@ -26,10 +26,12 @@ def main() -> None:
     """The command line; as :func:`fgslam.cli.main.main`."""
     # Registered before any library is imported, it is called after all that these register.
     atexit.register(_leave)
+    _open_closed_streams()
     try:
         with signals.OtherErrors():
             signals.watch()
             _require_memory()
+            _require_current_folder()
             from fgslam.cli.main import main as command
 
             command()
@@ -44,6 +46,20 @@ def main() -> None:
         if ended.code is None or isinstance(ended.code, int):
             _ended_with.append(ended.code or 0)
         raise
+
+
+def _open_closed_streams() -> None:
+    """Standard streams that were closed lead nowhere.
+
+    A file that is opened would take their number, and get what libraries write to them.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        if getattr(sys, name) is None:
+            file = os.open(os.devnull, os.O_RDWR)
+            os.dup2(file, number)
+            if file != number:
+                os.close(file)
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
 def _leave() -> None:
@@ -67,6 +83,19 @@ def _require_memory() -> None:
             file=sys.stderr,
         )
         raise SystemExit(2)
+
+
+def _require_current_folder() -> None:
+    """Ends with a line where the folder that this was called in has been deleted."""
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        print(
+            "fgslam: the current folder has been deleted, or made anew; change to one that "
+            "exists: cd FOLDER",
+            file=sys.stderr,
+        )
+        raise SystemExit(2) from None
 
 
 def _flush() -> None:

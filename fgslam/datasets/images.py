@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,14 +16,8 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import require_file
 from fgslam.core.sensors import CAMERA_NAMES
+from fgslam.datasets.image_bytes import fault_of_bytes
 from fgslam.datasets.loose_files import IMAGE_SUFFIXES
-
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-# Some writers pad a JPEG after its end marker.
-_JPEG_TAIL = 64
-_MOST_PIXELS = 100_000_000
-"""The largest cameras have that many; SIFT would need 30 GB for one such image."""
 
 
 def list_numbered_images(folder: Path) -> dict[int, Path]:
@@ -250,7 +243,9 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
-    _require_complete(name, data)
+    fault = fault_of_bytes(data)
+    if fault is not None:
+        raise FrameError(f"image {name} {fault}")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data else None
     except cv2.error:  # absurd sizes in a damaged header
@@ -258,46 +253,6 @@ def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
     if image is None:
         raise FrameError(f"image {name} is not an image that can be decoded; restore the file")
     return image
-
-
-def _require_complete(name: str, data: bytes) -> None:
-    if data.startswith(_PNG_SIGNATURE):
-        fault = _png_fault(data)
-    elif data.startswith(_JPEG_START):
-        fault = None if _JPEG_END in data[-_JPEG_TAIL:] else "is truncated (no end marker)"
-    else:
-        fault = None if data else "is empty"
-    if fault is not None:
-        mend = "" if ";" in fault else "; copy the file again from its source"
-        raise FrameError(f"image {name} {fault}{mend}")
-
-
-def _png_fault(data: bytes) -> str | None:
-    """What is wrong with the chunks of a PNG file, or None. The decoder would fill in grey."""
-    at = len(_PNG_SIGNATURE)
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        kind, end = data[at + 4 : at + 8], at + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return f"is damaged (checksum of its {kind.decode('latin-1')} chunk)"
-        if kind == b"IHDR" and (fault := _size_fault(data[at + 8 : end])):
-            return fault
-        if kind == b"acTL":
-            return "is animated; give one file an image"
-        if kind == b"IEND":
-            return None
-        at = end + 4
-    return f"is truncated at {len(data)} bytes"
-
-
-def _size_fault(header: bytes) -> str | None:
-    """What is wrong with the size in a PNG's header: a few bytes may stand for gigabytes."""
-    width, height = (int.from_bytes(header[k : k + 4], "big") for k in (0, 4))
-    if 0 < width * height <= _MOST_PIXELS:
-        return None
-    return f"claims to be {width}x{height}, at most {_MOST_PIXELS / 1e6:.0f} megapixels are read"
 
 
 # --------------------------------------------------------------------------------------------
@@ -395,7 +350,7 @@ def check_sizes(files: StereoFiles, where: Path) -> None:
     if images is None:
         raise DatasetError(
             f"{where}: not one of {len(files.paths)} frames has a readable image from each of "
-            f"{len(files.paths[0])} cameras; check that the file names fit the list of times"
+            f"{len(files.paths[0])} cameras; {_why_unreadable(files.paths[0])}"
         )
     sizes = [size(image) for image in images]
     if len(set(sizes)) > 1:
@@ -409,6 +364,18 @@ def check_sizes(files: StereoFiles, where: Path) -> None:
             f"{where}: images are {sizes[0]} but the calibration says {files.width}x{files.height}"
             "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
         )
+
+
+def _why_unreadable(paths: Sequence[Path]) -> str:
+    """What is wrong with the images of the first frame."""
+    if not all(path.exists() for path in paths):
+        return "check that the file names fit the list of times"
+    try:
+        for path in paths:
+            read_grey_image(path)
+    except FrameError as error:
+        return f"of the first: {error}"
+    return "restore the files"
 
 
 def missing_notes(files: StereoFiles, stamps: FloatArray) -> tuple[str, ...]:

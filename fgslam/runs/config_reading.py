@@ -230,6 +230,8 @@ _PLAIN_WORDS = {
     "bool_parsing": "give true or false",
     "string_type": "give text, in quotes where it looks like a number",
     "finite_number": "give a finite number",
+    "string_unicode": "it has bytes that are no UTF-8; give the file or folder another name (or, "
+    "where the locale is at fault: export LC_ALL=C.UTF-8)",
 }
 """What a value must be, by pydantic's type of error; others speak for themselves."""
 

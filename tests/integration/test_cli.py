@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -209,6 +210,21 @@ def test_a_closed_pipe_is_no_fault() -> None:
     process.stderr.close()
     process.wait(timeout=HANGS_AFTER_S)
     assert b"Traceback" not in error
+
+
+def test_closed_standard_streams_are_no_fault() -> None:
+    """As a daemon or a job of cron may be started."""
+    line = shlex.join(command("--version")) + " <&- >&- 2>&-"
+    assert subprocess.run(["sh", "-c", line], check=False).returncode == 0  # noqa: S603, S607
+
+
+def test_a_current_folder_that_has_been_deleted_is_told(tmp_path: Path) -> None:
+    (tmp_path / "gone").mkdir()
+    line = f"cd {tmp_path}/gone && rmdir {tmp_path}/gone && " + shlex.join(command("--version"))
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, check=False)  # noqa: S603, S607
+    assert done.returncode == 2
+    assert done.stderr.startswith("fgslam: the current folder has been deleted")
+    assert done.stderr.count("\n") == 1
 
 
 def test_the_resolved_configuration_repeats_the_run(finished: Finished, tmp_path: Path) -> None:

@@ -12,8 +12,14 @@ import numpy as np
 import pytest
 from PIL import Image as PictureFile
 
-from fgslam.core.errors import FrameError
-from fgslam.datasets.images import decode_grey, mosaic_note, read_grey_image
+from fgslam.core.errors import DatasetError, FrameError
+from fgslam.datasets.images import (
+    StereoFiles,
+    check_sizes,
+    decode_grey,
+    mosaic_note,
+    read_grey_image,
+)
 
 GREY = np.add.outer(np.arange(60), 2 * np.arange(80)).astype(np.uint8)
 
@@ -94,6 +100,34 @@ def test_half_a_file_is_no_image(kind: str) -> None:
     np.testing.assert_allclose(decode_grey(data, "a").astype(int), GREY, rtol=0, atol=12)
     with pytest.raises(FrameError):
         decode_grey(data[: len(data) // 2], "a")
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (LFS, "is a pointer of Git LFS; get the image itself: git lfs pull"),
+        (b"\n<!DOCTYPE html>\n<html>404", "is a web page, as a download that failed leaves it"),
+        (b"<HTML><body>gone", "is a web page, as a download that failed leaves it"),
+        (b"", "is empty; copy the file again from its source"),
+    ],
+)
+def test_a_file_in_the_place_of_an_image_is_said_to_be_what_it_is(data: bytes, words: str) -> None:
+    with pytest.raises(FrameError, match=words):
+        decode_grey(data, "a.png")
+
+
+def test_a_recording_without_a_readable_image_says_what_the_first_one_is(tmp_path: Path) -> None:
+    paths = tuple((tmp_path / f"right_{k}.png", tmp_path / f"left_{k}.png") for k in range(2))
+    with pytest.raises(DatasetError, match="check that the file names fit the list of times"):
+        check_sizes(StereoFiles(paths, 80, 60), tmp_path)
+    for right, left in paths:
+        right.write_bytes(encoded(PictureFile.fromarray(GREY)))
+        left.write_bytes(LFS)
+    with pytest.raises(DatasetError, match=r"of the first: image .*left_0.png is a pointer of Git"):
+        check_sizes(StereoFiles(paths, 80, 60), tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["a pipe", "a device", "a folder", "a loop", "nothing"])

@@ -430,6 +430,12 @@ def test_wrong_types_are_reported_in_plain_words(
     assert f"{key} = {value!r} is not usable: {words}" in message
 
 
+def test_a_name_with_bytes_that_are_no_utf_8_is_told() -> None:
+    """As archives made elsewhere leave names of folders."""
+    with pytest.raises(ConfigError, match="has bytes that are no UTF-8; give the file or folder"):
+        make_config(nested(MINIMAL, "dataset.path", "dri\udcffe"), "x")
+
+
 # --------------------------------------------------------------------------------------------
 # Maps
 
