@@ -239,9 +239,8 @@ class LocalCrew:
 
     lost = False
 
-    def __init__(self, jobs: int, module: str) -> None:
-        """``module`` is where the functions are that it will be given."""
-        self._jobs, self._workers = jobs, _LocalWorkers(module)
+    def __init__(self, jobs: int) -> None:
+        self._jobs, self._workers = jobs, _LocalWorkers()
         self._stack = ExitStack()
         self._crew: DaskCrew | None = None
 
@@ -295,9 +294,8 @@ def _local_crew(workers: _LocalWorkers) -> Iterator[DaskCrew]:
 class _LocalWorkers:
     """Processes of :mod:`fgslam.runs.dask_worker`."""
 
-    def __init__(self, module: str) -> None:
-        """``module`` is loaded before there is work."""
-        self._module, self._folder, self._scheduler = module, "", ""
+    def __init__(self) -> None:
+        self._folder, self._scheduler = "", ""
         self._workers: list[tuple[subprocess.Popen[bytes], float]] = []
         self._short_lives = 0
 
@@ -321,7 +319,7 @@ class _LocalWorkers:
             "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",  # 100 looks a second
         }
         process = subprocess.Popen(  # noqa: S603 - a module of this package
-            [sys.executable, "-m", "fgslam.runs.dask_worker", self._folder, self._module],
+            [sys.executable, "-m", "fgslam.runs.dask_worker", self._folder],
             env=os.environ | dict.fromkeys(ONE_THREAD, "1") | own,
             stdin=subprocess.PIPE,
             bufsize=0,  # what an ended worker did not read is not tried again

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import importlib
 import os
 import queue
 import shutil
@@ -11,17 +10,18 @@ import sys
 import threading
 
 
-def main(folder: str, module: str) -> None:
+def main(folder: str) -> None:
     """Works for the scheduler whose address is the first line of standard input, until that ends.
 
-    What takes a worker long, loading Dask and the module of the work, is done before it waits for
-    the address: while whoever started it still checks what there is to do.
+    What takes a worker long, loading Dask and what cases and trials need, is done before it waits
+    for the address: while whoever started it still checks what there is to do.
     """
     addresses: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_follow_parent, args=(addresses, folder), daemon=True).start()
     import distributed  # noqa: F401
 
-    importlib.import_module(module)
+    import fgslam.runs.sweeps.case  # noqa: F401
+
     asyncio.run(_work(addresses.get(), folder))
 
 
@@ -43,4 +43,4 @@ async def _work(scheduler: str, folder: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main(sys.argv[1])

@@ -105,7 +105,7 @@ def run_trials(
         changes: dict[str, Any] = {"trials": seeds.count, "seed": first}
         changes |= {"estimator": estimators[0], "compare": estimators[1:]}
         chosen = config.model_copy(update=changes)
-    with LocalCrew(jobs, perform_trial.__module__) as crew:
+    with LocalCrew(jobs) as crew:
         return run_task(opener, chosen, folder, existing, progress, stopped, jobs, crew)
 
 

@@ -99,7 +99,7 @@ def units_in_this_process() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fgslam.runs.units.run_apart", here)
-        patch.setattr("fgslam.runs.trials.LocalCrew", lambda *given: nullcontext(Here()))
+        patch.setattr("fgslam.runs.trials.LocalCrew", lambda jobs: nullcontext(Here()))
         yield
 
 

@@ -54,7 +54,7 @@ def drive(tmp_path: Path) -> Path:
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cases are done in this process."""
-    monkeypatch.setattr("fgslam.runs.sweeps.sweep.LocalCrew", lambda *given: nullcontext(Here()))
+    monkeypatch.setattr("fgslam.runs.sweeps.sweep.LocalCrew", lambda jobs: nullcontext(Here()))
 
 
 def do(

@@ -93,7 +93,7 @@ def crew_of(jobs: int | None, scheduler: str | None) -> AbstractContextManager[C
         ConfigError: both are given.
     """
     if scheduler is None:
-        return LocalCrew(jobs or os.cpu_count() or 1, perform_case.__module__)
+        return LocalCrew(jobs or os.cpu_count() or 1)
     if jobs is not None:
         raise ConfigError("--jobs is for workers of this machine; leave it out with --scheduler")
     return crew_at(scheduler)

@@ -167,7 +167,7 @@ def fatal(path: str) -> str:
 
 @pytest.mark.slow
 def test_a_worker_that_crashes_is_replaced_and_its_work_done(tmp_path: Path) -> None:
-    with LocalCrew(1, __name__) as crew:
+    with LocalCrew(1) as crew:
         assert list(crew.do(ending, [str(tmp_path / "mark")], never)) == [(0, "1")]
         ((_, ended),) = crew.do(fatal, [""], never)
     assert isinstance(ended, WorkerEnded)
@@ -180,19 +180,23 @@ def napping(seconds: float) -> int:
 
 
 @pytest.mark.slow
-def test_workers_load_what_they_need_before_there_is_work_and_end_without_any(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ready = tmp_path / "ready"
-    code = f"import os; from pathlib import Path; Path({str(ready)!r}).write_text(str(os.getpid()))"
-    (tmp_path / "needed_by_the_work.py").write_text(code)
-    monkeypatch.syspath_prepend(tmp_path)
+def test_workers_load_what_cases_need_before_there_is_work_and_end_without_any() -> None:
     end = time.monotonic() + 60.0
-    with LocalCrew(1, "needed_by_the_work"):
-        while not (ready.exists() and ready.read_text()):
+    with LocalCrew(1):
+        while not (ready := [one for one in workers_of_this_process() if has_loaded(one, "cv2")]):
             assert time.monotonic() < end, "no worker gets ready"
             time.sleep(0.02)
-    assert not alive(int(ready.read_text()))
+    assert not ready[0].exists()
+
+
+def has_loaded(process: Path, library: str) -> bool:
+    return library in (process / "maps").read_text(encoding="utf-8")
+
+
+def workers_of_this_process() -> list[Path]:
+    own = Path("/proc", str(os.getpid()), "task", str(os.getpid()), "children")
+    children = [Path("/proc", pid) for pid in own.read_text(encoding="utf-8").split()]
+    return [child for child in children if b"dask_worker" in (child / "cmdline").read_bytes()]
 
 
 @pytest.mark.slow
@@ -202,7 +206,7 @@ def test_a_stopped_crew_leaves_no_process_and_takes_no_time() -> None:
     def stopped() -> bool:
         return bool(until) and time.monotonic() > until[0]
 
-    with LocalCrew(2, __name__) as crew:
+    with LocalCrew(2) as crew:
         pids = {found for _, found in crew.do(napping, [0.5, 0.5], never)}
         until.append(time.monotonic() + 0.5)
         assert all(isinstance(one, WorkerEnded) for _, one in crew.do(napping, [60.0] * 4, stopped))
