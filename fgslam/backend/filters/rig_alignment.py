@@ -117,6 +117,13 @@ def _of_last(normal: _Normal, count: int) -> tuple[FloatArray, FloatArray]:
     return (information + information.T) / 2.0, score
 
 
+def _without_last(normal: _Normal, count: int) -> _Normal:
+    """The same with the last unknowns held where they are."""
+    kept = slice(None, len(normal.gradient) - count)
+    hessian, gradient = normal.hessian[kept, kept], normal.gradient[kept]
+    return dataclasses.replace(normal, hessian=hessian, gradient=gradient)
+
+
 class RigAlignment:
     """One window of frames: a list of observations, by landmark and then by frame."""
 
@@ -157,14 +164,14 @@ class RigAlignment:
         state = self._start(correction)
         if state is None:
             return None
-        found = self._minimise(state, correction, prior)
-        if found is None:
+        state = self._minimise(state, correction, prior)
+        if state is None:
             return None
-        state, normal = found
-        p = len(correction)
+        p, modes = len(correction), field_modes(self._rig)
+        normal = self._with_field(state)
         try:
-            information, score = _of_last(normal, p)
-            joint, pull = _of_last(self._with_field(state), p + field_modes(self._rig))
+            information, score = _of_last(_without_last(normal, modes), p)
+            joint, pull = _of_last(normal, p + modes)
         except np.linalg.LinAlgError:
             return None
         lean, field = joint[:p, p:], joint[p:, p:]
@@ -240,9 +247,7 @@ class RigAlignment:
         squared = (found.residual**2).sum(axis=1) / _KERNEL_WIDTH**2
         return float(_KERNEL_WIDTH**2 * np.log1p(squared).sum() + off @ prior @ off)
 
-    def _minimise(
-        self, state: _State, around: FloatArray, prior: FloatArray
-    ) -> tuple[_State, _Normal] | None:
+    def _minimise(self, state: _State, around: FloatArray, prior: FloatArray) -> _State | None:
         damping, best = 1e-6, self._cost(state, around, prior)
         for _ in range(_ITERATIONS):
             normal = self._linearise(state)
@@ -257,7 +262,7 @@ class RigAlignment:
             state, best, damping = moved, cost, max(damping / 10.0, _LEAST_DAMPING)
             if rested:
                 break
-        return state, self._linearise(state)
+        return state
 
     def _with_field(self, state: _State) -> _Normal:
         """Normal equations with the modes of a field as further unknowns, at zero."""
