@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.core.arrays import Image
-from fgslam.core.estimates import Trajectory
+from fgslam.core.estimates import EgoMotionStatus, Trajectory
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
@@ -27,6 +27,9 @@ from fgslam.slam.pipeline import FrameReport, SlamPipeline
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where the real recordings are looked for, one folder beside the checkout."""
+
+LOCATED = {EgoMotionStatus.FIRST, EgoMotionStatus.OK, EgoMotionStatus.CAPPED}
+"""How the pose of a frame is found where the map before it tells it."""
 
 _FOLDERS = {
     "euroc_v101": "euroc_v101_kf100",

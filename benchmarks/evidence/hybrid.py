@@ -11,10 +11,9 @@ from typing import Literal, TypeVar
 import cv2
 import numpy as np
 
-from benchmarks.runs import described, experiment, make_system, say
+from benchmarks.runs import LOCATED, described, experiment, make_system, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
@@ -31,7 +30,6 @@ RECORDINGS = ("lab_loop", "kitti06", "kitti_raw_0926", "euroc_v101")
 ESTIMATORS = ("landmark_kalman", "isam2")
 KINDS: tuple[Literal["sift", "hybrid"], ...] = ("sift", "hybrid")
 _RAW_EVERY = 4  # frames between those on which SIFT alone is timed, right beside the extractor
-_LOCATED = {EgoMotionStatus.FIRST, EgoMotionStatus.OK, EgoMotionStatus.CAPPED}
 
 
 def tables(data: Path, names: tuple[str, ...] = RECORDINGS) -> list[Table]:
@@ -125,7 +123,7 @@ def _row(
     spent = loop + sum(
         float(own[:images].sum()) for own, images in zip(found.seconds, described, strict=True)
     )
-    located = np.mean([r.tracking.status in _LOCATED for r in reports])
+    located = np.mean([r.tracking.status in LOCATED for r in reports])
     error = evaluate_trajectory(estimate, found.sequence.ground_truth, Alignment.SE3)
     ate_cm = 100.0 * (error.ate_rmse_m or np.nan)
     every = found.raw * len(reports)

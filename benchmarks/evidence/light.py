@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from benchmarks.runs import (
+    LOCATED,
     FoundFeatures,
     experiment,
     find_features,
@@ -21,7 +22,6 @@ from benchmarks.runs import (
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.features import Features
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.runs.config import ExperimentConfig
@@ -36,8 +36,6 @@ _SHOT = 0.0216
 _FRAMES = 100
 _CORNER = 0.25
 """Of the light in the middle: the fourth power of the cosine of 45 degrees."""
-
-_LOCATED = {EgoMotionStatus.FIRST, EgoMotionStatus.OK, EgoMotionStatus.CAPPED}
 
 
 @dataclass(frozen=True)
@@ -155,7 +153,7 @@ def _row(config: ExperimentConfig, found: FoundFeatures) -> tuple[Cell, ...]:
     """Frames located, features an image, matches a frame (medians), ATE in cm."""
     system = make_system(config, found.sequence)
     reports = list(process(found, system))
-    located = sum(report.tracking.status in _LOCATED for report in reports)
+    located = sum(report.tracking.status in LOCATED for report in reports)
     features = [len(image) for frame in found.frames for image in frame.features]
     matches = [len(report.stereo) for report in reports]
     ate = trajectory_error(system, found.sequence).ate_rmse_m

@@ -78,7 +78,7 @@ def drive(
         with all terms and its sigma, and the one that is taken off in the end, pixels.
     """
     slam = fg.Slam(RIG, ESTIMATOR, frontend={"tracking": kind})
-    for k, images in enumerate(_taken(clean, *draw)):
+    for k, images in enumerate(taken(clean, *draw)):
         slam.track(k * _PERIOD_S, images)
     result = slam.result()
     slam.close()
@@ -87,11 +87,11 @@ def drive(
     way = _length(result.trajectory.poses) / _length(poses)
     assert result.rig is not None
     offset, sigma = result.rig.estimated.centre_px()
-    taken = result.rig.applied.centre_px()[0]
-    return 100.0 * (error.ate_rmse_m or np.nan), 100.0 * (way - 1.0), offset, sigma, taken
+    applied = result.rig.applied.centre_px()[0]
+    return 100.0 * (error.ate_rmse_m or np.nan), 100.0 * (way - 1.0), offset, sigma, applied
 
 
-def _taken(clean: Float32, seed: int, light: str) -> Iterator[tuple[Image, Image]]:
+def taken(clean: Float32, seed: int, light: str) -> Iterator[tuple[Image, Image]]:
     """Left and right image of each frame."""
     gain, sigma = LIGHTS[light]
     rng = np.random.default_rng([seed, 5])

@@ -21,6 +21,7 @@ from benchmarks.runs import (
 from benchmarks.tables import Cell, Table
 
 PAPER_LITERALLY = (
+    "frontend.tracking=sift",
     "frontend.appearance.mode=paper",
     "frontend.stereo.measurement=paper",
     "frontend.matching.widen_sigmas=0",

@@ -351,10 +351,10 @@ class FrontendSettings:
     tracking: Annotated[
         Literal["sift", "hybrid"],
         Field(
-            description="`sift` on all images; `hybrid`: on the reference image of key frames, "
-            "patches (KLT) between and across"
+            description="`hybrid`: SIFT on the reference image of key frames, patches (KLT) "
+            "between and across; `sift`: SIFT on every frame"
         ),
-    ] = "sift"
+    ] = "hybrid"
     sift: SiftSettings = SiftSettings()
     stereo: StereoSettings = StereoSettings()
     appearance: AppearanceSettings = AppearanceSettings()

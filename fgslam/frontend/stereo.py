@@ -117,6 +117,7 @@ class StereoMatcher:
         """As :meth:`equally`; the other images' places are shifts from the first one's."""
         of_pixels = pixel_covariance(self._rig.cameras, "reference")
         covariance = self._map @ of_pixels @ self._map.T
+        covariance = 0.5 * (covariance + covariance.T)  # to the bit: logs keep one half
         return self._map, self._with_depth(self._settings.pixel_sigma**2 * covariance)
 
     def match_left(self, right: Features, left: Features) -> tuple[IntArray, IntArray]:

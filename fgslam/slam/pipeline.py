@@ -26,7 +26,7 @@ from fgslam.core.rig_correction import RigCorrection
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import unmeasured
-from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker
+from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
@@ -339,6 +339,8 @@ class SlamPipeline:
             tracked, located = self.places.recover(tracked, landmarks, stereo.whole, guessed)
             relocalised |= located
             maps_on = self.places.maps_on
+        if self.key_frames is not None:
+            tracked = spread(tracked, stereo)
         image = found.frame.images[0]
         association = self.tracker.associate(tracked, stereo, image, maps_on)
         if self.key_frames is not None:

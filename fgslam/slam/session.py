@@ -259,9 +259,9 @@ class Session:
         checked = None if images is None else checked_images(images, self.rig)
         frame = None if checked is None else Frame(i, timestamp, checked, self._margins)
         with one_blas_thread():
-            found = undescribed(i, frame)
-            if self.frontend.tracking == "sift" or self._start is not None:
-                found = self._describer.complete(found)
+            bare = undescribed(i, frame)
+            every = self.frontend.tracking == "sift"
+            found = self._describer.complete(bare) if every or self._start is not None else bare
             if images is not None:
                 self._seen.add(found, any_uint16(images))
             if self._start is None:
@@ -276,7 +276,8 @@ class Session:
                 return Step.of(report)
             if not self._arrives(self._start, found, timestamp):
                 return Step.not_located(timestamp, len(self.pipeline.tracker.database))
-            return Step.of(self.advance(replace(found, i=0), timestamp))
+            first = found if every else bare  # then measured as every key frame is
+            return Step.of(self.advance(replace(first, i=0), timestamp))
 
     def _arrives(self, start: MapStart, found: FeatureFrame, timestamp: float) -> bool:
         """True if the frame can be located in the map: the session then begins with it."""

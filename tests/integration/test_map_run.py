@@ -178,8 +178,9 @@ def test_a_run_starts_where_the_last_one_stopped(
     values = mapped(recording, first=CUT - 1, load=str(shorter), start="last")
     run = run_values(values, tmp_path / "run")
     assert metrics_of(run.folder)["status_counts"] == {"ok": 13 - CUT}
-    # The truth's world is the recording's first frame: that of the map, too.
-    assert unaligned_errors(run.folder).max() < 0.004
+    # The truth's world is the recording's first frame: that of the map, too. Its landmarks are
+    # those of one key frame, and SIFT finds them again from half a metre away.
+    assert unaligned_errors(run.folder).max() < 0.005
 
 
 @pytest.mark.slow

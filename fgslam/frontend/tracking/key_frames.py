@@ -18,7 +18,6 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, StateArra
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.frontend.patch_stereo import PATCH_PX
 from fgslam.frontend.tracking.carrying import Carried, LandmarkCarrier
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
@@ -26,7 +25,14 @@ from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Track
 _LEAST_SHARE = 0.4  # of the key frame's landmarks; fewer left take a new one
 _LEAST_LANDMARKS = 40  # a pose by fewer is poor, whatever the key frame had
 _LEAST_COVERAGE = 0.6  # of the image's cells that the key frame's landmarks covered
+_MOST_REJECTED = 0.2
+"""Of the carried landmarks: where more contradict the pose, something else moves, or patches went
+astray. On real roads nine frames of ten stay below 0.12."""
 _CELLS = (4, 3)  # columns, rows
+_APART_PX = 5.0
+"""Side of the squares of which each starts one landmark: a third of a patch. SIFT finds a sixth of
+its features twice in one place, by two orientations, whose patches are the same measurement; of
+patches that overlap by less each still adds to the pose."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +42,8 @@ class CarriedFrame:
     Attributes:
         carried: the landmarks found again.
         tracked: the pose that follows; its matches are rows of ``carried``.
-        lasting: enough of the last key frame's landmarks are left, over enough of the image.
+        lasting: enough of the last key frame's landmarks are left, over enough of the image, and
+            few of those found contradict the pose.
     """
 
     carried: Carried
@@ -107,8 +114,7 @@ class KeyFrameTracker:
         the image has not changed, and described by SIFT.
         """
         if frame is None or not frame.placed:
-            tracked = self._tracker.track(prediction, landmarks, sift)
-            return (tracked if len(landmarks) else _spread(tracked, sift)), sift
+            return self._tracker.track(prediction, landmarks, sift), sift
         pose = frame.tracked.ego_motion
         around = Prediction(pose.wTc, pose.covariance)
         expected, matches = self._tracker.matched_around(around, landmarks, sift)
@@ -116,8 +122,8 @@ class KeyFrameTracker:
         features, joined = _joined(expected, matches, frame.carried.select(kept), sift)
         tracked = self._tracker.solved(prediction, landmarks, (expected, joined, features))
         if not tracked.ego_motion.status.measured:
-            return _spread(self._tracker.track(prediction, landmarks, sift), sift), sift
-        return _spread(tracked, features), features
+            return self._tracker.track(prediction, landmarks, sift), sift
+        return tracked, features
 
     def begin(self, image: Image, features: StereoFeatures, association: Association) -> None:
         """After a key frame: its landmarks are carried from here, those in use by their patch.
@@ -147,10 +153,11 @@ class KeyFrameTracker:
         self._carrier.restore(state)
 
     def _lasting(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
-        pose = tracked.ego_motion
-        if pose.inliers.sum() < _LEAST_SHARE * self._count:
+        agreeing = tracked.ego_motion.inliers
+        enough = max(_LEAST_SHARE * self._count, (1.0 - _MOST_REJECTED) * len(carried))
+        if agreeing.sum() < enough:
             return False
-        cells = _cells(carried.features.pixels[pose.inliers, 0], image)
+        cells = _cells(carried.features.pixels[agreeing, 0], image)
         return len(cells) >= _LEAST_COVERAGE * self._cells
 
 
@@ -161,14 +168,13 @@ def _cells(places: FloatArray, image: Image) -> IntArray:
     return np.unique(at[:, 0] * _CELLS[1] + at[:, 1])
 
 
-def _spread(tracked: Tracked, features: StereoFeatures) -> Tracked:
-    """The frame starting landmarks only in squares of a patch's size that show none yet.
+def spread(tracked: Tracked, features: StereoFeatures) -> Tracked:
+    """The frame starting landmarks only in squares (:data:`_APART_PX`) that show none yet.
 
-    Patches that overlap err alike: more of them cost as much and tell little. Of several features
-    the finest is taken, which is seen longest on the way towards it.
+    Of several features the finest is taken, which is seen longest on the way towards it.
     """
     matches = tracked.matches
-    square = np.floor(features.pixels[:, 0] / PATCH_PX).astype(np.int64)
+    square = np.floor(features.measurement[:, :2] / _APART_PX).astype(np.int64)
     square = square[:, 0] + (square[:, 0].max(initial=0) + 1) * square[:, 1]
     taken = np.isin(square, square[matches.features[tracked.ego_motion.inliers]])
     order = np.lexsort((features.scale, matches.had_candidates | taken, square))

@@ -272,7 +272,8 @@ def submap_features(
     Args:
         sequence: the recording.
         found: the frames' features, in order, at least one.
-        frontend: the configuration's; neither loops are closed nor lost cameras found.
+        frontend: the configuration's; neither loops are closed nor lost cameras found, and every
+            frame's features are used: a sub-map is to show as much as it can.
         odometry: the configuration's; what was before the first of the frames is not used.
 
     Returns:
@@ -280,7 +281,7 @@ def submap_features(
         looks; those outside its image, too. And the covariance (6, 6) of that camera in the
         submap, which whoever is located by the submap has beside the map's.
     """
-    plain = dataclasses.replace(frontend, loops=None, lost=None)
+    plain = dataclasses.replace(frontend, tracking="sift", loops=None, lost=None)
     pipeline = make_pipeline(sequence.rig, plain, odometry, LandmarkKalmanSettings())
     for k, one in enumerate(found):
         timestamp = float(sequence.timestamps[one.i])

@@ -82,6 +82,8 @@ def views() -> Views:
 
 
 def session(views: Views, estimator: Any = "landmark_kalman", **more: Any) -> Session:
+    """These images show nothing that could be carried: features of every frame."""
+    more.setdefault("frontend", {"tracking": "sift"})
     return Session(RIG, estimator, features=views.find, **more)
 
 
@@ -539,7 +541,7 @@ def test_features_of_another_form_are_refused_and_the_session_goes_on(
         found = views.find(image)
         return change(found) if broken else found
 
-    slam = Session(RIG, "landmark_kalman", features=find)
+    slam = Session(RIG, "landmark_kalman", features=find, frontend={"tracking": "sift"})
     push(slam, views, range(3))
     broken = True
     with pytest.raises(ConfigError, match=words):
