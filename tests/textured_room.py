@@ -14,6 +14,7 @@ from fgslam.core.arrays import FloatArray, Image
 CAMERA = Equirectangular(601, 181, np.deg2rad(54.0), np.deg2rad(-54.0))
 SMALL_CAMERA = {"kind": "equirectangular", "top_elevation_deg": 54, "bottom_elevation_deg": -54}
 """Keys of the camera of every second pixel."""
+SMALL_CAMERA_FILE = "".join(f"{key}: {value}\n" for key, value in SMALL_CAMERA.items())
 HALF = 3.0
 """Metres from the middle to each wall; walls have no end upwards or downwards."""
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 from PIL import Image as PictureFile
 from running import main
 
@@ -21,7 +20,7 @@ from fgslam.runs.bare_routes import teaching
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.run import run_experiment
 from tests import textured_room
-from tests.textured_room import folder_of, seen_at
+from tests.textured_room import SMALL_CAMERA_FILE, folder_of, seen_at
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -33,8 +32,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("routes")
     folder_of(root / "drive", np.arange(0.0, 3.6, 0.4))
     folder_of(root / "again", np.arange(0.2, 3.6, 0.8))
-    camera = yaml.safe_dump(textured_room.SMALL_CAMERA)
-    (root / "camera.yaml").write_text(camera, encoding="utf-8")
+    (root / "camera.yaml").write_text(SMALL_CAMERA_FILE, encoding="utf-8")
     PictureFile.fromarray(np.ascontiguousarray(seen_at(1.8)[:, :200])).save(
         root / "drive" / "view_4a.png"
     )
