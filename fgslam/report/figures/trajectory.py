@@ -237,7 +237,8 @@ def _predicted(number: int, estimator: EstimatorReport, rows: IntArray, level: F
     """A mark at each of these poses."""
     points = estimator.final_poses[rows[thinned(len(rows), _MARKED)], :3, 3] @ level.T
     owner = Owner(f"{estimator.title}, predicted poses", number, ("final",))
-    marker = {"symbol": "x-thin-open", "size": 8 if len(level) == 2 else 3}
+    flat = len(level) == 2
+    marker = {"symbol": "x-thin-open" if flat else "x", "size": 8 if flat else 3}
     axes = dict(zip("xyz", points.T, strict=False))
     return trace(owner, axes, mode="markers", marker=marker, hoverinfo="name")
 

@@ -221,13 +221,18 @@ def test_far_landmarks_do_not_shrink_the_map() -> None:
     assert 7.5 < top < 9
 
 
-def test_poses_that_no_landmark_measured_are_marked_and_counted_in_every_title() -> None:
+@pytest.mark.usefixtures("coarse")
+def test_poses_that_no_landmark_measured_are_marked_and_counted_in_every_title(
+    tmp_path: Path,
+) -> None:
     data = results(40, 6, full=True)
     predicted = np.array([False, False, True, True, False, False])
     marked = replace(data, estimators=(replace(data.estimators[0], predicted=predicted),))
     for figure in (drive_from_above(marked, ON_PAPER), map_to_turn(marked, ON_PAPER)):
         (mark,) = [t for t in printed(figure) if t["name"] == "a, predicted poses"]
         assert np.allclose(mark["x"], data.estimators[0].final_poses[2:4, 0, 3], rtol=0, atol=1e-6)
+        draw = draw_figure if figure.key == "above" else draw_views
+        draw(tmp_path / "drawn.png", figure, "with marks")
     assert "no landmark measured" in drive_from_above(marked).description
     assert "no landmark measured" not in drive_from_above(data).description
     report = data.estimators[0]
