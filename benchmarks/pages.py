@@ -25,6 +25,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "ablations",
     ),
     "Filters and smoothers": ("filter_or_smoother", "robustness"),
+    "Failures, bad input, scale": ("nothing_lost",),
     "Maps": ("lasting_landmarks", "saved_maps", "relocalisation", "loops"),
     "Homing": (
         "homing_vectors",

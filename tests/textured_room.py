@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from PIL import Image as PictureFile
 from scipy import ndimage
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 
 CAMERA = Equirectangular(601, 181, np.deg2rad(54.0), np.deg2rad(-54.0))
+SMALL_CAMERA = {"kind": "equirectangular", "top_elevation_deg": 54, "bottom_elevation_deg": -54}
+"""Keys of the camera of every second pixel."""
+SMALL_CAMERA_FILE = "".join(f"{key}: {value}\n" for key, value in SMALL_CAMERA.items())
 HALF = 3.0
 """Metres from the middle to each wall; walls have no end upwards or downwards."""
 
@@ -58,3 +64,16 @@ def picture(pose: FloatArray) -> Image:
     )
     flat = np.round(grey).astype(np.uint8).reshape(CAMERA.height, CAMERA.width)
     return np.repeat(flat[:, :, None], 3, axis=2)
+
+
+def seen_at(metres: float, across: float = 0.4) -> Image:
+    """(91, 301, 3) a panorama of every second pixel, on a straight way through the room."""
+    return np.ascontiguousarray(picture(np.array([-2.0 + metres, across, 0.0]))[::2, ::2])
+
+
+def folder_of(place: Path, metres: FloatArray, across: float = 0.4) -> Path:
+    """The new folder ``place`` with a panorama from each of these places on the way."""
+    place.mkdir()
+    for k, one in enumerate(metres.tolist()):
+        PictureFile.fromarray(seen_at(one, across)).save(place / f"view_{k}.png")
+    return place

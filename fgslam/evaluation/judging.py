@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.core.geometry import transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
@@ -118,7 +118,8 @@ class Answer:
         nis, nis_dof: (n,) innovations squared and their degrees of freedom.
         update_ms: (n,) prediction and update.
         peak_memory_mb: of the process.
-        predicted: frames whose pose no landmark measured: bridged by odometry, or by the velocity.
+        predicted: (n,) whether no landmark measured the pose: bridged by odometry, or by the
+            velocity. Empty: none.
     """
 
     estimate: Estimate
@@ -128,11 +129,11 @@ class Answer:
     nis_dof: IntArray
     update_ms: FloatArray
     peak_memory_mb: float | None = None
-    predicted: int = 0
+    predicted: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
 
     @staticmethod
     def of(replay: Replayed) -> Answer:
-        """The answer of a replay; of dead reckoning no pose is marked, since none is measured."""
+        """The answer of a replay."""
         statuses = replay.column("status").tolist()
         return Answer(
             estimate=replay.estimate,
@@ -142,7 +143,7 @@ class Answer:
             nis_dof=replay.column("nis_dof").astype(np.int64),
             update_ms=replay.column("update_ms").astype(np.float64),
             peak_memory_mb=replay.peak_memory_mb,
-            predicted=0 if replay.kind == _DEAD_RECKONING else predicted_frames(statuses),
+            predicted=predicted_poses(statuses, replay.kind),
         )
 
 
@@ -186,7 +187,8 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
         peak_memory_mb=answer.peak_memory_mb,
         more={
             "frames": max(len(answer.online), len(final)),
-            "predicted_frames": answer.predicted,
+            "predicted_frames": int(answer.predicted.sum()),
+            "predicted_rows": np.flatnonzero(answer.predicted).tolist(),
             **_alignment_notes(aligned, first),
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
@@ -224,10 +226,15 @@ def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
     return Judgement(replace(metrics, more=more), judged.nees)
 
 
-def predicted_frames(statuses: Iterable[str]) -> int:
-    """How many of the statuses say that no landmark measured the pose; the first frame is given."""
-    found = map(EgoMotionStatus, statuses)
-    return sum(not one.measured and one is not EgoMotionStatus.FIRST for one in found)
+def predicted_poses(statuses: Iterable[str], kind: str = "") -> BoolArray:
+    """(n,) whether a status says that no landmark measured the pose; the first frame is given.
+
+    Of dead reckoning, an estimator's ``kind``, no pose is marked, since none is measured.
+    """
+    found = map(EgoMotionStatus, [] if kind == _DEAD_RECKONING else statuses)
+    return np.array(
+        [not one.measured and one is not EgoMotionStatus.FIRST for one in found], np.bool_
+    )
 
 
 def closure_counts(closed: Sequence[bool]) -> dict[str, JsonValue]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
 from fgslam.evaluation.trajectory import (
@@ -44,6 +44,7 @@ class EstimatorReport:
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to correct or leave out, in words.
         failure: why it ended early, with what it had until then, or gave nothing; else empty.
+        predicted: (n,) poses that no landmark measured; None: not known.
     """
 
     title: str
@@ -63,6 +64,7 @@ class EstimatorReport:
     verdict: str | None = None
     remarks: tuple[str, ...] = ()
     failure: str = ""
+    predicted: BoolArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.timestamps)
@@ -74,6 +76,7 @@ class EstimatorReport:
             "online_error_m": (n,),
             "nees": (n,),
             "update_ms": (n,),
+            **({} if self.predicted is None else {"predicted": (n,)}),
         }
         for name, shape in shapes.items():
             if getattr(self, name).shape != shape:

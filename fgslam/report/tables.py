@@ -81,7 +81,9 @@ def _text(cell: Cell) -> str:
 
 RESULT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("kind", "kind"),
+    ("odometry", "odometry"),
     ("frames", "frames"),
+    ("predicted_frames", "predicted_frames"),
     ("alignment", "alignment"),
     ("matched_poses", "matched_poses"),
     ("ate_final_m", "ate_rmse_m"),

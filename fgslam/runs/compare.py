@@ -38,7 +38,12 @@ from fgslam.runs.engine import (
 from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing_comparison import open_homing_comparison
 from fgslam.runs.metric_tables import ate_table
-from fgslam.runs.slam_comparison import judged_apart, named, open_slam_comparison
+from fgslam.runs.slam_comparison import (
+    judged_apart,
+    named,
+    open_slam_comparison,
+    with_odometry,
+)
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"
@@ -324,7 +329,10 @@ def _of_slam(results: Sequence[RunResult]) -> list[tuple[str, dict[str, Any]]]:
     """Name and numbers of each run, where they are of SLAM."""
     slam = [one for one in results if isinstance(one.config, ExperimentConfig)]
     names = _told_apart([one.config.name for one in slam], slam)
-    return [(name, one.metrics["estimators"]) for name, one in zip(names, slam, strict=True)]
+    return [
+        (name, with_odometry(one.config, one.metrics["estimators"]))  # type: ignore[arg-type]
+        for name, one in zip(names, slam, strict=True)
+    ]
 
 
 def _told_apart(names: Sequence[str], results: Sequence[RunResult]) -> list[str]:

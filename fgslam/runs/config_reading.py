@@ -215,12 +215,13 @@ def _agrees(given: Any, constant: Any) -> bool:
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
+_NO_GROUP = "model_attributes_type"
 _PLAIN_WORDS = {
     "tuple_type": "give a list, e.g. [a, b]",
     "list_type": "give a list, e.g. [a, b]",
     "dict_type": "give a group of keys",
     "dataclass_type": "give a group of keys",
-    "model_attributes_type": "give a group of keys, or the name of a kind where one will do",
+    _NO_GROUP: "give a group of keys, or the name of a kind where one will do",
     "int_type": "give a whole number",
     "int_parsing": "give a whole number",
     "int_from_float": "give a whole number",
@@ -252,12 +253,15 @@ def _describe(errors: list[ErrorDetails], where: str, schema: Schema) -> str:
         kinds, tag = _kinds(schema, names), first["ctx"]["tag"]
         return f"{where}: {key}.kind is {shortened(repr(tag))}; use one of {kinds}{more}"
     words = _PLAIN_WORDS.get(first["type"], first["msg"])
+    if first["type"] == _NO_GROUP and (kinds := _kinds(schema, names)):
+        words += f"; kinds: {kinds}"
     return f"{where}: {key} = {shortened(repr(first['input']))} is not usable: {words}{more}"
 
 
 def _kinds(schema: Schema, names: list[str]) -> str:
     _, nodes = _descend(schema, names)
-    return ", ".join(str(n["properties"]["kind"]["const"]) for n in nodes)
+    kinds = [n.get("properties", {}).get("kind", {}).get("const") for n in nodes]
+    return ", ".join(str(kind) for kind in kinds if kind is not None)
 
 
 def _nodes(schema: Schema, node: Schema) -> list[Schema]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias, cast, get_args
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
@@ -122,7 +123,8 @@ def open_recording(path: str | Path, overrides: Overrides = ()) -> RecordedFrame
         CalibrationError: its calibration is missing or impossible.
         ConfigError: no such experiment, or a key or value is wrong.
     """
-    return RecordedFrames(open_sequence(_recording_config(Path(path), overrides)))
+    found = as_path(path, "recording")
+    return RecordedFrames(open_sequence(_recording_config(found, overrides)))
 
 
 def rendered_recording(world: str = "lab", frames: int | None = None) -> RecordedFrames:
@@ -145,6 +147,22 @@ def rendered_recording(world: str = "lab", frames: int | None = None) -> Recorde
         raise ConfigError(f"frames is {frames}; give at least 1, or None for all")
     overrides = {} if frames is None else {"dataset.stop": frames}
     return open_recording(_WORLDS[world], overrides)
+
+
+def as_path(given: object, what: str) -> Path:
+    """A path as a user gives it; ``what`` names it. Raises DatasetError where it is none."""
+    if isinstance(given, str | os.PathLike) and os.fspath(given):
+        return Path(given)
+    found = "is empty" if given == "" else f"is a {type(given).__name__}"
+    raise DatasetError(f"the {what}'s path {found}; give that of a folder or file, or a name")
+
+
+def _checked_existing(existing: ExistingFolder) -> ExistingFolder:
+    """The same. Raises ConfigError where it is no such word."""
+    known = get_args(ExistingFolder)
+    if existing not in known:
+        raise ConfigError(f"existing is {existing!r}; use one of {', '.join(known)}")
+    return existing
 
 
 def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
@@ -185,9 +203,11 @@ def run(
         FgslamError: of any kind, with one line that says what to do.
     """
     calibration = None if camera is None else Path(camera)
-    config, _ = experiment_of(Path(experiment), calibration, override_texts(overrides))
+    config, _ = experiment_of(
+        as_path(experiment, "experiment"), calibration, override_texts(overrides)
+    )
     folder = Path("runs") / config.name if out is None else Path(out)
-    return run_experiment(config, folder, existing, progress)
+    return run_experiment(config, folder, _checked_existing(existing), progress)
 
 
 def sweep(  # noqa: PLR0913 - each is an option of the command
@@ -228,9 +248,10 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
         FgslamError: of any kind, with one line that says what to do.
     """
     given = [experiments] if isinstance(experiments, str | Path) else list(experiments)
-    plan = make_plan([Path(one) for one in given], settings, estimators)
+    plan = make_plan([as_path(one, "experiment") for one in given], settings, estimators)
     folder = plan.default_folder if out is None else Path(out)
     watch = (progress, *UNWATCHED[1:])
+    existing = _checked_existing(existing)
     return run_sweep(plan, folder, crew_of(jobs, scheduler), existing, metric, watch)
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from fgslam.evaluation.metrics import value_at
 from fgslam.report.content import Column, TextTable
+from fgslam.runs.marks import marked
 
 UNKNOWN = "-"
 _REMARKS_SHOWN = 3
@@ -83,32 +84,6 @@ def metrics_table(
 ) -> TextTable:
     """Values of metrics.json by estimator, as text; without columns that no estimator fills."""
     return _table(heading, heading, columns, marked(values))
-
-
-def marked(values: Mapping[str, Any], remark: str = "", say_failed: bool = True) -> dict[str, Any]:
-    """The metrics of estimators under titles that say what is not all there.
-
-    That it failed (but for a page, which says so itself), how many of the frames it saw, how many
-    of its poses no landmark measured, and ``remark``, what all of a run's are marked with.
-    """
-    frames = max((value_at(m, "frames") or 0 for m in values.values()), default=0)
-    out = {}
-    for title, metrics in values.items():
-        failed = "failed" if say_failed and value_at(metrics or {}, "failure") else ""
-        out[_marked(title, metrics or {}, frames, (failed, remark))] = metrics or {}
-    return out
-
-
-def _marked(title: str, metrics: Mapping[str, Any], frames: int, more: tuple[str, str]) -> str:
-    own, predicted = value_at(metrics, "frames"), value_at(metrics, "predicted_frames")
-    parts = [
-        more[0],
-        f"{own} of {frames} frames" if own is not None and own < frames else "",
-        f"{predicted} poses predicted" if predicted else "",
-        more[1],
-    ]
-    said = ", ".join(filter(None, parts))
-    return f"{title} ({said})" if said else title
 
 
 def _table(

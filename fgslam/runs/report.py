@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
@@ -32,11 +32,11 @@ from fgslam.report.run_results import (
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.metric_tables import marked, page_tables
+from fgslam.runs.marks import SYNTHETIC, marked
+from fgslam.runs.metric_tables import page_tables
 from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
 
 _UP = np.array([0.0, -1.0, 0.0])
-_SYNTHETIC = "synthetic odometry"
 _TIMED_STAGES = ("predict", "update")
 
 
@@ -81,7 +81,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
     pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
     loops = _find(folders, LOOPS_FILE)
     places, closures = (None, []) if loops is None else read_closures(loops)
-    synthetic = _SYNTHETIC if metrics.get("remark") else ""
+    synthetic = SYNTHETIC if metrics.get("remark") else ""
     of_estimators = marked(metrics["estimators"], synthetic, say_failed=False)
     estimators = tuple(
         replace(one, title=title) for one, title in zip(estimators, of_estimators, strict=True)
@@ -204,7 +204,17 @@ def _estimator(
         judged_report(title, kind, estimate, _online(folder / "online.tum"), truth),
         update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         failure=failure,
+        predicted=_predicted(values.get("predicted_rows"), len(final)),
     )
+
+
+def _predicted(rows: object, count: int) -> BoolArray:
+    """(n,) which poses no landmark measured, of the rows that metrics.json lists."""
+    out = np.zeros(count, np.bool_)
+    for row in rows if isinstance(rows, list) else ():
+        if isinstance(row, int) and 0 <= row < count:
+            out[row] = True
+    return out
 
 
 def _covariances(path: Path, final: Trajectory) -> FloatArray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, RunResult, Status, Task
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, METRICS_FILE, RUN_MARKER, digest_of
+from fgslam.runs.marks import SYNTHETIC, with_marks
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.tasks.slam_map_entry import arrival_of
@@ -70,7 +72,13 @@ def open_slam_comparison(
 
 def named(config: ExperimentConfig) -> str:
     """The run's name over tables; that its odometry was made from the truth is said there."""
-    return f"{config.name} (synthetic odometry)" if config.remark else config.name
+    return with_marks(config.name, [SYNTHETIC if config.remark else ""])
+
+
+def with_odometry(config: ExperimentConfig, values: Mapping[str, Any]) -> dict[str, Any]:
+    """The numbers of estimators by title, and the kind of odometry, for tables in files."""
+    kind = config.odometry.kind
+    return {title: {**metrics, "odometry": kind} for title, metrics in values.items()}
 
 
 def judged_apart(
@@ -136,7 +144,7 @@ def write_comparison(
     values = {title: one.as_json() for title, one in metrics.items()}
     own: dict[str, JsonValue] = {"name": config.name, "status": status, **about}
     write_metrics(out / METRICS_FILE, frames, metrics, own)
-    write_comparison_csv(out / COMPARISON_FILE, [(config.name, values)])
+    write_comparison_csv(out / COMPARISON_FILE, [(config.name, with_odometry(config, values))])
     if config.output.report:
         report_from_folder(out, run)
     return RunResult(

@@ -34,6 +34,7 @@ from fgslam.runs.folder import (
 )
 from fgslam.runs.metric_tables import TRIAL_COLUMNS, metrics_table
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.slam_comparison import named, with_odometry
 from fgslam.runs.tasks.homing_trials import open_trials
 from fgslam.runs.trial import Trial, TrialTask, perform_trial
 from fgslam.runs.units import Progress, Stopped, each_apart
@@ -134,7 +135,7 @@ def _run(config: ExperimentConfig, tasks: Sequence[TrialTask], context: Context)
     kinds = {settings.title: settings.kind for settings in tasks[0].estimators}
     summary = summarise(list(done.results.values()), kinds)
     status: Status = "interrupted" if context.stopped() else "finished"
-    write_trials(context.folder, config.name, summary, failures, status)
+    write_trials(context.folder, config, summary, failures, status)
     return _result(config, context.folder, status, summary, failures)
 
 
@@ -157,7 +158,7 @@ def _result(
     """Means over the trials, the verdict on each estimator, and who beats whom."""
     values = {title: together(summary, title).as_json() for title in summary.means}
     count = len(summary.trials)
-    heading = f"{config.name}: {count} trials, mean [95 % interval]; NEES pooled, 1 is right"
+    heading = f"{named(config)}: {count} trials, mean [95 % interval]; NEES pooled, 1 is right"
     failed = [("failed", line) for line in (*failures, *failures_of(summary))]
     return RunResult(
         config,
@@ -278,21 +279,26 @@ def summarise(trials: Sequence[Trial], kinds: Mapping[str, str]) -> TrialSummary
 
 def write_trials(
     folder: Path,
-    name: str,
+    config: ExperimentConfig,
     summary: TrialSummary,
     failures: Sequence[str],
     status: Status,
 ) -> None:
     """trials.csv (the same bytes for the same seeds), trials_timing.csv and metrics.json."""
     rows = [
-        (str(one.seed), {title: metrics.as_json() for title, metrics in one.metrics.items()})
+        (
+            str(one.seed),
+            with_odometry(config, {title: m.as_json() for title, m in one.metrics.items()}),
+        )
         for one in summary.trials
     ]
     write_comparison_csv(folder / TRIALS_FILE, rows, RESULT_COLUMNS, "seed")
     write_comparison_csv(folder / TIMING_FILE, rows, TIME_COLUMNS, "seed")
     about: dict[str, JsonValue] = {
-        "name": name,
+        "name": config.name,
         "status": status,
+        "odometry": config.odometry.kind,
+        "remark": config.remark or None,
         "trials": len(rows),
         "seeds": [one.seed for one in summary.trials],
         "failures": list(failures),
@@ -340,6 +346,7 @@ def together(summary: TrialSummary, title: str) -> EstimatorMetrics:
         nees_landmark_per_dof=_per_dof(pooled["landmark"]),
         more={
             "kind": summary.kinds[title],
+            "predicted_frames": _predicted(summary, title),
             "landmark_rmse_m": _mean(means["landmark_rmse_m"]),
             "landmark_median_m": _mean(means["landmark_median_m"]),
             "online": {"ate_rmse_m": _mean(means["online.ate_rmse_m"])},
@@ -373,6 +380,12 @@ def _column(trials: Sequence[Trial], title: str, path: str) -> FloatArray:
 
 def _ended_well(metrics: EstimatorMetrics) -> bool:
     return not metrics.more.get("failure")
+
+
+def _predicted(summary: TrialSummary, title: str) -> int:
+    """Poses of all its trials that no landmark measured."""
+    found = (one.metrics[title].more.get("predicted_frames") for one in summary.trials)
+    return sum(count for count in found if isinstance(count, int))
 
 
 def _mean(found: MeanInterval | None) -> float | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -38,6 +38,11 @@ def checked_extractor(features: FeatureExtractor | None) -> FeatureExtractor | N
     return features
 
 
+def _is_colour(image: np.ndarray) -> bool:
+    """Whether an array is one image with colours, and not several images."""
+    return image.ndim == 3 and image.shape[2] in (3, 4)
+
+
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     """Grey rectified images (right, left[, top]) of the rig's size from (left, right[, top]).
 
@@ -46,13 +51,15 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     """
     wanted = ", ".join(_NAMES[: rig.cameras])
     try:
+        if isinstance(images, str | bytes | Mapping):
+            raise TypeError
         given = len(images)
     except TypeError:
         raise FrameError(
             f"the images are a {type(images).__name__}; give a tuple ({wanted}), or None where the "
             "cameras gave nothing"
         ) from None
-    if isinstance(images, np.ndarray) and images.ndim < 3:
+    if isinstance(images, np.ndarray) and (images.ndim < 3 or _is_colour(images)):
         raise FrameError(f"one image given instead of {rig.cameras}; give ({wanted})")
     if given != rig.cameras:
         other = {2: ", or a rig without vertical_baseline", 3: ", or a rig with one more camera"}

@@ -77,6 +77,9 @@ def test_a_frozen_camera_is_said_in_console_status_and_report(
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert words in page
     assert f"{KIND} (7 poses predicted)" in page
+    assert "x: a pose that no landmark measured" in page  # beside the drive from above
+    found = metrics_of(tmp_path / "run")["estimators"][KIND]
+    assert (found["predicted_frames"], found["predicted_rows"]) == (7, list(range(5, 12)))
 
 
 def replace_line(path: Path, number: int, line: str) -> None:

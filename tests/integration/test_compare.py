@@ -182,6 +182,8 @@ def test_compare_gives_the_runs_own_bytes_and_a_table(
     assert [e["update"] for e in written["compare"]] == ["pixel", "half"]
     assert written["provenance"]["run"] == str(measured)
     assert (out / "report.html").is_file()
+    rows = rows_of(out / "comparison.csv")
+    assert {(row["odometry"], row["predicted_frames"]) for row in rows} == {("recorded", "0")}
     # The estimators of the configuration are the default; the second one differs from `half`.
     assert main(monkeypatch, "compare", measured, "--out", out) == 2
     assert "holds results already" in capsys.readouterr().err

@@ -16,7 +16,8 @@ import pytest
 from recordings import experiment
 from running import HANGS_AFTER_S, main, run_values
 from test_resume_run import write_config
-from test_routes_cli import CAMERA, folder_of
+
+from tests.textured_room import SMALL_CAMERA_FILE, folder_of
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +32,7 @@ def place(tmp_path_factory: pytest.TempPathFactory, recording: Path) -> Path:
     root = tmp_path_factory.mktemp("commands")
     folder_of(root / "drive", np.arange(0.0, 3.6, 0.2))
     folder_of(root / "again", np.arange(0.1, 3.6, 0.2))
-    (root / "camera.yaml").write_text(CAMERA, encoding="utf-8")
+    (root / "camera.yaml").write_text(SMALL_CAMERA_FILE, encoding="utf-8")
     for name in ("drive", "again"):
         given = (root / name, "--camera", root / "camera.yaml", "--out", root / f"{name}.fgpath")
         with pytest.MonkeyPatch.context() as patch:

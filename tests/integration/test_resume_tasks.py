@@ -42,6 +42,7 @@ from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder, create_run_folder
 from fgslam.runs.run import run_experiment
 from fgslam.runs.trials import Seeds, run_trials
+from tests.textured_room import SMALL_CAMERA, folder_of
 
 QUIET = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
 SILENT = {"pictures": 1, "report": False}
@@ -60,16 +61,18 @@ TASKS = (
     "compare",
     "compare_homing",
     "trials",
+    "teach",
+    "follow",
+    "join",
+    "crossroads",
 )
+WHOLE_DRIVES = ("homing", "slam", "crossroads")
+"""A homing is a path of one leg, done by the same module, as are the drives over crossroads; a run
+of one estimator is a part of one of several."""
 EACH_TASK = pytest.mark.parametrize(
     "task",
-    [
-        pytest.param(task, marks=pytest.mark.slow if task in ("homing", "slam") else ())
-        for task in TASKS
-    ],
+    [pytest.param(task, marks=pytest.mark.slow if task in WHOLE_DRIVES else ()) for task in TASKS],
 )
-"""A homing is a path of one leg, done by the same module; a run of one estimator a part of one of
-several."""
 HOUSE: dict[str, Any] = {
     "name": "short",
     "jobs": 1,
@@ -111,8 +114,30 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
+def routes(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two routes through one room, beside the panoramas that they were taught from."""
+    base = tmp_path_factory.mktemp("routes")
+    found = []
+    for name, across in (("first", 0.4), ("second", 0.0)):
+        folder_of(base / name, np.array([0.2, 1.1, 2.0]), across)
+        dataset = panoramas_of(base / name)
+        route = base / f"{name}.fgpath"
+        values = {"task": "teach", "name": name, "dataset": dataset, "route": str(route)}
+        run(values | {"output": {"pictures": 0, "report": False}}, base / f"{name}_taught")
+        found.append(route)
+    return found[0], found[1]
+
+
+def panoramas_of(folder: Path) -> dict[str, Any]:
+    return {"kind": "panoramas", "path": str(folder), "camera": SMALL_CAMERA}
+
+
+@pytest.fixture(scope="module")
+def values_of(
+    recording: Path, views: Path, routes: tuple[Path, Path]
+) -> Callable[[str], dict[str, Any]]:
     """A small experiment of each task."""
+    ways = [panoramas_of(route.with_suffix("")) for route in routes]
     dataset = {"kind": "image_folder", "path": str(recording), "stop": 5}
     images = experiment(recording, dataset=dataset, output=QUIET)
     panoramas = {"name": "x", "jobs": 1, "dataset": {"kind": "panoramas", "path": str(views)}}
@@ -128,7 +153,7 @@ def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
             },
             "frontend": {"ego_motion": {"dof": 3}},
             "compare": ["odometry", "ekf"],
-            "output": QUIET,
+            "output": QUIET | {"report": True},  # and that of comparisons and trials of it
         },
         "localisation": {
             **{k: v for k, v in images.items() if k not in ("compare", "map")},
@@ -136,7 +161,7 @@ def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
             "map": {"made_from": {"dataset": images["dataset"]}},
             "localisation": {"every": 3},
         },
-        "homing_pairs": panoramas | {"task": "homing_pairs", "output": SILENT},
+        "homing_pairs": panoramas | {"task": "homing_pairs", "output": {"pictures": 1}},
         "topological_map": panoramas
         | {"task": "topological_map", "held_out_every": 2, "routes": [[0, 3]], "output": SILENT},
         "omni_video": panoramas | {"task": "omni_video", "least_points": 10, "most_points": 20},
@@ -153,6 +178,26 @@ def values_of(recording: Path, views: Path) -> Callable[[str], dict[str, Any]]:
         },
         "homing": HOUSE | {"task": "homing", "start_offset_m": 0.2},
         "path_following": HOUSE | {"task": "path_following"},
+        "crossroads": HOUSE | {"task": "crossroads", "dataset": {"path": {"spacing_m": 2.5}}},
+        "teach": {
+            "task": "teach",
+            "name": "taught",
+            "dataset": ways[0],
+            "route": str(routes[0].with_name("again.fgpath")),
+            "output": {"pictures": 1},
+        },
+        "follow": {
+            "task": "follow",
+            "name": "followed",
+            "dataset": ways[1] | {"stop": 2},
+            "route": str(routes[0]),
+        },
+        "join": {
+            "task": "join",
+            "name": "joined",
+            "routes": [str(route) for route in routes],
+            "map": str(routes[0].with_name("joined.fgmap")),
+        },
     }
     return known.__getitem__
 
@@ -478,6 +523,32 @@ def test_a_command_killed_by_a_signal_resumes_to_the_same_bytes(
     found = content_of(folder)
     assert found.keys() == expected.keys()
     assert [name for name in found if found[name] != expected[name]] == []
+
+
+@pytest.mark.parametrize("task", ["teach", "join"])
+def test_killed_routes_and_maps_outside_the_run_folder_are_whole_or_absent(
+    task: str, values_of: Callable[[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    """Half of a file lies under a hidden name; the same command with --overwrite goes on."""
+    (tmp_path / "out").mkdir()
+    key = {"teach": "route", "join": "map"}[task]
+    written = tmp_path / "out" / "kept"
+    values = values_of(task) | {key: str(written), "output": {"pictures": 0, "report": False}}
+    with pytest.MonkeyPatch.context() as patch:
+        order = renames(patch, float("inf"), after=False)
+        run(values, tmp_path / "run")
+    whole, number = written.read_bytes(), order.index(written)
+    for after in (False, True):
+        written.unlink()
+        with pytest.MonkeyPatch.context() as patch:
+            renames(patch, number, after=after)
+            with pytest.raises(Killed):
+                run(values, tmp_path / "run", "overwrite")
+        left = [path.name for path in (tmp_path / "out").iterdir()]
+        assert [name for name in left if not name.startswith(".")] == ["kept"] * after
+        assert not after or written.read_bytes() == whole
+        run(values, tmp_path / "run", "overwrite")
+        assert written.read_bytes() == whole
 
 
 def killed(do: Callable[[], object], most: int) -> None:

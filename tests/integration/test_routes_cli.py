@@ -20,25 +20,10 @@ from fgslam.runs.bare_routes import teaching
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.run import run_experiment
 from tests import textured_room
+from tests.textured_room import SMALL_CAMERA_FILE, folder_of, seen_at
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
-CAMERA = """kind: equirectangular
-top_elevation_deg: 54
-bottom_elevation_deg: -54
-"""
-
-
-def seen_at(metres: float, across: float = 0.4) -> np.ndarray:
-    """(91, 301, 3) a panorama on a straight way through the room."""
-    return textured_room.picture(np.array([-2.0 + metres, across, 0.0]))[::2, ::2]
-
-
-def folder_of(place: Path, metres: np.ndarray) -> Path:
-    place.mkdir()
-    for k, one in enumerate(metres.tolist()):
-        PictureFile.fromarray(np.ascontiguousarray(seen_at(one))).save(place / f"view_{k}.png")
-    return place
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +32,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("routes")
     folder_of(root / "drive", np.arange(0.0, 3.6, 0.4))
     folder_of(root / "again", np.arange(0.2, 3.6, 0.8))
-    (root / "camera.yaml").write_text(CAMERA, encoding="utf-8")
+    (root / "camera.yaml").write_text(SMALL_CAMERA_FILE, encoding="utf-8")
     PictureFile.fromarray(np.ascontiguousarray(seen_at(1.8)[:, :200])).save(
         root / "drive" / "view_4a.png"
     )

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 from running import ROOT, Patch, main
-from test_routes_cli import CAMERA, folder_of
 
 import fgslam as fg
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import se3_exp
 from scripts import make_tutorial_pictures as pictures
+from tests.textured_room import SMALL_CAMERA_FILE, folder_of
 
 TUTORIALS = ROOT / "docs" / "tutorials"
 FRAMES = 12
@@ -111,7 +111,7 @@ def panoramas(folder: Path) -> None:
     """A way through a textured room, and the same way on another day."""
     folder_of(folder / "drive", np.arange(0.0, 3.6, 0.4))
     folder_of(folder / "again", np.arange(0.2, 3.6, 0.8))
-    (folder / "camera.yaml").write_text(CAMERA, encoding="utf-8")
+    (folder / "camera.yaml").write_text(SMALL_CAMERA_FILE, encoding="utf-8")
 
 
 DATA: dict[str, Callable[[Path], None]] = {

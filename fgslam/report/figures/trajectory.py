@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.report.figures.traces import (
     SIGMAS,
     Figure,
@@ -35,6 +35,7 @@ from fgslam.report.figures.traces import (
 from fgslam.report.run_results import EstimatorReport, ReportData
 
 ELLIPSES = 40
+_MARKED = 500  # predicted poses of an estimator
 _DENSE = 3_000  # dots; finer ones keep the paths in sight
 # Dead reckoning beside smoothers: enlarged as these need it, its ellipses would cover everything.
 _FLOOD = 0.25
@@ -93,12 +94,14 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     ellipses, of_ellipses = _uncertainty(data, level)
     alone = len(data.estimators) == 1
     dots = "coloured by height" if alone else "of the estimator chosen"
+    any_predicted = any(len(_predicted_rows(one)) for one in data.estimators)
     return Figure(
         "above",
         "The drive from above",
         "Solid: the path as known at the end. Dotted: each pose as first estimated. Dashed: the "
         f"truth. An ellipse reaches {SIGMAS:.0f} standard deviations of the position as the "
-        f"estimator claims it. Dots: landmarks, {dots}. Cross: start; dot: end.",
+        f"estimator claims it. Dots: landmarks, {dots}. Cross: start; dot: end."
+        + (" x: a pose that no landmark measured." if any_predicted else ""),
         (
             *_dots_above(data, level, detail),
             *_paths(data, level[:2], detail),
@@ -211,6 +214,8 @@ def _paths(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Trac
             rows = thinned(len(poses), detail.poses)
             times = estimator.timestamps[rows] - data.start
             yield _path(owner, times, poses[rows], level, style)
+        if len(rows := _predicted_rows(estimator)):
+            yield _predicted(i, estimator, rows, level)
         if len(estimator):
             yield _place(f"{estimator.title}, end", estimator.final_poses[-1], level, i)
     if data.truth is not None and len(data.truth):
@@ -221,6 +226,21 @@ def _paths(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Trac
     start = next((e.final_poses[0] for e in data.estimators if len(e)), None)
     if start is not None:
         yield _place("start", start, level)
+
+
+def _predicted_rows(estimator: EstimatorReport) -> IntArray:
+    """(k,) which poses no landmark measured."""
+    return np.flatnonzero(() if estimator.predicted is None else estimator.predicted)
+
+
+def _predicted(number: int, estimator: EstimatorReport, rows: IntArray, level: FloatArray) -> Trace:
+    """A mark at each of these poses."""
+    points = estimator.final_poses[rows[thinned(len(rows), _MARKED)], :3, 3] @ level.T
+    owner = Owner(f"{estimator.title}, predicted poses", number, ("final",))
+    flat = len(level) == 2
+    marker = {"symbol": "x-thin-open" if flat else "x", "size": 8 if flat else 3}
+    axes = dict(zip("xyz", points.T, strict=False))
+    return trace(owner, axes, mode="markers", marker=marker, hoverinfo="name")
 
 
 def _place(name: str, pose: FloatArray, level: FloatArray, number: int | None = None) -> Trace:

@@ -24,7 +24,7 @@ from fgslam.report.figures.traces import Figure, Trace
 from fgslam.report.pictures.style import MAP_COLOURS, colour_bar, picture
 
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
-_MARKERS = {"circle": "o", "cross": "P", "square": "s", "x-thin-open": "x"}
+_MARKERS = {"circle": "o", "cross": "P", "square": "s", "x-thin-open": "x", "x": "x"}
 _POINTS_A_PIXEL = 0.75
 _STEEP = 45.0
 _BAND = {"color": "#c9d3dc", "linewidth": 0.0}

@@ -139,7 +139,7 @@ def _rows(config: Experiment, estimators: tuple[Any, ...]) -> Iterator[Row]:
     if isinstance(config, ExperimentConfig):
         trial = perform_trial(TrialTask(config, config.seed, estimators))
         for title, metrics in trial.metrics.items():
-            values = plain(metrics.as_json())
+            values = {**plain(metrics.as_json()), "odometry": config.odometry.kind}
             numbers = {name: value_at(values, path) for name, path in RESULT_COLUMNS}
             times = {name: value_at(values, path) for name, path in TIME_COLUMNS}
             yield Row(title, numbers, times)

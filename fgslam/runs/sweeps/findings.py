@@ -16,6 +16,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.evaluation.comparing import MeanInterval, PairedTest, holm, mean_interval, paired_test
+from fgslam.runs.marks import measured_marks, with_marks
 from fgslam.runs.sweeps.grid import SEED, Grid
 from fgslam.runs.sweeps.table import ESTIMATOR, EXPERIMENT, FAILURE, Columns, SweepTable
 
@@ -39,6 +40,8 @@ class Variant:
         estimator: its title; empty where the task has none.
         values: each metric by repetition, where it is known.
         failures: repetitions that gave none.
+        predicted: poses of all repetitions that no landmark measured.
+        synthetic: the odometry of some was made from the ground truth.
     """
 
     label: str
@@ -46,6 +49,13 @@ class Variant:
     estimator: str
     values: Mapping[str, Values]
     failures: int
+    predicted: int = 0
+    synthetic: bool = False
+
+    @property
+    def shown(self) -> str:
+        """The label with marks of what is not measured, for tables and figures."""
+        return with_marks(self.label, measured_marks(self.predicted, self.synthetic))
 
     def mean(self, metric: str) -> MeanInterval | None:
         """Over its repetitions; None where none is known."""
@@ -133,7 +143,16 @@ def _variants(
         label = " ".join([*words, *([title] if several or not words else [])])
         values = {metric: _values(table.numbers, keys, metric, own) for metric in metrics}
         failures = sum(_failed(table, row) for row in own)
-        yield Variant(label or "all", named, title, values, failures)
+        marks = _measured(table.numbers, own)
+        yield Variant(label or "all", named, title, values, failures, *marks)
+
+
+def _measured(numbers: Columns, rows: Sequence[int]) -> tuple[int, bool]:
+    """How many poses of the rows no landmark measured; whether odometry of some is synthetic."""
+    nothing: list[Any] = [None] * (max(rows, default=0) + 1)
+    predicted = numbers.get("predicted_frames", nothing)
+    odometry = numbers.get("odometry", nothing)
+    return sum(predicted[row] or 0 for row in rows), any(odometry[k] == "synthetic" for k in rows)
 
 
 def _failed(table: SweepTable, row: int) -> bool:
@@ -158,7 +177,7 @@ def _compare(variants: Sequence[Variant], metric: str) -> tuple[Comparison, ...]
     known = [(a, b, test) for a, b, test in tests if test is not None and test.difference.count > 1]
     corrected = iter(holm([t.p_value for _, _, t in known if t.p_value is not None]))
     return tuple(
-        Comparison(a.label, b.label, test, None if test.p_value is None else next(corrected))
+        Comparison(a.shown, b.shown, test, None if test.p_value is None else next(corrected))
         for a, b, test in known
     )
 

@@ -15,6 +15,7 @@ from fgslam.report.figures.sweeps import effect_figure
 from fgslam.report.figures.traces import Figure
 from fgslam.report.page import write_html
 from fgslam.runs.folder import versions
+from fgslam.runs.marks import measured_marks, with_marks
 from fgslam.runs.sweeps.findings import ALL_PAIRS_OF, Comparison, Findings, Variant
 
 _SERIES_SHOWN = 24
@@ -27,7 +28,7 @@ def sentences(findings: Findings | None, cases: int, done: int, failed: int) -> 
     first = f"{done:,} of {cases:,} cases done" + (f", {failed:,} failed" if failed else "")
     if findings is None:
         return (first,)
-    means = [(found.mean, v.label) for v in findings.variants if (found := v.mean(findings.metric))]
+    means = [(found.mean, v.shown) for v in findings.variants if (found := v.mean(findings.metric))]
     if len(means) < 2:
         return (first,)
     least = min(means)
@@ -55,7 +56,7 @@ def _means(findings: Findings) -> TextTable:
     ]
     rows = [
         (
-            v.label,
+            v.shown,
             (
                 str(len(v.values[findings.metric])),
                 *(_interval(v.mean(name)) for name in findings.metrics),
@@ -141,7 +142,11 @@ def _series(findings: Findings | None) -> dict[str, list[Variant]]:
         label = " ".join(filter(None, [*words, variant.estimator])) or "all"
         if label in found or len(found) < _SERIES_SHOWN:
             found.setdefault(label, []).append(variant)
-    return found
+    return {with_marks(label, _marks(own)): own for label, own in found.items()}
+
+
+def _marks(variants: Sequence[Variant]) -> tuple[str, str]:
+    return measured_marks(sum(v.predicted for v in variants), any(v.synthetic for v in variants))
 
 
 def _figures(findings: Findings | None, series: dict[str, list[Variant]]) -> Iterator[Figure]:

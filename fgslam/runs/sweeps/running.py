@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.crews import Failed
+from fgslam.runs.marks import measured_marks, with_marks
 from fgslam.runs.processes import WorkerEnded
 from fgslam.runs.sweeps.case import CaseResult
 from fgslam.runs.sweeps.findings import METRICS
@@ -23,11 +25,17 @@ class _Mean:
     count: int = 0
     failed: int = 0
     mean: float = math.nan
+    predicted: int = 0
+    synthetic: bool = False
 
     @property
     def cells(self) -> tuple[str, str, str]:
         mean = f"{self.mean:.4g}" if self.count else "-"
         return mean, str(self.count), str(self.failed or "")
+
+    def mark(self, numbers: Mapping[str, Any]) -> None:
+        self.predicted += numbers.get("predicted_frames") or 0
+        self.synthetic |= numbers.get("odometry") == "synthetic"
 
     def add(self, value: float) -> None:
         self.count += 1
@@ -54,6 +62,7 @@ class RunningMeans:
                 value = row.numbers.get(self.metric or "")
                 name = " ".join(filter(None, (label, row.estimator)))
                 known = self._means.setdefault(name, _Mean())
+                known.mark(row.numbers)
                 if isinstance(value, (int, float)):
                     known.add(float(value))
         due = time.monotonic() - self._told > _EVERY_S
@@ -62,7 +71,10 @@ class RunningMeans:
 
     def table(self) -> TextTable:
         """The combinations that have results, as many as fit a terminal."""
-        rows = [(label, one.cells) for label, one in self._means.items()]
+        rows = [
+            (with_marks(label, measured_marks(one.predicted, one.synthetic)), one.cells)
+            for label, one in self._means.items()
+        ]
         more = f"; {len(rows) - _SHOWN} more" if len(rows) > _SHOWN else ""
         columns = (Column(self.metric or "metric", ""), Column("cases", ""), Column("failed", ""))
         return TextTable("running", f"means so far{more}", "", columns, tuple(rows[:_SHOWN]))

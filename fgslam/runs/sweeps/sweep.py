@@ -90,8 +90,10 @@ def crew_of(jobs: int | None, scheduler: str | None) -> AbstractContextManager[C
     """Workers of a scheduler, or so many of this machine; None: one a core.
 
     Raises:
-        ConfigError: both are given.
+        ConfigError: both are given, or there would be no worker.
     """
+    if jobs is not None and jobs < 1:
+        raise ConfigError(f"jobs is {jobs}; give at least 1, or none for one a core")
     if scheduler is None:
         return LocalCrew(jobs or os.cpu_count() or 1)
     if jobs is not None:

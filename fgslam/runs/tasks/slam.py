@@ -24,7 +24,7 @@ from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, ExistingFolder, is_run
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.owner import give_back
 from fgslam.runs.report import report_from_folder
-from fgslam.runs.slam_comparison import judged_apart, named, replay_apart
+from fgslam.runs.slam_comparison import judged_apart, named, replay_apart, with_odometry
 from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_state as state
 from fgslam.runs.tasks.slam_metrics import located
@@ -225,7 +225,7 @@ def _compare(outputs: RunOutputs, live: EstimatorMetrics, context: Context) -> d
     metrics = {outputs.title: live} | replay_apart(config, folder, others, context)
     outputs.write_metrics(metrics, "interrupted" if context.stopped() else "finished")
     values = {title: one.as_json() for title, one in metrics.items()}
-    write_comparison_csv(folder / COMPARISON_FILE, [(config.name, values)])
+    write_comparison_csv(folder / COMPARISON_FILE, [(config.name, with_odometry(config, values))])
     return values
 
 

@@ -14,6 +14,7 @@ from fgslam.core.sensors import vertical_of
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
+from fgslam.evaluation.judging import predicted_poses
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.point_cloud import read_ply
 from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_truth, write_timing
@@ -116,6 +117,7 @@ def _figures(
         truth=recording.ground_truth,
         valid=points.valid,
         frames=np.array([i.index for i in recording.log.increments[: len(rows)]], np.int64),
+        predicted=predicted_poses((row.status for row in rows), config.estimator.kind),
         matched=counts[0],
         inliers=counts[1],
         landmarks=counts[2],

@@ -15,7 +15,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correlation
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
-from fgslam.evaluation.judging import Answer, Truth, judge_answer, predicted_frames
+from fgslam.evaluation.judging import Answer, Truth, judge_answer, predicted_poses
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.report.content import Column, TextTable
 from fgslam.report.tables import Cell, write_csv
@@ -41,7 +41,7 @@ def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -
         nis_dof=recorder.column("nis_dof").astype(np.int64),
         update_ms=_stage_sum(times, _ESTIMATOR_STAGES),
         peak_memory_mb=peak_memory_mb(),
-        predicted=predicted_frames(recorder.column("status").tolist()),
+        predicted=predicted_poses(recorder.column("status").tolist()),
     )
     return judge_answer(answer, truth).metrics
 

@@ -16,7 +16,7 @@ from fgslam.core.files import make_subfolder
 from fgslam.core.measurements import moved_pixels
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import vertical_of
-from fgslam.evaluation.judging import Truth, closure_counts
+from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.report.content import Column, TextTable
 from fgslam.report.figures.over_time import error_by_axis, matches_over_time
@@ -33,6 +33,7 @@ from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import write_estimate
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.maps import map_points
+from fgslam.runs.marks import SYNTHETIC, measured_marks
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tasks.slam_calibration import (
     calibration_note,
@@ -322,7 +323,6 @@ def _nees(metrics: EstimatorMetrics) -> str:
 
 
 FOLDER = "pictures"
-_SYNTHETIC = ", synthetic odometry"
 _SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
 """Frames shown, as parts of the run: those of the paper's Figure 4."""
 
@@ -360,6 +360,7 @@ class RunFigures:
         truth: true poses, or None.
         valid: (n,) which landmarks of the estimate were seen often enough (Se et al. 6.1).
         frames: (m,) the recording's numbers of the frames.
+        predicted: (m,) poses that no landmark measured, which every title counts.
         matched, inliers, landmarks: (m,) counts of each frame.
         up: (3,) the vertical in the first camera's frame.
     """
@@ -370,6 +371,7 @@ class RunFigures:
     truth: Trajectory | None
     valid: BoolArray
     frames: IntArray
+    predicted: BoolArray
     matched: IntArray
     inliers: IntArray
     landmarks: IntArray
@@ -377,7 +379,8 @@ class RunFigures:
 
     def title(self, what: str) -> str:
         """Title of one picture."""
-        return f"{self.name}: {what}{_SYNTHETIC if self.synthetic else ''}"
+        marks = measured_marks(int(self.predicted.sum()), self.synthetic)
+        return ", ".join(filter(None, (f"{self.name}: {what}", *marks)))
 
 
 def figures_of(outputs: RunOutputs) -> RunFigures:
@@ -392,6 +395,7 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
         truth=outputs.sequence.ground_truth,
         valid=book.valid[book.rows(estimate.landmarks.ids)],
         frames=recorder.log.numbers,
+        predicted=predicted_poses(recorder.column("status").tolist()),
         matched=recorder.column("matched"),
         inliers=recorder.column("inliers"),
         landmarks=recorder.column("landmarks"),
@@ -426,6 +430,8 @@ def _results(figures: RunFigures) -> ReportData:
     if valid.any():
         estimate = replace(estimate, landmarks=estimate.landmarks.select(valid))
     report = judged_report("estimate", "", estimate, None, figures.truth)
+    if len(figures.predicted):
+        report = replace(report, predicted=figures.predicted)
     truth = truth_in_their_world((report,), figures.truth)
     return ReportData(
         title=figures.name, subtitle="", estimators=(report,), truth=truth, up=figures.up
@@ -433,4 +439,4 @@ def _results(figures: RunFigures) -> ReportData:
 
 
 def _title(outputs: RunOutputs, what: str) -> str:
-    return f"{outputs.config.name}: {what}{_SYNTHETIC if outputs.remark else ''}"
+    return f"{outputs.config.name}: {what}{f', {SYNTHETIC}' if outputs.remark else ''}"

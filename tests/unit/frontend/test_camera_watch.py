@@ -178,6 +178,13 @@ SOUND = (
     "euroc_v101_kf100",
     "euroc_v101_raw",
     "stanford_chess_grid",
+    "rgbd_fr1",
+    "stereo_raw/euroc_V1_01_cut",
+    "stereo_raw/kimera_test_pairs/ForStereoFrame",
+    "bumblebee2_pairs",
+    "bags/converted_from_euroc/euroc_ros1.bag",
+    "bags/converted_from_euroc/euroc_ros2_mcap",
+    "bags/converted_from_euroc/euroc_ros2_sqlite3",
 )
 
 

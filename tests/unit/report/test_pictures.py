@@ -6,6 +6,7 @@ import dataclasses
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -23,7 +24,12 @@ from fgslam.report.figures.located import Located, located_figure
 from fgslam.report.figures.over_time import error_by_axis, matches_over_time
 from fgslam.report.figures.palette import printed
 from fgslam.report.figures.traces import SIGMAS, exaggeration, world_position_covariances
-from fgslam.report.figures.trajectory import bulk_limits, drive_from_above, map_to_turn
+from fgslam.report.figures.trajectory import (
+    ON_PAPER,
+    bulk_limits,
+    drive_from_above,
+    map_to_turn,
+)
 from fgslam.report.pictures import style
 from fgslam.report.pictures.image_overlays import (
     draw_disparities,
@@ -33,6 +39,7 @@ from fgslam.report.pictures.image_overlays import (
 )
 from fgslam.report.pictures.on_paper import draw_figure, draw_views
 from fgslam.report.run_results import ReportData, judged_report
+from fgslam.runs.tasks.slam_outputs import RunFigures
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 
@@ -212,6 +219,31 @@ def test_far_landmarks_do_not_shrink_the_map() -> None:
     assert -6 < left < -4 < 4 < right < 6
     assert -6 < bottom < -4
     assert 7.5 < top < 9
+
+
+@pytest.mark.usefixtures("coarse")
+def test_poses_that_no_landmark_measured_are_marked_and_counted_in_every_title(
+    tmp_path: Path,
+) -> None:
+    data = results(40, 6, full=True)
+    predicted = np.array([False, False, True, True, False, False])
+    marked = replace(data, estimators=(replace(data.estimators[0], predicted=predicted),))
+    for figure in (drive_from_above(marked, ON_PAPER), map_to_turn(marked, ON_PAPER)):
+        (mark,) = [t for t in printed(figure) if t["name"] == "a, predicted poses"]
+        assert np.allclose(mark["x"], data.estimators[0].final_poses[2:4, 0, 3], rtol=0, atol=1e-6)
+        draw = draw_figure if figure.key == "above" else draw_views
+        draw(tmp_path / "drawn.png", figure, "with marks")
+    assert "no landmark measured" in drive_from_above(marked).description
+    assert "no landmark measured" not in drive_from_above(data).description
+    report = data.estimators[0]
+    counts = np.arange(6)
+    figures = RunFigures(
+        "drive", True, Estimate(report.final, report.covariances, report.landmarks), None,
+        np.ones(40, np.bool_), counts, predicted, counts, counts, counts, data.up,
+    )  # fmt: skip
+    assert figures.title("matches") == "drive: matches, 2 poses predicted, synthetic odometry"
+    whole = replace(figures, predicted=np.zeros(6, np.bool_), synthetic=False)
+    assert whole.title("matches") == "drive: matches"
 
 
 def test_switches_that_are_off_and_other_moments_are_not_printed() -> None:

@@ -20,6 +20,7 @@ from fgslam.errors import (
     DatasetError,
     EstimatorError,
     FgslamError,
+    FrameError,
     MapError,
     MeasurementLogError,
     OutputError,
@@ -261,6 +262,23 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "no names to plot": (ConfigError, "give a dict", lambda _: fg.plot(as_any([1]))),
         "truth": (ConfigError, "Trajectory.load", lambda _: fg.compare({}, as_any("truth.tum"))),
         "world": (ConfigError, "known: lab", lambda _: fg.rendered_recording("moon")),
+        "no path": (DatasetError, "path is empty", lambda _: fg.open_recording("")),
+        "None": (DatasetError, "path is a NoneType", lambda p: fg.run(as_any(None), p)),
+        "existing": (
+            ConfigError,
+            "use one of refuse, overwrite, resume",
+            lambda p: fg.run("lab_loop", p, existing=as_any("replace")),
+        ),
+        "no workers": (
+            ConfigError,
+            "jobs is 0; give at least 1",
+            lambda p: fg.sweep("lab_trials", {"seed": [1, 2]}, p / "out", jobs=0),
+        ),
+        "name of no kind": (
+            ConfigError,
+            "estimator = 'ekf2' is not usable: give a group of keys, .*; kinds: odometry, ",
+            lambda p: fg.run("lab_loop", p, {"estimator": "ekf2"}),
+        ),
         "begins in a map": (
             ConfigError,
             r"use\s+fgslam\.run",
@@ -275,3 +293,20 @@ def test_wrong_use_is_answered_in_one_line(name: str, tmp_path: Path) -> None:
     with pytest.raises(error, match=words) as caught:
         use(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("left.png", "the images are a str; give a tuple"),
+        ({"left": 1, "right": 2, "top": 3}, "the images are a dict; give a tuple"),
+        (("a.png", "b.png", "c.png"), "left image is a str; give its pixels as an array"),
+        ((np.zeros((120, 160), np.uint8),) * 2 + (None,), "top image is a NoneType"),
+        (np.zeros((120, 160, 3), np.uint8), "one image given instead of 3"),
+    ],
+)
+def test_what_are_no_images_is_told_by_what_it_is(folder: Path, given: Any, words: str) -> None:
+    slam = fg.Slam(fg.open_recording(folder).rig)
+    with pytest.raises(FrameError, match=words):
+        slam.track(0.0, given)
+    assert slam.numbering == fg.Slam(fg.open_recording(folder).rig).numbering  # nothing was taken

@@ -12,6 +12,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import compose, wrap
 from fgslam.runs.tasks.homing_pairs import (
+    _tables,
     answer_numbers,
     error_numbers,
     pair_errors,
@@ -76,6 +77,18 @@ def test_coverage_is_right_for_honest_errors_and_low_for_overconfident_ones() ->
     assert "same_room" not in honest
     bold = error_numbers(pair_errors(*noisy_answers(2.0)))
     assert bold["covered_joint_95"] < 0.6  # type: ignore[operator]
+
+
+def test_shares_are_shown_as_percentages_and_what_is_not_known_as_a_dash() -> None:
+    answers = []
+    for k, sigmas in enumerate((0.0, 1.0, 0.5, 9.0)):  # three within the region, one far out
+        answers.append(PairAnswer(2 * k, 2 * k + 1, vector(sigmas * SIGMA, 0.0), 9))
+    poses = np.zeros((8, 3))
+    poses[1::2, 0] = 1.0
+    (table,) = _tables(pair_errors(answers, poses, ("a",) * 8))
+    column = [column.name for column in table.columns].index("covered joint 95 %")
+    cells = {name: cells[column] for name, cells in table.rows}
+    assert list(cells.values()) == ["75.0 %", "75.0 %", "-"]  # all, of one room, of different ones
 
 
 def test_refusals_are_counted_by_reason_and_written_with_them(tmp_path: Path) -> None:

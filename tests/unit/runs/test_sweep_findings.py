@@ -137,6 +137,46 @@ def test_the_page_says_what_the_table_says(grid: Grid, tmp_path: Path) -> None:
     assert 'id="plot-spread"' in text
 
 
+def bridged(case: Case) -> CaseResult:
+    """As :func:`result`; with the smaller gate `a` has poses that no landmark measured."""
+    rows = [
+        Row(
+            row.estimator,
+            row.numbers
+            | {
+                "odometry": "synthetic",
+                "predicted_frames": 2 if (row.estimator, case.place[1]) == ("a", 0) else 0,
+            },
+            row.times,
+        )
+        for row in given(case).rows
+    ]
+    return CaseResult(0.1, tuple(rows))
+
+
+def test_poses_and_odometry_that_are_not_measured_are_marked_wherever_a_sweep_shows_them(
+    grid: Grid, tmp_path: Path
+) -> None:
+    found = find(make_table(grid, ((case, bridged(case)) for case in grid)), grid)
+    assert found is not None
+    worst = f"gate=2 a ({2 * SEEDS} poses predicted, synthetic odometry)"
+    best = "gate=3 b (synthetic odometry)"
+    shown = [worst, "gate=2 b (synthetic odometry)", "gate=3 a (synthetic odometry)", best]
+    means, pairs = comparison_tables(found)
+    assert [name for name, _ in means.rows] == shown
+    assert f"{worst} | {best}" in dict(pairs.rows)
+    assert dict(pairs.rows)[f"{worst} | {best}"][-1] == best
+    assert sentences(found, len(grid), len(grid), 0)[1].endswith(best)
+    path = tmp_path / "report.html"
+    write_sweep_page(path, [], {}, found, "")
+    text = path.read_text(encoding="utf-8")
+    assert f"a ({2 * SEEDS} poses predicted, synthetic odometry)" in text  # the curve of both gates
+    running = RunningMeans(grid, None)
+    for case in grid[:5]:
+        running.add(case, bridged(case))
+    assert "gate=2 a (6 poses predicted, synthetic odometry)" in dict(running.table().rows)
+
+
 def test_means_while_it_runs_are_those_of_the_cases_so_far(grid: Grid) -> None:
     running = RunningMeans(grid, None)
     for case in grid[:5]:
