@@ -12,6 +12,7 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, MeasurementLogError
 from fgslam.core.estimates import Trajectory
+from fgslam.core.files import as_path
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
@@ -122,7 +123,7 @@ def open_recording(path: str | Path, overrides: Overrides = ()) -> RecordedFrame
         CalibrationError: its calibration is missing or impossible.
         ConfigError: no such experiment, or a key or value is wrong.
     """
-    return RecordedFrames(open_sequence(_recording_config(Path(path), overrides)))
+    return RecordedFrames(open_sequence(_recording_config(as_path(path, DatasetError), overrides)))
 
 
 def rendered_recording(world: str = "lab", frames: int | None = None) -> RecordedFrames:
@@ -139,7 +140,7 @@ def rendered_recording(world: str = "lab", frames: int | None = None) -> Recorde
         ConfigError: no such world, or not so many frames.
         MissingDependencyError: a library that rendering needs is absent.
     """
-    if world not in _WORLDS:
+    if not isinstance(world, str) or world not in _WORLDS:
         raise ConfigError(f"no rendered world {world!r}; known: {', '.join(_WORLDS)}")
     if frames is not None and frames < 1:
         raise ConfigError(f"frames is {frames}; give at least 1, or None for all")
@@ -264,6 +265,10 @@ def replay(
         raise MeasurementLogError(
             "replay: this log begins in a saved map, which it does not hold; compare estimators on "
             "it by a run: fgslam run with map.load, then fgslam compare RUN"
+        )
+    if not isinstance(ego_motion, EgoMotionSettings | None):
+        raise ConfigError(
+            f"replay: ego_motion is a {type(ego_motion).__name__}; give settings of it, or None"
         )
     return replay_log(log, _unused(chosen_estimator(estimator)), ego_motion or EgoMotionSettings())
 
