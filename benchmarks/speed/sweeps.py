@@ -27,7 +27,7 @@ CASES = 2_000
 _LEAST = 20
 WORKERS = (1, 2)
 _EXPERIMENT = Path("lab_trials")
-_FRAMES = 100
+_FRAMES = 20
 _ESTIMATORS = ("landmark_kalman",)
 _LEFT_OUT = 0.1  # of the cases, at either end
 
