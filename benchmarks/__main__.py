@@ -1,9 +1,9 @@
 """Measures speed or accuracy, stores what was measured, writes the pages of results.
 
-`python -m benchmarks NAME` prints one set of tables as Markdown; `speed`, `long_drive` and `soak`
-write `bench.json`, `bench_long.json` and `bench_soak.json`; `keep PATH` stores such a file, or the
-numbers of a run folder, in benchmarks/measured; `pages` writes docs/results from benchmarks/results
-and benchmarks/measured.
+`python -m benchmarks NAME` prints one set of tables as Markdown; `speed`, `long_drive`, `soak`,
+`submaps` and `sweep` write `bench.json`, `bench_long.json` and so on; `keep PATH` stores such a
+file, or the numbers of a run folder, in benchmarks/measured; `pages` writes docs/results from
+benchmarks/results and benchmarks/measured.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from benchmarks.evidence import (
 from benchmarks.measured import keep
 from benchmarks.pages import write_pages
 from benchmarks.runs import DATA, say
-from benchmarks.speed import long_drive, parts, soak, submaps
+from benchmarks.speed import long_drive, parts, soak, submaps, sweeps
 from benchmarks.tables import Table
 from fgslam.core.errors import ConfigError, FgslamError
 
@@ -79,12 +79,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = ("pages", "keep", "speed", "long_drive", "soak", "submaps", *sorted(EVIDENCE))
+    names = ("pages", "keep", "speed", "long_drive", "soak", "submaps", "sweep", *sorted(EVIDENCE))
     parser.add_argument("what", choices=names, metavar="NAME", help=", ".join(names))
     parser.add_argument("path", type=Path, nargs="?", help="keep: run folder or file of --out")
     parser.add_argument("--out", type=Path, help="write the numbers as JSON to this file")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real recordings")
     parser.add_argument("--frames", type=int, default=2000, help="speed: frames over images")
+    parser.add_argument("--cases", type=int, default=sweeps.CASES, help="sweep: cases, 20 or more")
     choices = ("all", *parts.PARTS)
     parser.add_argument("--part", choices=choices, default="all", help="speed: which part")
     return parser
@@ -101,6 +102,8 @@ def _do(given: argparse.Namespace) -> None:
         _write_ratios(parts.measure(given.part, given.frames), given.out or Path("bench.json"))
     elif given.what == "submaps":
         _write_ratios(submaps.numbers(), given.out or Path("bench_submaps.json"))
+    elif given.what == "sweep":
+        _write_ratios(sweeps.numbers(given.cases), given.out or Path("bench_sweep.json"))
     elif given.what == "long_drive":
         _write_ratios(long_drive.ratios_beside_batch(), given.out or Path("bench_long.json"))
     elif given.what == "soak":

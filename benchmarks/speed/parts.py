@@ -17,6 +17,7 @@ from benchmarks.speed import (
     smoothers,
     soak,
     starting,
+    sweeps,
 )
 from benchmarks.speed.drives import open_drive
 from fgslam.core.threads import one_blas_thread
@@ -31,6 +32,7 @@ LIMITS: dict[str, float] = (
     | smoothers.LIMITS
     | soak.LIMITS
     | starting.LIMITS
+    | sweeps.LIMITS
 )
 """Largest allowed value of each bounded ratio, by its name in `bench.json`."""
 

@@ -29,6 +29,7 @@ from fgslam.cameras.rectification import WIDEST_CYLINDER_DEG, Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
+from fgslam.core.files import as_path
 from fgslam.core.geometry import pose
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
@@ -160,13 +161,15 @@ def load_rig(
     """
     asked = asked_view(fov_deg, view)
     require_options(size, unit_m)
-    own = _own_rectified(Path(path), cameras, unit_m) if path2 is None else None
+    file = as_path(path, CalibrationError)
+    file2 = None if path2 is None else as_path(path2, CalibrationError, "path2")
+    own = _own_rectified(file, cameras, unit_m) if file2 is None else None
     same_size = own is not None and size in (None, (own.width, own.height))
     if own is not None and same_size and asked in (ANY_VIEW, ViewAsked(None, own.view)):
-        return with_masks(own, Path(path))
-    found = read_calibration_file(Path(path), None if path2 is None else Path(path2), size)
+        return with_masks(own, file)
+    found = read_calibration_file(file, file2, size)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
-    return with_masks(rig_of(found, asked), Path(path))
+    return with_masks(rig_of(found, asked), file)
 
 
 def rig_of(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> StereoRig:

@@ -26,6 +26,7 @@ from fgslam.cli.performing import (
 from fgslam.cli.signals import stop_flag, stoppable
 from fgslam.cli.sweeping import sweep
 from fgslam.core.errors import FgslamError, one_line
+from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ EXIT_USER = 2
 # Typer exports only the child; its parent's home differs from one Typer to the next.
 _UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 _OF_TYPER = 130  # what it makes of any KeyboardInterrupt; no command of ours returns it
-_NO_MEMORY = "not enough memory; free some, raise the limit (ulimit -v), or take fewer frames"
 _CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
 
 app = typer.Typer(
@@ -409,7 +409,8 @@ def _keep_close_options(error: Exception) -> None:
 
 def _performed(arguments: list[str]) -> int:
     """Exit status of a command. Raises what it raised, an interruption as KeyboardInterrupt."""
-    status = int(app(arguments, prog_name="fgslam", standalone_mode=False) or 0)
+    with ShortageTold():
+        status = int(app(arguments, prog_name="fgslam", standalone_mode=False) or 0)
     if status == _OF_TYPER and signals.was_asked():
         raise KeyboardInterrupt
     return status
@@ -440,9 +441,6 @@ def main() -> None:
         raise SystemExit(signals.status()) from None
     except BrokenPipeError:
         raise SystemExit(EXIT_FAULT) from None
-    except MemoryError:
-        print(f"fgslam: {_NO_MEMORY}", file=sys.stderr)
-        raise SystemExit(EXIT_USER) from None
     except OSError as error:
         # Of files of this program FgslamErrors tell; this is the terminal's, or a library's own.
         where = one_line(str(error.filename or "standard output"))

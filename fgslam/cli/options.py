@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.core.files import require_file
 from fgslam.datasets.layouts import fitting_layouts, is_recording
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
@@ -74,10 +75,10 @@ def run_folder_or_experiment(given: str) -> Path:
 
 def saved_map(given: str) -> Path:
     """An existing file. Raises DatasetError."""
-    path = Path(given)
-    if not path.is_file():
-        what = "is a folder" if path.is_dir() else "no such file"
-        raise DatasetError(f"{path}: {what}; save a map with fgslam run --map-out")
+    path, remedy = Path(given), "save a map with fgslam run --map-out"
+    if not path.exists():
+        raise DatasetError(f"{path}: no such file; {remedy}")
+    require_file(path, DatasetError, remedy)
     return path
 
 

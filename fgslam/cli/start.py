@@ -11,12 +11,15 @@ if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
 
 import atexit
 import os
-import resource
 import sys
 
 from fgslam.cli import signals
+from fgslam.core.memory import limit_bytes
 
-_LEAST_MEMORY = 700_000_000  # bytes of address space: below it libraries crash or hang at import
+_LEAST_MEMORY = 1_200_000_000
+"""Bytes of address space. Below it libraries crash at import, and OpenBLAS tries without end to get
+the memory of its first call."""
+_SINGLE = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 
 _ended_with: list[int] = []
 """Status of the command, once it has one."""
@@ -75,8 +78,12 @@ def _leave() -> None:
 
 def _require_memory() -> None:
     """Ends with a line where the system's limit is below what the libraries take by themselves."""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < _LEAST_MEMORY:
+    limit = limit_bytes()
+    if limit is None:
+        return
+    for name in _SINGLE:  # each thread takes 40 MB of address space, in each of three libraries
+        os.environ.setdefault(name, "1")
+    if limit < _LEAST_MEMORY:
         print(
             f"fgslam: the memory limit of {limit / 1e6:.0f} MB (ulimit -v) is below the "
             f"{_LEAST_MEMORY / 1e6:.0f} MB that the libraries need; raise it",

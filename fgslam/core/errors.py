@@ -72,6 +72,10 @@ class OutputError(FgslamError):
     """The run folder cannot be written, or it exists already."""
 
 
+class MemoryShortageError(FgslamError):
+    """There is no memory left, or a library needs more than the process may use."""
+
+
 class EstimatorError(FgslamError):
     """An estimator was given input that it cannot accept (time running backwards, unknown type)."""
 

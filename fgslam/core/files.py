@@ -219,6 +219,23 @@ def require_file(
         raise error(f"cannot read {path}: {size:.1f} MB, {most:g} MB at most; {remedy}")
 
 
+def as_path(given: object, error: type[FgslamError], what: str = "path") -> Path:
+    """The path that a text or a path-like object is. Raises ``error`` for what can be none."""
+    if not isinstance(given, str | os.PathLike):
+        raise error(f"{what}: a {type(given).__name__}; give a text or a pathlib.Path")
+    if not os.fspath(given):
+        raise error(f"{what}: the name is empty; give that of a file or folder")
+    path = Path(given)
+    try:
+        path.stat()
+    except ValueError as cause:  # a name that holds NUL, or half of a surrogate pair
+        raise error(f"{what}: {cause}; give the name of a file or folder") from cause
+    except OSError as cause:
+        if cause.errno == errno.ENAMETOOLONG:
+            raise error(f"{what}: {path}: the name is too long") from cause
+    return path
+
+
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a pipe"),

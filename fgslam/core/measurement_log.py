@@ -16,6 +16,7 @@ import numpy as np
 from fgslam.core.array_files import write_arrays
 from fgslam.core.arrays import Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
+from fgslam.core.files import as_path
 from fgslam.core.log_arrays import SENSOR_ARRAYS, arrays_of, frames_of, sensor_of, version_of
 from fgslam.core.log_blocks import LogBlocks
 from fgslam.core.log_file import FramesOnDisk, LogFile
@@ -157,7 +158,7 @@ class MeasurementLog(Brief):
     @staticmethod
     def load(path: str | Path) -> MeasurementLog:
         """Reads a log. Raises MeasurementLogError for a missing, truncated or foreign file."""
-        return MeasurementLog.from_arrays(LOG.load(Path(path)), str(path))
+        return MeasurementLog.from_arrays(LOG.load(as_path(path, MeasurementLogError)), str(path))
 
 
 def _without_stand_in(odometry: Odometry | None) -> Odometry | None:

@@ -15,7 +15,7 @@ import numpy as np
 from fgslam.core.array_files import from_upper
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.files import read_text, write_text
+from fgslam.core.files import as_path, read_text, write_text
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"
@@ -82,7 +82,7 @@ class Trajectory(Brief):
             DatasetError: the file is missing, a line is malformed, a quaternion is zero, or the
                 time stamps do not increase. The message names the line.
         """
-        path = Path(path)
+        path = as_path(path, DatasetError)
         expected = "timestamp tx ty tz qx qy qz qw on each line"
         values, lines = _parse_rows(
             path,

@@ -89,6 +89,11 @@ def compare(
             trajectory.
     """
     require_named(answers, truth)
+    if not isinstance(landmark_truth, LandmarkTruth | None):
+        raise ConfigError(
+            f"the landmarks' truth is a {type(landmark_truth).__name__}; give a LandmarkTruth, or "
+            "None"
+        )
     known = Truth(truth, landmark_truth)
     table = _frame({name: _judged(name, one, known) for name, one in answers.items()})
     if full:

@@ -20,6 +20,7 @@ from fgslam.core.errors import (
     CalibrationError,
     ConfigError,
     EstimatorError,
+    FrameError,
     SessionError,
     StoredMapError,
 )
@@ -128,6 +129,10 @@ def teach(
         ConfigError: ``features`` are no settings.
     """
     size = (_require_camera(camera, "teach").width, camera.height)
+    if not isinstance(images, Iterable):
+        raise FrameError(f"teach: the images are a {type(images).__name__}; give a list of arrays")
+    if not isinstance(select, bool):
+        raise ConfigError(f"teach: select is a {type(select).__name__}; give True or False")
     front_end = replace(DRIVING, features=_require_features(features, "teach"))
     given = (colour_image(image, size, f"image {k}") for k, image in enumerate(images))
     if select:

@@ -22,6 +22,7 @@ from fgslam.core.array_files import (
 from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import CalibrationError, StoredMapError
+from fgslam.core.files import as_path
 from fgslam.core.geometry import is_rigid
 from fgslam.core.homing import OmniFeatures
 from fgslam.homing.feature_files import VERSIONS, pack_features, unpack_features
@@ -148,7 +149,7 @@ def load_images(kind: ArrayFile, path: str | Path) -> tuple[PathMemory, StateArr
     Raises:
         StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
     """
-    arrays = kind.load(Path(path))
+    arrays = kind.load(as_path(path, StoredMapError))
     header = kind.read_header(arrays, str(path))
     images = unpack_features(arrays, str(path), header["version"])
     names, values = header.get("names"), header.get("camera")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, MeasurementLogError
 from fgslam.core.estimates import Trajectory
+from fgslam.core.files import as_path
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
@@ -123,7 +123,7 @@ def open_recording(path: str | Path, overrides: Overrides = ()) -> RecordedFrame
         CalibrationError: its calibration is missing or impossible.
         ConfigError: no such experiment, or a key or value is wrong.
     """
-    found = as_path(path, "recording")
+    found = as_path(path, DatasetError, "recording")
     return RecordedFrames(open_sequence(_recording_config(found, overrides)))
 
 
@@ -141,20 +141,12 @@ def rendered_recording(world: str = "lab", frames: int | None = None) -> Recorde
         ConfigError: no such world, or not so many frames.
         MissingDependencyError: a library that rendering needs is absent.
     """
-    if world not in _WORLDS:
+    if not isinstance(world, str) or world not in _WORLDS:
         raise ConfigError(f"no rendered world {world!r}; known: {', '.join(_WORLDS)}")
     if frames is not None and frames < 1:
         raise ConfigError(f"frames is {frames}; give at least 1, or None for all")
     overrides = {} if frames is None else {"dataset.stop": frames}
     return open_recording(_WORLDS[world], overrides)
-
-
-def as_path(given: object, what: str) -> Path:
-    """A path as a user gives it; ``what`` names it. Raises DatasetError where it is none."""
-    if isinstance(given, str | os.PathLike) and os.fspath(given):
-        return Path(given)
-    found = "is empty" if given == "" else f"is a {type(given).__name__}"
-    raise DatasetError(f"the {what}'s path {found}; give that of a folder or file, or a name")
 
 
 def _checked_existing(existing: ExistingFolder) -> ExistingFolder:
@@ -204,7 +196,7 @@ def run(
     """
     calibration = None if camera is None else Path(camera)
     config, _ = experiment_of(
-        as_path(experiment, "experiment"), calibration, override_texts(overrides)
+        as_path(experiment, DatasetError, "experiment"), calibration, override_texts(overrides)
     )
     folder = Path("runs") / config.name if out is None else Path(out)
     return run_experiment(config, folder, _checked_existing(existing), progress)
@@ -248,7 +240,9 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
         FgslamError: of any kind, with one line that says what to do.
     """
     given = [experiments] if isinstance(experiments, str | Path) else list(experiments)
-    plan = make_plan([as_path(one, "experiment") for one in given], settings, estimators)
+    plan = make_plan(
+        [as_path(one, DatasetError, "experiment") for one in given], settings, estimators
+    )
     folder = plan.default_folder if out is None else Path(out)
     watch = (progress, *UNWATCHED[1:])
     existing = _checked_existing(existing)
@@ -285,6 +279,10 @@ def replay(
         raise MeasurementLogError(
             "replay: this log begins in a saved map, which it does not hold; compare estimators on "
             "it by a run: fgslam run with map.load, then fgslam compare RUN"
+        )
+    if not isinstance(ego_motion, EgoMotionSettings | None):
+        raise ConfigError(
+            f"replay: ego_motion is a {type(ego_motion).__name__}; give settings of it, or None"
         )
     return replay_log(log, _unused(chosen_estimator(estimator)), ego_motion or EgoMotionSettings())
 

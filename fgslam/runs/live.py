@@ -248,7 +248,10 @@ def override_texts(overrides: Overrides) -> list[str]:
             f"overrides: {overrides!r} is no settings; give a dict or a list of texts"
         )
     if not isinstance(overrides, Mapping):
-        return list(overrides)
+        texts = list(overrides)
+        if not all(isinstance(text, str) for text in texts):
+            raise ConfigError("overrides: a list of other things than texts; write a.b=value each")
+        return texts
     return [f"{key}={_as_yaml(key, value)}" for key, value in overrides.items()]
 
 

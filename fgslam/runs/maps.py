@@ -15,6 +15,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.checks import require_seed
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
+from fgslam.core.files import as_path
 from fgslam.core.geometry import so3_log
 from fgslam.core.recordings import Frame
 from fgslam.core.saved_map import SavedMap, load_map, save_map
@@ -60,7 +61,7 @@ class Map:
         Raises:
             MapError: the file is missing, truncated, damaged, foreign, or of a newer fgslam.
         """
-        saved = load_map(Path(path))
+        saved = load_map(as_path(path, MapError))
         return Map(saved, points_of(saved), remark_of_map(saved))
 
     def save(self, path: str | Path) -> None:

@@ -19,7 +19,7 @@ import fgslam as fg
 from fgslam.core.errors import FgslamError
 from fgslam.datasets.images import read_grey_image
 from fgslam.runs.config import load_experiment
-from scripts.fuzz import calls, pictures, texts
+from scripts.fuzz import calls, pictures, texts, values
 from scripts.fuzz.archives import (
     BEARINGS,
     MAP,
@@ -31,6 +31,7 @@ from scripts.fuzz.archives import (
 from scripts.fuzz.damage import Rng, require_one_line
 
 HANGS_AFTER_S = 10
+_WAITS_AFTER_S = 30  # by the clock, on a machine that has other work as well
 
 
 @dataclass(frozen=True)
@@ -78,21 +79,34 @@ KINDS = (
     Kind("joined_bytes", ROUTE_MAP.of_damaged_bytes, ROUTE_MAP.load, ROUTE_MAP.is_same),
     Kind("joined_values", ROUTE_MAP.of_odd_values, ROUTE_MAP.load),
     Kind("calibration_archive", calibration_archive, lambda path: fg.load_rig(path)),
+    Kind("calibration_digit", values.calibration, values.read_calibration, values.is_as_written),
+    Kind(
+        "configuration_digit",
+        values.configuration,
+        values.read_configuration,
+        values.is_as_written,
+    ),
+    Kind("library_call", calls.library_call, calls.read_library_call),
 )
 
 
 @contextmanager
 def _time_limit() -> Iterator[None]:
+    """Raises Hang after seconds of processor time, or after minutes of waiting."""
+
     def stop(number: int, frame: FrameType | None) -> None:
         raise Hang
 
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(HANGS_AFTER_S)
+    before = {n: signal.signal(n, stop) for n in (signal.SIGPROF, signal.SIGALRM)}
+    signal.setitimer(signal.ITIMER_PROF, HANGS_AFTER_S)
+    signal.alarm(_WAITS_AFTER_S)
     try:
         yield
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def outcome(kind: Kind, seed: int) -> str:

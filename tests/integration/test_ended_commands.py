@@ -9,6 +9,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,9 @@ from running import HANGS_AFTER_S, main, run_values
 from test_resume_run import write_config
 
 from tests.textured_room import SMALL_CAMERA_FILE, folder_of
+
+from fgslam.runs.config import make_experiment
+from fgslam.runs.run import run_experiment
 
 pytestmark = pytest.mark.slow
 
@@ -46,8 +50,22 @@ def place(tmp_path_factory: pytest.TempPathFactory, recording: Path) -> Path:
         values = experiment(recording, seed=k) | {"map": {"save": str(root / f"{k}.fgmap")}}
         run_values(values, root / f"run{k}")
     write_config(root / "drive.yaml", experiment(recording))
+    (root / "recording").symlink_to(recording)
+    run_experiment(make_experiment(HOMINGS, "test"), root / "homings")
     boards(root / "boards")
     return root
+
+
+HOMINGS: dict[str, Any] = {
+    "task": "homing_trials",
+    "name": "few_homings",
+    "jobs": 1,
+    "trials": 2,
+    "outliers": [0.0],
+    "estimator": {"kind": "homing_ekf"},
+    "dataset": {"images_per_s": 4.0},
+    "output": {"logs": 2},
+}
 
 
 def boards(folder: Path) -> None:
@@ -75,6 +93,11 @@ COMMANDS = {
     "sweep": "sweep {}/drive.yaml --set seed=0:40 --jobs 2 --out swept",
     "merge": "merge {}/0.fgmap {}/1.fgmap --out both.fgmap",
     "demo": "demo --out demo",
+    "compare": "compare {}/run0 {}/run1 --estimators isam2,batch,ekf --jobs 2 --out compared",
+    "compare-homing": "compare {}/homings --estimators homing_graph,graph_batch --out compared",
+    "localize": "localize {}/0.fgmap {}/recording --out located",
+    "inspect": "inspect {}/recording",
+    "export": "export {}/run0 --map map.ply --trajectory t.mcap --graph run.g2o --images colmap",
 }
 
 

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+import fgslam as fg
+from scripts.fuzz import values
 from scripts.fuzz.cases import KINDS, Kind, faults, outcome
+from scripts.fuzz.damage import written
+from scripts.fuzz.texts import CALIBRATION
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.name)
@@ -43,3 +51,22 @@ def test_what_is_looked_for_is_found() -> None:
         patch.setattr("scripts.fuzz.cases.KINDS", (silent, stumbling := Kind("x", spoil, stumble)))
         assert outcome(silent, 0) == "other values without a word"
         assert outcome(stumbling, 0).startswith("KeyError: ")
+
+
+def test_a_changed_digit_that_is_read_as_another_value_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rig's focal length is read half a pixel off."""
+    rng = np.random.default_rng(5)
+    text = "a: 12.5\nb: [3, x4]\n"
+    changed = {values.digit_changed(rng, text) for _ in range(200)}
+    assert text not in changed
+    assert {sum(a != b for a, b in zip(text, one, strict=True)) for one in changed} == {1}
+    assert all("x4" in one for one in changed)
+
+    calibration = json.loads(CALIBRATION)
+    given = (written(tmp_path / "calib.json", json.dumps(calibration)), None)
+    assert values.is_as_written(values.read_calibration(given))
+    read = fg.load_rig(given[0])
+    monkeypatch.setattr("fgslam.load_rig", lambda path: dataclasses.replace(read, fx=200.5))
+    assert not values.is_as_written(values.read_calibration(given))

@@ -88,9 +88,14 @@ class CaseTask:
         names = self.names or tuple(settings.title for settings in _own(config))
         return config, choose(config, Choice(names, choice.of_estimators.overrides))
 
-    def key(self, identity: str) -> str:
-        """Digest of all that its numbers depend on; ``identity`` is the recording's."""
-        config, estimators = self.settled()
+    def key(self, identity: str, settled: tuple[Experiment, tuple[Any, ...]] | None = None) -> str:
+        """Digest of all that its numbers depend on.
+
+        Args:
+            identity: the recording's.
+            settled: what :meth:`settled` has given, which takes longer than all else here.
+        """
+        config, estimators = settled or self.settled()
         values = with_estimators(config, estimators).as_values()
         values = {name: value for name, value in values.items() if name not in ("name", "output")}
         text = json.dumps([values, identity, dict(self.made_with)], sort_keys=True)

@@ -205,11 +205,12 @@ def _checked(plan: Plan, watch: Watch) -> tuple[list[str], Experiment]:
     keys: list[str] = []
     for number in range(len(tasks)):
         task = tasks[number]
-        config, _ = task.settled()
+        settled = task.settled()
+        config = settled[0]
         ground = json.dumps(_ground(config), sort_keys=True)
         if ground not in opened:
             opened[ground] = _identity(config, progress)
-        keys.append(task.key(opened[ground]))
+        keys.append(task.key(opened[ground], settled))
         if stopped():
             raise KeyboardInterrupt
     return keys, tasks[0].settled()[0]
@@ -217,9 +218,9 @@ def _checked(plan: Plan, watch: Watch) -> tuple[list[str], Experiment]:
 
 def _ground(config: Experiment) -> dict[str, Any]:
     """What says which recording it is."""
-    values = config.as_values()
     if isinstance(getattr(config, "dataset", None), SimulatedMeasurementsSettings):
         return {"simulated": True}
+    values = config.as_values()
     return {name: values.get(name) for name in ("task", "dataset", "odometry", "map")}
 
 

@@ -19,9 +19,11 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 
-from fgslam.core.errors import MissingDependencyError
+from fgslam.core.errors import MemoryShortageError, MissingDependencyError
+from fgslam.core.memory import is_shortage, limit_bytes, room_bytes
 
 _LIBUSB = "libusb-1.0.so.0"
+_TAKES = 1_300_000_000  # bytes of address space, measured with Open3D 0.20; half of it is its code
 
 
 def load_open3d(
@@ -36,8 +38,10 @@ def load_open3d(
 
     Raises:
         MissingDependencyError: Open3D or a system library it needs is absent.
+        MemoryShortageError: the process may not use as much memory as Open3D takes.
     """
     load = load_library or _load_globally
+    _require_room()
     try:
         _provide_libusb(load, bundled_libusb or find_bundled_libusb)
         return import_module("open3d")
@@ -45,8 +49,29 @@ def load_open3d(
         raise MissingDependencyError(
             "the rendered lab needs Open3D, which is not installed: pip install open3d"
         ) from error
+    except MemoryError as error:
+        raise MemoryShortageError(_too_little()) from error
     except (ImportError, OSError) as error:
+        if is_shortage(error):
+            raise MemoryShortageError(_too_little()) from error
         raise MissingDependencyError(explain_missing_library(str(error))) from error
+
+
+def _require_room() -> None:
+    """Raises where Open3D would not fit: loaded in part it may end the process."""
+    room = room_bytes()
+    if room is not None and room < _TAKES:
+        raise MemoryShortageError(_too_little())
+
+
+def _too_little() -> str:
+    limit = limit_bytes()
+    given = "memory is short" if limit is None else f"memory is limited to {limit / 1e6:.0f} MB"
+    how = "free some" if limit is None else "raise the limit (ulimit -v)"
+    return (
+        f"{given}, and Open3D, which renders the lab, takes {_TAKES / 1e6:.0f} MB, more than "
+        f"is left; {how}, or run a recording that is not rendered"
+    )
 
 
 def find_bundled_libusb() -> Path | None:

@@ -21,7 +21,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import images, parts, soak, submaps
+from benchmarks.speed import images, parts, soak, submaps, sweeps
 from benchmarks.tables import Table
 
 
@@ -242,3 +242,12 @@ def test_a_street_of_any_length_is_a_ring_that_the_robot_is_carried_back_into(fr
     assert course.carried[-1] < first_round
     start, back = course.at(np.array([0, first_round]))
     np.testing.assert_allclose(back, start, rtol=0, atol=1e-6)
+
+
+def test_overhead_of_a_sweep_is_what_the_workers_had_less_what_the_cases_took() -> None:
+    """20 cases of 80 ms, one every 50 ms by two workers, from 3 s after the start on."""
+    took, came = np.full(20, 0.08), [3.0 + 0.05 * k for k in range(20)]
+    found = sweeps.of_sweep("two", 2, 5.0, took, came)
+    assert found["two_cases_a_second"] == pytest.approx(20.0, rel=0, abs=1e-9)
+    assert found["two_overhead_ms"] == pytest.approx(2 * 50.0 - 80.0, rel=0, abs=1e-9)
+    assert found["two_overhead_ms_in_all"] == pytest.approx(2 * 250.0 - 80.0, rel=0, abs=1e-9)

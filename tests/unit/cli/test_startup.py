@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -72,21 +73,43 @@ def test_a_run_of_the_paper_s_filter_loads_no_solver_of_graphs_and_nothing_that_
     assert loaded(code) == {"numpy", "scipy", "cv2", "yaml"}
 
 
-def test_a_memory_limit_below_what_libraries_take_is_one_line() -> None:
-    """Below it NumPy's and OpenCV's libraries crash or hang while they are loaded."""
-
-    def limited() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (400_000_000, 400_000_000))
-
-    done = subprocess.run(
-        [sys.executable, "-m", "fgslam", "inspect", "."],
+def limited_to(limit: int, *command: str) -> subprocess.CompletedProcess[str]:
+    """A command, ended, that may use so many bytes of address space."""
+    return subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "fgslam", *command],
         capture_output=True,
         text=True,
         check=False,
-        preexec_fn=limited,
-        timeout=60,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (limit, limit)),
+        timeout=600,
     )
+
+
+@pytest.mark.parametrize("mb", [400, 600, 900, 1150])
+def test_a_memory_limit_below_what_libraries_take_is_one_line(mb: int) -> None:
+    """Below it libraries crash while they are loaded, or try for memory without end."""
+    done = limited_to(mb * 1_000_000, "inspect", ".")
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert "memory limit of 400 MB" in line
+    assert f"memory limit of {mb} MB" in line
     assert "raise it" in line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mb", [1300, 2000])
+def test_a_memory_limit_below_what_rendering_takes_is_one_line(mb: int, tmp_path: Path) -> None:
+    given = ("--set", "dataset.stop=2", "--set", "compare=[]", "--out", str(tmp_path / "run"))
+    done = limited_to(mb * 1_000_000, "run", "lab_loop", *given)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"memory is limited to {mb} MB" in line
+    assert "raise the limit" in line
+
+
+@pytest.mark.slow
+def test_a_run_in_the_least_memory_that_is_allowed_finishes(tmp_path: Path) -> None:
+    """Of a simulated world: BLAS, SciPy, GTSAM and the page of the report."""
+    given = ("--set", "dataset.stop=5", "--set", "compare=[isam2]", "--out", str(tmp_path / "run"))
+    done = limited_to(1_200_000_000, "run", "lab_trials", *given)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run" / "report.html").is_file()

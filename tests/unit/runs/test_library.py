@@ -262,7 +262,7 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "no names to plot": (ConfigError, "give a dict", lambda _: fg.plot(as_any([1]))),
         "truth": (ConfigError, "Trajectory.load", lambda _: fg.compare({}, as_any("truth.tum"))),
         "world": (ConfigError, "known: lab", lambda _: fg.rendered_recording("moon")),
-        "no path": (DatasetError, "path is empty", lambda _: fg.open_recording("")),
+        "no path": (DatasetError, "recording: the name is empty", lambda _: fg.open_recording("")),
         "None": (DatasetError, "path is a NoneType", lambda p: fg.run(as_any(None), p)),
         "existing": (
             ConfigError,

@@ -1,9 +1,11 @@
+import resource
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from fgslam.core.errors import MissingDependencyError
+from fgslam.core.errors import MemoryShortageError, MissingDependencyError
+from fgslam.worlds.rendering import open3d_library
 from fgslam.worlds.rendering.open3d_library import (
     explain_missing_library,
     find_bundled_libusb,
@@ -11,6 +13,7 @@ from fgslam.worlds.rendering.open3d_library import (
 )
 
 NO_LIBUSB = OSError("libusb-1.0.so.0: cannot open shared object file: No such file or directory")
+NO_ROOM = "libOpen3D.so.0.20: failed to map segment from shared object"
 
 
 class Loader:
@@ -84,3 +87,22 @@ def test_absent_open3d_says_how_to_install_it() -> None:
 
     with pytest.raises(MissingDependencyError, match="pip install open3d"):
         load_open3d(import_module, lambda name: object(), lambda: None)
+
+
+@pytest.mark.parametrize("fault", [MemoryError(), ImportError(NO_ROOM), OSError(NO_ROOM)])
+def test_open3d_without_memory_is_not_called_a_missing_library(
+    fault: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def import_module(name: str) -> ModuleType:
+        raise fault
+
+    monkeypatch.setattr(resource, "getrlimit", lambda which: (10**12, -1))
+    with pytest.raises(MemoryShortageError, match="memory is limited to 1000000 MB") as caught:
+        load_open3d(import_module, lambda name: object(), lambda: None)
+    assert "\n" not in str(caught.value)
+
+
+def test_open3d_is_not_loaded_where_it_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(open3d_library, "room_bytes", lambda: 10**9)
+    with pytest.raises(MemoryShortageError, match="more than is left"):
+        load_open3d(lambda name: pytest.fail("it was loaded"), lambda name: object(), lambda: None)
