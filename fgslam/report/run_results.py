@@ -44,6 +44,7 @@ class EstimatorReport:
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to correct or leave out, in words.
         failure: why it ended early, with what it had until then, or gave nothing; else empty.
+        noise: (n,) each, the columns of noise.csv; empty where nothing is known of it.
     """
 
     title: str
@@ -63,6 +64,7 @@ class EstimatorReport:
     verdict: str | None = None
     remarks: tuple[str, ...] = ()
     failure: str = ""
+    noise: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.timestamps)
@@ -80,6 +82,8 @@ class EstimatorReport:
                 raise ValueError(
                     f"{self.title}: {name} has shape {getattr(self, name).shape}, not {shape}"
                 )
+        if any(values.shape != (n,) for values in self.noise.values()):
+            raise ValueError(f"{self.title}: its noise is not one of {n} frames")
 
     def __len__(self) -> int:
         return len(self.timestamps)

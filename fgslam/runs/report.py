@@ -31,6 +31,7 @@ from fgslam.report.run_results import (
 )
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
+from fgslam.runs.estimator_files import NOISE_FILE
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.metric_tables import marked, page_tables
 from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
@@ -99,7 +100,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         versions=_versions(config),
         up=_up(_find(folders, LOG_FILE)),
         alignment="after SE3 alignment",
-        calibration=_calibration(_find(folders, CALIBRATION_FILE)),
+        calibration=_columns(_find(folders, CALIBRATION_FILE)),
     )
 
 
@@ -204,7 +205,21 @@ def _estimator(
         judged_report(title, kind, estimate, _online(folder / "online.tum"), truth),
         update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         failure=failure,
+        noise=_noise(folder / NOISE_FILE, final),
     )
+
+
+def _noise(path: Path, final: Trajectory) -> dict[str, FloatArray]:
+    """(n,) each, the columns of noise.csv at the path's time stamps; none where it is absent."""
+    found = _columns(path if path.is_file() else None)
+    if found is None or "timestamp" not in found:
+        return {}
+    # Files keep 9 decimals of a second, which makes time stamps of one frame equal.
+    rows, of = same_times(final.timestamps.round(9), found.pop("timestamp").round(9))
+    out = {name: np.full(len(final), np.nan) for name in found}
+    for name, values in found.items():
+        out[name][rows] = values[of]
+    return out
 
 
 def _covariances(path: Path, final: Trajectory) -> FloatArray:
@@ -251,13 +266,13 @@ def _live_times(path: Path | None) -> dict[float, float]:
     return out
 
 
-def _calibration(path: Path | None) -> dict[str, FloatArray] | None:
-    """The columns of calibration.csv; None where there is none, or nothing in it."""
+def _columns(path: Path | None) -> dict[str, FloatArray] | None:
+    """The columns of a table of numbers, NaN where empty; None where there is none, or no row."""
     if path is None:
         return None
     rows = list(csv.reader(io.StringIO(_text(path))))
     try:
-        values = np.array([[float(cell) for cell in row] for row in rows[1:]])
+        values = np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
         return dict(zip(rows[0], values.T, strict=True)) if len(values) else None
     except (IndexError, ValueError) as error:
         raise DatasetError(

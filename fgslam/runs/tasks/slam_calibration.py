@@ -55,7 +55,8 @@ def write_calibration(
         then = replace(known, values=step.values, covariance=step.covariance)
         of_terms = np.column_stack([step.values, then.sigmas, step.applied])
         pairs = [number for pair in then.changes().values() for number in pair]
-        rows.append([step.timestamp, step.knocks, *pairs, *of_terms.ravel().tolist()])
+        stamp = f"{step.timestamp:.9f}"  # of an epoch has more digits than a table's numbers
+        rows.append([stamp, step.knocks, *pairs, *of_terms.ravel().tolist()])
     write_csv(folder / CALIBRATION_FILE, columns, rows)
 
 
