@@ -21,7 +21,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import images, parts, soak, submaps
+from benchmarks.speed import growth, images, parts, soak, submaps
 from benchmarks.tables import Table
 
 
@@ -242,3 +242,9 @@ def test_a_street_of_any_length_is_a_ring_that_the_robot_is_carried_back_into(fr
     assert course.carried[-1] < first_round
     start, back = course.at(np.array([0, first_round]))
     np.testing.assert_allclose(back, start, rtol=0, atol=1e-6)
+
+
+def test_growth_of_memory_is_the_exponent_of_the_factors() -> None:
+    factors = np.array([1e3, 3e3, 8e3, 2e4])
+    for expected in (0.0, 1.0, 1.37):
+        assert growth.exponent(factors, 0.02 * factors**expected) == pytest.approx(expected)
