@@ -16,7 +16,7 @@ from benchmarks.speed.blocks import resident_mb
 from benchmarks.speed.drives import MeasuredDrive, Player, open_drive
 from benchmarks.speed.long_drive import KEYFRAMES
 from fgslam.backend.settings import EstimatorSettings, SlidingWindowSettings
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.threads import one_blas_thread
 
 ESTIMATORS: dict[str, EstimatorSettings] = {
@@ -41,7 +41,7 @@ def exponents(frames: int = 2500) -> dict[str, float]:
 @one_blas_thread()
 def _traced(name: str, frames: int) -> dict[str, float]:
     drive = open_drive("long_drive", (f"dataset.stop={frames}",))
-    stops = np.arange(BLOCK, frames + 1, BLOCK)
+    stops = np.arange(BLOCK, frames + 1, BLOCK, dtype=np.int64)
     player = Player(drive, ESTIMATORS[name])
     player.on_to(1)
     before, grown = resident_mb(), []
@@ -61,7 +61,7 @@ def exponent(factors: FloatArray, memory: FloatArray) -> float:
     return float(np.polyfit(np.log(factors), np.log(memory), 1)[0])
 
 
-def _factors(drive: MeasuredDrive, stops: FloatArray) -> FloatArray:
+def _factors(drive: MeasuredDrive, stops: IntArray) -> FloatArray:
     """(n,) observations that fit, and steps, up to each stop."""
     kept = [len(increment.kept) + 1 for increment in drive.log]
-    return np.cumsum(kept)[stops - 1].astype(np.float64)
+    return np.asarray(np.cumsum(kept)[stops - 1], np.float64)

@@ -70,8 +70,9 @@ def noise_in_use(
 
 def _of_motion(motion: MotionModel, odometry: Odometry | None) -> tuple[float, float]:
     """Deviations of the acceleration, degrees/s^2 and m/s^2, where the step stands on it."""
-    known = isinstance(motion, ConstantVelocityMotion | OdometryMotion)
-    if odometry is None or odometry.measured or not known:
+    if odometry is None or odometry.measured:
+        return math.nan, math.nan
+    if not isinstance(motion, ConstantVelocityMotion | OdometryMotion):
         return math.nan, math.nan
     rotation, translation = np.sqrt(motion.acceleration_variance.reshape(2, 3).mean(axis=1))
     return math.nan if odometry.turned else math.degrees(rotation), float(translation)

@@ -50,7 +50,7 @@ def write_calibration(
     columns = ["timestamp", "knocks"]
     columns += [f"{name}{part}" for name in changes for part in ("", "_sigma")]
     columns += [f"{name}{part}" for name in terms for part in ("", "_sigma", "_applied")]
-    rows = []
+    rows: list[list[str | int | float]] = []
     for step in calibration.steps:
         then = replace(known, values=step.values, covariance=step.covariance)
         of_terms = np.column_stack([step.values, then.sigmas, step.applied])
