@@ -30,6 +30,12 @@ GOALS = (
     Goal("kitti06", (), 0.15, None),
 )
 
+FINAL_GOALS = (
+    Goal("euroc_v101", ("estimator.kind=isam2", "compare=[]"), 0.015, None),
+    Goal("kitti06", ("estimator.kind=isam2", "compare=[]"), 0.055, None),
+)
+"""Of the final estimate of the default estimator, with the default front-end."""
+
 
 def reach(goal: Goal, data: Path = DATA) -> Run:
     """Runs one of the goals."""

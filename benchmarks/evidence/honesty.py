@@ -64,7 +64,7 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-class _Judged(NamedTuple):
+class Judged(NamedTuple):
     """Of one drive: mean numbers."""
 
     online: float
@@ -77,28 +77,31 @@ class _Judged(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Drive:
+class Drive:
+    """A simulated drive of the lab, whose log is replayed."""
+
     recording: MeasurementRecording
     ego_motion: EgoMotionSettings
 
     @staticmethod
-    def of(seed: int, *overrides: str) -> _Drive:
+    def of(seed: int, *overrides: str) -> Drive:
+        """The drive of a seed, with overrides of its experiment."""
         config = load_config(
             EXPERIMENTS / "lab_trials.yaml",
             (f"seed={seed}", f"dataset.stop={FRAMES}", *overrides),
         )
         assert isinstance(config.dataset, MeasurementDatasetSettings)
         recording = open_measurements(config.dataset, config.seed, config.odometry)
-        return _Drive(recording, config.frontend.ego_motion)
+        return Drive(recording, config.frontend.ego_motion)
 
-    def judged(self, settings: EstimatorSettings, log: MeasurementLog | None = None) -> _Judged:
+    def judged(self, settings: EstimatorSettings, log: MeasurementLog | None = None) -> Judged:
         """A replay's numbers; another log than the drive's own may be given."""
         of = self.recording
         played = replay(of.log if log is None else log, settings, self.ego_motion)
         found = judge_replay(played, Truth(of.ground_truth, of.landmark_truth)).metrics
         online: Any = found.more["online"]
         final: Any = found.more["coverage"]
-        return _Judged(
+        return Judged(
             online["nees_pose_per_dof"],
             100.0 * online["coverage"]["all"],
             found.nees_pose_per_dof or np.nan,
@@ -120,7 +123,7 @@ def noise_table(seeds: Sequence[int]) -> Table:
     for motion, drive in MOTION.items():
         for noise in NOISE:
             say(f"driving with noise {noise:g} and motion {motion:g} times the nominal")
-            drives = [_noisy(seed, noise, drive) for seed in seeds]
+            drives = [noisy_drive(seed, noise, drive) for seed in seeds]
             for kind, settings in SMOOTHERS.items():
                 cells = _means([each.judged(settings) for each in drives])
                 rows.append((motion, noise, f"`{kind}`", *cells))
@@ -134,7 +137,7 @@ def rig_table(seeds: Sequence[int]) -> Table:
     for name, log_of in (("exact", _exact), ("a pixel off", _off)):
         for kind, settings in EVERY.items():
             say(f"driving {kind} with a rig: {name}")
-            drives = [(seed, _Drive.of(seed)) for seed in seeds]
+            drives = [(seed, Drive.of(seed)) for seed in seeds]
             cells = _means(
                 [
                     drive.judged(settings, log_of(drive.recording.log, seed))
@@ -145,8 +148,9 @@ def rig_table(seeds: Sequence[int]) -> Table:
     return Table(f"A rig that is not exact, {len(seeds)} drives each", ("rig", "", *_COLUMNS), rows)
 
 
-def _noisy(seed: int, noise: float, drive: tuple[str, ...]) -> _Drive:
-    return _Drive.of(
+def noisy_drive(seed: int, noise: float, drive: tuple[str, ...]) -> Drive:
+    """Without odometry, noise of pixels times ``noise``; ``drive`` is one of MOTION."""
+    return Drive.of(
         seed,
         "odometry.kind=constant_velocity",
         f"dataset.detection.noise_scale={noise}",
@@ -154,7 +158,7 @@ def _noisy(seed: int, noise: float, drive: tuple[str, ...]) -> _Drive:
     )
 
 
-def _means(judged: list[_Judged]) -> tuple[Cell, ...]:
+def _means(judged: list[Judged]) -> tuple[Cell, ...]:
     return tuple(float(value) for value in np.mean(judged, axis=0))
 
 

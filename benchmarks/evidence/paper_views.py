@@ -70,6 +70,13 @@ def tables() -> list[Table]:
     ]
 
 
+def default_moves() -> BothMoves:
+    """Both small motions from every place of the drive, matched and tracked by defaults."""
+    lab = LabViews(experiment("lab_loop"))
+    triples = [lab.triple(i) for i in STARTS if i < len(lab.sequence)]
+    return _moves(lab, triples, _MODES["`descriptor` (default)"])
+
+
 # ----------------------------------------------------------------------------------------------
 # One view
 

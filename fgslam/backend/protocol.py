@@ -12,7 +12,7 @@ To add an estimator:
    object of it can be given to ``fgslam.Slam(rig, estimator=...)`` as it is.
 2. Where it can do more, add the members of :class:`Resumable` (interrupted runs),
    :class:`JointCovariances` or :class:`MapUser` (beginning in a saved map). What asks for them
-   refuses an estimator without, in one line.
+   refuses an estimator without, in one line. :class:`NoiseEstimating` is only shown.
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
    derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
    its family; add it to the union there, and one ``case`` to ``make_estimator`` in
@@ -179,6 +179,19 @@ class Recalibrated(Protocol):
         Called before that frame is predicted. Landmarks that were measured with another one, and
         are contradicted, move to where this one would have put them; those of a saved map stay.
         What is returned is not used.
+        """
+        ...
+
+
+@runtime_checkable
+class NoiseEstimating(Protocol):
+    """An estimator that finds from the drive how large its measurements' errors are; optional."""
+
+    @property
+    def noise_factors(self) -> tuple[float, float]:
+        """Factors on the stated deviations of measurements: of a single one, and as it is weighed.
+
+        The second is larger where errors persist from frame to frame.
         """
         ...
 

@@ -45,6 +45,7 @@ class EstimatorReport:
         remarks: what the estimator had to correct or leave out, in words.
         failure: why it ended early, with what it had until then, or gave nothing; else empty.
         predicted: (n,) poses that no landmark measured; None: not known.
+        noise: (n,) each, the columns of noise.csv; empty where nothing is known of it.
     """
 
     title: str
@@ -65,6 +66,7 @@ class EstimatorReport:
     remarks: tuple[str, ...] = ()
     failure: str = ""
     predicted: BoolArray | None = None
+    noise: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         n = len(self.timestamps)
@@ -83,6 +85,8 @@ class EstimatorReport:
                 raise ValueError(
                     f"{self.title}: {name} has shape {getattr(self, name).shape}, not {shape}"
                 )
+        if any(values.shape != (n,) for values in self.noise.values()):
+            raise ValueError(f"{self.title}: its noise is not one of {n} frames")
 
     def __len__(self) -> int:
         return len(self.timestamps)

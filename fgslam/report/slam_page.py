@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fgslam.report.content import Page
 from fgslam.report.figures.calibration import calibration_over_time
+from fgslam.report.figures.noise import noise_over_time
 from fgslam.report.figures.over_time import (
     error_by_axis,
     error_over_time,
@@ -48,6 +49,7 @@ def slam_page(data: ReportData) -> Page:
             error_by_axis(data),
             nees_over_time(data),
             time_per_frame(data),
+            *_noise(data),
             *_calibration(data),
         ),
         pictures=data.pictures,
@@ -60,6 +62,12 @@ def slam_page(data: ReportData) -> Page:
         config_yaml=data.config_yaml,
         versions=data.versions,
     )
+
+
+def _noise(data: ReportData) -> Iterator[Figure]:
+    """The noise estimated, where the run kept it."""
+    if any(estimator.noise for estimator in data.estimators):
+        yield noise_over_time(data)
 
 
 def _calibration(data: ReportData) -> Iterator[Figure]:

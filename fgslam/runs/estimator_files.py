@@ -5,22 +5,25 @@ from __future__ import annotations
 import csv
 import io
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import write_covariances
 from fgslam.report.point_cloud import MapPoints, write_ply
+from fgslam.report.tables import write_csv
+from fgslam.slam.noise_in_use import FrameNoise
 from fgslam.slam.replay import Replay, ReplayRow
 
 FRAMES_FILE = "frames.csv"
+NOISE_FILE = "noise.csv"
 _VALUE: dict[str, Callable[[str], Any]] = typing.get_type_hints(ReplayRow)
 """What makes a cell's text a value again."""
 
@@ -56,6 +59,14 @@ def write_replay(
     points = points_from_log(replay.estimate.landmarks, log, look)
     write_estimate(folder, replay.online, replay.estimate, points, remark)
     write_frames(folder / FRAMES_FILE, replay)
+    write_noise(folder / NOISE_FILE, replay.online.timestamps, replay.noise)
+
+
+def write_noise(path: Path, timestamps: FloatArray, noise: Sequence[FrameNoise]) -> None:
+    """Write noise.csv: time stamp, then a column for each name of :class:`FrameNoise`."""
+    stamped = zip(timestamps.tolist(), noise, strict=True)
+    rows = [(f"{stamp:.9f}", *values) for stamp, values in stamped]
+    write_csv(path, ("timestamp", *FrameNoise._fields), rows)
 
 
 def write_frames(path: Path, replay: Replay) -> None:

@@ -44,7 +44,14 @@ CAMERA_FILE = "camera.json"
 TRIALS_FILE = "trials.csv"
 TIMING_FILE = "trials_timing.csv"
 
-_ESTIMATOR_FILES = ("online.tum", "final.tum", "covariance.csv", "map.ply", "frames.csv")
+_ESTIMATOR_FILES = (
+    "online.tum",
+    "final.tum",
+    "covariance.csv",
+    "map.ply",
+    "frames.csv",
+    "noise.csv",
+)
 _RESULT_FILES = (
     RUN_MARKER,
     LOG_FILE,

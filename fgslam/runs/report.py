@@ -31,6 +31,7 @@ from fgslam.report.run_results import (
 )
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
+from fgslam.runs.estimator_files import NOISE_FILE
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.marks import SYNTHETIC, marked
 from fgslam.runs.metric_tables import page_tables
@@ -99,7 +100,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         versions=_versions(config),
         up=_up(_find(folders, LOG_FILE)),
         alignment="after SE3 alignment",
-        calibration=_calibration(_find(folders, CALIBRATION_FILE)),
+        calibration=_columns(_find(folders, CALIBRATION_FILE)),
     )
 
 
@@ -205,6 +206,7 @@ def _estimator(
         update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         failure=failure,
         predicted=_predicted(values.get("predicted_rows"), len(final)),
+        noise=_noise(folder / NOISE_FILE, final),
     )
 
 
@@ -214,6 +216,19 @@ def _predicted(rows: object, count: int) -> BoolArray:
     for row in rows if isinstance(rows, list) else ():
         if isinstance(row, int) and 0 <= row < count:
             out[row] = True
+    return out
+
+
+def _noise(path: Path, final: Trajectory) -> dict[str, FloatArray]:
+    """(n,) each, the columns of noise.csv at the path's time stamps; none where it is absent."""
+    found = _columns(path if path.is_file() else None)
+    if found is None or "timestamp" not in found:
+        return {}
+    # Files keep 9 decimals of a second, which makes time stamps of one frame equal.
+    rows, of = same_times(final.timestamps.round(9), found.pop("timestamp").round(9))
+    out = {name: np.full(len(final), np.nan) for name in found}
+    for name, values in found.items():
+        out[name][rows] = values[of]
     return out
 
 
@@ -261,13 +276,13 @@ def _live_times(path: Path | None) -> dict[float, float]:
     return out
 
 
-def _calibration(path: Path | None) -> dict[str, FloatArray] | None:
-    """The columns of calibration.csv; None where there is none, or nothing in it."""
+def _columns(path: Path | None) -> dict[str, FloatArray] | None:
+    """The columns of a table of numbers, NaN where empty; None where there is none, or no row."""
     if path is None:
         return None
     rows = list(csv.reader(io.StringIO(_text(path))))
     try:
-        values = np.array([[float(cell) for cell in row] for row in rows[1:]])
+        values = np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
         return dict(zip(rows[0], values.T, strict=True)) if len(values) else None
     except (IndexError, ValueError) as error:
         raise DatasetError(

@@ -91,6 +91,16 @@ class OdometryMotion:
         self._stand_in = stand_in
         self._gyroscope = GyroscopeError()
 
+    @property
+    def acceleration_variance(self) -> FloatArray:
+        """(6,) of the stand-in, as in :class:`ConstantVelocityMotion`."""
+        return self._stand_in.acceleration_variance
+
+    @property
+    def gyroscope_factor(self) -> float:
+        """By how much the deviation of turns exceeds what a gyroscope's noise states."""
+        return float(np.sqrt(self._gyroscope.noise_factor))
+
     def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
         """Camera motion by the odometry, or by the stand-in."""
         if body is None:
@@ -147,6 +157,11 @@ class ConstantVelocityMotion:
         self._founded = False
         self._pose = np.eye(4)
         self._velocity: FloatArray | None = None
+
+    @property
+    def acceleration_variance(self) -> FloatArray:
+        """(6,) of the random acceleration, [rotation, translation], rad^2/s^4 and m^2/s^4."""
+        return self._noise.variance
 
     def between(self, timestamp: float, body: Odometry | None = None) -> Odometry | None:
         """Motion at the last velocity over the new interval ``dt``.

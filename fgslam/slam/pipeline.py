@@ -31,6 +31,7 @@ from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
+from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
 from fgslam.slam.submaps.whole import LandmarkBook
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ class FrameReport:
     tracking: EgoMotion
     stats: UpdateStats
     stage_ms: dict[str, float]
+    noise: FrameNoise
 
 
 class Stopwatch:
@@ -153,6 +155,7 @@ class SlamPipeline:
         seen, self._ended = seen.without(self._ended), _nobody()
         increment = self._increment(index, timestamp, odometry, seen)
         stats = updated(self.estimator, increment, seen.tracking)
+        noise = noise_in_use(self.motion, odometry, self.tracker.noise, self.estimator)
         observe(self.motion, increment, seen.tracking, stats)
         self.tracker.noise.learn(seen.tracking)
         self._remember(increment, seen, stats)
@@ -166,7 +169,7 @@ class SlamPipeline:
         if self.submaps is not None:
             self.submaps.after(stats.wTc, described, any(stats.closed))
             watch.lap("places")
-        return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms)
+        return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms, noise)
 
     def founds(self, found: FeatureFrame, least: int) -> bool:
         """Whether a map could begin with the frame: it has ``least`` stereo matches, or more.

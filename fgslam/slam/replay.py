@@ -45,6 +45,7 @@ from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.bridging import bridged
 from fgslam.slam.factory import made_or_given
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel
+from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
 from fgslam.slam.pipeline import Stopwatch, observe
 from fgslam.slam.results import ESTIMATOR_FAULTS, estimate_of_failed, reason
 
@@ -81,6 +82,7 @@ class Replay(Brief):
         peak_memory_mb: its largest since the process began, the final estimate included.
         failure: empty, or at which frame and why the estimator ended early.
         closed: of the log's loop closures so far, in their order, whether it took them.
+        noise: that each frame was estimated with.
     """
 
     title: str
@@ -94,6 +96,7 @@ class Replay(Brief):
     peak_memory_mb: float
     failure: str = ""
     closed: tuple[bool, ...] = ()
+    noise: tuple[FrameNoise, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -110,6 +113,7 @@ class ReplayedFrame:
     tracking: EgoMotion
     stats: UpdateStats
     stage_ms: dict[str, float]
+    noise: FrameNoise
 
 
 @one_blas_thread()
@@ -176,10 +180,11 @@ def replay_frame(
         tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
     watch.lap("track")
     stats = updated(estimator, increment, tracking)
+    noise = noise_in_use(motion, increment.odometry, ego_motion.noise, estimator)
     observe(motion, increment, tracking, stats)
     ego_motion.noise.learn(tracking)
     watch.lap("update")
-    return ReplayedFrame(tracking, stats, watch.ms)
+    return ReplayedFrame(tracking, stats, watch.ms, noise)
 
 
 def _solve(
@@ -271,6 +276,7 @@ class _Replaying:
         self._covariances: list[FloatArray] = []
         self._rows: list[ReplayRow] = []
         self._closed: list[bool] = []
+        self._noise: list[FrameNoise] = []
         self._parts = MapParts()
 
     def book(self, increment: Increment, frame: ReplayedFrame) -> None:
@@ -281,6 +287,7 @@ class _Replaying:
         self._poses.append(np.array(stats.wTc))
         self._covariances.append(np.array(stats.covariance))
         self._closed += stats.closed
+        self._noise.append(frame.noise)
         self._parts.book(increment, stats.closed)
         self._rows.append(
             ReplayRow(
@@ -322,4 +329,5 @@ class _Replaying:
             peak_memory_mb=peak_memory_mb(),
             failure=failure,
             closed=tuple(self._closed),
+            noise=tuple(self._noise),
         )

@@ -18,6 +18,7 @@ from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajec
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
+from fgslam.slam.noise_in_use import FrameNoise
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 STAGES = (
@@ -67,6 +68,7 @@ class RunRecorder:
     online_covariances: list[FloatArray] = field(default_factory=list)
     stage_ms: list[FloatArray] = field(default_factory=list)
     frame_digests: list[int] = field(default_factory=list)
+    noise: list[FrameNoise] = field(default_factory=list)
     left_out: int = 0
     most_stereo: int = field(default=0, init=False)
 
@@ -87,6 +89,7 @@ class RunRecorder:
         frame = report.found.frame
         self.frame_digests.append(0 if frame is None else frame.digest())
         self.rows.append(row)
+        self.noise.append(report.noise)
         self.most_stereo = max(self.most_stereo, row.stereo)
 
     def column(self, name: str) -> npt.NDArray[Any]:
@@ -105,6 +108,7 @@ class RunRecorder:
         out["online_poses"] = np.array(self.online_poses).reshape(-1, 4, 4)
         out["online_covariances"] = np.array(self.online_covariances).reshape(-1, 6, 6)
         out["stage_ms"] = np.array(self.stage_ms).reshape(-1, len(STAGES))
+        out["noise"] = np.array(self.noise).reshape(-1, len(FrameNoise._fields))
         out["frame_digests"] = np.array(self.frame_digests, np.int64)
         return out
 
@@ -117,6 +121,7 @@ class RunRecorder:
         self.online_poses = list(state["online_poses"])
         self.online_covariances = list(state["online_covariances"])
         self.stage_ms = list(state["stage_ms"])
+        self.noise = [FrameNoise(*row) for row in state["noise"].tolist()]
         self.frame_digests = state["frame_digests"].tolist()
         self.log.continue_with(itertools.islice(log, len(self.rows)))
 
@@ -270,6 +275,7 @@ class SessionResult(Brief):
     def column(self, name: str) -> npt.NDArray[Any]:
         """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`...
 
+        With them the :class:`~fgslam.slam.noise_in_use.FrameNoise` of each.
         `connected` is False where a gap that nothing bridges lies between the first frame and it.
         """
         return self.frames[name]
@@ -341,6 +347,7 @@ def _columns(recorder: RunRecorder) -> dict[str, npt.NDArray[Any]]:
     times = np.array(recorder.stage_ms).reshape(-1, len(STAGES))
     stage = {name: times[:, k] for k, name in enumerate(STAGES)}
     columns = {name: recorder.column(name) for name in recorder.rows[0]._fields}
+    columns |= dict(zip(FrameNoise._fields, np.array(recorder.noise).T, strict=True))
     return columns | {
         "update_ms": stage["predict"] + stage["update"],
         "solve_ms": stage["track"],

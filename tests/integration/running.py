@@ -39,6 +39,7 @@ SAME_BYTES = (
     f"{KIND}/final.tum",
     f"{KIND}/covariance.csv",
     f"{KIND}/map.ply",
+    f"{KIND}/noise.csv",
 )
 """What the same configuration and seed must give to the byte."""
 HANGS_AFTER_S = 600.0

@@ -34,7 +34,14 @@ from fgslam.runs.run import run_experiment
 
 CONTRACT = set(EstimatorMetrics().as_json())
 FRAMES = 30
-ESTIMATOR_FILES = {"online.tum", "final.tum", "covariance.csv", "map.ply", "frames.csv"}
+ESTIMATOR_FILES = {
+    "online.tum",
+    "final.tum",
+    "covariance.csv",
+    "map.ply",
+    "frames.csv",
+    "noise.csv",
+}
 DRIVE: dict[str, Any] = {
     "name": "short_drive",
     "dataset": {"kind": "simulated_measurements", "stop": FRAMES, "detection": {"features": 40}},
@@ -147,7 +154,7 @@ def test_a_run_replays_its_own_log_to_the_bit(recording: Path, tmp_path: Path) -
     }
     run = run_values(values, tmp_path / "run")
     assert list(run.result.metrics["estimators"]) == ["live", "again"]
-    for name in SAME[:3]:
+    for name in (*SAME[:3], "noise.csv"):
         live, again = (run.folder / title / name for title in ("live", "again"))
         assert live.read_bytes() == again.read_bytes()
     live_map, again_map = (read_ply(run.folder / title / "map.ply") for title in ("live", "again"))

@@ -99,7 +99,10 @@ def test_errors_over_time_are_those_of_displaced_poses(run: Path) -> None:
 @pytest.mark.parametrize(
     "absent",
     ["ground_truth.tum", "timing.csv", "measurements.npz", "config.yaml"]
-    + [f"{KIND}/{name}" for name in ("online.tum", "covariance.csv", "map.ply", "final.tum")],
+    + [
+        f"{KIND}/{name}"
+        for name in ("online.tum", "covariance.csv", "map.ply", "final.tum", "noise.csv")
+    ],
 )
 def test_a_run_that_lacks_a_file_has_a_page(run: Path, absent: str) -> None:
     (run / absent).unlink()
@@ -116,6 +119,8 @@ def test_a_run_that_lacks_a_file_has_a_page(run: Path, absent: str) -> None:
         assert np.isnan(estimator.online_error_m).all()
     elif absent.endswith("covariance.csv"):
         assert "can be believed is not known" in text
+    elif absent.endswith("noise.csv"):
+        assert "Noise estimated" not in text
     elif absent == "timing.csv":
         assert np.isnan(estimator.update_ms).all()
 

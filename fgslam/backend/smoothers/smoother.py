@@ -126,6 +126,12 @@ class Smoother:
         """The solver's."""
         return self._solver.kind
 
+    @property
+    def noise_factors(self) -> tuple[float, float]:
+        """Factors on stated deviations: of a single measurement, and as the graph weighs them."""
+        noise = self._builder.noise
+        return float(np.sqrt(noise.spread)), float(np.sqrt(noise.power))
+
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
         return self._tracker.predict(odometry)

@@ -50,12 +50,13 @@ def write_calibration(
     columns = ["timestamp", "knocks"]
     columns += [f"{name}{part}" for name in changes for part in ("", "_sigma")]
     columns += [f"{name}{part}" for name in terms for part in ("", "_sigma", "_applied")]
-    rows = []
+    rows: list[list[str | int | float]] = []
     for step in calibration.steps:
         then = replace(known, values=step.values, covariance=step.covariance)
         of_terms = np.column_stack([step.values, then.sigmas, step.applied])
         pairs = [number for pair in then.changes().values() for number in pair]
-        rows.append([step.timestamp, step.knocks, *pairs, *of_terms.ravel().tolist()])
+        stamp = f"{step.timestamp:.9f}"  # of an epoch has more digits than a table's numbers
+        rows.append([stamp, step.knocks, *pairs, *of_terms.ravel().tolist()])
     write_csv(folder / CALIBRATION_FILE, columns, rows)
 
 

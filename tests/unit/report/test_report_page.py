@@ -138,6 +138,43 @@ def test_the_map_of_the_best_estimator_is_shown_first() -> None:
 # Figures
 
 
+def test_noise_is_drawn_where_it_is_known_each_kind_with_its_unit() -> None:
+    data = full_report(frames=20)
+    assert "noise" not in [figure.key for figure in slam_page(data).figures]
+    unknown = np.full(20, np.nan)
+    noise = {
+        "rotation_sigma_dps2": np.r_[np.nan, np.linspace(100.0, 5.0, 19)],
+        "translation_sigma_mps2": np.full(20, 0.4),
+        "gyroscope_factor": unknown,
+        "match_factor": np.ones(20),
+        "single_factor": np.full(20, 0.9),
+        "correlated_factor": np.full(20, 2.5),
+    }
+    figure = next(f for f in slam_page(with_values(data, noise=noise)).figures if f.key == "noise")
+    titles = [
+        figure.layout[axis]["title"]["text"] for axis in sorted(figure.layout) if "yaxis" in axis
+    ]
+    assert titles == [
+        "rotation (deg/s\u00b2)",
+        "translation (m/s\u00b2)",
+        "matches (\u00d7 stated)",
+        "graph (\u00d7 stated)",
+    ]
+    assert "isam2, weighed by" in {trace["name"] for trace in figure.traces}
+    drawn = unpacked(named(figure, "isam2, rotation")["y"])
+    np.testing.assert_allclose(drawn, noise["rotation_sigma_dps2"], rtol=1e-6)
+    assert {
+        named(figure, f"isam2, {words}")["yaxis"] for words in ("weighed by", "single measurement")
+    } == {"y4"}
+    assert not figure.note
+
+
+def test_without_noise_of_the_motion_the_page_says_that_it_was_measured() -> None:
+    figures = slam_page(with_values(full_report(20), noise={"match_factor": np.ones(20)})).figures
+    note = next(figure.note for figure in figures if figure.key == "noise")
+    assert note == "Motion was measured by odometry, with its stated noise."
+
+
 @pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.1, -0.9, 0.4), (1.0, 0.0, 0.0)])
 def test_level_axes_are_a_rotation_with_up_last(up: tuple[float, ...]) -> None:
     level = level_axes(np.array(up))

@@ -27,6 +27,7 @@ from fgslam.evaluation.judging import Truth
 from fgslam.evaluation.metrics import value_at
 from fgslam.runs.tasks.slam_metrics import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.noise_in_use import FrameNoise
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.results import STAGES, FrameRow, RunRecorder
 
@@ -72,7 +73,8 @@ def report(k: int, matches: int, problem: str = "") -> FrameReport:
     stats = UpdateStats(pose_at(k), np.eye(6) * 1e-4, 100 + k, float("nan"), 0)
     times = {"predict": 1.0, "stereo": 2.0, "track": 2.5, "places": 0.5, "update": 4.0 + k}
     times["calibrate"] = 0.0
-    return FrameReport(found, StereoFeatures.empty(), increment, tracking, stats, times)
+    noise = FrameNoise(match_factor=1.0 + k)
+    return FrameReport(found, StereoFeatures.empty(), increment, tracking, stats, times, noise)
 
 
 def recorder_of(count: int, bad: int = -1) -> RunRecorder:
@@ -138,6 +140,7 @@ def test_state_survives_a_file(count: int, tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.online_poses, before.online_poses)
     np.testing.assert_array_equal(after.online_covariances, before.online_covariances)
     np.testing.assert_array_equal(after.stage_ms, before.stage_ms)
+    np.testing.assert_array_equal(after.noise, before.noise)
 
 
 def test_a_restored_recorder_goes_on_and_drops_what_came_after_the_state() -> None:
@@ -149,6 +152,7 @@ def test_a_restored_recorder_goes_on_and_drops_what_came_after_the_state() -> No
         after.add(report(k, 10 + k), 5.0, float("nan"))
     for name in ("status", "features", "matched", "landmarks"):
         np.testing.assert_array_equal(after.column(name), late.column(name))
+    assert [row.match_factor for row in after.noise] == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     assert len(late.log) == 6
 
 
