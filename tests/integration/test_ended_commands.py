@@ -18,10 +18,9 @@ from recordings import experiment
 from running import HANGS_AFTER_S, main, run_values
 from test_resume_run import write_config
 
-from tests.textured_room import SMALL_CAMERA_FILE, folder_of
-
 from fgslam.runs.config import make_experiment
 from fgslam.runs.run import run_experiment
+from tests.textured_room import SMALL_CAMERA_FILE, folder_of
 
 pytestmark = pytest.mark.slow
 
