@@ -20,8 +20,7 @@ from fgslam.report.slam_page import write_report
 
 FIGURES = ("above", "map", "error", "axes", "nees", "time")
 FARTHEST_PLOT = (
-    "Math.max(...[...document.querySelectorAll('.plot')]"
-    ".map(p => p.getBoundingClientRect().right))"
+    "Math.max(...[...document.querySelectorAll('.plot')].map(p => p.getBoundingClientRect().right))"
 )
 DRAWN = "document.getElementById('plot-{}')._fullData"
 
