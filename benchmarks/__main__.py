@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.evidence import (
     chess,
     drives,
+    euroc_raw,
     false_matches,
     honesty,
     hybrid,
@@ -49,6 +50,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "variants": lambda data: [variants.table(data)],
     "paired": lambda data: [variants.paired_table()],
     "real": lambda data: [drives.real_table(data)],
+    "euroc_raw": euroc_raw.tables,
     "hybrid": hybrid.tables,
     "light": light.tables,
     "false_matches": lambda data: false_matches.tables(),
