@@ -35,6 +35,7 @@ _STATED_NOISE = float(WINDOW)
 _LEAST_DEG = 0.1  # turns below are followed by the self-calibration
 _UNKNOWN_RAD = 0.05  # deviation of a turn's prior: none to speak of
 _TOLD_SIGMAS = 3.0
+_TOLD_DEG = 0.05  # about an axis beside the largest
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +60,8 @@ class Turns:
     def known(self) -> tuple[FloatArray, FloatArray]:
         """The turns (c, 3), and their covariance (c, 3, 3) by the points' own noise."""
         covariance = np.linalg.inv(self.information + np.eye(3) / _UNKNOWN_RAD**2)
-        return np.einsum("cij,cj->ci", covariance, self.score), covariance
+        turns = np.einsum("cij,cj->ci", covariance, self.score)
+        return np.asarray(turns, np.float64), np.asarray(covariance, np.float64)
 
 
 def turns_of(
@@ -87,13 +89,14 @@ def _turn_of(
     first = len(TERMS) * (camera - 1)
     unit = camera_displacements(rig, camera, place)[:, across, first : first + len(TERMS)]
     design = unit[:, _COLUMNS]
-    found, information = np.zeros(3), np.zeros((3, 3))
+    found: FloatArray = np.zeros(3)
     for _ in range(_ROUNDS):
         residual = offset - design @ found
         spread = max(spread_px, 1.4826 * middle(np.abs(residual)))
         weighted = design.T / (spread**2 * (1.0 + (residual / (_KERNEL * spread)) ** 2))
         information = weighted @ design
-        found = np.linalg.solve(information + np.eye(3) / _UNKNOWN_RAD**2, weighted @ offset)
+        known = information + np.eye(3) / _UNKNOWN_RAD**2
+        found = np.asarray(np.linalg.solve(known, weighted @ offset), np.float64)
     return information, weighted @ offset
 
 
@@ -163,7 +166,9 @@ class TurnWatch:
     def _told(self, knock: Knock, change: FloatArray, covariance: FloatArray, noise: float) -> str:
         camera, turn, spread = _who(change, noise * covariance)
         sigma = np.sqrt(np.diag(spread))
-        sure = [k for k in np.argsort(-np.abs(turn)) if abs(turn[k]) > _TOLD_SIGMAS * sigma[k]]
+        order = np.argsort(-np.abs(turn)).tolist()
+        least = np.maximum(_TOLD_SIGMAS * sigma, np.deg2rad(_TOLD_DEG))
+        sure = [k for k in order if abs(turn[k]) > least[k]] or order[:1]
         parts = ", ".join(
             f"{np.rad2deg(turn[k]):.2f} degrees in {_AXES[k]} ({abs(turn[k]) / sigma[k]:.0f} sigma)"
             for k in sure

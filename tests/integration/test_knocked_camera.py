@@ -38,9 +38,10 @@ def knocked_recording(root: Path, cameras: int, name: str, axis: int) -> Path:
             shown = image
             if folder == name and k >= KNOCKED_AT:
                 size = (rig.width, rig.height)
-                shown = cv2.warpPerspective(
+                turned = cv2.warpPerspective(
                     image, homography, size, borderMode=cv2.BORDER_REPLICATE
                 )
+                shown = np.asarray(turned, np.uint8)
             assert cv2.imwrite(str(root / folder / f"{k:06d}.png"), shown)
     lines = "".join(f"{k:06d} {t:.6f}\n" for k, t in enumerate(stamps))
     (root / "times.txt").write_text(lines, encoding="utf-8")

@@ -56,7 +56,7 @@ def said_of(rig: CameraRig, frames: list[Images], camera: int, turn_deg: FloatAr
 
 
 def about(axis: int) -> FloatArray:
-    return TURN_DEG * np.eye(3)[axis]
+    return np.asarray(TURN_DEG * np.eye(3)[axis], np.float64)
 
 
 def cases() -> Iterator[ParameterSet]:
