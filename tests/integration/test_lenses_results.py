@@ -21,7 +21,7 @@ UNSEEN = {"output.pictures": False, "output.report": False}
 
 @pytest.mark.parametrize("cameras", [2, 3])
 def test_the_rig_behind_the_lab_s_lenses_is_the_ideal_one(cameras: int) -> None:
-    """Turns of up to 1.1 degrees and distortion are taken out; what is left has the lab's view."""
+    """Turns of up to 1.4 degrees and distortion are taken out; what is left has the lab's view."""
     ideal = make_rig(LabRigSettings())
     rig = loaded(raw_cameras(ideal)[:cameras])
     assert rig.rectifier is not None
