@@ -14,6 +14,7 @@ from fgslam.core.arrays import Image
 from fgslam.core.estimates import EgoMotionStatus, Trajectory
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
@@ -91,8 +92,12 @@ class FoundFeatures:
 def find_features(config: ExperimentConfig) -> FoundFeatures:
     """Opens the recording and finds the features of all frames."""
     say(f"finding the features of {config.name} (seed {config.seed})")
-    sequence = open_sequence(config)
-    stream = make_stream(sequence, config.frontend)()
+    return found_features(open_sequence(config), config.frontend)
+
+
+def found_features(sequence: Sequence, settings: FrontendSettings) -> FoundFeatures:
+    """Features of all frames of a recording."""
+    stream = make_stream(sequence, settings)()
     try:
         return FoundFeatures(sequence, list(stream))
     finally:

@@ -38,6 +38,7 @@ _FLAGS = (
 )
 _LOCAL = ("file:", "data:", "blob:", "about:", "chrome:", "chrome-untrusted:")
 WIDE = (1400, 900)
+LAPTOP = (1280, 800)
 PHONE = (390, 844)
 
 

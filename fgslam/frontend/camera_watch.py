@@ -1,4 +1,4 @@
-"""Watches the cameras of a rig: one that delivers old images, swapped ones, one that is darker.
+"""Watches the cameras of a rig: one that delivers old images, swapped, darker or knocked ones.
 
 Each frame's images are compared with each other and with those of the frame before, whatever the
 front-end makes of them. docs/derivations/camera_faults.md.
@@ -25,6 +25,7 @@ from fgslam.frontend.image_lag import (
     followed,
     spread_of,
 )
+from fgslam.frontend.turned_cameras import TurnWatch
 
 _WIDE_PX = 400  # wider images are made smaller
 _SURE = 5.0  # deviations: by chance once in three million frames
@@ -62,6 +63,7 @@ class CameraWatch:
         self._factor = max(1, math.ceil(rig.width / _WIDE_PX))
         self._spread = spread_of(self._factor)
         self._pairs = [_Pair(LagModel(rig, c), ([], []), []) for c in range(1, rig.cameras)]
+        self._turns = TurnWatch(rig, self._spread)
         self._late = [False] * rig.cameras
         self._before: list[Image] = []
         self._sums = [-1] * rig.cameras
@@ -76,6 +78,7 @@ class CameraWatch:
         across = [followed(now.images[0], other, points) for other in now.images[1:]]
         shown = np.logical_or.reduce([kept for _, kept in across])
         moved: Followed | None = None
+        lines: list[tuple[FloatArray, FloatArray]] = []
         for camera, (pair, (found, kept)) in enumerate(zip(self._pairs, across, strict=True), 1):
             here, there = points[kept], found[kept]
             self._order(pair, self._factor * (there - here)[:, camera - 1])
@@ -83,16 +86,26 @@ class CameraWatch:
                 swapped = (
                     f"the images of the right and the {CAMERA_NAMES[camera]} camera are swapped"
                 )
+            offset = self._factor * (there - here)[:, pair.model.across]
+            lines.append((offset, self._factor * there))
             self._weigh(pair, now.grey[0], now.grey[camera], here, there)
             if self._before and not repeated and not swapped:
                 moved = moved or _followed_of(now.images[0], self._before[0], points, shown)
                 self._judge(camera, now, (here, there), (moved[0][kept], moved[1][kept]))
+        fault = repeated or swapped or self._old()
+        if not fault:
+            self._turns.take(self._frames, *zip(*lines, strict=True))
         self._before, self._frames = now.images, self._frames + 1
-        return repeated or swapped or self._old()
+        return fault
+
+    @property
+    def knocked(self) -> bool:
+        """Whether a camera was turned during the drive."""
+        return bool(self._turns.knocks)
 
     def remarks(self) -> tuple[str, ...]:
         """What is to be said of images that are used all the same."""
-        out = []
+        out = list(self._turns.remarks())
         for camera, pair in enumerate(self._pairs, 1):
             if pair.unequal:
                 out.append(
@@ -206,6 +219,7 @@ class CameraWatch:
             "swapped": np.array([pair.swapped for pair in self._pairs]),
             "before": np.array(self._before, np.uint8),
         }
+        out |= {f"turns/{name}": value for name, value in self._turns.state().items()}
         for k, pair in enumerate(self._pairs):
             out[f"{k}/ratios"] = np.array(pair.ratios, np.float64)
             out[f"{k}/unequal"] = np.array(pair.unequal)
@@ -221,6 +235,8 @@ class CameraWatch:
         self._sums = state["sums"].tolist()
         self._frames = int(state["frames"])
         self._before = list(state["before"])
+        own = [name for name in state if name.startswith("turns/")]
+        self._turns.restore({name.removeprefix("turns/"): state[name] for name in own})
         for k, pair in enumerate(self._pairs):
             pair.swapped = bool(state["swapped"][k])
             pair.ratios = state[f"{k}/ratios"].tolist()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import PHONE, WIDE, Browser, browsing
+from browser import LAPTOP, PHONE, WIDE, Browser, browsing
 from reports import HOSTILE, estimator_report, full_report, loop, without_truth
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
@@ -19,6 +19,9 @@ from fgslam.report.run_results import EstimatorReport, ReportData
 from fgslam.report.slam_page import write_report
 
 FIGURES = ("above", "map", "error", "axes", "nees", "time")
+FARTHEST_PLOT = (
+    "Math.max(...[...document.querySelectorAll('.plot')].map(p => p.getBoundingClientRect().right))"
+)
 DRAWN = "document.getElementById('plot-{}')._fullData"
 
 
@@ -247,6 +250,24 @@ def test_a_foreign_script_is_refused_by_the_page(browser: Browser) -> None:
     )
     assert browser.js("window.ran === undefined") is True
     assert any("Content Security Policy" in line for line in browser.complaints())
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_laptop_shows_tables_and_figures_whole(browser: Browser, scheme: str) -> None:
+    browser.scheme(scheme)
+    browser.size(*LAPTOP)
+    browser.wait(f"({FARTHEST_PLOT}) <= {LAPTOP[0]}")
+    assert browser.js("innerWidth") == LAPTOP[0]
+    assert browser.js("document.documentElement.scrollWidth") <= LAPTOP[0]
+    tables = browser.js(
+        "[...document.querySelectorAll('.scroll')].map(b => [b.scrollWidth, b.clientWidth])"
+    )
+    assert tables
+    assert all(content <= box for content, box in tables)
+    narrowest = browser.js(
+        "Math.min(...[...document.querySelectorAll('.plot')].map(p => p.clientWidth))"
+    )
+    assert narrowest > 300  # as wide as a phone shows it
 
 
 def test_a_phone_scrolls_the_table_and_not_the_page(browser: Browser, page: Path) -> None:

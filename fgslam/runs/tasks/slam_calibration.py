@@ -86,13 +86,18 @@ def calibration_numbers(calibration: SelfCalibration) -> dict[str, JsonValue]:
     }
 
 
-def calibration_note(calibration: SelfCalibration | None) -> str:
-    """What the drive showed of the calibration, in a sentence; empty where it showed nothing."""
+def calibration_note(calibration: SelfCalibration | None, knocked: bool = False) -> str:
+    """What the drive showed of the calibration, in a sentence; empty where it showed nothing.
+
+    ``knocked``: a camera was seen to be turned; then no calibration holds for the whole drive.
+    """
     if calibration is None or not calibration.windows:
         return ""
     found = calibration.found
     knocks = f"; the rig moved {calibration.knocks} times on the way" * bool(calibration.knocks)
     if found.probabilities["exact"] > 0.5:
+        if knocked:
+            return ""
         return f"the drive agrees with the rig's calibration{knocks}{_field(calibration)}"
     parts = [text for camera in ("left", "top") if (text := _told(found.estimated, camera))]
     rms = found.applied.rms_px()

@@ -261,7 +261,9 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     lines += problems[:_PROBLEMS_SHOWN]
     if len(problems) > _PROBLEMS_SHOWN:
         lines.append(f"and {len(problems) - _PROBLEMS_SHOWN} more such frames, see metrics.json")
-    if note := calibration_note(outputs.pipeline.calibration):
+    watch = outputs.pipeline.watch
+    knocked = watch is not None and watch.knocked
+    if note := calibration_note(outputs.pipeline.calibration, knocked):
         lines.append(note)
     if not metrics.landmarks:
         lines.append(

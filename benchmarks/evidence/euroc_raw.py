@@ -1,0 +1,70 @@
+"""EuRoC as its cameras gave it against the pairs that others rectified at half the size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.runs import (
+    DATA,
+    FoundFeatures,
+    experiment,
+    find_features,
+    make_system,
+    process,
+    say,
+    trajectory_error,
+)
+from benchmarks.tables import Cell, Table
+from fgslam.core.arrays import FloatArray
+from fgslam.core.threads import one_blas_thread
+
+SEEDS = range(3)
+"""Of the synthetic odometry; both sets get errors of the same draws."""
+ESTIMATORS = {
+    "isam2": ("estimator.kind=isam2",),
+    "batch": ("estimator.kind=batch",),
+    "landmark_kalman": ("estimator.kind=landmark_kalman",),
+}
+_RAW = "euroc_v101_raw"
+
+_COLUMNS = (
+    "estimator", "ATE cm, rectified at half the size", "ATE cm, raw", "raw over rectified",
+    "standard error of that", "located, rectified", "located, raw",
+)  # fmt: skip
+
+
+def tables(data: Path = DATA, seeds: Sequence[int] = SEEDS) -> list[Table]:
+    """One row an estimator, means over the seeds."""
+    found = np.array([_both(data, seed) for seed in seeds])  # (seeds, sets, estimators, 2)
+    rows: list[tuple[Cell, ...]] = []
+    for k, name in enumerate(ESTIMATORS):
+        ates, located = found[:, :, k, 0], found[:, :, k, 1].mean(axis=0)
+        half, raw = ates.mean(axis=0).tolist()
+        spread = (ates[:, 1] - ates[:, 0]).std(ddof=1) if len(ates) > 1 else np.nan
+        error = float(spread / np.sqrt(len(ates)) / half)
+        rows.append((name, half, raw, raw / half, error, *located.tolist()))
+    return [Table(f"EuRoC V1_01, raw and rectified, {len(seeds)} draws", _COLUMNS, rows)]
+
+
+def _both(data: Path, seed: int) -> FloatArray:
+    return np.array([of_set(data, seed, raw, ESTIMATORS) for raw in (False, True)])
+
+
+@one_blas_thread()
+def of_set(data: Path, seed: int, raw: bool, estimators: Iterable[str]) -> FloatArray:
+    """(estimators, 2) ATE in cm after SE3 alignment, and share of frames located, of one set."""
+    where = (f"dataset={{kind: euroc, path: {data / _RAW}}}",) if raw else ()
+    base = (*where, f"seed={seed}", "compare=[]")
+    found = find_features(experiment("euroc_v101", base, data))
+    say(f"{found.sequence.name}: {len(found.frames)} pairs")
+    return np.array([_judged(found, (*base, *ESTIMATORS[name]), data) for name in estimators])
+
+
+def _judged(found: FoundFeatures, overrides: Iterable[str], data: Path) -> tuple[float, float]:
+    pipeline = make_system(experiment("euroc_v101", overrides, data), found.sequence)
+    measured = [report.tracking.status.measured for report in process(found, pipeline)][1:]
+    ate = trajectory_error(pipeline, found.sequence).ate_rmse_m
+    return float("nan") if ate is None else 100.0 * ate, float(np.mean(measured))
