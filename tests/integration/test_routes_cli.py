@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -162,6 +163,58 @@ def test_another_drive_follows_it(
     again = tmp_path / "again"
     assert main(monkeypatch, "run", tmp_path / "run" / RUN_MARKER, "--out", again) == 0
     assert (again / "follow.csv").read_bytes() == (tmp_path / "run" / "follow.csv").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def followed(taught: Path, data: Path) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        assert main(patch, "follow", taught, data / "again", "--out", data / "followed") == 0
+    return data / "followed"
+
+
+def shown_in(film: Path) -> list[np.ndarray]:
+    frames = cv2.VideoCapture(str(film))
+    return [frame.astype(int) for ok, frame in iter(frames.read, (False, None)) if ok]
+
+
+def test_a_film_shows_image_path_image_and_the_way_home(
+    followed: Path, data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    film, pictured = tmp_path / "way.mp4", tmp_path / "pictured.mp4"
+    assert main(monkeypatch, "film", followed, film) == 0
+    assert "way.mp4: 5 frames" in capfd.readouterr().out
+    frames = shown_in(film)
+    assert [frame.shape for frame in frames] == [(720, 1280, 3)] * 5
+    rows = rows_of(followed / "follow.csv")
+    for frame, row in zip(frames, rows, strict=True):
+        blue, green, red = np.moveaxis(frame[360:600, 800:], 2, 0)  # arrow and command
+        arrow = ((red > 190) & (np.abs(green - 150) < 40) & (blue < 80)).any()
+        assert arrow == bool(row["direction_deg"])
+    assert (np.abs(frames[1] - frames[0])[:600, :760].max(axis=2) > 60).any()  # the image
+    assert main(monkeypatch, "film", followed, pictured, "--taught", data / "taught") == 0
+    panel = np.abs(shown_in(pictured)[0] - frames[0]).max(axis=2) > 60
+    assert panel[60:300, 820:].mean() > 0.1  # the path image's picture
+    assert panel[:, :760].mean() < 0.01
+
+
+def test_mistakes_of_a_film_of_a_route(
+    taught: Path, followed: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    film = ("film", followed, tmp_path / "way.gif")
+    assert "leave out --estimator" in mistake(capfd, monkeypatch, *film, "--estimator", "isam2")
+    assert "give its --report" in mistake(capfd, monkeypatch, *film, "--taught", tmp_path)
+    said = mistake(capfd, monkeypatch, *film, "--taught", followed)
+    assert "task is follow, which this does not take" in said
+    config = followed / RUN_MARKER
+    kept, route = config.read_text(encoding="utf-8"), tmp_path / "other.fgpath"
+    path = PathMemory.load(taught)
+    replace(path, names=tuple(f"{name} again" for name in path.names)).save(route)
+    config.write_text(kept.replace(str(taught), str(route)), encoding="utf-8")
+    try:
+        assert "was taught anew since it was followed" in mistake(capfd, monkeypatch, *film)
+    finally:
+        config.write_text(kept, encoding="utf-8")
+    assert not (tmp_path / "way.gif").exists()
 
 
 def test_another_place_is_said(
