@@ -59,7 +59,8 @@ class Followed:
         rows = _rows(run / FOLLOW_FILE)
         _require_same_route(rows, path, config.route)
         recording = recording_along(config, path)
-        return Followed(rows, path, recording, taught and _taught_recording(taught, path))
+        driven = None if taught is None else _taught_recording(taught, path)
+        return Followed(rows, path, recording, driven)
 
     @property
     def times(self) -> FloatArray:
