@@ -66,6 +66,7 @@ def numbers(pattern: re.Pattern[str], said: str) -> list[int]:
     return [int(one) for one in match.groups()]
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_map_while_the_bag_plays(
     tmp_path: Path, record_property: Callable[[str, object], None]
 ) -> None:

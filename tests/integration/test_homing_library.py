@@ -227,6 +227,20 @@ def test_a_robot_that_is_carried_off_is_lost_finds_its_place_again_and_reaches_t
     assert robot.follower.legs[-1].result == "arrived"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("back", [False, True])
+def test_the_experiment_of_crossroads_drives_over_both_routes(tmp_path: Path, back: bool) -> None:
+    """Its shortest pair of routes, nine path images each: there, and back."""
+    given = {"seed": 6, "trials": 1, "back": back, "output.report": False, "output.pictures": 0}
+    result = fg.run("crossroads", tmp_path / "run", given)
+    assert result.status == "finished"
+    assert result.metrics["arrived"] == result.metrics["drives"] == 1
+    assert result.metrics["false_arrivals"] == 0
+    legs = rows(tmp_path / "run" / "legs.csv")
+    assert len(legs) >= 4
+    assert legs[-1]["result"] == "arrived"
+
+
 def test_a_follower_by_default_has_the_settings_of_the_driving_experiments() -> None:
     for name in ("homing_lab", "path_following"):
         values = yaml.safe_load(Path(f"experiments/{name}.yaml").read_text(encoding="utf-8"))
