@@ -17,6 +17,7 @@ from typing import Any
 
 from benchmarks.evidence import (
     chess,
+    compact_memory,
     drives,
     euroc_raw,
     false_matches,
@@ -63,6 +64,7 @@ EVIDENCE: dict[str, Callable[[Path], Iterable[Table]]] = {
     "sizes": lambda data: sizes.tables(),
     "street": lambda data: street.tables(),
     "visits": lambda data: visits.tables(),
+    "compact_memory": lambda data: compact_memory.tables(),
     "wrong_mirror": lambda data: wrong_mirror.tables(),
     "unmapped": lambda data: relocalising.unmapped_tables(),
     "recognised": relocalising.recognised_tables,

@@ -16,6 +16,8 @@ import time
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 
+import numpy as np
+
 import fgslam as fg
 from fgslam.runs.library import RecordedFrames
 
@@ -67,15 +69,17 @@ def main() -> None:
     """Tracks until the camera ends or Ctrl-C is pressed; then saves the map."""
     here, there = get_context("spawn").Pipe(duplex=False)
     get_context("spawn").Process(target=camera, args=(there,), daemon=True).start()
-    frames = fg.NewestFrame()
+    source, frames, in_time = recording(), fg.NewestFrame(), 0
+    frame_ms = 1e3 * float(np.median(np.diff(source.timestamps))) / SPEED
     threading.Thread(target=receive, args=(here, frames), daemon=True).start()
-    slam = fg.Slam(recording().rig, estimator="landmark_kalman")
+    slam = fg.Slam(source.rig, estimator="landmark_kalman")
     try:
         for t, images, odometry in frames:
             began = time.perf_counter()
             step = slam.track(t, images, odometry)
             x, _, z = step.wTc[:3, 3]
             milliseconds = 1e3 * (time.perf_counter() - began)
+            in_time += milliseconds <= frame_ms
             print(
                 f"{t:5.2f} s  {step.status.value:5}  x {x:6.3f} z {z:6.3f} m  {milliseconds:.0f} ms"
             )
@@ -85,9 +89,9 @@ def main() -> None:
         return  # before the first frame
     result = slam.result()
     result.map.save("live.fgmap")  # to begin in next time
-    print(
-        f"{len(result.trajectory)} frames, {frames.dropped} left out, {len(result.map)} landmarks"
-    )
+    count = len(result.trajectory)
+    print(f"{count} frames, {frames.dropped} left out, {len(result.map)} landmarks")
+    print(f"{100.0 * in_time / count:.0f} % of the poses within the frame time, {frame_ms:.0f} ms")
 
 
 if __name__ == "__main__":

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from PIL import Image as PictureFile
 from scipy import ndimage
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.sensors import CameraRig
 
 CAMERA = Equirectangular(601, 181, np.deg2rad(54.0), np.deg2rad(-54.0))
 SMALL_CAMERA = {"kind": "equirectangular", "top_elevation_deg": 54, "bottom_elevation_deg": -54}
@@ -53,7 +55,23 @@ def picture(pose: FloatArray) -> Image:
     """(h, w, 3) what the camera sees from a planar pose (3,)."""
     columns, rows = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
     pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
-    points = hits(pose, CAMERA.rays(pixels))
+    grey = greys(pose, CAMERA.rays(pixels)).reshape(CAMERA.height, CAMERA.width)
+    return np.repeat(grey[:, :, None], 3, axis=2)
+
+
+def stereo(pose: FloatArray, rig: CameraRig) -> tuple[Image, Image]:
+    """(h, w) what a right and a left camera see that look ahead, the right one at the pose (3,)."""
+    columns, rows = np.meshgrid(np.arange(rig.width), np.arange(rig.height))
+    across, down = (columns.ravel() - rig.cx) / rig.fx, (rows.ravel() - rig.cy) / rig.fy
+    rays = np.column_stack([np.ones(len(across)), -across, -down])
+    beside = rig.baseline * np.array([-np.sin(pose[2]), np.cos(pose[2]), 0.0])
+    right, left = (greys(at, rays).reshape(rows.shape) for at in (pose, pose + beside))
+    return right, left
+
+
+def greys(pose: FloatArray, rays: FloatArray) -> npt.NDArray[np.uint8]:
+    """(n,) what is seen along rays (n, 3), x forward, y left, z up, from a planar pose (3,)."""
+    points = hits(pose, rays)
     east_or_west = np.abs(points[:, 0]) > np.abs(points[:, 1])
     # Places along the walls, each wall with its own stretch of the texture.
     side = np.where(east_or_west, points[:, 1], points[:, 0])
@@ -62,8 +80,7 @@ def picture(pose: FloatArray) -> Image:
     grey = ndimage.map_coordinates(
         TEXTURE, np.stack([points[:, 2] * _A_METRE, u]), order=1, mode="grid-wrap"
     )
-    flat = np.round(grey).astype(np.uint8).reshape(CAMERA.height, CAMERA.width)
-    return np.repeat(flat[:, :, None], 3, axis=2)
+    return np.asarray(np.round(grey), np.uint8)
 
 
 def seen_at(metres: float, across: float = 0.4) -> Image:

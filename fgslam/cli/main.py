@@ -14,6 +14,7 @@ import typer
 from fgslam.cli import options, routes, signals
 from fgslam.cli.calibrate import app as calibrate_app
 from fgslam.cli.camera import app as camera_app
+from fgslam.cli.filming import film
 from fgslam.cli.performing import (
     EXIT_FAULT,
     existing_folder,
@@ -319,21 +320,7 @@ def export(
         typer.echo(line)
 
 
-@app.command()
-def film(
-    run_folder: options.RunToView,
-    out: Annotated[Path, typer.Argument(metavar="FILE", help="the film, .mp4 or .gif")],
-    estimator: Annotated[
-        str | None, typer.Option(help="whose path and map; default the one that steered")
-    ] = None,
-) -> None:
-    """Make a film of a run: images with their matches, beside the map as it grows."""
-    from fgslam.cli.console import progress_bar
-    from fgslam.runs.film import film_of_run
-
-    with progress_bar() as progress:
-        line = film_of_run(run_folder, out, estimator, progress)
-    typer.echo(line)
+app.command()(film)
 
 
 @app.command()

@@ -53,6 +53,28 @@ def camera_pairs(names: Iterable[str], any_number: bool = True) -> tuple[tuple[s
     return tuple(sorted(found))
 
 
+def camera_trio(names: Iterable[str]) -> tuple[str, ...]:
+    """Of three names that differ in the side alone those of left, right and third; () of others.
+
+    The third is called top, or t beside l and r; or all three have numbers that follow each other.
+    """
+    given = set(names)
+    pairs = camera_pairs(given) if len(given) == 3 else ()
+    for left, right in pairs:
+        (third,) = given - {left, right}
+        if (right, third) in pairs or third.lower() in _called_top(left):
+            return left, right, third
+    return ()
+
+
+def _called_top(left: str) -> set[str]:
+    """Names of a third camera beside a left one, in lower case."""
+    found = [m for pattern in (_WORD, _LETTER) for m in pattern.finditer(left)]
+    top = {1: "t", 4: "top"}
+    return {f"{left[: m.start(1)]}{top[len(m[1])]}{left[m.end(1) :]}".lower() for m in found
+            if m[1][0] in "lL"}  # fmt: skip
+
+
 def _readings(name: str, any_number: bool) -> Iterable[tuple[tuple[str, str], int]]:
     """What the name is without its side, and the side as a number, in each way to read it."""
     for pattern in (_WORD, _LETTER):

@@ -22,7 +22,7 @@ Rig = TypeVar("Rig", bound=CameraRig)
 
 
 def calibrated_rig(
-    settings: CalibratedSettings, own: Path, size: tuple[int, int] | None
+    settings: CalibratedSettings, own: Path, size: tuple[int, int] | None, pair: bool = True
 ) -> StereoRig:
     """The rig by the file that the settings name, else by the recording's own file or folder.
 
@@ -30,14 +30,16 @@ def calibrated_rig(
         settings: of the recording.
         own: the recording's file or folder of calibration.
         size: width and height of the images, for formats that do not state it.
+        pair: whether they are of two cameras; else of three.
 
     Raises:
         CalibrationError: there is no calibration, or it cannot be used.
     """
     if settings.camera_file is not None:
-        return mounted(loaded_rig(settings, Path(settings.camera_file), size=size), settings)
+        file = Path(settings.camera_file)
+        return mounted(loaded_rig(settings, file, size=size, pair=pair), settings)
     try:
-        return mounted(loaded_rig(settings, own, size=size), settings)
+        return mounted(loaded_rig(settings, own, size=size, pair=pair), settings)
     except CalibrationError as fault:
         if not str(fault).startswith(f"{own}:"):  # of a file in it: that is there, and at fault
             raise

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
-from fgslam.core.sides import camera_pairs, is_view
+from fgslam.core.sides import camera_pairs, camera_trio, is_view
 from fgslam.datasets.loose_files import (
     IMAGE_SUFFIXES,
     find_cameras,
@@ -328,17 +328,20 @@ VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg
 
 
 def films_in(given: Path) -> list[Path]:
-    """The film or the two that a file, folder or pattern means, left first; none where unclear."""
+    """The film, or the left, right[, third] one, of a file, folder or pattern; none if unclear."""
     within = sorted(shown_in(given), key=natural) if given.is_dir() else files_of(given)
     films = {p.name: p for p in within if p.suffix.lower() in VIDEO_ENDINGS and p.is_file()}
     pairs = camera_pairs(films)
     if len(films) == 1:
         return list(films.values())
+    if len(films) == 3:
+        return [films[name] for name in camera_trio(films)]
     return [films[name] for name in pairs[0]] if len(pairs) == 1 and len(films) == 2 else []
 
 
 def _lacking_of_video(folder: Path) -> tuple[str, ...]:
-    return () if films_in(folder) else ("one film, or one of a left and one of a right camera",)
+    lacking = "one film, or one of a left and one of a right camera (and one of a top one)"
+    return () if films_in(folder) else (lacking,)
 
 
 _COLOUR_FOLDERS = (

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
@@ -49,6 +51,33 @@ def pair_stamps(
         if n
     )
     return (kept, partner[kept]), (*notes, *_skew_note(skew[kept]))
+
+
+def pair_all(
+    reference: IntArray,
+    others: Sequence[tuple[str, str, IntArray]],
+    tolerance: float,
+    name: str,
+) -> tuple[IntArray, tuple[str, ...]]:
+    """Rows (n, 1 + others) of images of one time, those of the reference first, and notes.
+
+    Args:
+        reference: (n,) stamps of the right camera in nanoseconds, increasing.
+        others: side, name and stamps of each other camera.
+        tolerance: largest difference in seconds from the reference.
+        name: of the right camera, in messages.
+
+    Raises:
+        DatasetError: no image is left that has a partner of each camera.
+    """
+    rows = np.arange(len(reference))[:, None]
+    notes: tuple[str, ...] = ()
+    for side, other, stamps in others:
+        (kept, partners), said = pair_stamps(
+            reference[rows[:, 0]], stamps, tolerance, (name, other), side
+        )
+        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *said)
+    return rows, notes
 
 
 def _span(stamps: IntArray) -> str:

@@ -150,7 +150,7 @@ class VideoSettings(CalibratedSettings):
 
     path: Annotated[
         str,
-        Field(min_length=1, description="the film, a folder of one or two, or a pattern"),
+        Field(min_length=1, description="the film, a folder of one to three, or a pattern"),
     ]
     kind: Literal["video"] = "video"
     views: Annotated[

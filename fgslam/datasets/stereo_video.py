@@ -1,11 +1,11 @@
-"""Stereo films: side by side, over and under, or two files (docs/datasets/video.md)."""
+"""Stereo films: side by side, over and under, two files or three (docs/datasets/video.md)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -31,7 +31,7 @@ _USUAL_SHAPE = 1.5  # width over height of a camera's image
 
 
 def open_video(settings: VideoSettings) -> Recording:
-    """Open a film of both views, or the films of a left and a right camera.
+    """Open a film of both views, or the films of a left and a right camera, and of a third one.
 
     Raises:
         DatasetError: there is no film, it holds no frame, or is of one camera.
@@ -43,7 +43,7 @@ def open_video(settings: VideoSettings) -> Recording:
     if not films:
         raise DatasetError(
             f"{given}: neither one film nor one of a left and one of a right camera, by their "
-            "names (left.mp4 and right.mp4); check dataset.path"
+            "names (left.mp4 and right.mp4, with a third camera top.mp4); check dataset.path"
         )
     frames = [VideoFrames(film) for film in films]
     rate = settings.fps or frames[0].rate
@@ -73,8 +73,8 @@ def open_video(settings: VideoSettings) -> Recording:
     )
 
 
-Views = Callable[..., tuple[Image, Image]]
-"""Right and left view (height, width, 3) in R, G, B, by numbers in the films; or FrameError."""
+Views = Callable[..., tuple[Image, ...]]
+"""Right, left[, top] view (height, width, 3) in R, G, B, by numbers in the films; or FrameError."""
 
 
 def _views(
@@ -82,12 +82,14 @@ def _views(
 ) -> tuple[Views, StereoRig, tuple[str, ...]]:
     """What gives the views of a frame, the rig that they fit, and what was assumed."""
     height, width = frames[0].load(0).shape[:2]
-    if len(frames) == 2:
-        left, right = frames
-        rig, told = _rig(settings, folder, (width, height), (1, 1))
-        if differ_in_number(left.name, right.name):
-            rig = numbered(rig)
-        return lambda of_left, of_right: (right.load(of_right), left.load(of_left)), rig, told
+    if len(frames) > 1:
+        rig, told = _rig(settings, folder, (width, height), (1, 1), pair=len(frames) == 2)
+        by_number = differ_in_number(frames[0].name, frames[1].name)
+        if len(frames) == 3:
+            rig, order = _of_three(rig, folder, by_number)
+        else:
+            rig, order = numbered(rig) if by_number else rig, (1, 0)
+        return _Films(frames, order).load, rig, told
     film = frames[0]
     fault: CalibrationError | None = None
     for name in [settings.views] if settings.views else _by_shape(width, height):
@@ -103,8 +105,36 @@ def _views(
     raise fault or DatasetError(f"{folder}: no film")
 
 
+def _of_three(rig: StereoRig, where: Path, by_number: bool) -> tuple[StereoRig, tuple[int, ...]]:
+    """The rig, and which of left, right and third film its right, left[, top] camera's is.
+
+    Films with numbers are those of the file's cameras in its order, and so are all of a file that
+    calls its cameras left and right. Else the names say what the geometry must agree with.
+
+    Raises:
+        CalibrationError: it is of two cameras.
+    """
+    known = None if rig.rectifier is None else rig.rectifier.calibration
+    in_line = rig.cameras == 2 and known is not None and len(known.cameras) == 3
+    by_file = by_number or (known is not None and known.sided)
+    if rig.cameras == 2 and not (in_line and by_file):
+        raise CalibrationError(
+            f"{where} has films of three cameras, but the calibration knows two; give one of all "
+            "three, --camera FILE, or move the third film elsewhere"
+        )
+    order = rig.sources if by_file else (1, 0, 2)
+    if rig.rectifier is not None:
+        kept = tuple(range(rig.cameras))
+        rig = replace(rig, rectifier=replace(rig.rectifier, order=kept))
+    return rig, order
+
+
 def _rig(
-    settings: VideoSettings, folder: Path, size: tuple[int, int], views: tuple[int, int]
+    settings: VideoSettings,
+    folder: Path,
+    size: tuple[int, int],
+    views: tuple[int, int],
+    pair: bool = True,
 ) -> tuple[StereoRig, tuple[str, ...]]:
     """The rig of views of a size, or of a column or row more, and what was assumed then.
 
@@ -112,7 +142,7 @@ def _rig(
     beside and above each other: of two the film's size is even.
     """
     try:
-        return calibrated_rig(settings, folder, size), ()
+        return calibrated_rig(settings, folder, size, pair), ()
     except CalibrationError:
         columns, rows = (
             (one, one + 1) if count == 1 and one % 2 == 0 else (one,)
@@ -120,7 +150,7 @@ def _rig(
         )
         for whole in list(product(columns, rows))[1:]:
             with suppress(CalibrationError):
-                rig = calibrated_rig(settings, folder, whole)
+                rig = calibrated_rig(settings, folder, whole, pair)
                 return rig, (
                     f"the film's views are {size[0]}x{size[1]}, calibrated for "
                     f"{whole[0]}x{whole[1]}: its encoder is taken to have left out the last column "
@@ -169,6 +199,17 @@ class _Halves:
 
 
 @dataclass(frozen=True, eq=False)
+class _Films:
+    """A film of each camera; ``order``: whose are the right, left[, top] views."""
+
+    films: list[VideoFrames]
+    order: tuple[int, ...]
+
+    def load(self, *numbers: int) -> tuple[Image, ...]:
+        return tuple(self.films[k].load(numbers[k]) for k in self.order)
+
+
+@dataclass(frozen=True, eq=False)
 class _Film:
     """Rectified images of a film by number."""
 
@@ -178,10 +219,10 @@ class _Film:
     grey: bool
 
     def load(self, index: int) -> tuple[Image, ...]:
-        """(right, left). Raises FrameError."""
+        """(right, left[, top]). Raises FrameError."""
         images = self.views(*self.numbers[index].tolist())
         if self.grey:
-            images = (_grey(images[0]), _grey(images[1]))
+            images = tuple(map(_grey, images))
         size = self.rig.image_size
         whole = (_with_last(image, size) for image in images)
         return self.rig.rectified(tuple(sized(i, f"frame {index}", *size) for i in whole))

@@ -1,4 +1,7 @@
-"""A run as a film: the camera's images with the matches, beside the map as it grows."""
+"""A run as a film: the camera's images with the matches, beside the map as it grows.
+
+Of a route that was followed: :mod:`fgslam.runs.route_film`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.arrays import Image, IntArray
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, moved_pixels
@@ -17,40 +20,70 @@ from fgslam.datasets.film_files import require_film_suffix, write_film
 from fgslam.report.figures.trajectory import level_axes
 from fgslam.report.pictures.film import FilmCanvas, Moment
 from fgslam.report.point_cloud import MapPoints, read_ply
-from fgslam.runs.config import load_config
+from fgslam.runs.config import load_config, load_experiment
+from fgslam.runs.config_models import FollowConfig
 from fgslam.runs.exporting import log_of, results_folder
 from fgslam.runs.exporting_images import Pictures, frames_of, rows_of_frames
-from fgslam.runs.folder import RUN_MARKER
+from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.report import load_report
+from fgslam.runs.route_film import Followed
 
 _MOST_FPS = 30.0
 Progress = Callable[[str, int, int], None]
 
 
-def film_of_run(run: Path, out: Path, estimator: str | None, progress: Progress) -> str:
-    """Writes the film of a run; a line about it.
+def film_of_run(
+    run: Path, out: Path, estimator: str | None, taught: Path | None, progress: Progress
+) -> str:
+    """Writes the film of a run, of SLAM or of a route that was followed; a line about it.
 
-    Path and landmarks are those known at the end; a landmark appears with the frame that saw it
-    first. The film runs as fast as the recording, at most 30 frames a second.
+    The film runs as fast as the recording, at most 30 frames a second.
 
     Args:
-        run: what ``fgslam run`` wrote.
+        run: what ``fgslam run`` or ``fgslam follow`` wrote.
         out: the file, .mp4 or .gif.
         estimator: whose path and map; None for the one that steered.
+        taught: what ``fgslam teach`` wrote, for the pictures of path images; None: their features.
         progress: called with what is done, how far, of how much.
 
     Raises:
         FgslamError: no run of cameras there, its recording is gone, or the film cannot be written.
     """
     require_film_suffix(out)
+    if is_run_folder(run) and isinstance(config := load_experiment(run / RUN_MARKER), FollowConfig):
+        if estimator is not None:
+            raise ConfigError(
+                f"{run}: a route was followed, without estimators; leave out --estimator"
+            )
+        return _film_of_following(run, Followed.of(run, config, taught), out, progress)
+    if taught is not None:
+        raise ConfigError(f"{run}: no route was followed there; leave out --taught")
+    return _film_of_slam(run, out, estimator, progress)
+
+
+def _film_of_following(run: Path, followed: Followed, out: Path, progress: Progress) -> str:
+    total = len(followed.rows)
+    fps = _rate(followed.times, "images", run)
+    count = write_film(out, followed.frames(lambda done: progress("film", done, total)), fps)
+    progress("film", total, total)
+    return f"{out}: {count} frames"
+
+
+def _rate(times: FloatArray, what: str, where: Path) -> float:
+    """Frames a second of a film of these times. Raises ConfigError of fewer than two."""
+    if len(times) < 2:
+        raise ConfigError(f"{where}: has {len(times)} {what}; a film needs two at least")
+    return min(_MOST_FPS, 1.0 / float(np.median(np.diff(times))))
+
+
+def _film_of_slam(run: Path, out: Path, estimator: str | None, progress: Progress) -> str:
+    """Path and landmarks are those known at the end; a landmark appears when first seen."""
     folder = run / results_folder(run, estimator)
     trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
     log = MeasurementLog.read_from(log_of(run))
     if not isinstance(log.rig, CameraRig):
         raise DatasetError(f"{run}: its sensor has no images, so that there is nothing to film")
-    if len(trajectory) < 2:
-        raise ConfigError(f"{run}: has {len(trajectory)} poses; a film needs two at least")
-    fps = min(_MOST_FPS, 1.0 / float(np.median(np.diff(trajectory.timestamps))))
+    fps = _rate(trajectory.timestamps, "poses", run)
     rows, pictures = frames_of(load_config(run / RUN_MARKER), trajectory)
     moments = _moments(log, rows_of_frames(log, trajectory), points, rows, pictures)
     data = load_report(run)

@@ -337,6 +337,9 @@ def test_mistakes_of_film(
     assert "no estimator 'x'" in mistake(
         capfd, monkeypatch, "film", finished.folder, tmp_path / "a.gif", "--estimator", "x"
     )
+    assert "no route was followed there; leave out --taught" in mistake(
+        capfd, monkeypatch, "film", finished.folder, tmp_path / "a.gif", "--taught", tmp_path
+    )
     assert not list(tmp_path.iterdir())
 
 

@@ -14,7 +14,14 @@ import yaml
 import fgslam as fg
 from fgslam.cli.main import app
 from fgslam.datasets.simulated_homing import open_house
-from fgslam.homing.settings import DRIVING, AvoidanceSettings, HomingBehaviourSettings
+from fgslam.homing.command import Drive, DriveCommand
+from fgslam.homing.settings import (
+    DRIVING,
+    AvoidanceSettings,
+    HomingBehaviourSettings,
+    SteeringSettings,
+)
+from fgslam.homing.steering import RangeScan, make_avoider
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.house_settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
 
@@ -117,6 +124,121 @@ def test_followers_side_by_side_do_not_disturb_each_other(world: OmniWorld) -> N
             out.append((command.v, command.omega, command.reason))
     assert list(both) == [alone(there, path), alone(here, back)]
     assert both[0][-1][0] > 0.0
+
+
+# --------------------------------------------------------------------------------------------
+# As a robot uses it: tracks, the default
+
+
+class Robot:
+    """A wheelchair in the house, a follower of ten legs from room to room, and its own avoidance.
+
+    Attributes:
+        world: the house.
+        follower: of the path; begins before its first target.
+        commands: so far.
+    """
+
+    def __init__(self) -> None:
+        ten_legs = OmniHouseSettings(path=HousePathSettings(legs=10, spacing_m=2.0))
+        self.world = open_house(ten_legs, SEED)
+        path = fg.teach(self.world.targets, self.world.camera)
+        self.follower = fg.PathFollower(self.world.camera, path, seed=SEED)
+        self._avoider = make_avoider(AvoidanceSettings(), SteeringSettings().max_turn_deg_s)
+        self.commands: list[DriveCommand] = []
+
+    def put(self, leg: int, part: float, turned: float) -> None:
+        """Sets it down on the way to a target, that part of the leg behind it, turned (rad)."""
+        a, b = self.world.reference_poses[leg : leg + 2]
+        self.world.put(np.append((a + part * (b - a))[:2], b[2] + turned))
+
+    def step(self, dark: bool = False, blocked: bool = False) -> DriveCommand:
+        """One image, one command; ``blocked``: something stands before it, and it is not let go."""
+        time = DT * len(self.commands)
+        image = self.world.image(time)
+        command = self.follower.step(np.zeros_like(image) if dark else image, time)
+        wanted = Drive(command.v, command.omega)
+        scan = RangeScan(*self.world.scan())
+        driven = self._avoider.override(wanted, command.heading, scan) if command.v else wanted
+        if blocked:
+            driven = Drive(0.0, 0.0, overridden=True)
+        self.world.drive(driven.speed, driven.turn_rate, DT)
+        if driven.overridden:
+            self.follower.driven(driven.speed, driven.turn_rate, DT)
+        self.commands.append(command)
+        return command
+
+    def until(self, state: str, most: int, **how: bool) -> list[DriveCommand]:
+        """The commands until one of that state, which must come within ``most`` images."""
+        given = []
+        for _ in range(most):
+            given.append(self.step(**how))
+            if given[-1].state.value == state:
+                return given
+        raise AssertionError(f"not {state} but {given[-1].state.value}: {given[-1].reason}")
+
+    def away(self, target: int) -> float:
+        """Metres to a target."""
+        way = self.world.true_pose[:2] - self.world.target_poses[target, :2]
+        return float(np.linalg.norm(way))
+
+
+def test_a_robot_that_is_put_down_anywhere_finds_its_place_and_waits_for_obstacles() -> None:
+    robot = Robot()
+    robot.put(leg=8, part=0.4, turned=0.3)
+    given = robot.until("drive", 20)
+    assert given[-1].target == 8
+    place = given[-1].place
+    assert place is not None
+    assert place.sure
+    assert place.nearest in (7, 8)
+    assert all(c.v == 0.0 for c in given[:-1])  # it stands until it knows
+    robot.until("drive", 1)
+    before = robot.away(8)
+    stopped = [robot.step(blocked=True) for _ in range(10)]
+    assert {c.state.value for c in stopped} == {"drive"}
+    assert robot.away(8) == pytest.approx(before, abs=0.1)
+    went = [robot.step() for _ in range(25)]
+    assert went[-1].v > 0.1
+    assert robot.away(8) < before - 0.3
+
+
+@pytest.mark.slow
+def test_a_robot_that_is_carried_off_is_lost_finds_its_place_again_and_reaches_the_end() -> None:
+    robot = Robot()
+    robot.put(leg=8, part=0.4, turned=0.3)
+    assert robot.until("drive", 20)[-1].target == 8
+    for _ in range(20):
+        robot.step()
+    lost = robot.until("wait", 100, dark=True)  # under somebody's coat
+    assert "grey" in lost[-1].reason
+    assert [robot.step(dark=True).v for _ in range(10)][-1] == 0.0  # after braking
+    robot.put(leg=3, part=0.4, turned=-0.4)
+    found = robot.until("drive", 60)
+    assert found[-1].target == 3
+    for _ in range(30):
+        robot.step(blocked=True)
+    on_the_way = robot.until("arrived", 700)
+    assert {c.target for c in on_the_way} == set(range(3, 10))
+    while robot.commands[-1].v or robot.commands[-1].omega:
+        robot.step()
+    assert robot.follower.finished
+    assert robot.away(9) < 0.3
+    assert robot.follower.legs[-1].result == "arrived"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("back", [False, True])
+def test_the_experiment_of_crossroads_drives_over_both_routes(tmp_path: Path, back: bool) -> None:
+    """Its shortest pair of routes, nine path images each: there, and back."""
+    given = {"seed": 6, "trials": 1, "back": back, "output.report": False, "output.pictures": 0}
+    result = fg.run("crossroads", tmp_path / "run", given)
+    assert result.status == "finished"
+    assert result.metrics["arrived"] == result.metrics["drives"] == 1
+    assert result.metrics["false_arrivals"] == 0
+    legs = rows(tmp_path / "run" / "legs.csv")
+    assert len(legs) >= 4
+    assert legs[-1]["result"] == "arrived"
 
 
 def test_a_follower_by_default_has_the_settings_of_the_driving_experiments() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ from PIL import Image as PictureFile
 from running import main
 
 import fgslam as fg
+from fgslam.core.sensors import CameraRig
 from fgslam.core.trajectories import write_covariances
 from fgslam.homing.path_memory import PathMemory
 from fgslam.runs.bare_routes import teaching
@@ -147,6 +149,113 @@ def test_another_drive_follows_it(
     again = tmp_path / "again"
     assert main(monkeypatch, "run", tmp_path / "run" / RUN_MARKER, "--out", again) == 0
     assert (again / "follow.csv").read_bytes() == (tmp_path / "run" / "follow.csv").read_bytes()
+
+
+STEREO = CameraRig(320, 240, 200.0, 200.0, 159.5, 119.5, 0.2, None, np.eye(4))
+
+
+def stereo_folder(place: Path, metres: np.ndarray, times: np.ndarray) -> Path:
+    """The drive as a stereo rig saw it that rode along: left/, right/, calib.json, times.txt."""
+    for side in ("left", "right"):
+        (place / side).mkdir(parents=True)
+    for k, one in enumerate(metres.tolist()):
+        seen = textured_room.stereo(np.array([-2.0 + one, 0.4, 0.0]), STEREO)
+        for side, image in zip(("right", "left"), seen, strict=True):
+            PictureFile.fromarray(image).save(place / side / f"{k:06d}.png")
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    calibration = {name: getattr(STEREO, name) for name in names} | {"baseline_m": STEREO.baseline}
+    (place / "calib.json").write_text(json.dumps(calibration), encoding="utf-8")
+    lines = "".join(f"{k} {t}\n" for k, t in enumerate(times.tolist()))
+    (place / "times.txt").write_text(lines, encoding="utf-8")
+    return place
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
+def test_a_route_of_a_robot_with_stereo_has_the_metres_of_its_own_slam(
+    data: Path, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    """SLAM's world is the right camera's first place: z is ahead, x to the right."""
+    metres = np.arange(0.0, 3.3, 0.1)
+    drive = stereo_folder(tmp_path / "stereo", metres, 5.0 + metres / 0.4)
+    run, route = tmp_path / "slam", tmp_path / "route.fgpath"
+    assert main(monkeypatch, "run", drive, "--out", run) == 0
+    (poses,) = run.glob("*/final.tum")
+    given = ("--camera", data / "camera.yaml", "--poses", poses, "--out", route)
+    assert main(monkeypatch, "teach", data / "drive", *given, "--report", tmp_path / "t") == 0
+    path = PathMemory.load(route)
+    assert path.metric is not None
+    truth = np.array([0.4 * int(name[5:].removesuffix(".png")) for name in path.names])
+    found = path.metric.poses[:, :3, 3]
+    expected = np.column_stack([np.zeros((len(truth), 2)), truth])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.05)
+    sigma = np.sqrt(path.metric.covariances[1:, [3, 4, 5], [3, 4, 5]])
+    assert (sigma > 0.0).all()
+    assert (sigma < 0.1).all()
+    assert main(monkeypatch, "follow", route, data / "again", "--out", tmp_path / "f") == 0
+    rows = rows_of(tmp_path / "f" / "follow.csv")
+    metric = [(0.2 + 0.8 * k, row) for k, row in enumerate(rows) if row["x_m"]]
+    assert len(metric) >= 2
+    ahead = {path.names[k]: truth[k] for k in range(len(path))}
+    for place, row in metric:
+        here = np.array([float(row[name]) for name in ("x_m", "y_m", "z_m")])
+        off, sigma_m = here - [0.0, 0.0, place], float(row["sigma_position_m"])
+        assert np.abs(off).max() < 0.4
+        assert np.linalg.norm(off) < 3.0 * sigma_m
+        left = ahead[path.names[int(row["target"])]] - place
+        assert abs(float(row["to_target_m"]) - left) < 0.4
+
+
+@pytest.fixture(scope="module")
+def followed(taught: Path, data: Path) -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        assert main(patch, "follow", taught, data / "again", "--out", data / "followed") == 0
+    return data / "followed"
+
+
+def shown_in(film: Path) -> list[np.ndarray]:
+    frames = cv2.VideoCapture(str(film))
+    return [frame.astype(int) for ok, frame in iter(frames.read, (False, None)) if ok]
+
+
+def test_a_film_shows_image_path_image_and_the_way_home(
+    followed: Path, data: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    film, pictured = tmp_path / "way.mp4", tmp_path / "pictured.mp4"
+    assert main(monkeypatch, "film", followed, film) == 0
+    assert "way.mp4: 5 frames" in capfd.readouterr().out
+    frames = shown_in(film)
+    assert [frame.shape for frame in frames] == [(720, 1280, 3)] * 5
+    rows = rows_of(followed / "follow.csv")
+    for frame, row in zip(frames, rows, strict=True):
+        blue, green, red = np.moveaxis(frame[360:600, 800:], 2, 0)  # arrow and command
+        arrow = ((red > 190) & (np.abs(green - 150) < 40) & (blue < 80)).any()
+        assert arrow == bool(row["direction_deg"])
+    assert (np.abs(frames[1] - frames[0])[:600, :760].max(axis=2) > 60).any()  # the image
+    assert main(monkeypatch, "film", followed, pictured, "--taught", data / "taught") == 0
+    panel = np.abs(shown_in(pictured)[0] - frames[0]).max(axis=2) > 60
+    assert panel[60:300, 820:].mean() > 0.1  # the path image's picture
+    assert panel[:, :760].mean() < 0.01
+
+
+def test_mistakes_of_a_film_of_a_route(
+    taught: Path, followed: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    film = ("film", followed, tmp_path / "way.gif")
+    assert "leave out --estimator" in mistake(capfd, monkeypatch, *film, "--estimator", "isam2")
+    assert "give its --report" in mistake(capfd, monkeypatch, *film, "--taught", tmp_path)
+    said = mistake(capfd, monkeypatch, *film, "--taught", followed)
+    assert "task is follow, which this does not take" in said
+    config = followed / RUN_MARKER
+    kept, route = config.read_text(encoding="utf-8"), tmp_path / "other.fgpath"
+    path = PathMemory.load(taught)
+    replace(path, names=tuple(f"{name} again" for name in path.names)).save(route)
+    config.write_text(kept.replace(str(taught), str(route)), encoding="utf-8")
+    try:
+        assert "was taught anew since it was followed" in mistake(capfd, monkeypatch, *film)
+    finally:
+        config.write_text(kept, encoding="utf-8")
+    assert not (tmp_path / "way.gif").exists()
 
 
 def test_another_place_is_said(

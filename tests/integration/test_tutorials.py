@@ -122,7 +122,12 @@ DATA: dict[str, Callable[[Path], None]] = {
 MADE = {
     "two_webcams": ("rig.json", "understood.png", "room.ply", "path.tum"),
     "bag_to_map": ("bag.rrd", "map.ply", "drive.gif", "path.mcap", "colmap/sparse"),
-    "teach_a_route": ("route.fgpath", "taught/path_images.csv", "runs/again/follow.csv"),
+    "teach_a_route": (
+        "route.fgpath",
+        "taught/path_images.csv",
+        "runs/again/follow.csv",
+        "again.mp4",
+    ),
 }
 
 

@@ -28,7 +28,7 @@ from fgslam.datasets.depth_view import (
     in_words,
 )
 from fgslam.datasets.images import bits_held, mosaic_note, sized
-from fgslam.datasets.pairing import NANOSECONDS, pair_stamps
+from fgslam.datasets.pairing import NANOSECONDS, pair_all
 from fgslam.datasets.recording import Recording, recording_identity, select_frames
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings, RgbdSettings
 
@@ -178,15 +178,10 @@ def _paired(
     index: _Index, chosen: Chosen, settings: BagSettings
 ) -> tuple[IntArray, tuple[str, ...]]:
     """Rows (n, 2 or 3) of the right, left[, top] images of one time, and notes."""
-    right, tolerance = index.stamps[chosen.right], 1e-3 * settings.pairing_tolerance_ms
-    notes: tuple[str, ...] = ()
-    rows = np.arange(len(right))[:, None]
-    for side, view in zip(("left", "top"), (chosen.left, *chosen.views[2:]), strict=False):
-        (kept, partners), said = pair_stamps(
-            right[rows[:, 0]], index.stamps[view], tolerance, (chosen.right, view), side
-        )
-        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *said)
-    return rows, notes
+    views = zip(("left", "top"), (chosen.left, *chosen.views[2:]), strict=False)
+    others = [(side, view, index.stamps[view]) for side, view in views]
+    tolerance = 1e-3 * settings.pairing_tolerance_ms
+    return pair_all(index.stamps[chosen.right], others, tolerance, chosen.right)
 
 
 # --------------------------------------------------------------------------------------------

@@ -80,9 +80,7 @@ class FilmCanvas:
             self._dots.set_data(*known.T)
             self._path.set_data(*self._poses[: row + 1].T)
             self._here.set_data(*self._poses[row : row + 1].T)
-            canvas: Any = self._canvas
-            canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            return drawn(self._canvas)
 
     def _mark(self, moment: Moment) -> None:
         axes = self._image
@@ -94,6 +92,13 @@ class FilmCanvas:
         axes.plot(*moment.new.T, "+", color=YELLOW, markersize=5.0, label="new landmark")
         legend = axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=2)
         legend.legend_handles[1].set_color(INK)  # yellow on white is hard to see
+
+
+def drawn(canvas: FigureCanvasAgg) -> Image:
+    """What a canvas shows, (height, width, 3) in red, green, blue."""
+    agg: Any = canvas
+    agg.draw()
+    return np.asarray(agg.buffer_rgba())[..., :3].copy()
 
 
 def _filling(limits: list[list[float]], panel: Bbox) -> FloatArray:

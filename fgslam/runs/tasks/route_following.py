@@ -73,18 +73,23 @@ _NUMBER = re.compile(r"-?\d+(\.\d+)?(e-?\d+(\.\d+)?)?")
 def open_following(config: FollowConfig, opening: Opening) -> Task[RunResult]:
     """Opens route and recording. Raises StoredMapError, DatasetError or CalibrationError."""
     path = PathMemory.load(config.route)
-    recording = open_omni(config.dataset)
-    if config.taught_camera:
-        recording = _with_taught_camera(config, path, recording)
+    recording = recording_along(config, path)
     notes = camera_notes(recording, stated=not config.taught_camera)
     recording = replace(recording, notes=recording.notes + notes)
     ground = provenance_of(recording) | {"log": {"route": config.route, "images": len(path)}}
     return Task(ground, lambda context: _run(config, path, recording, context))
 
 
-def _with_taught_camera(
-    config: FollowConfig, path: PathMemory, recording: OmniRecording
-) -> OmniRecording:
+def recording_along(config: FollowConfig, path: PathMemory) -> OmniRecording:
+    """The recording, of its own camera or of the one that the route was taught with.
+
+    Raises:
+        DatasetError: it cannot be opened.
+        CalibrationError: the route holds no camera, or one of another size.
+    """
+    recording = open_omni(config.dataset)
+    if not config.taught_camera:
+        return recording
     camera, given = path.camera, recording.camera
     if camera is None:
         raise CalibrationError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,9 +13,13 @@ import numpy as np
 import pytest
 from dataset_builders import write_calibration
 
+import fgslam as fg
+from fgslam.cameras.formats.own import raw_values
 from fgslam.cameras.omni.settings import EquirectangularSettings
+from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.geometry import pose
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni
@@ -23,6 +28,7 @@ from fgslam.datasets.settings import VideoSettings
 from fgslam.datasets.stereo_video import open_video
 from fgslam.datasets.video_frames import VideoFrames
 from fgslam.runs.bare_recording import bare_experiment
+from tests import textured_wall
 
 SIZE = (64, 48)
 _NEAR = 3  # grey levels that the codec may change in even areas
@@ -183,6 +189,106 @@ def test_a_film_of_each_camera(tmp_path: Path) -> None:
         assert len(recording) == 4
         assert np.abs(levels(recording, 2) - [160, 60]).max() <= _NEAR
         assert any("the left film has 5 frames, the right one 4" in n for n in recording.notes)
+
+
+TRIO = ("left", "right", "top")
+
+
+def three_films(folder: Path, names: tuple[str, ...], counts: tuple[int, ...] = (4, 4, 4)) -> Path:
+    """Grey levels 40, 50, ... of the first camera, from 140 and from 200 on of the others."""
+    for name, level, count in zip(names, (40, 140, 200), counts, strict=True):
+        film(folder / f"{name}.mp4", [view(level + 10 * k) for k in range(count)])
+    return folder
+
+
+def raw_trio(path: Path, places: list[list[float]], sided: bool) -> Path:
+    """Calibration of three cameras at these places (3,), x to the right and y down."""
+    matrix = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
+    cameras = tuple(
+        RawCamera(*SIZE, matrix, np.array([-0.1, 0.0, 0.0, 0.0]), pose(np.eye(3), np.array(place)))
+        for place in places
+    )
+    values = raw_values(Calibration("made", "made", cameras, sided=sided))
+    path.write_text(json.dumps(values), encoding="utf-8")
+    return path
+
+
+def test_a_film_of_each_of_three_cameras(tmp_path: Path) -> None:
+    write_calibration(
+        tmp_path, width=64, height=48, cx=31.5, cy=23.5, fy=30.0, vertical_baseline_m=0.1
+    )
+    three_films(tmp_path, TRIO, (5, 4, 4))
+    assert recognise_layout(tmp_path)["kind"] == "video"
+    recording = opened(tmp_path)
+    assert (len(recording), recording.rig.cameras) == (4, 3)
+    assert np.abs(levels(recording, 2) - [160, 60, 220]).max() <= _NEAR
+    assert len(recording.colour(1)) == 3
+    notes = " ".join(recording.notes)
+    assert "three films are paired by their number: all must begin at one time" in notes
+    assert "the left film has 5 frames, the third one 4" in notes
+    assert "film, 3 cameras 64x48; 4 frames at 20 Hz" in bare_experiment(tmp_path).said
+
+
+def test_three_films_are_paired_by_time_where_one_parts_from_the_others(tmp_path: Path) -> None:
+    write_calibration(
+        tmp_path, width=64, height=48, cx=31.5, cy=23.5, fy=30.0, vertical_baseline_m=0.1
+    )
+    for name, level in (("left", 20), ("right", 80)):
+        film(tmp_path / f"{name}.avi", [view(level + 2 * k) for k in range(20)], 20.0)
+    film(tmp_path / "top.avi", [view(140 + 10 * k) for k in range(10)], 10.0)
+    recording = opened(tmp_path)
+    np.testing.assert_allclose(recording.timestamps, 0.1 * np.arange(10), rtol=0.0, atol=1e-9)
+    assert np.abs(levels(recording, 7) - [108, 48, 210]).max() <= _NEAR
+    assert "10 right images have no partner within 20 ms and are left out" in recording.notes
+
+
+@pytest.mark.parametrize(
+    ("names", "places", "sided", "expected"),
+    [  # the corner of the L is the right camera, then the left and the top one
+        (("cam0", "cam1", "cam2"), [[0, 0, 0], [0.2, 0, 0], [0.2, -0.1, 0]], False, [140, 40, 200]),
+        (("cam0", "cam1", "cam2"), [[0.2, -0.1, 0], [0.2, 0, 0], [0, 0, 0]], False, [140, 200, 40]),
+        (TRIO, [[0.2, -0.1, 0], [0.2, 0, 0], [0, 0, 0]], True, [140, 200, 40]),
+        (TRIO, [[0.2, -0.1, 0], [0.2, 0, 0], [0, 0, 0]], False, [140, 40, 200]),
+        (("cam0", "cam1", "cam2"), [[0, 0, 0], [0.1, 0, 0], [0.3, 0, 0]], False, [200, 40]),
+    ],
+)
+def test_which_of_three_films_is_of_which_camera(
+    tmp_path: Path, names: tuple[str, ...], places: list[list[float]], sided: bool, expected: list
+) -> None:
+    """Numbers, and files that call their cameras left and right, count in the file's order."""
+    three_films(tmp_path / "films", names)
+    rig = raw_trio(tmp_path / "rig.json", places, sided)
+    recording = opened(tmp_path / "films", camera_file=str(rig))
+    assert np.abs(levels(recording, 0) - expected).max() <= _NEAR
+
+
+def test_three_films_of_a_wall_give_its_distance(tmp_path: Path) -> None:
+    rig = textured_wall.RIG
+    seen = [textured_wall.pictures(np.array([0.03 * k, 0.0, 0.0])) for k in range(5)]
+    for place, name in ((1, "left"), (0, "right"), (2, "top")):
+        film(tmp_path / f"{name}.mp4", [images[place] for images in seen])
+    write_calibration(
+        tmp_path, width=rig.width, height=rig.height, fx=rig.fx, fy=rig.fy, cx=rig.cx, cy=rig.cy,
+        baseline_m=rig.baseline, vertical_baseline_m=rig.vertical_baseline,
+    )  # fmt: skip
+    recording = fg.open_recording(tmp_path)
+    slam = fg.Slam(recording.rig, estimator="landmark_kalman")
+    for t, images, odometry in recording:
+        slam.track(t, images, odometry)
+    result = slam.result()
+    depths = result.map.positions[:, 2]
+    assert len(depths) > 50
+    assert abs(float(np.median(depths)) - textured_wall.WALL_M) < 0.03  # an error of 0.2 px
+    np.testing.assert_allclose(result.trajectory.poses[-1, :3, 3], [0.12, 0, 0], rtol=0, atol=0.01)
+
+
+def test_three_films_need_a_calibration_of_three(tmp_path: Path) -> None:
+    calibrated(three_films(tmp_path, TRIO))
+    with pytest.raises(CalibrationError, match="three cameras, but the calibration knows two; "):
+        opened(tmp_path)
+    (tmp_path / "top.mp4").rename(tmp_path / "other.mp4")
+    with pytest.raises(DatasetError, match="neither one film nor one of a left and one of a right"):
+        opened(tmp_path)
 
 
 def test_frames_are_chosen_and_the_rate_is_said(tmp_path: Path) -> None:

@@ -1,0 +1,170 @@
+"""A followed route as a film: each image with its path image, the way home and the command."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.cameras.omni.camera import OmniCamera, unit_rays
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import ConfigError, DatasetError, FrameError, StoredMapError
+from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.opening import open_omni
+from fgslam.homing.path_memory import PathMemory
+from fgslam.report.pictures.route_film import PathPicture, RouteCanvas, RouteMoment
+from fgslam.runs.config import as_task, load_experiment
+from fgslam.runs.config_models import FollowConfig, TeachConfig
+from fgslam.runs.folder import RUN_MARKER, is_run_folder
+from fgslam.runs.tasks.route_following import FOLLOW_FILE, recording_along
+from fgslam.runs.tasks.route_teaching import ROUTE_FILE
+
+_BEAM = np.deg2rad(np.linspace(-60.0, 60.0, 121))  # elevations of the line towards home
+
+Row = dict[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """What a film of a follow folder is made of.
+
+    Attributes:
+        rows: of follow.csv, an image each.
+        path: the route.
+        recording: its images.
+        taught: the recording that the route was taught from; None where it is not given.
+    """
+
+    rows: tuple[Row, ...]
+    path: PathMemory
+    recording: OmniRecording
+    taught: OmniRecording | None
+
+    @staticmethod
+    def of(run: Path, config: FollowConfig, taught: Path | None) -> Followed:
+        """Opens what ``fgslam follow`` wrote into ``run``, and used.
+
+        Args:
+            run: the folder.
+            config: its configuration.
+            taught: what ``fgslam teach`` wrote of the same route; None: without.
+
+        Raises:
+            FgslamError: a file is gone, no table, or the route is another one since.
+        """
+        path = PathMemory.load(config.route)
+        rows = _rows(run / FOLLOW_FILE)
+        _require_same_route(rows, path, config.route)
+        recording = recording_along(config, path)
+        driven = None if taught is None else _taught_recording(taught, path)
+        return Followed(rows, path, recording, driven)
+
+    @property
+    def times(self) -> FloatArray:
+        """(n,) seconds, of the rows."""
+        return np.array([float(row["time_s"]) for row in self.rows])
+
+    def frames(self, progress: Callable[[int], None]) -> Iterator[Image]:
+        """The film's frames; ``progress`` is told how many are done."""
+        canvas = RouteCanvas([self._path_picture(k) for k in range(len(self.path))])
+        places = {int(number): i for i, number in enumerate(self.recording.ids)}
+        for done, row in enumerate(self.rows):
+            progress(done)
+            image = _image(self.recording, places.get(int(row["image"])))
+            yield canvas.draw(_moment(row, image, self.recording.camera))
+
+    def _path_picture(self, k: int) -> PathPicture:
+        camera = self.path.camera or self.recording.camera
+        name, sift = self.path.names[k], self.path.images[k].sift
+        image = None
+        if self.taught is not None:
+            image = _image(self.taught, self.taught.names.index(name))
+        pixels = camera.pixels(unit_rays(sift.bearing, sift.elevation))
+        return PathPicture(name, (camera.width, camera.height), pixels, image)
+
+
+def _rows(table: Path) -> tuple[Row, ...]:
+    """Raises DatasetError where it is gone, or none that `fgslam follow` wrote."""
+    needed = {"image", "name", "time_s", "path_image", "probability", "direction_deg", "refusal"}
+    try:
+        with table.open(encoding="utf-8", newline="") as file:
+            rows = tuple(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{table}: cannot be read ({error}); follow the route anew") from error
+    if not rows or not needed <= set(rows[0]):
+        raise DatasetError(f"{table}: holds no image that was followed; follow the route anew")
+    return rows
+
+
+def _require_same_route(rows: tuple[Row, ...], path: PathMemory, route: str) -> None:
+    """Raises StoredMapError unless each named path image is at its place in the route."""
+    named = {(int(row["path_image"]), row["path_image_name"]) for row in rows if row["path_image"]}
+    if not named <= set(enumerate(path.names)):
+        raise StoredMapError(f"{route}: was taught anew since it was followed; follow it again")
+
+
+def _taught_recording(taught: Path, path: PathMemory) -> OmniRecording:
+    """The recording of a teach folder. Raises ConfigError, or StoredMapError of another route."""
+    if not is_run_folder(taught):
+        raise ConfigError(f"{taught}: not a folder that fgslam teach wrote; give its --report")
+    config = as_task(TeachConfig, load_experiment(taught / RUN_MARKER), str(taught))
+    recording = open_omni(config.dataset)
+    same = PathMemory.load(taught / ROUTE_FILE).names == path.names
+    if not same or not set(path.names) <= set(recording.names):
+        raise StoredMapError(f"{taught}: taught another route than the one that was followed")
+    return recording
+
+
+def _image(recording: OmniRecording, i: int | None) -> Image | None:
+    """Picture ``i``; None where it is missing or damaged."""
+    try:
+        return None if i is None else recording.image(i)
+    except FrameError:
+        return None
+
+
+def _moment(row: Row, image: Image | None, camera: OmniCamera) -> RouteMoment:
+    direction = np.deg2rad(_number(row, "direction_deg"))
+    nearest, target = _number(row, "path_image"), _number(row, "target")
+    return RouteMoment(
+        image=image,
+        title=f"{row['name']} at {float(row['time_s']):.1f} s",
+        nearest=int(nearest) if np.isfinite(nearest) else None,
+        probability=_number(row, "probability"),
+        target=int(target) if np.isfinite(target) else None,
+        direction=float(direction),
+        sigma=float(np.deg2rad(_number(row, "sigma_direction_deg"))),
+        beam=_beam(camera, float(direction)),
+        ahead=_beam(camera, 0.0),
+        command=_command(row),
+        refused=bool(row["refusal"]) and row["state"] != "arrived",
+    )
+
+
+def _beam(camera: OmniCamera, bearing: float) -> FloatArray:
+    """(m, 2) pixels in which the camera sees what lies in a direction; NaN where it does not."""
+    return camera.pixels(unit_rays(np.full(len(_BEAM), bearing), _BEAM))
+
+
+def _command(row: Row) -> str:
+    """Lines: speed, turn and metres; or why there is no homing vector."""
+    if row["refusal"]:
+        return row["refusal"]
+    turn = _number(row, "omega_deg_s")
+    side = "left" if turn > 0.0 else "right"
+    metres = _number(row, "to_target_m")
+    return "\n".join(
+        [
+            f"v {_number(row, 'v_mps'):.2f} m/s",
+            f"omega {abs(turn):.0f} degrees/s, {side}",
+            f"{row['inliers']} matches agree",
+            *([f"{metres:.1f} m to path image {row['target']}"] if np.isfinite(metres) else []),
+        ]
+    )
+
+
+def _number(row: Row, column: str) -> float:
+    return float(row[column]) if row.get(column) else float("nan")
