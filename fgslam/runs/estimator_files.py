@@ -23,7 +23,7 @@ from fgslam.slam.noise_in_use import FrameNoise
 from fgslam.slam.replay import Replay, ReplayRow
 
 FRAMES_FILE = "frames.csv"
-NOISE_FILE = "noise.csv"
+NOISE_TABLE = "noise.csv"
 _VALUE: dict[str, Callable[[str], Any]] = typing.get_type_hints(ReplayRow)
 """What makes a cell's text a value again."""
 
@@ -59,7 +59,7 @@ def write_replay(
     points = points_from_log(replay.estimate.landmarks, log, look)
     write_estimate(folder, replay.online, replay.estimate, points, remark)
     write_frames(folder / FRAMES_FILE, replay)
-    write_noise(folder / NOISE_FILE, replay.online.timestamps, replay.noise)
+    write_noise(folder / NOISE_TABLE, replay.online.timestamps, replay.noise)
 
 
 def write_noise(path: Path, timestamps: FloatArray, noise: Sequence[FrameNoise]) -> None:

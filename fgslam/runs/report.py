@@ -31,7 +31,7 @@ from fgslam.report.run_results import (
 )
 from fgslam.report.slam_page import write_report
 from fgslam.report.tables import read_metrics
-from fgslam.runs.estimator_files import NOISE_FILE
+from fgslam.runs.estimator_files import NOISE_TABLE
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.marks import SYNTHETIC, marked
 from fgslam.runs.metric_tables import page_tables
@@ -206,7 +206,7 @@ def _estimator(
         update_ms=_update_ms(folder / "frames.csv", final, live_ms),
         failure=failure,
         predicted=_predicted(values.get("predicted_rows"), len(final)),
-        noise=_noise(folder / NOISE_FILE, final),
+        noise=_noise(folder / NOISE_TABLE, final),
     )
 
 

@@ -30,7 +30,7 @@ from fgslam.report.tables import (
     write_timing,
 )
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.estimator_files import NOISE_FILE, write_estimate, write_noise
+from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.maps import map_points
 from fgslam.runs.marks import SYNTHETIC, measured_marks
@@ -165,7 +165,7 @@ class RunOutputs:
         )
         points = map_points(estimate.landmarks, self.pipeline.book)
         write_estimate(folder, online, estimate, points, self.remark)
-        write_noise(folder / NOISE_FILE, online.timestamps, self.recorder.noise)
+        write_noise(folder / NOISE_TABLE, online.timestamps, self.recorder.noise)
 
     def _write_timing(self, trajectory: Trajectory) -> None:
         indices = self.recorder.log.numbers.tolist()

@@ -263,7 +263,7 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "truth": (ConfigError, "Trajectory.load", lambda _: fg.compare({}, as_any("truth.tum"))),
         "world": (ConfigError, "known: lab", lambda _: fg.rendered_recording("moon")),
         "no path": (DatasetError, "recording: the name is empty", lambda _: fg.open_recording("")),
-        "None": (DatasetError, "path is a NoneType", lambda p: fg.run(as_any(None), p)),
+        "None": (DatasetError, "experiment: a NoneType", lambda p: fg.run(as_any(None), p)),
         "existing": (
             ConfigError,
             "use one of refuse, overwrite, resume",
