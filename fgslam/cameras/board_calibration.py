@@ -7,7 +7,7 @@ each other and their intrinsics come with one covariance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,6 +36,7 @@ _OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once i
 MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
 _TRIMMINGS = 4
 _MOST_OFF = 0.0025  # of the image's diagonal: corners are found to a tenth of that
+_FIRST_STEPS = 30  # with the distortion held: far from the least it would bend back
 _STEPS = 300  # of the fit; twenty are usual, and without an end there is no least
 _UNCERTAIN = 0.1  # of the focal length: with a larger deviation nothing is known of a camera
 _LEAST_CORNERS = 6  # of an image, for its board's pose to follow with something left
@@ -185,12 +186,14 @@ def _fit(
     start = problem.start(size)
     if not np.isfinite(start).all() or not np.isfinite(problem.residuals(start)).all():
         raise CalibrationError(_UNDETERMINED)
-    fit = least_squares(
-        problem.residuals, start, problem.jacobian, method="lm", x_scale="jac", max_nfev=_STEPS
-    )
+    if model != "radtan":
+        start = _least(problem.residuals, problem.jacobian_without_lens, start, _FIRST_STEPS).x
+    fit = _least(problem.residuals, problem.jacobian, start, _STEPS)
     jacobian = problem.jacobian(fit.x)
     rows = len(fit.fun)
     scale = np.linalg.norm(jacobian, axis=0)
+    if not (np.isfinite(scale).all() and scale.all()):
+        raise CalibrationError(_UNDETERMINED)
     information = (jacobian / scale).T @ (jacobian / scale)
     if not fit.success or rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
         raise CalibrationError(_UNDETERMINED)
@@ -199,6 +202,15 @@ def _fit(
     problem.require_determined(size, fit.x, covariance)
     found = problem.result(size, fit.x, np.sqrt(np.diag(covariance)))
     return replace(found, off=_distances(found, board, views))
+
+
+def _least(
+    residuals: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], FloatArray],
+    start: FloatArray,
+    steps: int,
+) -> Any:
+    return least_squares(residuals, start, jacobian, method="lm", x_scale="jac", max_nfev=steps)
 
 
 class _Problem:
@@ -310,6 +322,14 @@ class _Problem:
                 out[rows, at : at + TURN] = by_turn
             at = self._boards_at + TURN * self._row_of[view]
             out[rows, at : at + TURN] = by_board
+        return out
+
+    def jacobian_without_lens(self, x: FloatArray) -> FloatArray:
+        """(r, p), by which the lenses' distortion stays as it is."""
+        out = self.jacobian(x)
+        kept = len(INTRINSICS) + (1 if self.model == "omni" else 0)
+        for camera in range(self.cameras):
+            out[:, camera * self._own + kept : (camera + 1) * self._own] = 0.0
         return out
 
     def require_determined(
