@@ -50,12 +50,12 @@ def fit_lines(files: Files, views: Sequence[View], found: BoardCalibration) -> I
     for k, camera in enumerate(found.cameras):
         seen = sum(view[k] is not None for view in views)
         covered = coverage(views, k, camera.size)
+        sigmas, at = found.sigmas[k], len(INTRINSICS)
         yield (
             f"{names[k]:11} {seen} of {len(views)} images, {covered:.0%} of the image; "
-            f"{_with_sigmas(INTRINSICS, _intrinsics(camera), found.sigmas[k], 2)} px"
+            f"{_with_sigmas(INTRINSICS, _intrinsics(camera), sigmas[:at], 2)} px"
         )
-        lens = slice(len(INTRINSICS), None)
-        own = _with_sigmas(PARAMETERS[camera.model], camera.distortion, found.sigmas[k][lens], 5)
+        own = _with_sigmas(PARAMETERS[camera.model], camera.distortion, sigmas[at:], 5)
         yield f"            {camera.model}: {own}"
     for k in range(1, len(found.cameras)):
         length = float(np.linalg.norm(found.cameras[k].bTc[:3, 3]))
