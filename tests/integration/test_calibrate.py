@@ -184,9 +184,9 @@ def test_mistakes_of_calibrate(tmp_path: Path, monkeypatch: Patch, capfd: Captur
 
 
 FISHEYE = RawCamera(
-    480,
-    480,
-    np.array([[150.0, 0.0, 241.0], [0.0, 150.5, 238.0], [0.0, 0.0, 1.0]]),
+    720,
+    720,
+    np.array([[225.0, 0.0, 361.0], [0.0, 225.5, 358.0], [0.0, 0.0, 1.0]]),
     np.array([0.01, -0.004, 0.001, 0.0]),
     np.eye(4),
     model="equidistant",
@@ -195,11 +195,12 @@ FISHEYE = RawCamera(
 
 def draw_boards(folder: Path, count: int) -> None:
     """Chessboards of 6x4 corners of 50 mm through a fisheye of 180 degrees, off its axis too."""
-    columns, rows = np.meshgrid(np.arange(480.0), np.arange(480.0))
+    fine = (np.arange(1440.0) + 0.5) / 2.0 - 0.5  # four rays a pixel
+    columns, rows = np.meshgrid(fine, fine)
     rays = FISHEYE.unproject(np.column_stack([columns.ravel(), rows.ravel()]))
     rng = np.random.default_rng(2)
     for number in range(count):
-        tilt, off_axis = rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.6, 0.6, 2)
+        tilt, off_axis = rng.uniform(-0.4, 0.4, 3), rng.uniform(-0.5, 0.5, 2)
         turn = so3_exp(np.array([*off_axis, 0.0])) @ so3_exp(tilt)
         middle = so3_exp(np.array([*off_axis, 0.0])) @ np.array([0.0, 0.0, 0.24])
         away = middle - turn @ np.array([0.125, 0.075, 0.0])
@@ -207,15 +208,17 @@ def draw_boards(folder: Path, count: int) -> None:
         flat = (rays * np.where(depth > 0.0, depth, np.nan)[:, None] - away) @ turn / 0.05
         across, down = np.floor(flat[:, 0]) + 1.0, np.floor(flat[:, 1]) + 1.0
         on = (across >= 0) & (across <= 6) & (down >= 0) & (down <= 4)
-        image = np.where(on & ((across + down) % 2 == 0), 30.0, 200.0).reshape(480, 480)
-        image = cv2.GaussianBlur(image, (0, 0), 0.8)
+        image = np.where(on & ((across + down) % 2 == 0), 30.0, 200.0).reshape(1440, 1440)
+        image = cv2.resize(
+            cv2.GaussianBlur(image, (0, 0), 1.4), (720, 720), None, 0, 0, cv2.INTER_AREA
+        )
         cv2.imwrite(str(folder / f"board{number:02d}.png"), image.astype(np.uint8))
 
 
 @pytest.fixture(scope="module")
 def drawn_boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("boards")
-    draw_boards(folder, 18)
+    draw_boards(folder, 14)
     return folder
 
 
@@ -229,11 +232,12 @@ def test_a_fisheye_is_calibrated_from_images_of_a_board(
     for word in ("corners ", "camera ", "equidistant: k1", "worst ", "held out", "verdict", "up: "):
         assert word in told
     (camera,) = read_calibration_file(tmp_path / "camera.json").cameras
-    assert camera.focal_px == pytest.approx(FISHEYE.focal_px, rel=0.01)
-    assert median_apart_px(camera, FISHEYE) < 0.5
+    # Corners of drawn squares are found to 0.2 px, eight boards of fourteen.
+    assert camera.focal_px == pytest.approx(FISHEYE.focal_px, rel=0.015)
+    assert median_apart_px(camera, FISHEYE) < 0.7
     assert (tmp_path / "camera.png").read_bytes().startswith(b"\x89PNG")
     images = list(csv.DictReader((tmp_path / "camera_images.csv").open(encoding="utf-8")))
-    assert [row["image"] for row in images] == [f"board{k:02d}.png" for k in range(18)]
+    assert [row["image"] for row in images] == [f"board{k:02d}.png" for k in range(14)]
     assert all(row["rms_px"] for row in images if row["corners"] != "0")
     parameters = list(csv.DictReader((tmp_path / "camera_parameters.csv").open(encoding="utf-8")))
     names = ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]
