@@ -247,8 +247,9 @@ class _Problem:
             intrinsics.append(first_guess(model, points, [o.pixels for o in own], size))
         cTb = {}
         for v, c, corners in self.seen:
-            camera = camera_of(model, size, intrinsics[c])
-            found = board_pose(camera, self._points[corners.ids], corners.pixels)
+            found = board_pose(
+                camera_of(model, size, intrinsics[c]), self._points[corners.ids], corners.pixels
+            )
             if found is None:
                 raise CalibrationError(_UNDETERMINED)
             cTb[v, c] = found
@@ -345,7 +346,7 @@ class _Problem:
             by[0] = 1.0 / x[own][0]
             if self.model == "omni":
                 by[len(INTRINSICS)] = -1.0 / (1.0 + x[own][len(INTRINSICS)])
-            known = by @ covariance[own, own] @ by <= _UNCERTAIN**2
+            known = bool(by @ covariance[own, own] @ by <= _UNCERTAIN**2)
             try:
                 checked_camera(camera_of(self.model, size, x[own]))
             except CalibrationError:

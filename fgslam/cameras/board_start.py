@@ -120,7 +120,8 @@ def board_pose(camera: RawCamera, points: FloatArray, pixels: FloatArray) -> Flo
     )
     if not found or not (np.isfinite(vector).all() and np.isfinite(shift).all()):
         return None
-    return pose(turn.T @ so3_exp(vector.ravel()), turn.T @ shift.ravel())
+    rotation = so3_exp(np.asarray(vector, np.float64).ravel())
+    return pose(turn.T @ rotation, turn.T @ np.asarray(shift, np.float64).ravel())
 
 
 def _turned_ahead(direction: FloatArray) -> FloatArray:
