@@ -7,7 +7,7 @@ each other and their intrinsics come with one covariance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
+from fgslam.cameras.board_projection import INTRINSICS, PARAMETERS, TURN, projected
+from fgslam.cameras.board_start import board_pose, camera_of, first_guess
 from fgslam.cameras.boards import Board, Corners
-from fgslam.cameras.formats.trees import intrinsic_matrix
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.raw_cameras import RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import (
@@ -29,14 +30,15 @@ from fgslam.core.geometry import (
     transform_to_world,
 )
 
-MODELS = {"radtan": 5, "equidistant": 4}
-"""Lenses that can be calibrated, and how many parameters each has; names as of the lenses."""
 NAMES = ("left", "right", "top")
 LEAST_VIEWS = 5
-_TURN = 6  # numbers of a pose: rotation vector and translation
 _OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once in 270,000
-_MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
+MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
 _TRIMMINGS = 4
+_MOST_OFF = 0.0025  # of the image's diagonal: corners are found to a tenth of that
+_FIRST_STEPS = 30  # with the distortion held: far from the least it would bend back
+_STEPS = 300  # of the fit; twenty are usual, and without an end there is no least
+_UNCERTAIN = 0.1  # of the focal length: with a larger deviation nothing is known of a camera
 _LEAST_CORNERS = 6  # of an image, for its board's pose to follow with something left
 
 _UNDETERMINED = (
@@ -46,53 +48,6 @@ _UNDETERMINED = (
 
 View = tuple[Corners | None, ...]
 """What the cameras see of the board at one moment, in their order; None where it was not found."""
-
-
-def _projected(
-    model: str, points: FloatArray, turn: FloatArray, intrinsics: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Pixels (n, 2) and derivatives (2n, 6 + p) by the board's pose (6,) and the intrinsics (p,).
-
-    Intrinsics are fx, fy, cx, cy and the model's parameters.
-    """
-    matrix, distortion = intrinsic_matrix(*intrinsics[:4]), intrinsics[4:]
-    if model == "equidistant":
-        pixels, by = cv2.fisheye.projectPoints(
-            points[:, None], turn[:3], turn[3:], matrix, distortion
-        )
-        by = np.hstack([by[:, 8:14], by[:, : len(intrinsics)]])
-    else:
-        pixels, by = cv2.projectPoints(points, turn[:3], turn[3:], matrix, distortion)
-        by = by[:, : _TURN + len(intrinsics)]
-    return np.asarray(pixels, np.float64).reshape(-1, 2), np.asarray(by, np.float64)
-
-
-def _first_guess(
-    model: str,
-    points: Sequence[FloatArray],
-    pixels: Sequence[FloatArray],
-    size: tuple[int, int],
-) -> FloatArray:
-    """Intrinsics of one camera to start from.
-
-    Of a perspective camera by OpenCV from its own images; of a fisheye lens one that shows half a
-    turn over the longer side, without distortion.
-    """
-    if model == "equidistant":
-        focal = max(size) / np.pi
-        centre = (size[0] - 1) / 2.0, (size[1] - 1) / 2.0
-        return np.array([focal, focal, *centre, *np.zeros(MODELS[model])])
-    flat = [p.astype(np.float32)[:, None] for p in points]
-    seen = [p.astype(np.float32)[:, None] for p in pixels]
-    try:
-        _, matrix, distortion, *_ = cv2.calibrateCamera(flat, seen, size, np.eye(3), np.zeros(5))
-    except cv2.error as error:
-        raise CalibrationError(
-            f"the board's images do not determine a camera ({error.err}); take more of them, "
-            "tilted and filling the image"
-        ) from error
-    numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    return np.array([*numbers, *np.ravel(distortion)[: MODELS[model]]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +72,10 @@ class BoardCalibration:
     off: tuple[tuple[FloatArray, ...], ...]
     left_out: int
 
+    def turn(self, camera: int) -> FloatArray:
+        """(6,) rotation vector and translation from the first camera's coordinates to another's."""
+        return turn_of_matrix(inverse(self.cameras[camera].bTc) @ self.cameras[0].bTc)
+
     @property
     def errors(self) -> FloatArray:
         """(views, cameras) root mean square distance in each image, pixels; NaN where unseen."""
@@ -137,7 +96,8 @@ def _matrix_of_turn(turn: FloatArray) -> FloatArray:
     return pose(so3_exp(turn[:3]), turn[3:])
 
 
-def _turn_of_matrix(matrix: FloatArray) -> FloatArray:
+def turn_of_matrix(matrix: FloatArray) -> FloatArray:
+    """(6,) rotation vector and translation."""
     return np.concatenate([so3_log(matrix[:3, :3]), matrix[:3, 3]])
 
 
@@ -150,10 +110,11 @@ def calibrate(
         board: the board.
         views: of each moment what each camera saw; the first camera is the reference.
         size: width and height of all images.
-        model: one of :data:`MODELS`, of all cameras.
+        model: one of :data:`fgslam.cameras.board_projection.PARAMETERS`, of all cameras.
 
     Raises:
-        CalibrationError: too few views, or they do not determine the cameras.
+        CalibrationError: too few views, they do not determine the cameras, or no such cameras show
+            a board like that.
     """
     given = tuple(views)
     for _ in range(_TRIMMINGS):
@@ -162,6 +123,11 @@ def calibrate(
         if _count(trimmed) == _count(given):
             break
         given = trimmed
+    if found.rms > _MOST_OFF * float(np.hypot(*size)):
+        raise CalibrationError(
+            f"the corners lie {found.rms:.1f} px (rms) off what {model} cameras show of a flat "
+            "board; is --lens that of the camera, its focus fixed, and the board flat?"
+        )
     return replace(found, left_out=_count(views) - _count(given))
 
 
@@ -175,7 +141,10 @@ def _trimmed(views: Sequence[View], off: Sequence[Sequence[FloatArray]]) -> tupl
     What an earlier, worse fit left out comes back where it fits now.
     """
     everything = np.concatenate([distance for view in off for distance in view])
-    limit = _OUTLIER_SIGMAS * float(np.nanmedian(everything)) / _MEDIAN_OF_RAYLEIGH
+    known = everything[np.isfinite(everything)]
+    if not len(known):
+        raise CalibrationError(_UNDETERMINED)
+    limit = _OUTLIER_SIGMAS * float(np.median(known)) / MEDIAN_OF_RAYLEIGH
     out = []
     for view, distances in zip(views, off, strict=True):
         kept = (
@@ -217,17 +186,31 @@ def _fit(
     start = problem.start(size)
     if not np.isfinite(start).all() or not np.isfinite(problem.residuals(start)).all():
         raise CalibrationError(_UNDETERMINED)
-    fit = least_squares(problem.residuals, start, problem.jacobian, method="lm", x_scale="jac")
+    if model != "radtan":
+        start = _least(problem.residuals, problem.jacobian_without_lens, start, _FIRST_STEPS).x
+    fit = _least(problem.residuals, problem.jacobian, start, _STEPS)
     jacobian = problem.jacobian(fit.x)
     rows = len(fit.fun)
     scale = np.linalg.norm(jacobian, axis=0)
+    if not (np.isfinite(scale).all() and scale.all()):
+        raise CalibrationError(_UNDETERMINED)
     information = (jacobian / scale).T @ (jacobian / scale)
-    if rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
+    if not fit.success or rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
         raise CalibrationError(_UNDETERMINED)
     variance = 2.0 * fit.cost / (rows - len(fit.x))
-    sigmas = np.sqrt(variance * np.diag(np.linalg.inv(information))) / scale
-    found = problem.result(size, fit.x, sigmas)
+    covariance = variance * np.linalg.inv(information) / np.outer(scale, scale)
+    problem.require_determined(size, fit.x, covariance)
+    found = problem.result(size, fit.x, np.sqrt(np.diag(covariance)))
     return replace(found, off=_distances(found, board, views))
+
+
+def _least(
+    residuals: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], FloatArray],
+    start: FloatArray,
+    steps: int,
+) -> Any:
+    return least_squares(residuals, start, jacobian, method="lm", x_scale="jac", max_nfev=steps)
 
 
 class _Problem:
@@ -236,9 +219,9 @@ class _Problem:
     def __init__(self, board: Board, views: Sequence[View], model: str) -> None:
         self.model, self.views = model, views
         self.cameras, self._points = len(views[0]), board.points
-        self._own = 4 + MODELS[model]
+        self._own = len(INTRINSICS) + len(PARAMETERS[model])
         self._turns_at = self.cameras * self._own
-        self._boards_at = self._turns_at + _TURN * (self.cameras - 1)
+        self._boards_at = self._turns_at + TURN * (self.cameras - 1)
         self.seen = [
             (v, c, corners)
             for v, view in enumerate(views)
@@ -248,8 +231,9 @@ class _Problem:
         for camera in range(self.cameras):
             count = sum(c == camera for _, c, _ in self.seen)
             if count < LEAST_VIEWS:
+                which = f"{NAMES[camera]} camera" if self.cameras > 1 else "camera"
                 raise CalibrationError(
-                    f"the {NAMES[camera]} camera shows the board in {count} images that can be "
+                    f"the {which} shows the board in {count} images that can be "
                     f"used; {LEAST_VIEWS} are needed at least, twenty are good"
                 )
         self._row_of = {v: k for k, v in enumerate(sorted({v for v, _, _ in self.seen}))}
@@ -260,26 +244,18 @@ class _Problem:
         for camera in range(self.cameras):
             own = [corners for _, c, corners in self.seen if c == camera]
             points = [self._points[corners.ids] for corners in own]
-            intrinsics.append(_first_guess(model, points, [o.pixels for o in own], size))
-        cTb = {
-            (v, c): self._board_pose(corners, self._camera(size, intrinsics[c], np.eye(4), c))
-            for v, c, corners in self.seen
-        }
+            intrinsics.append(first_guess(model, points, [o.pixels for o in own], size))
+        cTb = {}
+        for v, c, corners in self.seen:
+            found = board_pose(
+                camera_of(model, size, intrinsics[c]), self._points[corners.ids], corners.pixels
+            )
+            if found is None:
+                raise CalibrationError(_UNDETERMINED)
+            cTb[v, c] = found
         turns = [self._relative(cTb, camera) for camera in range(1, self.cameras)]
         boards = [self._in_first(cTb, turns, v) for v in self._row_of]
-        return np.concatenate([*intrinsics, *map(_turn_of_matrix, turns), *boards])
-
-    def _camera(
-        self, size: tuple[int, int], intrinsics: FloatArray, fTc: FloatArray, number: int
-    ) -> RawCamera:
-        matrix, distortion = intrinsic_matrix(*intrinsics[:4]), intrinsics[4:]
-        return RawCamera(*size, matrix, distortion, fTc, f"cam{number}", self.model)
-
-    def _board_pose(self, corners: Corners, camera: RawCamera) -> FloatArray:
-        rays = camera.unproject(corners.pixels)
-        flat, points = rays[:, :2] / rays[:, 2:], self._points[corners.ids]
-        _, turn, shift = cv2.solvePnP(points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-        return _matrix_of_turn(np.concatenate([turn.ravel(), shift.ravel()]))
+        return np.concatenate([*intrinsics, *map(turn_of_matrix, turns), *boards])
 
     def _relative(self, cTb: dict[tuple[int, int], FloatArray], camera: int) -> FloatArray:
         """Of the poses that single views give the one nearest to all others."""
@@ -300,20 +276,20 @@ class _Problem:
         self, cTb: dict[tuple[int, int], FloatArray], turns: Sequence[FloatArray], view: int
     ) -> FloatArray:
         if (view, 0) in cTb:
-            return _turn_of_matrix(cTb[view, 0])
+            return turn_of_matrix(cTb[view, 0])
         camera = next(c for c in range(1, self.cameras) if (view, c) in cTb)
-        return _turn_of_matrix(inverse(turns[camera - 1]) @ cTb[view, camera])
+        return turn_of_matrix(inverse(turns[camera - 1]) @ cTb[view, camera])
 
     def _intrinsics(self, x: FloatArray, camera: int) -> FloatArray:
         return x[camera * self._own : (camera + 1) * self._own]
 
     def _turn(self, x: FloatArray, camera: int) -> FloatArray:
-        at = self._turns_at + _TURN * (camera - 1)
-        return x[at : at + _TURN] if camera else np.zeros(_TURN)
+        at = self._turns_at + TURN * (camera - 1)
+        return x[at : at + TURN] if camera else np.zeros(TURN)
 
     def _board(self, x: FloatArray, view: int) -> FloatArray:
-        at = self._boards_at + _TURN * self._row_of[view]
-        return x[at : at + _TURN]
+        at = self._boards_at + TURN * self._row_of[view]
+        return x[at : at + TURN]
 
     def _looked_at(self, x: FloatArray, view: int, camera: int, corners: Corners) -> Any:
         """Residuals (2n,), derivatives by intrinsics, turn and board of one image."""
@@ -321,13 +297,13 @@ class _Problem:
         composed = cv2.composeRT(board[:3], board[3:], turn[:3], turn[3:])
         whole = np.concatenate([composed[0].ravel(), composed[1].ravel()])
         points = self._points[corners.ids]
-        pixels, by = _projected(self.model, points, whole, self._intrinsics(x, camera))
+        pixels, by = projected(self.model, points, whole, self._intrinsics(x, camera))
         d = [np.asarray(part) for part in composed[2:]]  # dr3 by r1, t1, r2, t2; dt3 by the same
         by_board = np.block([[d[0], d[1]], [d[4], d[5]]])
         by_turn = np.block([[d[2], d[3]], [d[6], d[7]]])
-        of_pose = by[:, :_TURN]
+        of_pose = by[:, :TURN]
         off = (pixels - corners.pixels).ravel()
-        return off, by[:, _TURN:], of_pose @ by_turn, of_pose @ by_board
+        return off, by[:, TURN:], of_pose @ by_turn, of_pose @ by_board
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """(r,) pixels, predicted minus found."""
@@ -343,28 +319,58 @@ class _Problem:
             row = rows.stop
             out[rows, camera * self._own : (camera + 1) * self._own] = by_lens
             if camera:
-                at = self._turns_at + _TURN * (camera - 1)
-                out[rows, at : at + _TURN] = by_turn
-            at = self._boards_at + _TURN * self._row_of[view]
-            out[rows, at : at + _TURN] = by_board
+                at = self._turns_at + TURN * (camera - 1)
+                out[rows, at : at + TURN] = by_turn
+            at = self._boards_at + TURN * self._row_of[view]
+            out[rows, at : at + TURN] = by_board
         return out
+
+    def jacobian_without_lens(self, x: FloatArray) -> FloatArray:
+        """(r, p), by which the lenses' distortion stays as it is."""
+        out = self.jacobian(x)
+        kept = len(INTRINSICS) + (1 if self.model == "omni" else 0)
+        for camera in range(self.cameras):
+            out[:, camera * self._own + kept : (camera + 1) * self._own] = 0.0
+        return out
+
+    def require_determined(
+        self, size: tuple[int, int], x: FloatArray, covariance: FloatArray
+    ) -> None:
+        """Raises CalibrationError for a camera that is none, or of uncertain focal length.
+
+        The unified model's is ``f / (1 + xi)``, that around the axis: the two are nearly one.
+        """
+        for camera in range(self.cameras):
+            own = slice(camera * self._own, (camera + 1) * self._own)
+            by = np.zeros(self._own)
+            by[0] = 1.0 / x[own][0]
+            if self.model == "omni":
+                by[len(INTRINSICS)] = -1.0 / (1.0 + x[own][len(INTRINSICS)])
+            known = bool(by @ covariance[own, own] @ by <= _UNCERTAIN**2)
+            try:
+                checked_camera(camera_of(self.model, size, x[own]))
+            except CalibrationError:
+                known = False
+            if not known:
+                raise CalibrationError(_UNDETERMINED)
 
     def result(self, size: tuple[int, int], x: FloatArray, sigmas: FloatArray) -> BoardCalibration:
         """The solution in words of cameras."""
-        boards = np.full((len(self.views), _TURN), np.nan)
+        boards = np.full((len(self.views), TURN), np.nan)
         for view in self._row_of:
             boards[view] = self._board(x, view)
         own, turns = self._turns_at, slice(self._turns_at, self._boards_at)
         cameras = tuple(
-            self._camera(
-                size, self._intrinsics(x, c), inverse(_matrix_of_turn(self._turn(x, c))), c
+            replace(
+                camera_of(self.model, size, self._intrinsics(x, c), f"cam{c}"),
+                bTc=inverse(_matrix_of_turn(self._turn(x, c))),
             )
             for c in range(self.cameras)
         )
         return BoardCalibration(
             cameras=cameras,
             sigmas=sigmas[:own].reshape(self.cameras, -1),
-            turn_sigmas=np.vstack([np.zeros((1, _TURN)), sigmas[turns].reshape(-1, _TURN)]),
+            turn_sigmas=np.vstack([np.zeros((1, TURN)), sigmas[turns].reshape(-1, TURN)]),
             boards=boards,
             off=(),
             left_out=0,

@@ -6,8 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from fgslam.cameras.board_calibration import BoardCalibration, View, calibrate
+from fgslam.cameras.board_calibration import (
+    MEDIAN_OF_RAYLEIGH,
+    BoardCalibration,
+    View,
+    calibrate,
+    turn_of_matrix,
+)
+from fgslam.cameras.board_projection import TURN, projected
+from fgslam.cameras.board_start import board_pose
 from fgslam.cameras.boards import Board, Corners
 from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray, IntArray
@@ -15,6 +24,7 @@ from fgslam.core.errors import CalibrationError
 
 _CELLS = 10  # of the image, along each side, that corners may cover
 _MEDIAN_TO_SIGMA = 1.4826  # of a normal distribution
+_HUBER_PX = 0.5  # beyond which a corner counts less in the board's place
 _FAR = 1e-6  # radians of parallax: below it a point has no depth
 DEPTH_SHARE = 0.05
 """Of the depth: where a point lies deeper than this error, it is of no use as a place."""
@@ -114,6 +124,91 @@ def _squares(board: Board, seen: _Seen) -> FloatArray:
     ends = row[board.neighbours]
     ends = ends[(ends >= 0).all(axis=1)]
     return np.asarray(np.linalg.norm(seen.points[ends[:, 0]] - seen.points[ends[:, 1]], axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutAlone:
+    """How one camera does on images that did not take part in its calibration.
+
+    Attributes:
+        views: (k,) which of all views those were.
+        off_px: deviation of a corner's distance, from the median of all: one that was found wrongly
+            says nothing of the calibration. The board's pose alone is fitted to each image.
+        each_px: (k,) root mean square distance in each image.
+    """
+
+    views: IntArray
+    off_px: float
+    each_px: FloatArray
+
+
+def held_out_alone(
+    board: Board, views: Sequence[View], size: tuple[int, int], model: str
+) -> HeldOutAlone | None:
+    """Every second view calibrates a camera, the others judge it.
+
+    None where half of the views are not enough to calibrate with.
+    """
+    own = np.array([k for k, view in enumerate(views) if view[0] is not None], np.int64)
+    try:
+        camera = calibrate(board, [views[k] for k in own[::2]], size, model).cameras[0]
+    except CalibrationError:
+        return None
+    kept, off = [], []
+    for k in own[1::2].tolist():
+        corners = views[k][0]
+        distances = None if corners is None else _off_when_placed(board, camera, corners)
+        if distances is not None:
+            kept.append(k)
+            off.append(distances)
+    if not kept:
+        return None
+    off_px = float(np.median(np.concatenate(off))) / MEDIAN_OF_RAYLEIGH * np.sqrt(2.0)
+    each = np.array([np.sqrt(np.mean(distances**2)) for distances in off])
+    return HeldOutAlone(np.array(kept), float(off_px), each)
+
+
+def _off_when_placed(board: Board, camera: RawCamera, corners: Corners) -> FloatArray | None:
+    """Distances (n,) in pixels with the board where they are least; None where it has no place."""
+    points = board.points[corners.ids]
+    cTb = board_pose(camera, points, corners.pixels)
+    if cTb is None:
+        return None
+    matrix = camera.matrix
+    focal_and_centre = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
+    intrinsics = np.concatenate([focal_and_centre, camera.distortion])
+
+    def off(turn: FloatArray) -> FloatArray:
+        return projected(camera.model, points, turn, intrinsics)[0].ravel() - corners.pixels.ravel()
+
+    def slope(turn: FloatArray) -> FloatArray:
+        return projected(camera.model, points, turn, intrinsics)[1][:, :TURN]
+
+    fit = least_squares(off, turn_of_matrix(cTb), slope, loss="huber", f_scale=_HUBER_PX)
+    return np.asarray(np.linalg.norm(off(fit.x).reshape(-1, 2), axis=1))
+
+
+def coverage_of_circle(views: Sequence[View], camera: RawCamera) -> float:
+    """Share of the cells (ten by ten) of the widest circle in the image with a corner.
+
+    The circle is that around the principal point: a fisheye's or a mirror's image is black beyond.
+    """
+    centre = camera.matrix[:2, 2]
+    radius = float(np.min([*centre, *(np.array(camera.size) - 1 - centre)]))
+    seen = [corners.pixels for view in views if (corners := view[0]) is not None]
+    pixels = np.concatenate([np.empty((0, 2)), *seen])
+    found = np.floor(((pixels - centre) / radius + 1.0) * 0.5 * _CELLS).astype(int)
+    middles = (np.arange(_CELLS) + 0.5) / _CELLS * 2.0 - 1.0
+    within = np.hypot(middles[:, None], middles) < 1.0
+    found = np.unique(found[((found >= 0) & (found < _CELLS)).all(axis=1)], axis=0)
+    return float(within[found[:, 0], found[:, 1]].sum() / within.sum())
+
+
+def farthest_from_axis(views: Sequence[View], camera: RawCamera) -> float:
+    """Largest angle from the axis, radians, at which a corner was found."""
+    seen = [corners.pixels for view in views if (corners := view[0]) is not None]
+    rays = camera.unproject(np.concatenate([np.empty((0, 2)), *seen]))
+    return float(np.nanmax(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]), initial=0.0))
 
 
 def coverage(views: Sequence[View], camera: int, size: tuple[int, int]) -> float:

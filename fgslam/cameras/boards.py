@@ -89,10 +89,21 @@ def _grid(columns: int, rows: int) -> FloatArray:
     return np.column_stack([column, row]).astype(np.float64)
 
 
-def find_corners(board: Board, image: Image) -> Corners | None:
-    """Corners of the board in a grey image (height, width) uint8; None where it is not found."""
+def find_corners(board: Board, image: Image, mirrored: bool = False) -> Corners | None:
+    """Corners of the board in a grey image (height, width) uint8; None where it is not found.
+
+    ``mirrored``: the image may be one in a mirror, where no markers are known; a board of them is
+    then looked for in its reflection as well. Reflected, a flat board is one seen from behind.
+    """
     finders = {"chessboard": _chessboard, "charuco": _charuco, "aprilgrid": _aprilgrid}
-    return finders[board.kind](board, image)
+    found = finders[board.kind](board, image)
+    if found is not None or not mirrored or board.kind == "chessboard":
+        return found
+    reflected = finders[board.kind](board, np.ascontiguousarray(image[:, ::-1]))
+    if reflected is None:
+        return None
+    pixels = np.array([image.shape[1] - 1.0, 0.0]) + reflected.pixels * np.array([-1.0, 1.0])
+    return Corners(reflected.ids, pixels)
 
 
 def _chessboard(board: Board, image: Image) -> Corners | None:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fgslam.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from fgslam.cameras.boards import Board as CalibrationBoard
+    from fgslam.runs.calibrating import Calibrated
 
 app = typer.Typer(
     help="Calibrate cameras from images of a board, a mirror from one of rings.",
@@ -27,6 +31,16 @@ Target = Annotated[str, typer.Option(help="chessboard, charuco or aprilgrid (tag
 Spacing = Annotated[float, typer.Option(help="of an AprilGrid: gap between tags over a tag's side")]
 Dictionary = Annotated[str, typer.Option(help="of a ChArUco board: OpenCV's name of its markers")]
 Lens = Annotated[str, typer.Option(help="radtan (perspective) or equidistant (fisheye)")]
+WideLens = Annotated[
+    str, typer.Option(help="omni (unified model of mirrors and fisheyes, Mei) or equidistant")
+]
+Mount = Annotated[
+    str, typer.Option(help="mirror (above the camera), or up or down, where a fisheye looks")
+]
+CameraOut = Annotated[
+    Path,
+    typer.Option(metavar="FILE", help="where to write it, .yaml, for --camera; numbers in .json"),
+]
 Out = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .json, for --camera")]
 MirrorOut = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .yaml")]
 
@@ -66,15 +80,39 @@ def trinocular(  # noqa: PLR0913 - each option is a parameter
     square: Square,
     target: Target = "chessboard",
     spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_4X4_50",
     lens: Lens = "radtan",
     out: Out = Path("rig.json"),
 ) -> None:
     """Calibrate three cameras, in an L or a line; images of one moment in the same order."""
-    _calibrate([left, right, top], (target, board, square, spacing, "DICT_4X4_50"), lens, out)
+    _calibrate([left, right, top], (target, board, square, spacing, dictionary), lens, out)
 
 
 @app.command()
-def omni(
+def omni(  # noqa: PLR0913 - each option is a parameter
+    images: Annotated[Path, typer.Argument(metavar="IMAGES", help="folder of the board's images")],
+    board: Board,
+    square: Square,
+    target: Target = "chessboard",
+    spacing: Spacing = 0.3,
+    dictionary: Dictionary = "DICT_4X4_50",
+    lens: WideLens = "omni",
+    mount: Mount = "mirror",
+    out: CameraOut = Path("camera.yaml"),
+) -> None:
+    """Calibrate one fisheye, or a camera below a mirror, from images of a board."""
+    from fgslam.cli.console import progress_bar
+    from fgslam.runs import calibrating
+
+    known = _board(target, board, square, spacing, dictionary)
+    wide = calibrating.WideLens(lens, mount)
+    with progress_bar() as progress:
+        found = calibrating.calibrate_wide_camera(images, known, wide, out, progress)
+    _tell(found)
+
+
+@app.command()
+def rings(
     image: Annotated[
         Path, typer.Argument(metavar="IMAGE", help="rings around the camera in its mirror")
     ],
@@ -103,17 +141,27 @@ def omni(
 def _calibrate(
     folders: list[Path], board: tuple[str, str, float, float, str], lens: str, out: Path
 ) -> None:
-    from fgslam.cameras.boards import Board as CalibrationBoard
     from fgslam.cli.console import progress_bar
     from fgslam.runs.calibrating import calibrate_cameras
 
-    kind, size, square, spacing, dictionary = board
+    known = _board(*board)
+    with progress_bar() as progress:
+        found = calibrate_cameras(folders, known, lens, out, progress)
+    _tell(found)
+
+
+def _board(
+    kind: str, size: str, square: float, spacing: float, dictionary: str
+) -> CalibrationBoard:
+    from fgslam.cameras.boards import Board as KnownBoard
+
     counted = re.fullmatch(r"(\d{1,3})x(\d{1,3})", size)
     if counted is None:
         raise ConfigError(f"--board {size}: give columns and rows as 9x6")
-    known = CalibrationBoard(kind, int(counted[1]), int(counted[2]), square, spacing, dictionary)
-    with progress_bar() as progress:
-        found = calibrate_cameras(folders, known, lens, out, progress)
+    return KnownBoard(kind, int(counted[1]), int(counted[2]), square, spacing, dictionary)
+
+
+def _tell(found: Calibrated) -> None:
     for line in found.lines:
         typer.echo(line)
-    typer.echo(f"calibration {found.file}, picture {found.picture}")
+    typer.echo(f"calibration {found.file}, with {', '.join(str(path) for path in found.others)}")

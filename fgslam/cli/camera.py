@@ -62,16 +62,25 @@ def show(  # noqa: PLR0913 - each option is a parameter
 
 
 @app.command()
-def convert(
+def convert(  # noqa: PLR0913 - each option is a parameter
     file: File,
     out: Annotated[
         Path,
         typer.Argument(
             metavar="OUT",
-            help=".json is fgslam's, .yml or .xml OpenCV's, .yaml Kalibr's, no ending a folder "
-            "with left.yaml and right.yaml of ROS",
+            help=".json is fgslam's, .yml or .xml OpenCV's, .yaml Kalibr's, .txt KITTI's, no "
+            "ending a folder with left.yaml and right.yaml of ROS",
         ),
     ],
+    form: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="another than the ending says: fgslam, opencv, kalibr, ros, kitti, euroc (a "
+            "folder with cam0/sensor.yaml, ...), orb_slam3",
+        ),
+    ] = None,
     second: Second = None,
     size: Size = None,
     scale: Scale = False,
@@ -83,5 +92,5 @@ def convert(
     from fgslam.runs.camera_files import Asked, convert_calibration
 
     asked = Asked(file, second, size, scale, unit, fov, cameras)
-    for line in convert_calibration(asked, out):
+    for line in convert_calibration(asked, out, form):
         typer.echo(line)

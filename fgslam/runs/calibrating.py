@@ -3,57 +3,99 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import yaml
 
 from fgslam.cameras.assembly import assembled
-from fgslam.cameras.board_calibration import MODELS, NAMES, BoardCalibration, View, calibrate
-from fgslam.cameras.board_check import DEPTH_SHARE, HeldOut, coverage, held_out
-from fgslam.cameras.boards import Board, find_corners, sizes_that_fit
+from fgslam.cameras.board_calibration import View, calibrate
+from fgslam.cameras.board_check import held_out, held_out_alone
+from fgslam.cameras.boards import Board, Corners, find_corners, sizes_that_fit
 from fgslam.cameras.formats.own import raw_values
 from fgslam.cameras.omni.mirrors import MirrorFrame
 from fgslam.cameras.omni.ring_calibration import calibrate_from_rings, find_mirror_circle
 from fgslam.cameras.raw_cameras import Calibration
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.files import write_text
 from fgslam.datasets.images import bits_of, read_grey_image
 from fgslam.datasets.loose_files import find_cameras, images_in, pair_files
-from fgslam.report.pictures.board import draw_corners
+from fgslam.runs.calibration_report import (
+    Files,
+    draw_coverage,
+    fit_lines,
+    rig_verdict,
+    wide_verdict,
+    write_tables,
+)
 
-_ROWS_PX = 0.5  # stereo matching takes rows that agree to 1.5; half a pixel leaves it room
-_SQUARE = 0.01  # of the square's side: what a tape measure is good for
-_COVERAGE = 0.5
-_VIEWS = 10
 _WITHIN_RIM = 0.98  # of a mirror's radius: its edge is a border of two bands, too
 _SEED = 0  # of the search for a mirror's circle: the same image gives the same calibration
 
+RIG_MODELS = ("radtan", "equidistant")
+WIDE_MODELS = ("omni", "equidistant")
+MOUNTS = {
+    "mirror": ("down", True, "a mirror above the camera, the image's middle looks down"),
+    "up": ("up", True, "a fisheye that looks up"),
+    "down": ("down", False, "a fisheye that looks down"),
+}
+"""How an omnidirectional camera may be mounted: where the image's middle looks, whether bearings
+grow clockwise in it, and that in words."""
+
 Progress = Callable[[str, int, int], None]
+Finder = Callable[[Image], Corners | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """What came out: the file, its picture and what to tell, a line each."""
+    """What came out: the calibration, what else was written, and what to tell, a line each."""
 
     file: Path
-    picture: Path
+    others: tuple[Path, ...]
     lines: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WideLens:
+    """Model of a single wide camera, and how it is mounted.
+
+    Raises:
+        ConfigError: one of them is not known.
+    """
+
+    model: str = "omni"
+    mount: str = "mirror"
+
+    def __post_init__(self) -> None:
+        _require_model(self.model, WIDE_MODELS)
+        if self.mount not in MOUNTS:
+            raise ConfigError(f"mount {self.mount!r} is not known; use {', '.join(MOUNTS)}")
+
+    def camera_file(self, numbers: str) -> dict[str, str | bool]:
+        """Keys of a camera file that names the calibration beside it."""
+        middle, clockwise, _ = MOUNTS[self.mount]
+        return {"kind": "lens", "file": numbers, "middle": middle, "clockwise": clockwise}
+
+
+def _require_model(model: str, known: Sequence[str]) -> None:
+    if model not in known:
+        raise ConfigError(f"lens {model!r} is not known; use {' or '.join(known)}")
 
 
 def calibrate_cameras(
     folders: Sequence[Path], board: Board, model: str, out: Path, progress: Progress
 ) -> Calibrated:
-    """Writes the calibration of a rig and a picture of how its images are covered.
+    """Writes the calibration of a rig, a picture of how its images are covered, and tables.
 
     Args:
         folders: one folder with the images of a pair, or one folder for each of two or three
             cameras, left, right, top.
         board: what the images show.
-        model: of the lenses.
+        model: of the lenses, one of :data:`RIG_MODELS`.
         out: the calibration, .json, for `--camera`.
         progress: called with what is done, how far, of how much.
 
@@ -63,26 +105,74 @@ def calibrate_cameras(
     """
     if out.suffix != ".json":
         raise ConfigError(f"{out}: a calibration is written as .json; give such a name")
-    if model not in MODELS:
-        raise ConfigError(f"lens {model!r} is not known; use {' or '.join(MODELS)}")
+    _require_model(model, RIG_MODELS)
     files, notes = _files(folders)
     bits, held = bits_of([moment[0] for moment in files])
-    views, size = _views(files, bits, board, progress)
+    views, size = _views(files, bits, partial(find_corners, board), progress)
+    _require_found(views, files, bits, board)
     found = calibrate(board, views, size, model)
     checked = [held_out(board, views, size, model, k) for k in range(1, len(found.cameras))]
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
     remarks = assembled(calibration).remarks
     write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
-    picture = out.with_suffix(".png")
-    draw_corners(picture, size, _shown(views, found), NAMES)
+    others = (draw_coverage(out, views, found), *write_tables(out, files, views, found))
+    lines = (*fit_lines(files, views, found), *rig_verdict(board, views, found, checked), *remarks)
+    return Calibrated(out, others, (*notes, *held, *lines))
+
+
+def calibrate_wide_camera(
+    folder: Path, board: Board, lens: WideLens, out: Path, progress: Progress
+) -> Calibrated:
+    """Writes the calibration of one fisheye or mirror, a picture of its coverage, and tables.
+
+    Args:
+        folder: of the images.
+        board: what they show.
+        lens: how the camera is modelled and mounted.
+        out: the camera file, .yaml, for :func:`fgslam.load_camera`, `teach` and `follow`; the
+            calibration that it names is written beside it as .json.
+        progress: called with what is done, how far, of how much.
+
+    Raises:
+        FgslamError: the images are not found, show no such board or too few, or a file cannot be
+            written.
+    """
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{out}: a camera file is written as .yaml; give such a name")
+    files = _files_of_one(folder)
+    bits, held = bits_of([moment[0] for moment in files])
+    finder = partial(find_corners, board, mirrored=lens.mount == "mirror")
+    views, size = _views(files, bits, finder, progress)
+    _require_found(views, files, bits, board)
+    found = calibrate(board, views, size, lens.model)
+    checked = held_out_alone(board, views, size, lens.model)
+    numbers = out.with_suffix(".json")
+    calibration = Calibration(str(numbers), "fgslam calibrate", found.cameras)
+    write_text(numbers, json.dumps(raw_values(calibration), indent=2) + "\n")
+    write_text(out, yaml.safe_dump(lens.camera_file(numbers.name), sort_keys=False))
+    tables = write_tables(out, files, views, found)
     lines = (
-        *notes,
         *held,
-        *_told(files, views, found),
-        *_judged(board, views, found, checked),
-        *remarks,
+        *fit_lines(files, views, found),
+        *wide_verdict(files, views, found, checked),
+        f"mount       {lens.mount}: {MOUNTS[lens.mount][-1]}; if not, give --mount",
     )
-    return Calibrated(out, picture, lines)
+    return Calibrated(out, (numbers, draw_coverage(out, views, found), *tables), lines)
+
+
+def _files_of_one(folder: Path) -> list[tuple[Path, ...]]:
+    """The images of one camera, each a moment of its own."""
+    if folder.is_file():
+        raise DatasetError(
+            f"{folder}: is a file; give the folder of the board's images (a mirror is calibrated "
+            "from one image of rings by fgslam calibrate rings)"
+        )
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: no such folder; give the folder of the board's images")
+    found = images_in(folder)
+    if not found:
+        raise DatasetError(f"{folder}: holds no images; give the folder of the board's images")
+    return [(path,) for path in found]
 
 
 def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, ...]]:
@@ -112,7 +202,7 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
 
 
 def _views(
-    files: Sequence[tuple[Path, ...]], bits: int, board: Board, progress: Progress
+    files: Files, bits: int, finder: Finder, progress: Progress
 ) -> tuple[list[View], tuple[int, int]]:
     """What the cameras see of the board at each moment, and the size of all images."""
     views, sizes = [], set()
@@ -125,14 +215,15 @@ def _views(
                 f"{moment[0]}: its images, or those before, differ in size ({sorted(sizes)}); "
                 "calibrate cameras of one resolution"
             )
-        views.append(tuple(find_corners(board, image) for image in images))
+        views.append(tuple(finder(image) for image in images))
     progress("board", len(files), len(files))
-    if not any(corners for view in views for corners in view):
-        raise CalibrationError(_no_board(files, bits, board))
     return views, sizes.pop()
 
 
-def _no_board(files: Sequence[tuple[Path, ...]], bits: int, board: Board) -> str:
+def _require_found(views: Sequence[View], files: Files, bits: int, board: Board) -> None:
+    """Raises CalibrationError where no image shows the board."""
+    if any(corners for view in views for corners in view):
+        return
     size = f"{board.columns}x{board.rows}"
     others = sizes_that_fit(board, read_grey_image(files[0][0], bits))
     meant = f"; {files[0][0].name} shows {', '.join(others)}" if others else ""
@@ -141,86 +232,10 @@ def _no_board(files: Sequence[tuple[Path, ...]], bits: int, board: Board) -> str
         "charuco": "squares are counted; is --dictionary that of the print",
         "aprilgrid": "tags are counted, of the family 36h11",
     }
-    return (
+    raise CalibrationError(
         f"no image of {len(files)} moments shows a {board.kind} of {size}{meant}; correct --board "
         f"({counted[board.kind]})"
     )
-
-
-# --------------------------------------------------------------------------------------------
-# What is told
-
-
-def _told(
-    files: Sequence[tuple[Path, ...]], views: Sequence[View], found: BoardCalibration
-) -> Iterator[str]:
-    total = sum(len(corners) for view in views for corners in view if corners is not None)
-    yield (
-        f"corners     {total - found.left_out} used, {found.left_out} left out that do not fit, "
-        f"rms {found.rms:.3f} px"
-    )
-    for k, camera in enumerate(found.cameras):
-        seen = sum(view[k] is not None for view in views)
-        covered = coverage(views, k, camera.size)
-        matrix, sigma = camera.matrix, found.sigmas[k]
-        yield (
-            f"{NAMES[k]:11} {seen} of {len(views)} images, {covered:.0%} of the image; "
-            f"f {matrix[0, 0]:.2f} {matrix[1, 1]:.2f} +- {sigma[:2].max():.2f} px, "
-            f"centre {matrix[0, 2]:.2f} {matrix[1, 2]:.2f} +- {sigma[2:4].max():.2f} px"
-        )
-    for k in range(1, len(found.cameras)):
-        length = float(np.linalg.norm(found.cameras[k].bTc[:3, 3]))
-        turn, shift = found.turn_sigmas[k, :3], found.turn_sigmas[k, 3:]
-        yield (
-            f"{NAMES[0]}-{NAMES[k]:6} {1e3 * length:.2f} +- {1e3 * shift.max():.2f} mm apart, "
-            f"turned to +- {np.degrees(turn.max()):.3f} deg"
-        )
-    worst = np.unravel_index(int(np.nanargmax(found.errors)), found.errors.shape)
-    name = files[int(worst[0])][int(worst[1])].name
-    yield f"worst       {name}: {found.errors[worst]:.2f} px"
-
-
-def _judged(
-    board: Board,
-    views: Sequence[View],
-    found: BoardCalibration,
-    checked: Sequence[HeldOut | None],
-) -> Iterator[str]:
-    """How the rig does on images that it was not calibrated with, and what to mend."""
-    faults = []
-    for k, held in enumerate(checked, start=1):
-        if held is None:
-            yield "held out    not known: half of the images are not enough to calibrate with"
-            continue
-        off = held.square / board.square - 1.0
-        yield (
-            f"held out    {NAMES[0]}-{NAMES[k]}, {held.views} images: rows agree to "
-            f"{held.rows_px:.2f} px, squares of {1e3 * held.square:.2f} mm ({off:+.1%}); depth to "
-            f"{DEPTH_SHARE:.0%} up to {held.reach_m:.1f} m"
-        )
-        if held.rows_px > _ROWS_PX:
-            faults.append(f"rows agree to {held.rows_px:.2f} px only")
-        if abs(off) > _SQUARE:
-            faults.append(f"squares come out {off:+.1%}")
-    least = min(coverage(views, k, camera.size) for k, camera in enumerate(found.cameras))
-    if least < _COVERAGE:
-        faults.append(f"a camera shows the board in {least:.0%} of its image only")
-    both = sum(all(corners is not None for corners in view) for view in views)
-    if both < _VIEWS:
-        faults.append(f"only {both} moments show it to all cameras")
-    if faults or None in checked:
-        mend = "take more images: tilted, near and far, in each corner, with a sharp and flat board"
-        yield f"verdict     doubtful: {'; '.join(faults or ['not checked'])}; {mend}"
-    else:
-        yield "verdict     good for mapping"
-
-
-def _shown(views: Sequence[View], found: BoardCalibration) -> list[FloatArray]:
-    """Of each camera (n, 2) pixels of all corners."""
-    return [
-        np.concatenate([corners.pixels for view in views if (corners := view[k]) is not None])
-        for k in range(len(found.cameras))
-    ]
 
 
 # --------------------------------------------------------------------------------------------

@@ -69,8 +69,8 @@ def _whole_numbers(text: str, separator: str, option: str, example: str) -> tupl
 # In another format
 
 
-def convert_calibration(asked: Asked, out: Path) -> list[str]:
-    """Writes the calibration in the format that the name of ``out`` says; lines about it.
+def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> list[str]:
+    """Writes the calibration in a format, None: the one that the name of ``out`` says; lines.
 
     Raises:
         CalibrationError: it cannot be read, or that format has no such cameras.
@@ -82,9 +82,10 @@ def convert_calibration(asked: Asked, out: Path) -> list[str]:
         raise CalibrationError(
             f"{found.source} does not state the images' size; give it: --size 640x480"
         )
-    view = _view(found, asked.rectified) if not out.suffix and len(found.cameras) == 2 else None
-    form = write_calibration(found, out, view)
-    return [f"{out}: {form}, {len(found.cameras)} cameras of {found.source}", *found.notes]
+    for_ros = form == "ros" or (form is None and not out.suffix)
+    view = _view(found, asked.rectified) if for_ros and len(found.cameras) == 2 else None
+    words = write_calibration(found, out, view, form)
+    return [f"{out}: {words}, {len(found.cameras)} cameras of {found.source}", *found.notes]
 
 
 def _view(found: Calibration, asked: ViewAsked) -> StatedView:

@@ -1,4 +1,4 @@
-"""Calibrations written in the formats of fgslam, OpenCV, Kalibr and ROS."""
+"""Calibrations written in the formats of fgslam, OpenCV, Kalibr, ROS and of SLAM data sets."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.formats.own import raw_values
+from fgslam.cameras.formats.writing_parts import refused, require_no_skew, shortened, two
+from fgslam.cameras.formats.writing_slam import euroc_files, kitti_text, orb_slam_text
 from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
@@ -22,34 +24,47 @@ _KALIBR = {"radtan": "pinhole", "equidistant": "pinhole", "fov": "pinhole", "omn
 _SPHERES = ("ds", "eucm")
 
 
-def write_calibration(calibration: Calibration, path: Path, view: StatedView | None = None) -> str:
-    """Writes a calibration; the name says the format.
+def write_calibration(
+    calibration: Calibration,
+    path: Path,
+    view: StatedView | None = None,
+    form: str | None = None,
+) -> str:
+    """Writes a calibration; the name says the format, unless it is given.
 
-    ``.json`` is fgslam's own, ``.yml`` and ``.xml`` OpenCV's, ``.yaml`` Kalibr's, and a name
-    without an ending a folder with ``left.yaml`` and ``right.yaml`` of ROS.
+    ``.json`` is fgslam's own, ``.yml`` and ``.xml`` OpenCV's, ``.yaml`` Kalibr's, ``.txt`` KITTI's,
+    and a name without an ending a folder with ``left.yaml`` and ``right.yaml`` of ROS.
 
     Args:
         calibration: what is written.
         path: the file or folder.
         view: rectification of left and right camera for ROS, whose files must state one.
+        form: one of :data:`FORMATS`; None: by the name.
 
     Returns:
         The format in words.
 
     Raises:
-        CalibrationError: the format has no such cameras, or the ending is not known.
+        CalibrationError: the format has no such cameras, or it or the ending is not known.
         OutputError: the file cannot be written.
     """
-    if path.suffix.lower() not in _WRITERS:
-        known = ", ".join(f"{ending} ({name})" for ending, (name, _) in _WRITERS.items() if ending)
+    name = form or _ENDINGS.get(path.suffix.lower())
+    if name is None:
+        known = ", ".join(f"{ending} ({form})" for ending, form in _ENDINGS.items() if ending)
         raise CalibrationError(
-            f"{path}: no format ends like that; known: {known}, and no ending (a folder for ROS)"
+            f"{path}: no format ends like that; known: {known}, and no ending (a folder for ROS); "
+            f"or give --format, one of {', '.join(FORMATS)}"
         )
-    name, write = _WRITERS[path.suffix.lower()]
+    if name not in FORMATS:
+        raise CalibrationError(f"format {name!r} is not known; use {', '.join(FORMATS)}")
+    words, endings, write = FORMATS[name]
+    if path.suffix.lower() not in endings:
+        wanted = " or ".join(ending or "no ending, a folder" for ending in endings)
+        raise CalibrationError(f"{path}: {words} is written as {wanted}; give such a name")
     if write is not _own:
-        calibration.require_uncorrected(f"{name} cannot hold them")
+        calibration.require_uncorrected(f"{words} cannot hold them")
     write(calibration, path, view)
-    return name
+    return words
 
 
 def _own(calibration: Calibration, path: Path, _: StatedView | None) -> None:
@@ -79,10 +94,10 @@ def _kalibr_camera(camera: RawCamera) -> dict[str, Any]:
     elif camera.model == "omni":
         own, distortion, kind = [camera.distortion[0]], camera.distortion[1:], "radtan"
     elif camera.model == "radtan":
-        distortion = _shortened(camera, 4, "Kalibr")
+        distortion = shortened(camera, 4, "Kalibr")
     elif camera.model not in _KALIBR:
-        raise _refused(camera, "Kalibr")
-    _require_no_skew(camera, "Kalibr")
+        raise refused(camera, "Kalibr")
+    require_no_skew(camera, "Kalibr")
     return {
         "camera_model": _KALIBR.get(camera.model, camera.model),
         "intrinsics": [float(v) for v in (*own, *focal)],
@@ -93,30 +108,6 @@ def _kalibr_camera(camera: RawCamera) -> dict[str, Any]:
     }
 
 
-def _shortened(camera: RawCamera, most: int, tool: str) -> FloatArray:
-    """The first ``most`` coefficients, where the others are zero."""
-    if camera.distortion[most:].any():
-        raise CalibrationError(
-            f"{camera.name}: {tool} has no radial-tangential model of {len(camera.distortion)} "
-            "coefficients; write calib.json, or OpenCV's .yml"
-        )
-    short = camera.distortion[:most]
-    return np.concatenate([short, np.zeros(most - len(short))])
-
-
-def _refused(camera: RawCamera, tool: str) -> CalibrationError:
-    return CalibrationError(
-        f"{camera.name}: {tool} has no model {camera.model}; write calib.json, which has all"
-    )
-
-
-def _require_no_skew(camera: RawCamera, tool: str) -> None:
-    if camera.matrix[0, 1] or camera.matrix[1, 0]:
-        raise CalibrationError(
-            f"{camera.name}: its pixels are skew, which {tool} has no number for; write calib.json"
-        )
-
-
 # --------------------------------------------------------------------------------------------
 # OpenCV
 
@@ -125,11 +116,11 @@ _OPENCV = {"radtan": "M", "equidistant": "K", "omni": "K"}
 
 
 def _opencv(calibration: Calibration, path: Path, _: StatedView | None) -> None:
-    first, second = _two(calibration, "OpenCV's file")
+    first, second = two(calibration, "OpenCV's file")
     values: dict[str, Any] = {"image_width": first.width, "image_height": first.height}
     for k, camera in enumerate((first, second), 1):
         if camera.model not in _OPENCV:
-            raise _refused(camera, "OpenCV")
+            raise refused(camera, "OpenCV")
         coefficients = camera.distortion
         if camera.model == "omni":
             values[f"xi{k}"], coefficients = float(coefficients[0]), coefficients[1:]
@@ -147,21 +138,6 @@ def _opencv(calibration: Calibration, path: Path, _: StatedView | None) -> None:
         storage.release()
 
 
-def _two(calibration: Calibration, what: str) -> tuple[RawCamera, RawCamera]:
-    if len(calibration.cameras) != 2:
-        raise CalibrationError(
-            f"{calibration.source}: holds {len(calibration.cameras)} cameras, but {what} two; "
-            "choose them (--cameras 0,1), or write calib.json or Kalibr's .yaml"
-        )
-    first, second = calibration.cameras
-    if first.model != second.model:
-        raise CalibrationError(
-            f"{calibration.source}: {first.name} is {first.model} and {second.name} "
-            f"{second.model}, but {what} has one model; write calib.json"
-        )
-    return first, second
-
-
 # --------------------------------------------------------------------------------------------
 # ROS
 
@@ -170,7 +146,7 @@ _ROS_SIZES = {5: "plumb_bob", 8: "rational_polynomial"}
 
 
 def _ros(calibration: Calibration, path: Path, view: StatedView | None) -> None:
-    cameras = _two(calibration, "ROS")
+    cameras = two(calibration, "ROS")
     if view is None:
         raise CalibrationError(f"{calibration.source}: is no stereo rig, of which ROS wants a pair")
     offset = calibration.offset(1, 0)[:3, 3]
@@ -191,9 +167,9 @@ def _ros_camera(camera: RawCamera) -> dict[str, Any]:
         kind, coefficients = "equidistant", camera.distortion
     elif camera.model == "radtan":
         most = 5 if not camera.distortion[5:].any() else 8
-        kind, coefficients = _ROS_SIZES[most], _shortened(camera, most, "ROS")
+        kind, coefficients = _ROS_SIZES[most], shortened(camera, most, "ROS")
     else:
-        raise _refused(camera, "ROS")
+        raise refused(camera, "ROS")
     values = {"image_width": camera.width, "image_height": camera.height}
     return {
         **values,
@@ -208,10 +184,43 @@ def _block(key: str, matrix: FloatArray) -> Mapping[str, Any]:
     return {key: {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}}
 
 
-_WRITERS: dict[str, tuple[str, Callable[[Calibration, Path, StatedView | None], None]]] = {
-    ".json": ("calib.json of fgslam", _own),
-    ".yml": ("OpenCV", _opencv),
-    ".xml": ("OpenCV", _opencv),
-    ".yaml": ("Kalibr", _kalibr),
-    "": ("ROS camera_info, a folder", _ros),
+# --------------------------------------------------------------------------------------------
+# KITTI, EuRoC, ORB-SLAM3
+
+
+def _kitti(calibration: Calibration, path: Path, _: StatedView | None) -> None:
+    write_text(path, kitti_text(calibration))
+
+
+def _orb_slam(calibration: Calibration, path: Path, _: StatedView | None) -> None:
+    write_text(path, orb_slam_text(calibration))
+
+
+def _euroc(calibration: Calibration, path: Path, _: StatedView | None) -> None:
+    files = euroc_files(calibration)
+    for name, text in files.items():
+        with clear_output_errors(path):
+            (path / name).parent.mkdir(parents=True, exist_ok=True)
+        write_text(path / name, text)
+
+
+FORMATS: dict[
+    str, tuple[str, tuple[str, ...], Callable[[Calibration, Path, StatedView | None], None]]
+] = {
+    "fgslam": ("calib.json of fgslam", (".json",), _own),
+    "opencv": ("OpenCV", (".yml", ".yaml", ".xml", ".json"), _opencv),
+    "kalibr": ("Kalibr", (".yaml", ".yml"), _kalibr),
+    "ros": ("ROS camera_info, a folder", ("",), _ros),
+    "kitti": ("KITTI's calib.txt", (".txt",), _kitti),
+    "euroc": ("EuRoC's sensor.yaml, a folder", ("",), _euroc),
+    "orb_slam3": ("ORB-SLAM3 settings", (".yaml", ".yml"), _orb_slam),
+}
+"""Formats that are written: in words, the endings of their names, and how."""
+_ENDINGS = {
+    ".json": "fgslam",
+    ".yml": "opencv",
+    ".xml": "opencv",
+    ".yaml": "kalibr",
+    ".txt": "kitti",
+    "": "ros",
 }

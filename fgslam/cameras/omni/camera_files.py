@@ -62,9 +62,10 @@ def load_camera(
 
     Args:
         source: the path of an OCamCalib result file (``calib_results.txt``), of a camera of
-            camodocal (MEI) or Kalibr whose middle looks down, of BloggieUnwarp's ``settings.txt``
-            or of a YAML file of keys; or the keys themselves, as under ``dataset.camera`` of an
-            experiment: ``{"kind": "mirror", "xi": 0.92}``; or the kind alone:
+            camodocal (MEI), Kalibr or fgslam (.json) whose middle looks down, of BloggieUnwarp's
+            ``settings.txt`` or of a YAML file of keys; or the keys themselves, as under
+            ``dataset.camera`` of an experiment: ``{"kind": "mirror", "xi": 0.92}``; or the kind
+            alone:
             ``"equirectangular"``, ``"cylinder"``, ``"mirror"``, ``"radial_polynomial"``.
         size: width and height of the images, pixels; None where the calibration states it.
 
@@ -156,6 +157,8 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
             return LensSettings(file=path.name), path.parent
         _refuse_opencv(path)
         return _settings_of(read_yaml(path, CalibrationError), str(path)), path.parent
+    if path.suffix.lower() == ".json":
+        return LensSettings(file=path.name), path.parent
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
         return BloggieSettings(file=path.name), path.parent
     return OCamCalibSettings(file=path.name), path.parent

@@ -13,6 +13,7 @@ import pytest
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.core.arrays import FloatArray
+from fgslam.runs.camera_files import Asked, show_calibration
 
 pytestmark = pytest.mark.data
 
@@ -94,6 +95,14 @@ BASELINES = {
 def test_the_baseline_of_every_tools_file(files: Path, name: str) -> None:
     expected = BASELINES[name]
     assert baseline(read(files / name)) == pytest.approx(expected, rel=6e-4)
+
+
+def test_a_swapped_pair_of_ros_files_is_said_when_shown(files: Path) -> None:
+    lines = show_calibration(Asked(files / "camera_info/uby56_imx219_stereo"), None)
+    assert any(line.startswith("rig: right = left.yaml, left = right.yaml") for line in lines)
+    assert any(
+        "left and right are swapped: left.yaml, the left one by its name" in x for x in lines
+    )
 
 
 SEVEN = {

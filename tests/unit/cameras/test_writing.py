@@ -1,7 +1,8 @@
-"""Calibrations are written in four formats, and read back as they were."""
+"""Calibrations are written in seven formats, and read back as they were."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -71,6 +72,46 @@ def test_a_pair_for_ros_is_read_back(model: str, count: int, tmp_path: Path) -> 
     np.testing.assert_allclose(found.offset(1, 0), STEP, rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("name", "form", "model", "count"),
+    [
+        ("a.json", "opencv", "radtan", 5),
+        ("a.json", "opencv", "equidistant", 4),
+        ("a.json", "opencv", "omni", 5),
+        ("mav0", "euroc", "radtan", 4),
+        ("mav0", "euroc", "equidistant", 4),
+        ("orb.yaml", "orb_slam3", "radtan", 4),
+        ("orb.yaml", "orb_slam3", "radtan", 5),
+        ("orb.yaml", "orb_slam3", "equidistant", 4),
+    ],
+)
+def test_a_format_that_is_named_is_read_back(
+    name: str, form: str, model: str, count: int, tmp_path: Path
+) -> None:
+    expected = calibration(model, [*PARAMETERS[model], 0.01][:count])
+    write_calibration(expected, tmp_path / "before.json")
+    convert_calibration(Asked(tmp_path / "before.json"), tmp_path / name, form)
+    found = read_calibration_file(tmp_path / name)
+    assert len(found.cameras) == 2
+    for a, b in zip(found.cameras, expected.cameras, strict=True):
+        assert (a.model, a.size) == (b.model, b.size)
+        np.testing.assert_array_equal(a.matrix, b.matrix)
+        np.testing.assert_array_equal(a.distortion, b.distortion)
+    np.testing.assert_allclose(found.offset(1, 0), STEP, rtol=0.0, atol=1e-15)
+
+
+def test_a_rectified_pair_for_kitti_is_read_back(tmp_path: Path) -> None:
+    first = calibration().cameras[0]
+    plain = replace(first, distortion=np.zeros(4))
+    beside = replace(plain, bTc=pose(np.eye(3), np.array([0.5371, 0.0, 0.0])))
+    write_calibration(Calibration("made", "made", (plain, beside)), tmp_path / "calib.txt")
+    found = read_calibration_file(tmp_path / "calib.txt", size=SIZE)
+    assert found.format == "KITTI"
+    for camera in found.cameras:
+        np.testing.assert_array_equal(camera.matrix, plain.matrix)
+    np.testing.assert_allclose(found.offset(1, 0), beside.bTc, rtol=0.0, atol=1e-12)
+
+
 def test_five_formats_one_after_another(tmp_path: Path) -> None:
     write_calibration(calibration(), tmp_path / "0.yaml")
     names = ("0.yaml", "1.yml", "2.xml", "3", "4.json", "5.yaml")
@@ -88,7 +129,8 @@ def test_five_formats_one_after_another(tmp_path: Path) -> None:
         (calibration("ds"), "a.yml", "OpenCV has no model ds; write calib.json"),
         (calibration("ocam"), "a.yaml", "Kalibr has no model ocam"),
         (calibration(parameters=[0.1] * 5), "a.yaml", "no radial-tangential model of 5"),
-        (calibration(), "a.txt", "no format ends like that; known: .json"),
+        (calibration(), "a.csv", "no format ends like that; known: .json"),
+        (calibration(), "a.txt", "of images that are not rectified"),
         (calibration("fov"), "a", "is no stereo rig"),
     ],
 )
@@ -97,6 +139,30 @@ def test_what_a_format_cannot_hold_is_refused(
 ) -> None:
     with pytest.raises(CalibrationError, match=words):
         write_calibration(given, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "name", "form", "words"),
+    [
+        (calibration("ds"), "a", "euroc", "EuRoC has no model ds"),
+        (calibration("omni"), "a.yaml", "orb_slam3", "ORB-SLAM3 has no model omni"),
+        (calibration(), "a.txt", "orb_slam3", "is written as .yaml or .yml"),
+        (calibration(), "a.yaml", "euroc", "is written as no ending, a folder"),
+        (calibration(), "a.yaml", "okvis", "format 'okvis' is not known; use fgslam, opencv"),
+        (
+            Calibration("made", "made", calibration().cameras[::-1]),
+            "a.yaml",
+            "orb_slam3",
+            "ORB-SLAM3 wants the left one first",
+        ),
+    ],
+)
+def test_what_a_named_format_cannot_hold_is_refused(
+    given: Calibration, name: str, form: str, words: str, tmp_path: Path
+) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        write_calibration(given, tmp_path / name, form=form)
     assert not (tmp_path / name).exists()
 
 

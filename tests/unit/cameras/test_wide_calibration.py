@@ -1,0 +1,267 @@
+"""Single wide cameras found from a board: drawn views against the truth, within their sigmas."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from fgslam.cameras.board_calibration import BoardCalibration, View, calibrate
+from fgslam.cameras.board_check import coverage_of_circle, farthest_from_axis, held_out_alone
+from fgslam.cameras.board_projection import PARAMETERS, projected
+from fgslam.cameras.board_start import board_pose
+from fgslam.cameras.boards import Board, Corners, find_corners
+from fgslam.cameras.formats.trees import intrinsic_matrix
+from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import so3_exp
+
+BOARD = Board("chessboard", 9, 6, 0.04)
+NOISE_PX = 0.1
+SEEDS = range(4)
+FISHEYE_F = 480.0 / np.radians(92.5)  # 185 degrees over the picture
+
+
+def camera(model: str, size: tuple[int, int], numbers: list[float]) -> RawCamera:
+    matrix = intrinsic_matrix(*numbers[:4])
+    return RawCamera(*size, matrix, np.array(numbers[4:]), np.eye(4), model=model)
+
+
+CAMERAS = {
+    "mirror": camera(
+        "omni", (640, 480), [250.0, 251.0, 322.0, 243.0, 0.95, -0.05, 0.01, 0.001, -0.0005]
+    ),
+    "unified": camera(
+        "omni", (640, 480), [420.0, 419.0, 315.0, 235.0, 1.6, -0.25, 0.2, 0.001, -0.0005]
+    ),
+    "fisheye": camera(
+        "equidistant",
+        (960, 960),
+        [FISHEYE_F, FISHEYE_F + 1.0, 478.0, 485.0, 0.02, -0.008, 0.002, -0.0003],
+    ),
+}
+WIDEST_DEG = {"mirror": 105.0, "unified": 80.0, "fisheye": 92.0}
+
+
+def views_of(name: str, seed: int, count: int = 16, mirrored: bool = False) -> list[View]:
+    """Boards all around the camera, tilted at random; corners outside the image are not seen."""
+    rng, seen_by = np.random.default_rng(seed), CAMERAS[name]
+    centred = BOARD.points - BOARD.points.mean(axis=0)
+    views: list[View] = []
+    while len(views) < count:
+        angle = np.radians(WIDEST_DEG[name]) * np.sqrt(rng.uniform())
+        around = rng.uniform(0.0, 2.0 * np.pi)
+        ahead = np.array(
+            [np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)]
+        )
+        side = np.cross(rng.normal(size=3), ahead)
+        side /= np.linalg.norm(side)
+        facing = np.column_stack([side, np.cross(-ahead, side), -ahead])
+        tilted = centred @ so3_exp(rng.uniform(-0.5, 0.5, 3)).T @ facing.T
+        pixels = seen_by.project(tilted + ahead * rng.uniform(0.25, 0.6))
+        last = np.array(seen_by.size) - 1
+        inside = np.isfinite(pixels).all(axis=1) & ((pixels >= 0) & (pixels <= last)).all(axis=1)
+        if inside.sum() < 20:
+            continue
+        noisy = pixels + rng.normal(0.0, NOISE_PX, pixels.shape)
+        if mirrored:
+            noisy = np.column_stack([last[0] - noisy[:, 0], noisy[:, 1]])
+        views.append((Corners(np.flatnonzero(inside), noisy[inside]),))
+    return views
+
+
+def numbers_of(found: RawCamera) -> FloatArray:
+    return np.concatenate([found.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], found.distortion])
+
+
+def in_sigmas(found: BoardCalibration, name: str) -> FloatArray:
+    off = numbers_of(found.cameras[0]) - numbers_of(CAMERAS[name])
+    return np.asarray(off / found.sigmas[0])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["fisheye", *(pytest.param(name, marks=pytest.mark.slow) for name in ("mirror", "unified"))],
+)
+def test_the_true_camera_is_found_within_its_sigmas(name: str) -> None:
+    true, errors = CAMERAS[name], []
+    for seed in SEEDS:
+        found = calibrate(BOARD, views_of(name, seed), true.size, true.model)
+        assert found.rms == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.1)
+        assert found.left_out == 0
+        errors.append(in_sigmas(found, name))
+    # 32 to 36 numbers, of which those of a lens correlate.
+    assert 0.5 < np.mean(np.square(errors)) < 1.8
+    assert np.abs(errors).max() < 4.0
+
+
+def test_rays_of_a_fisheye_of_185_degrees_agree_over_the_whole_view() -> None:
+    true = CAMERAS["fisheye"]
+    found = calibrate(BOARD, views_of("fisheye", 0, count=30), true.size, true.model).cameras[0]
+    angle, around = np.meshgrid(np.radians([10, 45, 80, 92]), np.linspace(0.0, 6.0, 13))
+    rays = np.column_stack(
+        [(np.sin(angle) * f(around)).ravel() for f in (np.cos, np.sin)] + [np.cos(angle).ravel()]
+    )
+    off = np.linalg.norm(found.project(rays) - true.project(rays), axis=1)
+    assert off.max() < 0.3
+
+
+def test_a_picture_in_a_mirror_gives_the_same_camera() -> None:
+    """Reflected, a flat board is one seen from behind: the columns alone count backward."""
+    true = CAMERAS["mirror"]
+    found = calibrate(BOARD, views_of("mirror", 1, mirrored=True), true.size, true.model)
+    numbers = numbers_of(found.cameras[0])
+    expected = numbers_of(true)
+    expected[2] = true.width - 1 - expected[2]
+    expected[8] = -expected[8]  # the lens's second tangential term
+    np.testing.assert_allclose((numbers - expected) / found.sigmas[0], 0.0, rtol=0, atol=4.0)
+
+
+def test_held_out_images_and_coverage() -> None:
+    true, views = CAMERAS["fisheye"], views_of("fisheye", 2, count=30)
+    held = held_out_alone(BOARD, views, true.size, true.model)
+    assert held is not None
+    assert held.views.tolist() == list(range(1, 30, 2))
+    assert held.off_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.25)
+    assert held.each_px.max() < 3 * NOISE_PX
+    assert 0.8 < coverage_of_circle(views, true) <= 1.0
+    ahead: list[View] = [(corners,) for corners in [views[0][0]] * 5]
+    assert coverage_of_circle(ahead, true) < 0.3
+    assert 80.0 < np.degrees(farthest_from_axis(views, true)) < 115.0
+    assert held_out_alone(BOARD, views[:8], true.size, true.model) is None
+
+
+def test_too_few_views_and_boards_that_are_all_far_are_refused() -> None:
+    views = views_of("fisheye", 0, count=12)
+    size = CAMERAS["fisheye"].size
+    with pytest.raises(CalibrationError, match="the camera shows the board in 4 images"):
+        calibrate(BOARD, views[:4], size, "equidistant")
+    ahead = BOARD.points + np.array([0.0, 0.0, 3.0])
+    rng, pixels = np.random.default_rng(0), CAMERAS["fisheye"].project(ahead)
+    far: list[View] = [
+        (Corners(np.arange(len(pixels)), pixels + rng.normal(0.0, NOISE_PX, pixels.shape)),)
+        for _ in range(8)
+    ]
+    with pytest.raises(CalibrationError, match="do not determine the cameras"):
+        calibrate(BOARD, far, size, "omni")
+
+
+@pytest.mark.parametrize("model", PARAMETERS)
+def test_derivatives_are_those_of_finite_differences_and_pixels_those_of_the_model(
+    model: str,
+) -> None:
+    numbers = {
+        "radtan": [500.0, 510.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002, 0.01],
+        "equidistant": [300.0, 310.0, 320.0, 240.0, 0.02, -0.01, 0.004, -0.001],
+        "omni": [500.0, 510.0, 320.0, 240.0, 1.2, -0.2, 0.05, 0.001, -0.002],
+    }[model]
+    x = np.array([0.3, -0.5, 0.2, 0.1, 0.2, 0.6 if model == "radtan" else -0.02, *numbers])
+    pixels, by = projected(model, BOARD.points, x[:6], x[6:])
+    there = BOARD.points @ so3_exp(x[:3]).T + x[3:6]
+    exact = camera(model, (640, 480), numbers).project(there)
+    assert (there[:, 2] < 0.0).any() == (model != "radtan")
+    np.testing.assert_allclose(pixels, exact, rtol=0, atol=1e-9)
+    for k, value in enumerate(x):
+        step = np.zeros(len(x))
+        step[k] = 1e-6 * max(1.0, abs(value))
+        ends = [projected(model, BOARD.points, (x + s)[:6], (x + s)[6:])[0] for s in (step, -step)]
+        slope = ((ends[0] - ends[1]) / (2.0 * step[k])).ravel()
+        np.testing.assert_allclose(by[:, k], slope, rtol=0, atol=1e-6 * np.abs(by[:, k]).max())
+
+
+def test_a_board_beside_the_camera_has_a_pose() -> None:
+    """Its middle is 90 degrees from the axis, where depth over z has no meaning."""
+    true = CAMERAS["fisheye"]
+    rotation = so3_exp(np.array([0.0, 1.4, 0.0]))
+    expected = np.array([0.3, -0.1, 0.02])
+    points = BOARD.points @ rotation.T + expected
+    pixels = true.project(points)
+    assert np.isfinite(pixels).all()
+    cTb = board_pose(true, BOARD.points, pixels)
+    assert cTb is not None
+    np.testing.assert_allclose(cTb[:3, 3], expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(cTb[:3, :3], rotation, rtol=0, atol=1e-6)
+
+
+# --------------------------------------------------------------------------------------------
+# ChArUco boards, drawn through a known camera
+
+
+CHARUCO = Board("charuco", 7, 5, 0.05, dictionary="DICT_5X5_100")
+_CELL = 60  # pixels of a square of the print
+
+
+def print_of_charuco() -> np.ndarray:
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    print_ = cv2.aruco.CharucoBoard((7, 5), 0.05, 0.0375, markers)
+    return np.asarray(print_.generateImage((7 * _CELL, 5 * _CELL), marginSize=0))
+
+
+def rays_of_all(seen_by: RawCamera) -> FloatArray:
+    columns, rows = np.meshgrid(np.arange(seen_by.width), np.arange(seen_by.height))
+    return seen_by.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+
+
+def drawn(
+    rays: FloatArray, size: tuple[int, int], turn: FloatArray, away: FloatArray
+) -> np.ndarray:
+    """The printed board as a camera sees it, by the ray of every pixel."""
+    width, height = size
+    normal = turn[:, 2]
+    depth = (normal @ away) / (rays @ normal)
+    depth = np.where(depth > 0.0, depth, np.nan)
+    flat = (rays * depth[:, None] - away) @ turn
+    # Half a square's corner: the print's pixels are at their centres.
+    at = ((flat[:, :2] + CHARUCO.square) / CHARUCO.square * _CELL - 0.5).astype(np.float32)
+    maps = np.nan_to_num(at, nan=-1e4).reshape(height, width, 2)
+    image = cv2.remap(
+        print_of_charuco(), maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=150
+    )
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7), np.uint8)
+
+
+def charuco_images(seen_by: RawCamera, count: int) -> list[np.ndarray]:
+    rng, rays = np.random.default_rng(4), rays_of_all(seen_by)
+    images = []
+    for _ in range(count):
+        turn = so3_exp(rng.uniform(-0.5, 0.5, 3))
+        away = np.array([*rng.uniform(-0.12, 0.12, 2), rng.uniform(0.3, 0.42)])
+        images.append(drawn(rays, seen_by.size, turn, away - turn @ CHARUCO.points.mean(axis=0)))
+    return images
+
+
+PERSPECTIVE = camera("radtan", (640, 480), [450, 452, 325, 236, -0.2, 0.05, 0.001, 0.0, 0.0])
+
+
+def test_a_charuco_board_gives_the_camera_that_drew_it() -> None:
+    images = charuco_images(PERSPECTIVE, 12)
+    views: list[View] = [(find_corners(CHARUCO, image),) for image in images]
+    found = calibrate(CHARUCO, views, PERSPECTIVE.size, "radtan")
+    assert sum(len(corners) for (corners,) in views if corners is not None) > 12 * 20
+    assert found.rms < 0.2
+    numbers = numbers_of(found.cameras[0])[:4]
+    np.testing.assert_allclose(numbers, [450, 452, 325, 236], rtol=0, atol=1.0)
+    columns, rows = np.meshgrid(np.arange(20.0, 640, 40), np.arange(20.0, 480, 40))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()])
+    off = found.cameras[0].project(PERSPECTIVE.unproject(pixels)) - pixels
+    # What all have in common is a turn of the camera, of which boards say little.
+    assert np.median(np.linalg.norm(off - off.mean(axis=0), axis=1)) < 0.1
+
+
+def test_a_charuco_board_is_read_in_a_mirror() -> None:
+    (image,) = charuco_images(PERSPECTIVE, 1)
+    reflected = np.ascontiguousarray(image[:, ::-1])
+    direct, found = find_corners(CHARUCO, image), find_corners(CHARUCO, reflected, mirrored=True)
+    assert find_corners(CHARUCO, reflected) is None
+    assert direct is not None
+    assert found is not None
+    np.testing.assert_array_equal(found.ids, direct.ids)
+    expected = np.column_stack([639.0 - direct.pixels[:, 0], direct.pixels[:, 1]])
+    np.testing.assert_allclose(found.pixels, expected, rtol=0, atol=1e-3)
+
+
+def test_markers_of_an_unknown_dictionary_are_refused() -> None:
+    unknown = Board("charuco", 7, 5, 0.05, dictionary="DICT_9X9")
+    with pytest.raises(CalibrationError, match="markers 'DICT_9X9' are not known to OpenCV"):
+        find_corners(unknown, np.zeros((48, 64), np.uint8))
