@@ -174,16 +174,23 @@ def spread(tracked: Tracked, features: StereoFeatures) -> Tracked:
     Of several features the finest is taken, which is seen longest on the way towards it.
     """
     matches = tracked.matches
-    square = np.floor(features.measurement[:, :2] / _APART_PX).astype(np.int64)
-    square = square[:, 0] + (square[:, 0].max(initial=0) + 1) * square[:, 1]
+    square = _squares(features.measurement[:, :2])
     taken = np.isin(square, square[matches.features[tracked.ego_motion.inliers]])
-    order = np.lexsort((features.scale, matches.had_candidates | taken, square))
+    partial = False if features.complete is None else ~features.complete  # these start none
+    order = np.lexsort((features.scale, matches.had_candidates | taken | partial, square))
     first = np.ones(len(square), np.bool_)
     first[order[1:]] = np.diff(square[order]) > 0
     starts = first & ~taken & ~matches.had_candidates
     return dataclasses.replace(
         tracked, matches=dataclasses.replace(matches, had_candidates=~starts)
     )
+
+
+def _squares(places: FloatArray) -> IntArray:
+    """Number (n,) of the square, :data:`_APART_PX` wide, in which each place (n, 2) lies."""
+    at = np.floor(places / _APART_PX).astype(np.int64)
+    at -= at.min(axis=0, initial=0)  # a corrected calibration moves places beyond the border
+    return np.asarray(at[:, 0] + (at[:, 0].max(initial=0) + 1) * at[:, 1])
 
 
 def _joined(

@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
+from fgslam.core.features import StereoFeatures
 from fgslam.frontend.tracking.carrying import Carried
-from fgslam.frontend.tracking.key_frames import CarriedFrame
+from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
+from fgslam.frontend.tracking.map_matching import MapMatches
+from fgslam.frontend.tracking.tracker import Tracked
 
 ENOUGH = 40
 
@@ -43,3 +46,75 @@ def test_few_that_are_left_ask_for_a_key_frame_beside_which_they_are_used() -> N
     found = replace(frame(100, 0), lasting=False)
     assert found.placed
     assert not found.suffices
+
+
+# --------------------------------------------------------------------------------------------
+# Where landmarks begin
+
+
+def features_at(places: list[tuple[float, float]], scales: list[float]) -> StereoFeatures:
+    n = len(places)
+    xy = np.array(places, np.float64).reshape(-1, 2)
+    return StereoFeatures(
+        measurement=np.column_stack([xy, np.full(n, 10.0)]),
+        measurement_covariance=np.tile(np.eye(3), (n, 1, 1)),
+        scale=np.array(scales),
+        orientation=np.zeros(n),
+        descriptors=np.zeros((n, 128), np.uint8),
+        position=np.ones((n, 3)),
+        position_covariance=np.tile(np.eye(3), (n, 1, 1)),
+        pixels=np.zeros((n, 3, 2)),
+    )
+
+
+def starting(
+    features: StereoFeatures, matched: list[int] | None = None, agreeing: list[bool] | None = None
+) -> list[int]:
+    """Features that begin a landmark, where ``matched`` are taken for landmarks already."""
+    seen = np.array(matched or [], np.int64)
+    had = np.isin(np.arange(len(features)), seen)
+    inliers = np.array(agreeing or [True] * len(seen), np.bool_)
+    pose = EgoMotion(
+        np.eye(4), np.eye(6), inliers, np.zeros(len(seen)), EgoMotionStatus.OK, 1
+    )  # fmt: skip
+    tracked = Tracked(SimpleNamespace(), MapMatches(np.arange(len(seen)), seen, had), pose)  # type: ignore[arg-type]
+    return np.flatnonzero(~spread(tracked, features).matches.had_candidates).tolist()
+
+
+def test_of_two_features_in_one_place_the_finer_begins_a_landmark() -> None:
+    assert starting(features_at([(12.0, 7.0), (12.0, 7.0), (40.0, 7.0)], [3.0, 2.0, 9.0])) == [1, 2]
+
+
+@pytest.mark.parametrize(("agrees", "begins"), [(True, []), (False, [1])])
+def test_a_square_that_shows_a_landmark_begins_none(agrees: bool, begins: list[int]) -> None:
+    """One whose match contradicts the pose shows nothing."""
+    features = features_at([(12.0, 7.0), (13.0, 8.0)], [3.0, 2.0])
+    assert starting(features, [0], [agrees]) == begins
+
+
+def test_a_feature_that_not_all_images_show_holds_no_square() -> None:
+    features = features_at([(12.0, 7.0), (13.0, 8.0)], [1.0, 2.0])
+    partial = replace(features, complete=np.array([False, True]))
+    assert 1 in starting(partial)
+
+
+def test_places_beyond_the_border_have_squares_of_their_own() -> None:
+    assert starting(features_at([(-1.0, 7.0), (119.0, 2.0), (2.0, 7.0)], [1.0] * 3)) == [0, 1, 2]
+
+
+def test_no_feature_begins_nothing() -> None:
+    assert starting(features_at([], [])) == []
+
+
+@pytest.mark.parametrize(("outliers", "lasting"), [(19, True), (21, False)])
+def test_many_that_contradict_the_pose_ask_for_a_key_frame(outliers: int, lasting: bool) -> None:
+    carried = Carried(
+        np.arange(100),
+        np.arange(100),
+        features_at([(float(k), 50.0) for k in range(100)], [1.0] * 100),
+    )
+    used = np.arange(100) >= outliers
+    pose = EgoMotion(np.eye(4), np.eye(6), used, np.zeros(100), EgoMotionStatus.OK, 1)
+    tracked: Any = SimpleNamespace(ego_motion=pose)
+    tracker = KeyFrameTracker(SimpleNamespace(), SimpleNamespace())  # type: ignore[arg-type]
+    assert tracker._lasting(carried, tracked, np.zeros((100, 100), np.uint8)) is lasting
