@@ -69,7 +69,9 @@ def overview(records: dict[str, Record]) -> str:
         "",
         *_wrapped(
             f"{len(rows)} bounds, {len(rows) - missed} met, {missed} missed. Each page gives the "
-            "numbers, their bounds and the commands that measure them; slow tests hold most bounds."
+            "numbers, their bounds and the commands that measure them; slow tests hold most "
+            "bounds. Images measured before 2026-11-25 had SIFT on every frame "
+            "(`frontend.tracking: sift`); since then [key frames](key_frames.md) are the default."
         ),
     ]
     for group, names in GROUPS.items():
