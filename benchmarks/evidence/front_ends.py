@@ -101,13 +101,14 @@ def tables(data: Path) -> list[Table]:
 _COLUMNS = ("on the way", "at the end", "CPU", "not located")
 
 
-def _opened(course: Course, data: Path) -> tuple[fg.StereoRig, Shots, Trajectory]:
+def _opened(course: Course, data: Path) -> tuple[CameraRig, Shots, Trajectory]:
     recording = fg.open_recording(str(data / course.folder))
     shots: Shots = []
     every = list(enumerate(recording))[course.frames]
     for number, (t, images, _) in every:
         rng = np.random.default_rng([number, 7])
         change = course.change
+        assert images is not None  # every frame of these recordings has its images
         shots.append((t, images if change is None else tuple(change(one, rng) for one in images)))
     assert recording.ground_truth is not None
     return recording.rig, shots, recording.ground_truth
