@@ -72,6 +72,15 @@ class StereoFeatures(Rows):
         found = self.select(np.flatnonzero(self.complete))
         return replace(found, complete=None)
 
+    def noisier(self, factors: FloatArray) -> StereoFeatures:
+        """The same with variances that are larger by factors (n,)."""
+        by = factors[:, None, None]
+        return replace(
+            self,
+            measurement_covariance=by * self.measurement_covariance,
+            position_covariance=by * self.position_covariance,
+        )
+
     def observations(self, which: IntArray, ids: IntArray, is_new: bool) -> Observations:
         """Some of the features as observations of the landmarks ``ids``."""
         return Observations(

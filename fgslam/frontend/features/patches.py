@@ -140,6 +140,21 @@ def align(
     return fitted, moved, np.where(good, correlation, -1.0)
 
 
+def crowding(places: FloatArray, size: int) -> FloatArray:
+    """Factors (n,) of variance of patches at places (n, 2) that overlap: their errors are alike.
+
+    Errors of two patches by the same pixels' noise correlate by the overlap of their weights,
+    exp(-d^2 / 4 s^2) at a distance d. A sum over n measurements that all correlate by r has
+    1 + (n - 1) r times the variance of independent ones; each is given its share of that, so that
+    all together tell no more than the image does.
+    """
+    if not len(places):
+        return np.empty(0)
+    reach = 2.0 * size / _SPREAD
+    apart = ((places[:, None] - places) ** 2).sum(axis=2) / reach**2
+    return np.asarray(np.exp(-apart).sum(axis=1))
+
+
 def _inverse(maps: FloatArray) -> FloatArray:
     """(n, 2, 2) inverses of matrices (n, 2, 2), whatever they are: not finite where there is none.
 

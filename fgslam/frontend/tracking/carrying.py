@@ -22,7 +22,7 @@ from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.features.patches import ReferencePatches, align, anchor
+from fgslam.frontend.features.patches import ReferencePatches, align, anchor, crowding
 from fgslam.frontend.patch_stereo import DEFORMATION, GREY_NOISE, PATCH_PX, across
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
@@ -147,6 +147,7 @@ class LandmarkCarrier:
             found, self._stereo.equally(NOISE_SHARE), correction
         )
         good[good] = consistent
+        features = features.noisier(crowding(places[good], PATCH_PX))
         self._points = _Points(self._points.ids[good], places[good], depths[good])
         self._patches = patches.select(good)
         return Carried(self._points.ids, rows[good], features)

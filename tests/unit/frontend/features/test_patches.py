@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.frontend.features.patches import align, anchor
+from fgslam.frontend.features.patches import align, anchor, crowding
 from tests.textured_room import TEXTURE
 
 PLACES = np.array([[60.0, 60.0], [100.0, 60.0], [60.0, 100.0], [90.0, 90.0]])
@@ -86,3 +86,37 @@ def test_taken_joined_and_none() -> None:
     aligned, places, correlation = align(none, GREY, np.empty((0, 2)))
     assert len(aligned) == len(places) == len(correlation) == 0
     assert len(none.join(some)) == 2
+
+
+# --------------------------------------------------------------------------------------------
+# Patches that overlap
+
+
+def test_patches_apart_are_independent_and_those_in_one_place_are_one() -> None:
+    places = np.array([[20.0, 20.0], [80.0, 20.0], [80.0, 20.0], [80.0, 20.0]])
+    np.testing.assert_allclose(crowding(places, 15), [1.0, 3.0, 3.0, 3.0], rtol=0, atol=1e-12)
+    assert crowding(np.empty((0, 2)), 15).shape == (0,)
+
+
+@pytest.mark.parametrize("apart", [3.0, 5.0, 8.0])
+def test_errors_of_overlapping_patches_correlate_as_stated(apart: float) -> None:
+    """The same image with other noise of the pixels: 400 pairs of patches on smooth texture."""
+    rng = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(rng.normal(size=(440, 440)), (0, 0), 1.5)
+    clean = 128.0 + 40.0 * texture / texture.std()
+    grid = np.stack(np.meshgrid(np.arange(20, 420, 20.0), np.arange(20, 420, 20.0)), axis=-1)
+    first = grid.reshape(-1, 2)
+    places = np.concatenate([first, first + np.array([apart, 0.0])])
+    noisy = clean + rng.normal(0.0, 6.0, clean.shape)
+    patches = anchor(_as_image(clean), places, 15, 4.0, 0.05)
+    found = places
+    for _ in range(3):
+        patches, found, _ = align(patches, _as_image(noisy), found)
+    errors = (found - places).reshape(2, -1)
+    measured = float((errors[0] * errors[1]).sum() / np.sqrt((errors**2).sum(axis=1).prod()))
+    stated = crowding(places[[0, len(first)]], 15)[0] - 1.0
+    assert measured == pytest.approx(stated, rel=0, abs=0.12)
+
+
+def _as_image(grey: FloatArray) -> Image:
+    return np.clip(np.round(grey), 0, 255).astype(np.uint8)
