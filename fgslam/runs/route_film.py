@@ -6,7 +6,6 @@ import csv
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from textwrap import shorten
 
 import numpy as np
 
@@ -134,8 +133,7 @@ def _require_whole(place: str, row: Row) -> None:
             known = False
         if not known:
             raise DatasetError(
-                f"{place}: {column} is {shorten(repr(text), 40)}, not a number; follow the route "
-                "anew"
+                f"{place}: {column} is {text[:40]!r}, not a number; follow the route anew"
             )
 
 
