@@ -33,7 +33,7 @@ from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.maps import map_points
-from fgslam.runs.marks import measured_marks
+from fgslam.runs.marks import picture_title
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tasks.slam_calibration import (
     calibration_note,
@@ -382,7 +382,7 @@ class RunFigures:
 
     def title(self, what: str) -> str:
         """Title of one picture."""
-        return _marked_title(self.name, what, self.predicted, self.synthetic)
+        return picture_title(f"{self.name}: {what}", int(self.predicted.sum()), self.synthetic)
 
 
 def figures_of(outputs: RunOutputs) -> RunFigures:
@@ -443,10 +443,6 @@ def _results(figures: RunFigures) -> ReportData:
 def _title(outputs: RunOutputs, what: str) -> str:
     """Title of a frame's picture, with the poses predicted so far."""
     predicted = predicted_poses(outputs.recorder.column("status").tolist())
-    return _marked_title(outputs.config.name, what, predicted, bool(outputs.remark))
-
-
-def _marked_title(name: str, what: str, predicted: BoolArray, synthetic: bool) -> str:
-    """What a picture shows, and what of it is not measured: poses, odometry."""
-    marks = measured_marks(int(predicted.sum()), synthetic)
-    return ", ".join(filter(None, (f"{name}: {what}", *marks)))
+    return picture_title(
+        f"{outputs.config.name}: {what}", int(predicted.sum()), bool(outputs.remark)
+    )
