@@ -89,9 +89,10 @@ def main() -> None:
         return  # before the first frame
     result = slam.result()
     result.map.save("live.fgmap")  # to begin in next time
-    count = len(result.trajectory)
-    print(f"{count} frames, {frames.dropped} left out, {len(result.map)} landmarks")
+    count, dropped = len(result.trajectory), frames.dropped
+    print(f"{count} frames, {dropped} left out, {len(result.map)} landmarks")
     print(f"{100.0 * in_time / count:.0f} % of the poses within the frame time, {frame_ms:.0f} ms")
+    print(f"{100.0 * dropped / (count + dropped):.0f} % of the frames that came were left out")
 
 
 if __name__ == "__main__":

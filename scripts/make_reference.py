@@ -39,6 +39,13 @@ _STATUS = """
 - 2: a mistake in what was given: one line on standard error says what, where, and how to fix it.
 - 3: done, but fewer than half of the frames were located (`run`; `localize`: of the queries).
 - 130, 143: ended by Ctrl-C or SIGTERM, within two seconds; all files are valid, `--resume` goes on.
+
+## Memory limit
+
+A command needs 1.2 GB of address space (`ulimit -v`) for its libraries. Open3D, which renders the
+lab, needs another 1.3 GB when it is loaded. With a limit below 8 GB, or below 240 MB a core where
+that is more, linear algebra works on one thread: those of all cores would fill the limit. Where
+memory runs out, one line says so, and the exit status is 2.
 """
 
 

@@ -19,6 +19,11 @@ from fgslam.core.memory import limit_bytes
 _LEAST_MEMORY = 1_200_000_000
 """Bytes of address space. Below it libraries crash at import, and OpenBLAS tries without end to get
 the memory of its first call."""
+_TIGHT_MEMORY = 8_000_000_000
+_THREADS_OF_CORE = 120_000_000
+"""Bytes of address space: the threads of one core take 40 MB in each of three libraries, so that
+they crash on machines of many cores. A limit above 8 GB that leaves threads less than half of it
+needs no such saving, and keeps the speed of all cores."""
 _SINGLE = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")
 
 _ended_with: list[int] = []
@@ -81,8 +86,9 @@ def _require_memory() -> None:
     limit = limit_bytes()
     if limit is None:
         return
-    for name in _SINGLE:  # each thread takes 40 MB of address space, in each of three libraries
-        os.environ.setdefault(name, "1")
+    if limit < max(_TIGHT_MEMORY, 2 * _THREADS_OF_CORE * (os.cpu_count() or 1)):
+        for name in _SINGLE:
+            os.environ.setdefault(name, "1")
     if limit < _LEAST_MEMORY:
         print(
             f"fgslam: the memory limit of {limit / 1e6:.0f} MB (ulimit -v) is below the "

@@ -223,9 +223,18 @@ def as_path(given: object, error: type[FgslamError], what: str = "path") -> Path
     """The path that a text or a path-like object is. Raises ``error`` for what can be none."""
     if not isinstance(given, str | os.PathLike):
         raise error(f"{what}: a {type(given).__name__}; give a text or a pathlib.Path")
-    if not os.fspath(given):
+    try:
+        name = os.fspath(given)
+    except TypeError as cause:  # a path-like object whose own path is neither text nor bytes
+        raise error(f"{what}: {cause}; give a text or a pathlib.Path") from cause
+    if not isinstance(name, str):
+        raise error(
+            f"{what}: the path of a {type(given).__name__} is of {type(name).__name__}; give a "
+            "text or a pathlib.Path"
+        )
+    if not name:
         raise error(f"{what}: the name is empty; give that of a file or folder")
-    path = Path(given)
+    path = Path(name)
     try:
         path.stat()
     except ValueError as cause:  # a name that holds NUL, or half of a surrogate pair

@@ -12,7 +12,7 @@ import re
 import resource
 from pathlib import Path
 
-from fgslam.core.errors import MemoryShortageError
+from fgslam.core.errors import FgslamError, MemoryShortageError
 
 _OF_LOADER = re.compile(
     r"failed to map segment|cannot allocate memory|cannot create shared object descriptor"
@@ -44,7 +44,12 @@ def room_bytes() -> int | None:
 
 
 def is_shortage(error: BaseException) -> bool:
-    """True of an error that says that there is no memory left, whichever library raised it."""
+    """True of an error that says that there is no memory left, whichever library raised it.
+
+    Not of this package's own errors: their text repeats names of files and settings.
+    """
+    if isinstance(error, FgslamError):
+        return False
     if isinstance(error, MemoryError):
         return True
     if isinstance(error, OSError) and error.errno == errno.ENOMEM:

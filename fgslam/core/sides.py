@@ -56,10 +56,11 @@ def camera_pairs(names: Iterable[str], any_number: bool = True) -> tuple[tuple[s
 def camera_trio(names: Iterable[str]) -> tuple[str, ...]:
     """Of three names that differ in the side alone those of left, right and third; () of others.
 
-    The third is called top, or t beside l and r; or all three have numbers that follow each other.
+    The third is called top, or t beside l and r; or all three have numbers of cameras that follow
+    each other, cam0 to cam2. Other numbers count the clips that one camera recorded.
     """
     given = set(names)
-    pairs = camera_pairs(given) if len(given) == 3 else ()
+    pairs = camera_pairs(given, any_number=False) if len(given) == 3 else ()
     for left, right in pairs:
         (third,) = given - {left, right}
         if (right, third) in pairs or third.lower() in _called_top(left):

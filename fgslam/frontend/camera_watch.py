@@ -230,13 +230,18 @@ class CameraWatch:
         return out
 
     def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
+        """Continues from :meth:`state`.
+
+        A checkpoint of an earlier version holds nothing of turned cameras: their watch begins anew.
+        """
         self._late = [bool(one) for one in state["late"]]
         self._sums = state["sums"].tolist()
         self._frames = int(state["frames"])
         self._before = list(state["before"])
+        self._turns = TurnWatch(self._rig, self._spread)
         own = [name for name in state if name.startswith("turns/")]
-        self._turns.restore({name.removeprefix("turns/"): state[name] for name in own})
+        if own:
+            self._turns.restore({name.removeprefix("turns/"): state[name] for name in own})
         for k, pair in enumerate(self._pairs):
             pair.swapped = bool(state["swapped"][k])
             pair.ratios = state[f"{k}/ratios"].tolist()

@@ -70,10 +70,21 @@ def _film_of_following(run: Path, followed: Followed, out: Path, progress: Progr
 
 
 def _rate(times: FloatArray, what: str, where: Path) -> float:
-    """Frames a second of a film of these times. Raises ConfigError of fewer than two."""
+    """Frames a second of a film of these times.
+
+    Raises:
+        ConfigError: fewer than two times.
+        DatasetError: most of them do not increase.
+    """
     if len(times) < 2:
         raise ConfigError(f"{where}: has {len(times)} {what}; a film needs two at least")
-    return min(_MOST_FPS, 1.0 / float(np.median(np.diff(times))))
+    step = float(np.median(np.diff(times)))
+    if not step > 0.0:
+        raise DatasetError(
+            f"{where}: the times of its {what} do not increase (median step {step:g} s), which "
+            "gives no frame rate; run the recording again"
+        )
+    return min(_MOST_FPS, 1.0 / step)
 
 
 def _film_of_slam(run: Path, out: Path, estimator: str | None, progress: Progress) -> str:

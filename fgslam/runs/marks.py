@@ -29,6 +29,11 @@ def measured_marks(predicted: int | None, synthetic: bool) -> tuple[str, str]:
     return predicted_mark(predicted), SYNTHETIC if synthetic else ""
 
 
+def picture_title(what: str, predicted: int, synthetic: bool) -> str:
+    """What a picture shows, and what of it is not measured: poses, odometry."""
+    return ", ".join(filter(None, (what, *measured_marks(predicted, synthetic))))
+
+
 def marked(values: Mapping[str, Any], remark: str = "", say_failed: bool = True) -> dict[str, Any]:
     """The metrics of estimators under titles that say what is not all there.
 

@@ -18,6 +18,7 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any, Generic, TypeVar
 
 from fgslam.core.errors import FgslamError
+from fgslam.core.memory import ShortageTold
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -117,6 +118,7 @@ def run_apart(
 
     Raises:
         FgslamError: what the function raised in its process.
+        MemoryShortageError: it ran out of memory there.
     """
     waiting = list(enumerate(arguments))[::-1]
     source = workers or Workers()
@@ -208,7 +210,8 @@ def _work(connection: Connection) -> None:
     while (work := _received(connection)) is not None:
         function, argument = work
         try:
-            connection.send(function(argument))
+            with ShortageTold():
+                connection.send(function(argument))
         except FgslamError as error:
             connection.send(error)
 

@@ -210,10 +210,15 @@ def _estimator(
     )
 
 
-def _predicted(rows: object, count: int) -> BoolArray:
-    """(n,) which poses no landmark measured, of the rows that metrics.json lists."""
+def _predicted(rows: object, count: int) -> BoolArray | None:
+    """(n,) which poses no landmark measured, of the rows that metrics.json lists.
+
+    None where it lists none: a run of an earlier version does not tell.
+    """
+    if not isinstance(rows, list):
+        return None
     out = np.zeros(count, np.bool_)
-    for row in rows if isinstance(rows, list) else ():
+    for row in rows:
         if isinstance(row, int) and 0 <= row < count:
             out[row] = True
     return out

@@ -26,6 +26,21 @@ _BEAM = np.deg2rad(np.linspace(-60.0, 60.0, 121))  # elevations of the line towa
 
 Row = dict[str, str]
 
+_NUMBERS: dict[str, type[int] | type[float]] = {
+    "image": int,
+    "time_s": float,
+    "path_image": int,
+    "probability": float,
+    "target": int,
+    "direction_deg": float,
+    "sigma_direction_deg": float,
+    "v_mps": float,
+    "omega_deg_s": float,
+    "to_target_m": float,
+}
+_NEEDED = (*_NUMBERS, "name", "path_image_name", "inliers", "state", "refusal")
+_ALWAYS = frozenset({"image", "time_s"})  # the other numbers are empty where they are not known
+
 
 @dataclass(frozen=True, eq=False)
 class Followed:
@@ -87,16 +102,39 @@ class Followed:
 
 
 def _rows(table: Path) -> tuple[Row, ...]:
-    """Raises DatasetError where it is gone, or none that `fgslam follow` wrote."""
-    needed = {"image", "name", "time_s", "path_image", "probability", "direction_deg", "refusal"}
+    """Raises DatasetError where it is gone, damaged, or none that `fgslam follow` wrote."""
     try:
         with table.open(encoding="utf-8", newline="") as file:
             rows = tuple(csv.DictReader(file))
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{table}: cannot be read ({error}); follow the route anew") from error
-    if not rows or not needed <= set(rows[0]):
+    if not rows:
         raise DatasetError(f"{table}: holds no image that was followed; follow the route anew")
+    lacking = [column for column in _NEEDED if column not in rows[0]]
+    if lacking:
+        raise DatasetError(f"{table}: lacks column {lacking[0]}; follow the route anew")
+    for line, row in enumerate(rows, 2):
+        _require_whole(f"{table}, line {line}", row)
     return rows
+
+
+def _require_whole(place: str, row: Row) -> None:
+    """Raises DatasetError unless each needed cell is there, and a number where one belongs."""
+    for column in _NEEDED:
+        text: str | None = row[column]  # None where the line ends before it
+        if text is None:
+            raise DatasetError(f"{place}: ends before column {column}; follow the route anew")
+        kind = _NUMBERS.get(column)
+        if kind is None or (not text and column not in _ALWAYS):
+            continue
+        try:
+            known = bool(np.isfinite(kind(text)))
+        except ValueError:
+            known = False
+        if not known:
+            raise DatasetError(
+                f"{place}: {column} is {text[:40]!r}, not a number; follow the route anew"
+            )
 
 
 def _require_same_route(rows: tuple[Row, ...], path: PathMemory, route: str) -> None:
@@ -154,12 +192,13 @@ def _command(row: Row) -> str:
     if row["refusal"]:
         return row["refusal"]
     turn = _number(row, "omega_deg_s")
-    side = "left" if turn > 0.0 else "right"
+    rate = f"{abs(turn):.0f}"
+    side = "" if rate == "0" else ", left" if turn > 0.0 else ", right"
     metres = _number(row, "to_target_m")
     return "\n".join(
         [
             f"v {_number(row, 'v_mps'):.2f} m/s",
-            f"omega {abs(turn):.0f} degrees/s, {side}",
+            f"omega {rate} degrees/s{side}",
             f"{row['inliers']} matches agree",
             *([f"{metres:.1f} m to path image {row['target']}"] if np.isfinite(metres) else []),
         ]

@@ -22,6 +22,7 @@ HANGS_AFTER_S = 300.0
 _POSE = re.compile(r"\s*(\d+\.\d\d) s  ")
 _ENDED = re.compile(r"(\d+) frames, (\d+) left out, (\d+) landmarks")
 _IN_TIME = re.compile(r"(\d+) % of the poses within the frame time, (\d+) ms")
+_LEFT_OUT = re.compile(r"(\d+) % of the frames that came were left out")
 
 
 def written_bag(folder: Path, frames: int, period_s: float) -> Path:
@@ -104,6 +105,7 @@ def test_late_frames_are_left_out_not_queued(tmp_path: Path) -> None:
     assert len(shown) == frames
     assert frames + left_out == 60
     assert left_out > 0
+    assert numbers(_LEFT_OUT, said) == [round(100.0 * left_out / 60)]
     recorded = fg.open_recording(bag).timestamps
     assert shown[-1] == pytest.approx(float(recorded[-1]), abs=0.006)
     assert fg.Map.load(tmp_path / "live.fgmap")

@@ -26,6 +26,7 @@ from tests.textured_room import SMALL_CAMERA_FILE, folder_of, seen_at
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
+EPOCH_S = 1_700_000_000.25
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +41,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     times = "".join(f"view_{k}.png {5 + k}\n" for k in range(9)) + "view_4a.png 9.5\n"
     (root / "drive" / "times.txt").write_text(times, encoding="utf-8")
+    stamps = "".join(f"view_{k}.png {EPOCH_S + 0.1 * k:.2f}\n" for k in range(5))
+    (root / "again" / "times.txt").write_text(stamps, encoding="utf-8")
     # SLAM on the drive: 0.4 m a second along x.
     poses = "".join(f"{5 + 0.5 * k} {0.2 * k} 0 0 0 0 0 1\n" for k in range(17))
     (root / "final.tum").write_text(poses, encoding="utf-8")
@@ -227,6 +230,9 @@ def test_a_film_shows_image_path_image_and_the_way_home(
     frames = shown_in(film)
     assert [frame.shape for frame in frames] == [(720, 1280, 3)] * 5
     rows = rows_of(followed / "follow.csv")
+    stamps = [float(row["time_s"]) for row in rows]
+    np.testing.assert_allclose(stamps, EPOCH_S + 0.1 * np.arange(5), rtol=0.0, atol=1e-6)
+    assert cv2.VideoCapture(str(film)).get(cv2.CAP_PROP_FPS) == pytest.approx(10.0, abs=0.1)
     for frame, row in zip(frames, rows, strict=True):
         blue, green, red = np.moveaxis(frame[360:600, 800:], 2, 0)  # arrow and command
         arrow = ((red > 190) & (np.abs(green - 150) < 40) & (blue < 80)).any()

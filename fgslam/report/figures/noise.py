@@ -12,6 +12,9 @@ from fgslam.report.figures.traces import Figure, Owner, Trace, thinned, trace
 from fgslam.report.run_results import ReportData
 
 _MAX_POINTS = 1000
+_NO_MOTION_NOISE = (
+    "No noise of a motion model is shown: it estimates none, or odometry measured the motion."
+)
 _FULL, _DASHED = "solid", "dash"
 
 
@@ -80,7 +83,7 @@ def noise_over_time(data: ReportData) -> Figure:
         "count for more) and as a single one is judged (dashed).",
         tuple(traces),
         layout,
-        note=_constant(data),
+        note=_without_motion(data),
     )
 
 
@@ -106,7 +109,7 @@ def _curves(data: ReportData, curve: _Curve, panel: int) -> Sequence[Trace]:
     return out
 
 
-def _constant(data: ReportData) -> str:
-    """That odometry was measured throughout, where no panel of the motion is drawn."""
-    measured = data.estimators and not any(_known(data, panel) for panel in _PANELS[:2])
-    return "Motion was measured by odometry, with its stated noise." if measured else ""
+def _without_motion(data: ReportData) -> str:
+    """Why no panel of the motion is drawn, as far as the table tells; empty where one is."""
+    absent = data.estimators and not any(_known(data, panel) for panel in _PANELS[:2])
+    return _NO_MOTION_NOISE if absent else ""

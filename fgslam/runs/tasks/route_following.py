@@ -171,6 +171,11 @@ def _time(recording: OmniRecording, i: int) -> float:
     return seconds if np.isfinite(seconds) else i / _RATE_HZ
 
 
+def _stamp(seconds: float) -> str:
+    """The time as a cell: an epoch's has more digits than a table's numbers."""
+    return f"{seconds:.9f}"
+
+
 def _row(i: int, recording: OmniRecording, path: PathMemory, command: DriveCommand) -> list[Cell]:
     place, homing = command.place, command.homing
     sigma = np.sqrt(np.diag(homing.covariance)[1:])
@@ -179,7 +184,7 @@ def _row(i: int, recording: OmniRecording, path: PathMemory, command: DriveComma
     return [
         int(recording.ids[i]),
         recording.names[i],
-        command.time,
+        _stamp(command.time),
         nearest,
         None if nearest is None else path.names[nearest],
         None if place is None else place.probability,
@@ -204,7 +209,7 @@ def _row_left_out(i: int, recording: OmniRecording, why: str) -> list[Cell]:
     cells: dict[str, Cell] = {
         "image": int(recording.ids[i]),
         "name": recording.names[i],
-        "time_s": _time(recording, i),
+        "time_s": _stamp(_time(recording, i)),
         "refusal": why,
     }
     return [cells.get(column) for column in COLUMNS]

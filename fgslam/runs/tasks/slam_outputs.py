@@ -33,7 +33,7 @@ from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.maps import map_points
-from fgslam.runs.marks import SYNTHETIC, measured_marks
+from fgslam.runs.marks import picture_title
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tasks.slam_calibration import (
     calibration_note,
@@ -382,8 +382,7 @@ class RunFigures:
 
     def title(self, what: str) -> str:
         """Title of one picture."""
-        marks = measured_marks(int(self.predicted.sum()), self.synthetic)
-        return ", ".join(filter(None, (f"{self.name}: {what}", *marks)))
+        return picture_title(f"{self.name}: {what}", int(self.predicted.sum()), self.synthetic)
 
 
 def figures_of(outputs: RunOutputs) -> RunFigures:
@@ -442,4 +441,8 @@ def _results(figures: RunFigures) -> ReportData:
 
 
 def _title(outputs: RunOutputs, what: str) -> str:
-    return f"{outputs.config.name}: {what}{f', {SYNTHETIC}' if outputs.remark else ''}"
+    """Title of a frame's picture, with the poses predicted so far."""
+    predicted = predicted_poses(outputs.recorder.column("status").tolist())
+    return picture_title(
+        f"{outputs.config.name}: {what}", int(predicted.sum()), bool(outputs.remark)
+    )

@@ -41,7 +41,8 @@ def load_open3d(
         MemoryShortageError: the process may not use as much memory as Open3D takes.
     """
     load = load_library or _load_globally
-    _require_room()
+    if "open3d" not in sys.modules:  # loaded already, it takes no more
+        _require_room()
     try:
         _provide_libusb(load, bundled_libusb or find_bundled_libusb)
         return import_module("open3d")

@@ -12,6 +12,16 @@ from fgslam.core.errors import DatasetError, MapError
 from fgslam.core.files import as_path
 
 
+class PathOf:
+    """A path-like object of whatever it is given."""
+
+    def __init__(self, what: object) -> None:
+        self._what = what
+
+    def __fspath__(self) -> object:
+        return self._what
+
+
 def test_a_pipe_or_a_folder_in_the_place_of_a_map_is_called_one(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.fgmap"
     os.mkfifo(pipe)
@@ -25,8 +35,9 @@ def test_a_pipe_or_a_folder_in_the_place_of_a_map_is_called_one(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("given", "what"),
     [(3, "a int"), (None, "a NoneType"), (b"x", "a bytes"), (["x"], "a list"),
+     (PathOf(b"x"), "the path of a PathOf is of bytes"), (PathOf(3), "PathOf"),
      ("\0", "null byte"), ("x" * 5000, "the name is too long")],
-    ids=["number", "none", "bytes", "list", "nul", "long"],
+    ids=["number", "none", "bytes", "list", "of bytes", "of number", "nul", "long"],
 )  # fmt: skip
 def test_what_is_no_path_is_refused_in_one_line(given: object, what: str) -> None:
     with pytest.raises(MapError, match=what) as caught:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from fgslam.cli import start
 
 HEAVY = frozenset(
     {"cv2", "gtsam", "jinja2", "matplotlib", "numpy", "open3d", "pandas", "PIL", "plotly"}
@@ -93,6 +96,23 @@ def test_a_memory_limit_below_what_libraries_take_is_one_line(mb: int) -> None:
     (line,) = done.stderr.splitlines()
     assert f"memory limit of {mb} MB" in line
     assert "raise it" in line
+
+
+@pytest.mark.parametrize(
+    ("gigabytes", "cores", "single"),
+    [(2, 2, True), (7.9, 2, True), (8.1, 2, False), (256, 2, False), (8.1, 64, True),
+     (256, 64, False), (None, 2, False)],
+)  # fmt: skip
+def test_only_a_limit_that_threads_would_fill_keeps_libraries_on_one(
+    gigabytes: float | None, cores: int, single: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limit = None if gigabytes is None else int(1e9 * gigabytes)
+    monkeypatch.setattr(start, "limit_bytes", lambda: limit)
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    monkeypatch.setattr(os, "environ", given := {"OMP_NUM_THREADS": "3"})
+    start._require_memory()
+    others = {"OPENBLAS_NUM_THREADS": "1"} if single else {}
+    assert given == {"OMP_NUM_THREADS": "3"} | others  # what the user says stays
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import pytest
 
 from fgslam.cli import main as cli
 from fgslam.core import memory
+from fgslam.core.errors import DatasetError
 
 SHORT = (
     MemoryError(),
@@ -25,6 +26,7 @@ OTHER = (
     OSError("libGL.so.1: cannot open shared object file: No such file"),
     ImportError("No module named cv2"),
     RuntimeError("indeterminate linear system"),
+    DatasetError("bad_alloc.bag: no such file"),
     KeyboardInterrupt(),
 )
 

@@ -20,6 +20,7 @@ from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import pose
+from fgslam.core.sides import camera_trio
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni
@@ -289,6 +290,39 @@ def test_three_films_need_a_calibration_of_three(tmp_path: Path) -> None:
     (tmp_path / "top.mp4").rename(tmp_path / "other.mp4")
     with pytest.raises(DatasetError, match="neither one film nor one of a left and one of a right"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("GX010001", "GX010002", "GX010003"),
+        ("clip1", "clip2", "clip3"),
+        ("20240101_120000", "20240101_120001", "20240101_120002"),
+    ],
+)
+def test_three_clips_of_one_camera_are_no_three_cameras(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    write_calibration(
+        tmp_path, width=64, height=48, cx=31.5, cy=23.5, fy=30.0, vertical_baseline_m=0.1
+    )
+    three_films(tmp_path, names)
+    with pytest.raises(DatasetError, match="neither one film nor one of a left and one of a right"):
+        opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("left", "right", "top"),
+        ("walk_l", "walk_r", "walk_t"),
+        ("cam0", "cam1", "cam2"),
+        ("walk_camera_1", "walk_camera_2", "walk_camera_3"),
+        ("infra1", "infra2", "infra3"),
+    ],
+)
+def test_three_names_of_sides_or_numbered_cameras_are_a_trio(names: tuple[str, ...]) -> None:
+    assert camera_trio(names[::-1]) == names
 
 
 def test_frames_are_chosen_and_the_rate_is_said(tmp_path: Path) -> None:

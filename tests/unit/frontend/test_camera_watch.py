@@ -172,6 +172,23 @@ def test_watching_goes_on_where_it_stopped(lab: tuple[CameraRig, list[Images]]) 
         np.testing.assert_equal(first.state(), first.state())
 
 
+def test_a_checkpoint_without_turns_begins_their_watch_anew(
+    lab: tuple[CameraRig, list[Images]],
+) -> None:
+    rig, frames = lab
+    first, then = CameraWatch(rig), CameraWatch(rig)
+    for images in frames[:3]:
+        first.look(images)
+        then.look(images)
+    known = first.state()
+    old = {name: value for name, value in known.items() if not name.startswith("turns/")}
+    then.restore(old)
+    begun = CameraWatch(rig).state()
+    for name, value in then.state().items():
+        np.testing.assert_array_equal(value, begun[name] if name not in old else known[name])
+    assert then.look(frames[3]) == first.look(frames[3]) == ""
+
+
 SOUND = (
     "kitti06",
     "kitti_raw_0926_5hz",

@@ -169,10 +169,12 @@ def test_noise_is_drawn_where_it_is_known_each_kind_with_its_unit() -> None:
     assert not figure.note
 
 
-def test_without_noise_of_the_motion_the_page_says_that_it_was_measured() -> None:
+def test_without_noise_of_the_motion_the_page_says_only_what_is_known() -> None:
     figures = slam_page(with_values(full_report(20), noise={"match_factor": np.ones(20)})).figures
     note = next(figure.note for figure in figures if figure.key == "noise")
-    assert note == "Motion was measured by odometry, with its stated noise."
+    assert note == (
+        "No noise of a motion model is shown: it estimates none, or odometry measured the motion."
+    )
 
 
 @pytest.mark.parametrize("up", [(0.0, -1.0, 0.0), (0.1, -0.9, 0.4), (1.0, 0.0, 0.0)])

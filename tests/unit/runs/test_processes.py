@@ -12,9 +12,10 @@ import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+import cv2
 import pytest
 
-from fgslam.core.errors import ConfigError
+from fgslam.core.errors import ConfigError, MemoryShortageError
 from fgslam.runs import processes
 from fgslam.runs.processes import WorkerEnded, Workers, run_apart
 
@@ -28,6 +29,10 @@ def work(what: str) -> str:
             os.kill(os.getpid(), signal.SIGKILL)
         case "exit":
             os._exit(3)
+        case "numpy":
+            raise MemoryError
+        case "opencv":
+            raise cv2.error("alloc.cpp:73: error: (-4:Insufficient memory) Failed to allocate 9")
         case "sleep":
             time.sleep(60.0)
     return f"{what} {os.environ.get('OMP_NUM_THREADS', 'unset')}"
@@ -144,6 +149,13 @@ def test_a_script_without_a_guard_is_not_run_again_in_its_workers(tmp_path: Path
 def test_a_users_mistake_is_raised_here() -> None:
     with pytest.raises(ConfigError, match="a user's mistake"):
         list(run_apart(work, ["error"]))
+
+
+@pytest.mark.parametrize("what", ["numpy", "opencv"])
+def test_lack_of_memory_in_a_process_is_raised_here_in_one_line(what: str) -> None:
+    with pytest.raises(MemoryShortageError, match="not enough memory") as caught:
+        list(run_apart(work, [what]))
+    assert "\n" not in str(caught.value)
 
 
 def clear_up(path: str) -> None:

@@ -1,4 +1,5 @@
 import resource
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -96,6 +97,7 @@ def test_open3d_without_memory_is_not_called_a_missing_library(
     def import_module(name: str) -> ModuleType:
         raise fault
 
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
     monkeypatch.setattr(resource, "getrlimit", lambda which: (10**12, -1))
     with pytest.raises(MemoryShortageError, match="memory is limited to 1000000 MB") as caught:
         load_open3d(import_module, lambda name: object(), lambda: None)
@@ -103,6 +105,20 @@ def test_open3d_without_memory_is_not_called_a_missing_library(
 
 
 def test_open3d_is_not_loaded_where_it_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "open3d", raising=False)
     monkeypatch.setattr(open3d_library, "room_bytes", lambda: 10**9)
     with pytest.raises(MemoryShortageError, match="more than is left"):
         load_open3d(lambda name: pytest.fail("it was loaded"), lambda name: object(), lambda: None)
+
+
+def test_a_second_load_needs_no_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    def import_module(name: str) -> ModuleType:
+        return sys.modules.setdefault(name, ModuleType(name))
+
+    monkeypatch.setitem(sys.modules, "open3d", ModuleType("open3d"))  # what was there comes back
+    monkeypatch.delitem(sys.modules, "open3d")
+    room = 2 * 10**9
+    monkeypatch.setattr(open3d_library, "room_bytes", lambda: room)
+    first = load_open3d(import_module, lambda name: object(), lambda: None)
+    room = 10**8  # Open3D has taken the rest
+    assert load_open3d(import_module, lambda name: object(), lambda: None) is first
