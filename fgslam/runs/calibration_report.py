@@ -18,7 +18,6 @@ from fgslam.cameras.board_check import (
 )
 from fgslam.cameras.board_projection import INTRINSICS, PARAMETERS
 from fgslam.cameras.boards import Board
-from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.report.pictures.board import draw_corners
 from fgslam.report.tables import write_csv
@@ -53,7 +52,7 @@ def fit_lines(files: Files, views: Sequence[View], found: BoardCalibration) -> I
         sigmas, at = found.sigmas[k], len(INTRINSICS)
         yield (
             f"{names[k]:11} {seen} of {len(views)} images, {covered:.0%} of the image; "
-            f"{_with_sigmas(INTRINSICS, _intrinsics(camera), sigmas[:at], 2)} px"
+            f"{_with_sigmas(INTRINSICS, camera.intrinsics, sigmas[:at], 2)} px"
         )
         own = _with_sigmas(PARAMETERS[camera.model], camera.distortion, sigmas[at:], 5)
         yield f"            {camera.model}: {own}"
@@ -67,10 +66,6 @@ def fit_lines(files: Files, views: Sequence[View], found: BoardCalibration) -> I
     worst = np.unravel_index(int(np.nanargmax(found.errors)), found.errors.shape)
     name = files[int(worst[0])][int(worst[1])].name
     yield f"worst       {name}: {found.errors[worst]:.2f} px"
-
-
-def _intrinsics(camera: RawCamera) -> FloatArray:
-    return camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
 
 
 def _with_sigmas(names: Sequence[str], values: FloatArray, sigmas: FloatArray, digits: int) -> str:
@@ -195,7 +190,7 @@ def _image_rows(
 def _parameter_rows(found: BoardCalibration) -> Iterator[tuple[str, str, float, float]]:
     names = names_of(len(found.cameras))
     for k, camera in enumerate(found.cameras):
-        own = np.concatenate([_intrinsics(camera), camera.distortion])
+        own = np.concatenate([camera.intrinsics, camera.distortion])
         named = INTRINSICS + PARAMETERS[camera.model]
         for name, value, sigma in zip(named, own, found.sigmas[k], strict=True):
             yield names[k], name, float(value), float(sigma)

@@ -72,7 +72,7 @@ def views_of(name: str, seed: int, count: int = 16, mirrored: bool = False) -> l
 
 
 def numbers_of(found: RawCamera) -> FloatArray:
-    return np.concatenate([found.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], found.distortion])
+    return np.concatenate([found.intrinsics, found.distortion])
 
 
 def in_sigmas(found: BoardCalibration, name: str) -> FloatArray:
