@@ -97,7 +97,9 @@ def _described(command: typer.core.TyperCommand, known: set[str]) -> Iterator[st
     for text in (command.help or "").split("\n\n"):
         yield from (*paragraph(text), "")
     for parameter in command.params:
-        if isinstance(parameter, TyperArgument | TyperOption) and parameter.name != "help":
+        if not isinstance(parameter, TyperArgument | TyperOption) or parameter.hidden:
+            continue
+        if parameter.name != "help":
             line = _parameter(parameter)
             if line in known:
                 alike.append(line.split(": ")[0])

@@ -36,14 +36,18 @@ _OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once i
 MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
 _TRIMMINGS = 4
 _MOST_OFF = 0.0025  # of the image's diagonal: corners are found to a tenth of that
-_FIRST_STEPS = 30  # with the distortion held: far from the least it would bend back
-_STEPS = 300  # of the fit; twenty are usual, and without an end there is no least
+_FIRST_STEPS = 30  # with fixed distortion: from a rough start it becomes non-monotonic
+_STEPS = 300  # evaluations of the fit; twenty are usual
 _UNCERTAIN = 0.1  # of the focal length: with a larger deviation nothing is known of a camera
 _LEAST_CORNERS = 6  # of an image, for its board's pose to follow with something left
 
 _UNDETERMINED = (
     "the board's images do not determine the cameras: take more of them, tilted in different "
     "directions, some in each corner of the image"
+)
+_UNFINISHED = (
+    "the fit of the {model} cameras does not converge in {steps} steps; try another --lens, or "
+    "leave out images in which corners were found wrongly"
 )
 
 View = tuple[Corners | None, ...]
@@ -62,6 +66,7 @@ class BoardCalibration:
         boards: (views, 6) pose of the board in the first camera.
         off: of each view and camera, how far off each corner (n,) is, pixels; empty where the board
             was not found, or did not fit.
+        kept: the corners of each view that were used; None where none were.
         left_out: corners that do not fit the others.
     """
 
@@ -70,6 +75,7 @@ class BoardCalibration:
     turn_sigmas: FloatArray
     boards: FloatArray
     off: tuple[tuple[FloatArray, ...], ...]
+    kept: tuple[View, ...]
     left_out: int
 
     def turn(self, camera: int) -> FloatArray:
@@ -116,19 +122,19 @@ def calibrate(
         CalibrationError: too few views, they do not determine the cameras, or no such cameras show
             a board like that.
     """
-    given = tuple(views)
-    for _ in range(_TRIMMINGS):
-        found = _fit(board, given, size, model)
+    found = _fit(*_first(board, views, model, size), size)
+    for _ in range(_TRIMMINGS - 1):
         trimmed = _trimmed(views, _distances(found, board, views))
-        if _count(trimmed) == _count(given):
+        if _count(trimmed) == _count(found.kept):
             break
-        given = trimmed
+        problem = _Problem(board, trimmed, model)
+        found = _fit(problem, problem.start_of(found), size)
     if found.rms > _MOST_OFF * float(np.hypot(*size)):
         raise CalibrationError(
             f"the corners lie {found.rms:.1f} px (rms) off what {model} cameras show of a flat "
             "board; is --lens that of the camera, its focus fixed, and the board flat?"
         )
-    return replace(found, left_out=_count(views) - _count(given))
+    return replace(found, left_out=_count(views) - _count(found.kept))
 
 
 def _count(views: Sequence[View]) -> int:
@@ -179,15 +185,29 @@ def _off(camera: RawCamera, points: FloatArray, corners: Corners | None) -> Floa
     return np.asarray(np.linalg.norm(pixels - corners.pixels, axis=1))
 
 
-def _fit(
-    board: Board, views: Sequence[View], size: tuple[int, int], model: str
-) -> BoardCalibration:
+def _first(
+    board: Board, views: Sequence[View], model: str, size: tuple[int, int]
+) -> tuple[_Problem, FloatArray]:
+    """The problem and first values; images in which the board has no pose are left out."""
     problem = _Problem(board, views, model)
-    start = problem.start(size)
+    intrinsics = problem.guesses(size)
+    cTb = problem.poses(size, intrinsics)
+    if len(cTb) < len(problem.seen):
+        posed = (
+            tuple(corners if (v, c) in cTb else None for c, corners in enumerate(view))
+            for v, view in enumerate(views)
+        )
+        problem = _Problem(board, tuple(posed), model)
+    start = problem.start(intrinsics, cTb)
     if not np.isfinite(start).all() or not np.isfinite(problem.residuals(start)).all():
         raise CalibrationError(_UNDETERMINED)
     if model != "radtan":
         start = _least(problem.residuals, problem.jacobian_without_lens, start, _FIRST_STEPS).x
+    return problem, start
+
+
+def _fit(problem: _Problem, start: FloatArray, size: tuple[int, int]) -> BoardCalibration:
+    """The cameras of the least residuals from a start on."""
     fit = _least(problem.residuals, problem.jacobian, start, _STEPS)
     jacobian = problem.jacobian(fit.x)
     rows = len(fit.fun)
@@ -195,13 +215,15 @@ def _fit(
     if not (np.isfinite(scale).all() and scale.all()):
         raise CalibrationError(_UNDETERMINED)
     information = (jacobian / scale).T @ (jacobian / scale)
-    if not fit.success or rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
+    if rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
         raise CalibrationError(_UNDETERMINED)
     variance = 2.0 * fit.cost / (rows - len(fit.x))
     covariance = variance * np.linalg.inv(information) / np.outer(scale, scale)
     problem.require_determined(size, fit.x, covariance)
+    if not fit.success:
+        raise CalibrationError(_UNFINISHED.format(model=problem.model, steps=_STEPS))
     found = problem.result(size, fit.x, np.sqrt(np.diag(covariance)))
-    return replace(found, off=_distances(found, board, views))
+    return replace(found, off=_distances(found, problem.board, problem.views))
 
 
 def _least(
@@ -217,7 +239,7 @@ class _Problem:
     """Residuals and derivatives over (intrinsics, turns of the other cameras, boards)."""
 
     def __init__(self, board: Board, views: Sequence[View], model: str) -> None:
-        self.model, self.views = model, views
+        self.board, self.model, self.views = board, model, tuple(views)
         self.cameras, self._points = len(views[0]), board.points
         self._own = len(INTRINSICS) + len(PARAMETERS[model])
         self._turns_at = self.cameras * self._own
@@ -238,21 +260,36 @@ class _Problem:
                 )
         self._row_of = {v: k for k, v in enumerate(sorted({v for v, _, _ in self.seen}))}
 
-    def start(self, size: tuple[int, int]) -> FloatArray:
-        """First values: each camera by itself, then its pose to the first where both see it."""
-        intrinsics, model = [], self.model
+    def guesses(self, size: tuple[int, int]) -> list[FloatArray]:
+        """First intrinsics of each camera, by itself."""
+        intrinsics = []
         for camera in range(self.cameras):
             own = [corners for _, c, corners in self.seen if c == camera]
             points = [self._points[corners.ids] for corners in own]
-            intrinsics.append(first_guess(model, points, [o.pixels for o in own], size))
-        cTb = {}
-        for v, c, corners in self.seen:
-            found = board_pose(
-                camera_of(model, size, intrinsics[c]), self._points[corners.ids], corners.pixels
-            )
-            if found is None:
-                raise CalibrationError(_UNDETERMINED)
-            cTb[v, c] = found
+            intrinsics.append(first_guess(self.model, points, [o.pixels for o in own], size))
+        return intrinsics
+
+    def poses(
+        self, size: tuple[int, int], intrinsics: Sequence[FloatArray]
+    ) -> dict[tuple[int, int], FloatArray]:
+        """Poses (4, 4) of the board by view and camera, of those images that give one."""
+        cameras = [camera_of(self.model, size, numbers) for numbers in intrinsics]
+        found = {
+            (v, c): board_pose(cameras[c], self._points[corners.ids], corners.pixels)
+            for v, c, corners in self.seen
+        }
+        return {key: cTb for key, cTb in found.items() if cTb is not None}
+
+    def start_of(self, found: BoardCalibration) -> FloatArray:
+        """First values: those of a fit to more or fewer corners of the same views."""
+        intrinsics = [np.concatenate([c.intrinsics, c.distortion]) for c in found.cameras]
+        turns = [found.turn(camera) for camera in range(1, self.cameras)]
+        return np.concatenate([*intrinsics, *turns, *(found.boards[v] for v in self._row_of)])
+
+    def start(
+        self, intrinsics: Sequence[FloatArray], cTb: dict[tuple[int, int], FloatArray]
+    ) -> FloatArray:
+        """First values: the cameras' poses to the first where both see the board."""
         turns = [self._relative(cTb, camera) for camera in range(1, self.cameras)]
         boards = [self._in_first(cTb, turns, v) for v in self._row_of]
         return np.concatenate([*intrinsics, *map(turn_of_matrix, turns), *boards])
@@ -336,7 +373,7 @@ class _Problem:
     def require_determined(
         self, size: tuple[int, int], x: FloatArray, covariance: FloatArray
     ) -> None:
-        """Raises CalibrationError for a camera that is none, or of uncertain focal length.
+        """Raises CalibrationError for impossible intrinsics, or an uncertain focal length.
 
         The unified model's is ``f / (1 + xi)``, that around the axis: the two are nearly one.
         """
@@ -373,5 +410,6 @@ class _Problem:
             turn_sigmas=np.vstack([np.zeros((1, TURN)), sigmas[turns].reshape(-1, TURN)]),
             boards=boards,
             off=(),
+            kept=self.views,
             left_out=0,
         )

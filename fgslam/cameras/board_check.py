@@ -174,9 +174,7 @@ def _off_when_placed(board: Board, camera: RawCamera, corners: Corners) -> Float
     cTb = board_pose(camera, points, corners.pixels)
     if cTb is None:
         return None
-    matrix = camera.matrix
-    focal_and_centre = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]
-    intrinsics = np.concatenate([focal_and_centre, camera.distortion])
+    intrinsics = np.concatenate([camera.intrinsics, camera.distortion])
 
     def off(turn: FloatArray) -> FloatArray:
         return projected(camera.model, points, turn, intrinsics)[0].ravel() - corners.pixels.ravel()

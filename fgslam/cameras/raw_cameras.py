@@ -57,6 +57,11 @@ class RawCamera:
         """Width and height in pixels."""
         return self.width, self.height
 
+    @property
+    def intrinsics(self) -> FloatArray:
+        """(4,) fx, fy, cx, cy, pixels."""
+        return self.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (n, 2) of points (n, 3) in the camera's axes; NaN where the model sees none.
 

@@ -39,7 +39,23 @@ Mount = Annotated[
 ]
 CameraOut = Annotated[
     Path,
-    typer.Option(metavar="FILE", help="where to write it, .yaml, for --camera; numbers in .json"),
+    typer.Option(
+        metavar="FILE", help="where to write it, .yaml, for --camera; numbers in *_lens.json"
+    ),
+]
+
+
+def _refuse_rings(given: str | None) -> None:
+    """Options that `omni` had while it was the command for mirrors and rings."""
+    if given is not None:
+        raise ConfigError(
+            "calibrate omni is of images of a board; a mirror from an image of rings (--elevations "
+            "and --inner) is now `fgslam calibrate rings`"
+        )
+
+
+OfRings = Annotated[
+    str | None, typer.Option(hidden=True, is_eager=True, callback=_refuse_rings, help="of rings")
 ]
 Out = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .json, for --camera")]
 MirrorOut = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .yaml")]
@@ -99,6 +115,8 @@ def omni(  # noqa: PLR0913 - each option is a parameter
     lens: WideLens = "omni",
     mount: Mount = "mirror",
     out: CameraOut = Path("camera.yaml"),
+    elevations: OfRings = None,
+    inner: OfRings = None,
 ) -> None:
     """Calibrate one fisheye, or a camera below a mirror, from images of a board."""
     from fgslam.cli.console import progress_bar
@@ -106,6 +124,7 @@ def omni(  # noqa: PLR0913 - each option is a parameter
 
     known = _board(target, board, square, spacing, dictionary)
     wide = calibrating.WideLens(lens, mount)
+    del elevations, inner  # refused before
     with progress_bar() as progress:
         found = calibrating.calibrate_wide_camera(images, known, wide, out, progress)
     _tell(found)

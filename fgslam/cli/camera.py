@@ -77,8 +77,8 @@ def convert(  # noqa: PLR0913 - each option is a parameter
         typer.Option(
             "--format",
             metavar="NAME",
-            help="another than the ending says: fgslam, opencv, kalibr, ros, kitti, euroc (a "
-            "folder with cam0/sensor.yaml, ...), orb_slam3",
+            help="the format, if not that of OUT's ending: fgslam, opencv, kalibr, ros, kitti, "
+            "euroc (a folder with cam0/sensor.yaml, ...), orb_slam3",
         ),
     ] = None,
     second: Second = None,

@@ -115,8 +115,8 @@ def calibrate_cameras(
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
     remarks = assembled(calibration).remarks
     write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
-    others = (draw_coverage(out, views, found), *write_tables(out, files, views, found))
-    lines = (*fit_lines(files, views, found), *rig_verdict(board, views, found, checked), *remarks)
+    others = (draw_coverage(out, found), *write_tables(out, files, views, found))
+    lines = (*fit_lines(files, views, found), *rig_verdict(board, found, checked), *remarks)
     return Calibrated(out, others, (*notes, *held, *lines))
 
 
@@ -130,7 +130,7 @@ def calibrate_wide_camera(
         board: what they show.
         lens: how the camera is modelled and mounted.
         out: the camera file, .yaml, for :func:`fgslam.load_camera`, `teach` and `follow`; the
-            calibration that it names is written beside it as .json.
+            calibration that it names is written beside it: of camera.yaml camera_lens.json.
         progress: called with what is done, how far, of how much.
 
     Raises:
@@ -146,18 +146,19 @@ def calibrate_wide_camera(
     _require_found(views, files, bits, board)
     found = calibrate(board, views, size, lens.model)
     checked = held_out_alone(board, views, size, lens.model)
-    numbers = out.with_suffix(".json")
+    # Not rig.json of rig.yaml, which may be the calibration of a rig, with a picture and tables.
+    numbers = out.with_name(f"{out.stem}_lens.json")
     calibration = Calibration(str(numbers), "fgslam calibrate", found.cameras)
     write_text(numbers, json.dumps(raw_values(calibration), indent=2) + "\n")
     write_text(out, yaml.safe_dump(lens.camera_file(numbers.name), sort_keys=False))
-    tables = write_tables(out, files, views, found)
+    tables = write_tables(numbers, files, views, found)
     lines = (
         *held,
         *fit_lines(files, views, found),
-        *wide_verdict(files, views, found, checked),
+        *wide_verdict(files, found, checked),
         f"mount       {lens.mount}: {MOUNTS[lens.mount][-1]}; if not, give --mount",
     )
-    return Calibrated(out, (numbers, draw_coverage(out, views, found), *tables), lines)
+    return Calibrated(out, (numbers, draw_coverage(numbers, found), *tables), lines)
 
 
 def _files_of_one(folder: Path) -> list[tuple[Path, ...]]:

@@ -18,7 +18,6 @@ from fgslam.cameras.board_check import (
 )
 from fgslam.cameras.board_projection import INTRINSICS, PARAMETERS
 from fgslam.cameras.boards import Board
-from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.report.pictures.board import draw_corners
 from fgslam.report.tables import write_csv
@@ -49,11 +48,11 @@ def fit_lines(files: Files, views: Sequence[View], found: BoardCalibration) -> I
     )
     for k, camera in enumerate(found.cameras):
         seen = sum(view[k] is not None for view in views)
-        covered = coverage(views, k, camera.size)
+        covered = coverage(found.kept, k, camera.size)
         sigmas, at = found.sigmas[k], len(INTRINSICS)
         yield (
             f"{names[k]:11} {seen} of {len(views)} images, {covered:.0%} of the image; "
-            f"{_with_sigmas(INTRINSICS, _intrinsics(camera), sigmas[:at], 2)} px"
+            f"{_with_sigmas(INTRINSICS, camera.intrinsics, sigmas[:at], 2)} px"
         )
         own = _with_sigmas(PARAMETERS[camera.model], camera.distortion, sigmas[at:], 5)
         yield f"            {camera.model}: {own}"
@@ -69,10 +68,6 @@ def fit_lines(files: Files, views: Sequence[View], found: BoardCalibration) -> I
     yield f"worst       {name}: {found.errors[worst]:.2f} px"
 
 
-def _intrinsics(camera: RawCamera) -> FloatArray:
-    return camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-
-
 def _with_sigmas(names: Sequence[str], values: FloatArray, sigmas: FloatArray, digits: int) -> str:
     return ", ".join(
         f"{name} {value:.{digits}f} +- {sigma:.{digits}f}"
@@ -86,7 +81,6 @@ def _with_sigmas(names: Sequence[str], values: FloatArray, sigmas: FloatArray, d
 
 def rig_verdict(
     board: Board,
-    views: Sequence[View],
     found: BoardCalibration,
     checked: Sequence[HeldOut | None],
 ) -> Iterator[str]:
@@ -106,21 +100,19 @@ def rig_verdict(
             faults.append(f"rows agree to {held.rows_px:.2f} px only")
         if abs(off) > _SQUARE:
             faults.append(f"squares come out {off:+.1%}")
-    least = min(coverage(views, k, camera.size) for k, camera in enumerate(found.cameras))
+    least = min(coverage(found.kept, k, camera.size) for k, camera in enumerate(found.cameras))
     if least < _COVERAGE:
         faults.append(f"a camera shows the board in {least:.0%} of its image only")
-    both = sum(all(corners is not None for corners in view) for view in views)
+    both = sum(all(corners is not None for corners in view) for view in found.kept)
     if both < _VIEWS:
         faults.append(f"only {both} moments show it to all cameras")
     yield _verdict(faults, None not in checked)
 
 
-def wide_verdict(
-    files: Files, views: Sequence[View], found: BoardCalibration, held: HeldOutAlone | None
-) -> Iterator[str]:
+def wide_verdict(files: Files, found: BoardCalibration, held: HeldOutAlone | None) -> Iterator[str]:
     """How a single camera does on images that it was not calibrated with, and what to mend."""
     camera, faults = found.cameras[0], []
-    angle, covered = farthest_from_axis(views, camera), coverage_of_circle(views, camera)
+    angle, covered = farthest_from_axis(found.kept, camera), coverage_of_circle(found.kept, camera)
     across, down, _ = np.degrees(camera.field_of_view())
     yield (
         f"view        {across:.0f} x {down:.0f} degrees; corners up to {np.degrees(angle):.0f} "
@@ -140,7 +132,7 @@ def wide_verdict(
             faults.append(f"corners agree to {held.off_px:.2f} px only")
     if covered < _COVERAGE:
         faults.append(f"the board is seen in {covered:.0%} of the circle only")
-    seen = sum(view[0] is not None for view in views)
+    seen = sum(view[0] is not None for view in found.kept)
     if seen < _VIEWS:
         faults.append(f"only {seen} images show it")
     yield _verdict(faults, held is not None)
@@ -195,7 +187,7 @@ def _image_rows(
 def _parameter_rows(found: BoardCalibration) -> Iterator[tuple[str, str, float, float]]:
     names = names_of(len(found.cameras))
     for k, camera in enumerate(found.cameras):
-        own = np.concatenate([_intrinsics(camera), camera.distortion])
+        own = np.concatenate([camera.intrinsics, camera.distortion])
         named = INTRINSICS + PARAMETERS[camera.model]
         for name, value, sigma in zip(named, own, found.sigmas[k], strict=True):
             yield names[k], name, float(value), float(sigma)
@@ -205,15 +197,15 @@ def _parameter_rows(found: BoardCalibration) -> Iterator[tuple[str, str, float, 
                 yield names[k], name, float(value), float(sigma)
 
 
-def draw_coverage(out: Path, views: Sequence[View], found: BoardCalibration) -> Path:
-    """Draws where in the images corners were found; the picture's path.
+def draw_coverage(out: Path, found: BoardCalibration) -> Path:
+    """Draws where in the images the corners are that were used; the picture's path.
 
     Raises:
         OutputError: the file cannot be written.
     """
     picture = out.with_suffix(".png")
     corners = [
-        np.concatenate([corners.pixels for view in views if (corners := view[k]) is not None])
+        np.concatenate([corners.pixels for view in found.kept if (corners := view[k]) is not None])
         for k in range(len(found.cameras))
     ]
     draw_corners(picture, found.cameras[0].size, corners, names_of(len(corners)))

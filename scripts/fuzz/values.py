@@ -100,10 +100,7 @@ def _said(chain: dict[str, dict[str, Any]]) -> np.ndarray[Any, Any]:
 
 def _found(calibration: Calibration) -> np.ndarray[Any, Any]:
     first, second = calibration.cameras
-    each = [
-        np.r_[c.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], c.distortion[:4], c.size]
-        for c in (first, second)
-    ]
+    each = [np.r_[c.intrinsics, c.distortion[:4], c.size] for c in (first, second)]
     motion = np.linalg.inv(second.bTc) @ first.bTc
     return np.concatenate([*each, motion.ravel()])
 

@@ -17,6 +17,7 @@ from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import MirrorFrame, RadialPolynomial
 from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import so3_exp, so3_log
 
 # Facts of the files' SOURCE.md: the square, metres, and the baseline that other programs found.
@@ -120,7 +121,7 @@ def test_a_real_fisheye_alone_agrees_with_its_pair(
     arguments = ("--board", "9x6", "--square", "0.02423", "--lens", "equidistant", "--out", out)
     assert main(monkeypatch, "calibrate", "omni", folder, *arguments) == 0
     told = capfd.readouterr().out
-    (camera,) = read_calibration_file(tmp_path / "camera.json").cameras
+    (camera,) = read_calibration_file(tmp_path / "camera_lens.json").cameras
     pair = read_calibration_file(stated, size=camera.size).cameras[side == "right"]
     # The pair's calibrations differ by as much: 226.4 stated, 228.4 by calibrate stereo (right).
     assert camera.focal_px == pytest.approx(pair.focal_px, rel=0.02)
@@ -228,27 +229,44 @@ def test_a_fisheye_is_calibrated_from_images_of_a_board(
     drawn_boards: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
     out = tmp_path / "camera.yaml"
+    siblings = ("camera.json", "camera.png", "camera_images.csv", "camera_parameters.csv")
+    for name in siblings:
+        (tmp_path / name).write_text("a rig", encoding="utf-8")
     board = ("--board", "6x4", "--square", "0.05", "--lens", "equidistant", "--mount", "up")
     assert main(monkeypatch, "calibrate", "omni", drawn_boards, *board, "--out", out) == 0
     told = capfd.readouterr().out
     for word in ("corners ", "camera ", "equidistant: k1", "worst ", "held out", "verdict", "up: "):
         assert word in told
-    (camera,) = read_calibration_file(tmp_path / "camera.json").cameras
+    (camera,) = read_calibration_file(tmp_path / "camera_lens.json").cameras
     # OpenCV finds half of the boards, and corners at the rim of these to half a pixel or worse.
     assert camera.focal_px == pytest.approx(FISHEYE.focal_px, rel=0.015)
     assert median_apart_px(camera, FISHEYE, 60.0) < 2.0
-    assert (tmp_path / "camera.png").read_bytes().startswith(b"\x89PNG")
-    images = list(csv.DictReader((tmp_path / "camera_images.csv").open(encoding="utf-8")))
+    assert (tmp_path / "camera_lens.png").read_bytes().startswith(b"\x89PNG")
+    images = list(csv.DictReader((tmp_path / "camera_lens_images.csv").open(encoding="utf-8")))
     assert [row["image"] for row in images] == [f"board{k:02d}.png" for k in range(14)]
-    assert all(row["rms_px"] for row in images if row["corners"] != "0")
-    parameters = list(csv.DictReader((tmp_path / "camera_parameters.csv").open(encoding="utf-8")))
+    assert all(0.0 < float(row["rms_px"]) < 1.0 for row in images if row["rms_px"])
+    assert sum(bool(row["rms_px"]) for row in images) >= 5
+    parameters = list(
+        csv.DictReader((tmp_path / "camera_lens_parameters.csv").open(encoding="utf-8"))
+    )
     names = ["fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"]
     assert [row["parameter"] for row in parameters] == names
     assert all(float(row["sigma"]) > 0.0 for row in parameters)
     read = fg.load_camera(out)
     above = read.pixels(np.array([[0.0, 0.0, 1.0]]))
     np.testing.assert_allclose(above, camera.matrix[None, :2, 2], rtol=0, atol=1e-6)
-    assert isinstance(fg.load_camera(tmp_path / "camera.json"), LensCamera)
+    with pytest.raises(CalibrationError, match=r"how the camera is mounted; give the \.yaml"):
+        fg.load_camera(tmp_path / "camera_lens.json")
+    assert all((tmp_path / name).read_text(encoding="utf-8") == "a rig" for name in siblings)
+
+
+def test_rings_are_pointed_to_their_command(
+    tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    """`calibrate omni` was the command for them before."""
+    for options in (("--elevations=-15,-5,5", "--inner", "20"), ("--inner", "20")):
+        arguments = ("calibrate", "omni", tmp_path / "x.png", *options)
+        assert "is now `fgslam calibrate rings`" in mistake(capfd, monkeypatch, *arguments)
 
 
 def test_mistakes_of_calibrate_omni(

@@ -12,7 +12,13 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.formats.own import raw_values
-from fgslam.cameras.formats.writing_parts import refused, require_no_skew, shortened, two
+from fgslam.cameras.formats.writing_parts import (
+    refused,
+    require_no_skew,
+    shortened,
+    two,
+    two_of_one_size,
+)
 from fgslam.cameras.formats.writing_slam import euroc_files, kitti_text, orb_slam_text
 from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
 from fgslam.core.arrays import FloatArray
@@ -87,7 +93,6 @@ def _kalibr(calibration: Calibration, path: Path, _: StatedView | None) -> None:
 
 
 def _kalibr_camera(camera: RawCamera) -> dict[str, Any]:
-    focal = [camera.matrix[0, 0], camera.matrix[1, 1], *camera.matrix[:2, 2]]
     own, distortion, kind = [], camera.distortion, camera.model
     if camera.model in _SPHERES:
         own, distortion, kind = list(camera.distortion), camera.distortion[:0], "none"
@@ -100,7 +105,7 @@ def _kalibr_camera(camera: RawCamera) -> dict[str, Any]:
     require_no_skew(camera, "Kalibr")
     return {
         "camera_model": _KALIBR.get(camera.model, camera.model),
-        "intrinsics": [float(v) for v in (*own, *focal)],
+        "intrinsics": [float(v) for v in (*own, *camera.intrinsics)],
         "distortion_model": kind,
         "distortion_coeffs": [float(v) for v in distortion],
         "resolution": list(camera.size),
@@ -116,7 +121,7 @@ _OPENCV = {"radtan": "M", "equidistant": "K", "omni": "K"}
 
 
 def _opencv(calibration: Calibration, path: Path, _: StatedView | None) -> None:
-    first, second = two(calibration, "OpenCV's file")
+    first, second = two_of_one_size(calibration, "OpenCV's file")
     values: dict[str, Any] = {"image_width": first.width, "image_height": first.height}
     for k, camera in enumerate((first, second), 1):
         if camera.model not in _OPENCV:

@@ -35,6 +35,18 @@ def require_no_skew(camera: RawCamera, tool: str) -> None:
         )
 
 
+def two_of_one_size(calibration: Calibration, what: str) -> tuple[RawCamera, RawCamera]:
+    """As :func:`two`. Raises CalibrationError: also where their images differ in size."""
+    first, second = two(calibration, what)
+    if first.size != second.size:
+        sizes = " and ".join(f"{width}x{height}" for width, height in (first.size, second.size))
+        raise CalibrationError(
+            f"{calibration.source}: its cameras have images of {sizes}, but {what} has one size; "
+            "write calib.json or Kalibr's .yaml"
+        )
+    return first, second
+
+
 def two(calibration: Calibration, what: str) -> tuple[RawCamera, RawCamera]:
     """Both cameras of a pair of one model. Raises CalibrationError: they are no such pair."""
     if len(calibration.cameras) != 2:

@@ -7,7 +7,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import yaml
 
-from fgslam.cameras.formats.writing_parts import refused, require_no_skew, shortened, two
+from fgslam.cameras.formats.writing_parts import (
+    refused,
+    require_no_skew,
+    shortened,
+    two_of_one_size,
+)
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
@@ -22,7 +27,7 @@ def kitti_text(calibration: Calibration) -> str:
     Raises:
         CalibrationError: the cameras are no rectified pair.
     """
-    left, right = two(calibration, "KITTI's calib.txt")
+    left, right = two_of_one_size(calibration, "KITTI's calib.txt")
     step = calibration.offset(1, 0)
     baseline = float(step[0, 3])
     rectified = (
@@ -81,14 +86,10 @@ def _sensor(camera: RawCamera) -> Mapping[str, object]:
         "T_BS": {"cols": 4, "rows": 4, "data": camera.bTc.ravel().tolist()},
         "resolution": list(camera.size),
         "camera_model": "pinhole",
-        "intrinsics": _intrinsics(camera).tolist(),
+        "intrinsics": camera.intrinsics.tolist(),
         "distortion_model": model,
         "distortion_coefficients": coefficients.tolist(),
     }
-
-
-def _intrinsics(camera: RawCamera) -> FloatArray:
-    return camera.matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
 
 
 # --------------------------------------------------------------------------------------------
@@ -105,7 +106,7 @@ def orb_slam_text(calibration: Calibration) -> str:
     Raises:
         CalibrationError: they are no pair of one of its models.
     """
-    cameras = two(calibration, "ORB-SLAM3")
+    cameras = two_of_one_size(calibration, "ORB-SLAM3")
     model = cameras[0].model
     if model not in _ORB_TYPES:
         raise refused(cameras[0], "ORB-SLAM3")
@@ -121,10 +122,15 @@ def orb_slam_text(calibration: Calibration) -> str:
         "Stereo.T_c1_c2: !!opencv-matrix",
         "   rows: 4",
         "   cols: 4",
-        "   dt: d",
-        f"   data: {calibration.offset(1, 0).ravel().tolist()}",
+        "   dt: f",  # it reads the matrix as of floats, whatever is written here
+        f"   data: [{', '.join(_as_float32(calibration.offset(1, 0)))}]",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _as_float32(matrix: FloatArray) -> Iterator[str]:
+    """The shortest numbers that give the same floats of 32 bits."""
+    return (str(number) for number in matrix.astype(np.float32).ravel())
 
 
 def _orb_camera(number: int, camera: RawCamera) -> Iterator[str]:
@@ -133,6 +139,9 @@ def _orb_camera(number: int, camera: RawCamera) -> Iterator[str]:
     if camera.model == "radtan":
         values = shortened(camera, 5, "ORB-SLAM3")
         terms = terms if len(camera.distortion) > 4 else terms[:4]
-    named = zip(("fx", "fy", "cx", "cy"), _intrinsics(camera).tolist(), strict=True)
+    named = zip(("fx", "fy", "cx", "cy"), camera.intrinsics.tolist(), strict=True)
     for name, value in (*named, *zip(terms, values.tolist(), strict=False)):
         yield f"Camera{number}.{name}: {value!r}"
+    if camera.model == "equidistant":  # columns that the other camera may see: all
+        yield f"Camera{number}.overlappingBegin: 0"
+        yield f"Camera{number}.overlappingEnd: {camera.width - 1}"

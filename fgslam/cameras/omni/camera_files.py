@@ -62,10 +62,11 @@ def load_camera(
 
     Args:
         source: the path of an OCamCalib result file (``calib_results.txt``), of a camera of
-            camodocal (MEI), Kalibr or fgslam (.json) whose middle looks down, of BloggieUnwarp's
-            ``settings.txt`` or of a YAML file of keys; or the keys themselves, as under
-            ``dataset.camera`` of an experiment: ``{"kind": "mirror", "xi": 0.92}``; or the kind
-            alone:
+            camodocal (MEI) or Kalibr whose middle looks down, of BloggieUnwarp's ``settings.txt``
+            or of a YAML file of keys (of fgslam's .json, which does not say how the camera is
+            mounted: ``kind: lens``, ``file``, ``middle``, ``clockwise``); or the keys themselves,
+            as under ``dataset.camera`` of an experiment: ``{"kind": "mirror", "xi": 0.92}``; or the
+            kind alone:
             ``"equirectangular"``, ``"cylinder"``, ``"mirror"``, ``"radial_polynomial"``.
         size: width and height of the images, pixels; None where the calibration states it.
 
@@ -158,7 +159,11 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
         _refuse_opencv(path)
         return _settings_of(read_yaml(path, CalibrationError), str(path)), path.parent
     if path.suffix.lower() == ".json":
-        return LensSettings(file=path.name), path.parent
+        raise CalibrationError(
+            f"{path} does not say how the camera is mounted; give the .yaml that names it, as "
+            f"`fgslam calibrate omni` writes: kind: lens, file: {path.name}, middle: up or down, "
+            "clockwise: true or false"
+        )
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
         return BloggieSettings(file=path.name), path.parent
     return OCamCalibSettings(file=path.name), path.parent

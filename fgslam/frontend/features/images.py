@@ -44,7 +44,9 @@ def grey_image(image: npt.ArrayLike, name: str = "image") -> Image:
 
 def as_array(image: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
     """The image as an array, of any type and shape. Raises FrameError where it has none."""
-    if image is None or isinstance(image, str | bytes | Path):
+    if image is None:
+        raise FrameError(f"{name} is missing (None); could its file be read?")
+    if isinstance(image, str | bytes | Path):
         raise FrameError(f"{name} is a {type(image).__name__}; give its pixels as an array")
     try:
         return np.asarray(image)

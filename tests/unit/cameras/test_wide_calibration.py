@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras import board_calibration
 from fgslam.cameras.board_calibration import BoardCalibration, View, calibrate
 from fgslam.cameras.board_check import coverage_of_circle, farthest_from_axis, held_out_alone
 from fgslam.cameras.board_projection import PARAMETERS, projected
@@ -16,6 +19,7 @@ from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import so3_exp
+from fgslam.runs.calibration_report import wide_verdict
 
 BOARD = Board("chessboard", 9, 6, 0.04)
 NOISE_PX = 0.1
@@ -72,7 +76,7 @@ def views_of(name: str, seed: int, count: int = 16, mirrored: bool = False) -> l
 
 
 def numbers_of(found: RawCamera) -> FloatArray:
-    return np.concatenate([found.matrix[[0, 1, 0, 1], [0, 1, 2, 2]], found.distortion])
+    return np.concatenate([found.intrinsics, found.distortion])
 
 
 def in_sigmas(found: BoardCalibration, name: str) -> FloatArray:
@@ -145,6 +149,58 @@ def test_too_few_views_and_boards_that_are_all_far_are_refused() -> None:
     ]
     with pytest.raises(CalibrationError, match="do not determine the cameras"):
         calibrate(BOARD, far, size, "omni")
+
+
+def test_an_image_without_a_pose_is_left_out_of_the_calibration() -> None:
+    """Its corners lie where no ray of the camera ends."""
+    true, views = CAMERAS["fisheye"], views_of("fisheye", 3, count=12)
+    beyond = 4000.0 + 1e3 * BOARD.points[:, :2]
+    given: list[View] = [*views[:4], (Corners(np.arange(54), beyond),), *views[4:]]
+    found = calibrate(BOARD, given, true.size, true.model)
+    assert found.kept[4] == (None,)
+    assert found.left_out == 54
+    assert np.isnan(found.boards[4]).all()
+    assert [len(c) for (c,) in found.kept if c is not None] == [len(v[0]) for v in views if v[0]]
+    assert numbers_of(found.cameras[0])[:4] == pytest.approx(numbers_of(true)[:4], abs=1.0)
+
+
+def test_a_fit_that_does_not_converge_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(board_calibration, "_STEPS", 2)
+    true = CAMERAS["fisheye"]
+    with pytest.raises(CalibrationError, match="equidistant cameras does not converge in 2 steps"):
+        calibrate(BOARD, views_of("fisheye", 0), true.size, true.model)
+
+
+def test_a_corner_that_is_left_out_counts_for_nothing_and_no_second_guess_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The corner farthest from the axis was found 20 px farther out."""
+    guessed = []
+    guess = board_calibration.first_guess
+
+    def counted(*given: Any) -> FloatArray:
+        guessed.append(1)
+        return guess(*given)
+
+    monkeypatch.setattr(board_calibration, "first_guess", counted)
+    true, views = CAMERAS["fisheye"], views_of("fisheye", 2, count=12)
+    middle, seen = true.matrix[:2, 2], [c for (c,) in views if c is not None]
+    v = int(np.argmax([np.linalg.norm(c.pixels - middle, axis=1).max() for c in seen]))
+    moved = seen[v].pixels.copy()
+    outward = moved - middle
+    corner = int(np.argmax(np.linalg.norm(outward, axis=1)))
+    moved[corner] += 20.0 * outward[corner] / np.linalg.norm(outward[corner])
+    given: list[View] = [*views[:v], (Corners(seen[v].ids, moved),), *views[v + 1 :]]
+    found = calibrate(BOARD, given, true.size, true.model)
+    assert len(guessed) == 1
+    assert found.left_out == 1
+    (used,) = found.kept[v]
+    assert used is not None
+    np.testing.assert_array_equal(used.ids, np.delete(seen[v].ids, corner))
+    angles = [np.degrees(farthest_from_axis(w, found.cameras[0])) for w in (given, found.kept)]
+    assert angles[0] > angles[1] + 1.0
+    (view, *_) = wide_verdict([], found, None)
+    assert f"corners up to {angles[1]:.0f} degrees" in view
 
 
 @pytest.mark.parametrize("model", PARAMETERS)

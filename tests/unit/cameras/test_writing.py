@@ -91,13 +91,50 @@ def test_a_format_that_is_named_is_read_back(
     expected = calibration(model, [*PARAMETERS[model], 0.01][:count])
     write_calibration(expected, tmp_path / "before.json")
     convert_calibration(Asked(tmp_path / "before.json"), tmp_path / name, form)
+    tolerance = np.finfo(np.float32).eps if form == "orb_slam3" else 1e-15
     found = read_calibration_file(tmp_path / name)
     assert len(found.cameras) == 2
     for a, b in zip(found.cameras, expected.cameras, strict=True):
         assert (a.model, a.size) == (b.model, b.size)
         np.testing.assert_array_equal(a.matrix, b.matrix)
         np.testing.assert_array_equal(a.distortion, b.distortion)
-    np.testing.assert_allclose(found.offset(1, 0), STEP, rtol=0.0, atol=1e-15)
+    np.testing.assert_allclose(found.offset(1, 0), STEP, rtol=0.0, atol=tolerance)
+
+
+def test_orb_slam3_is_given_floats_of_32_bits_and_the_columns_in_common(tmp_path: Path) -> None:
+    """It reads Stereo.T_c1_c2 by at<float>, and asks fisheyes for overlappingBegin and End."""
+    write_calibration(calibration("equidistant"), tmp_path / "orb.yaml", form="orb_slam3")
+    lines = [line.strip() for line in (tmp_path / "orb.yaml").read_text("utf-8").splitlines()]
+    at = lines.index("Stereo.T_c1_c2: !!opencv-matrix")
+    assert lines[at + 1 : at + 4] == ["rows: 4", "cols: 4", "dt: f"]
+    numbers = lines[at + 4].removeprefix("data: [").removesuffix("]").split(", ")
+    assert numbers == [str(number) for number in STEP.astype(np.float32).ravel()]
+    for k in (1, 2):
+        assert f"Camera{k}.overlappingBegin: 0" in lines
+        assert f"Camera{k}.overlappingEnd: 63" in lines
+    write_calibration(calibration("radtan"), tmp_path / "plain.yaml", form="orb_slam3")
+    assert "overlapping" not in (tmp_path / "plain.yaml").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "words"),
+    [
+        ("a.yml", None, "OpenCV's file has one size"),
+        ("a.yaml", "orb_slam3", "ORB-SLAM3 has one size"),
+        ("a.txt", None, "KITTI's calib.txt has one size"),
+    ],
+)
+def test_images_of_two_sizes_have_no_place_in_a_file_of_one(
+    name: str, form: str | None, words: str, tmp_path: Path
+) -> None:
+    left, right = calibration().cameras
+    given = Calibration("made", "made", (left, replace(right, width=80)), sided=True)
+    with pytest.raises(CalibrationError, match=f"images of 64x48 and 80x48, but {words}"):
+        write_calibration(given, tmp_path / name, form=form)
+    assert not (tmp_path / name).exists()
+    write_calibration(given, tmp_path / "a.json")
+    found = read_calibration_file(tmp_path / "a.json")
+    assert [camera.size for camera in found.cameras] == [(64, 48), (80, 48)]
 
 
 def test_a_rectified_pair_for_kitti_is_read_back(tmp_path: Path) -> None:

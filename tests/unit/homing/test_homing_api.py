@@ -99,6 +99,11 @@ WRONG: dict[str, tuple[Callable[[], object], type[FgslamError], str]] = {
         FrameError,
         "image_a is of type float64",
     ),
+    "no image": (
+        lambda: fg.HomingVector(CAMERA).between(picture(0), None),  # type: ignore[arg-type]
+        FrameError,
+        "image_b is missing (None); could its file be read?",
+    ),
     "nothing taught": (lambda: fg.teach([], CAMERA), StoredMapError, "at least one"),
     "names": (lambda: fg.teach([picture(0)], CAMERA, names=["a", "b"]), StoredMapError, "2 names"),
     "image for time": (
