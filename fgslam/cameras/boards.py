@@ -21,6 +21,7 @@ _BLACK_BORDER_BITS = 2  # Kalibr prints its tags with two
 _CORNERS_OF_TAG = 4
 _LEAST_TAGS = 4
 _WINDOW_OF_TAG = 0.1  # of a tag's side, half the window of refinement: less than half the gap
+_WINDOW_OF_SQUARE = 0.2  # of the distance to the nearest corner, half the window of refinement
 _LEAST_CORNERS = 6  # of which a pose follows with something left to judge it by
 
 
@@ -89,6 +90,20 @@ def _grid(columns: int, rows: int) -> FloatArray:
     return np.column_stack([column, row]).astype(np.float64)
 
 
+def find_corners_of_wide(board: Board, image: Image, mirrored: bool = False) -> Corners | None:
+    """As :func:`find_corners`, a chessboard's refined in small windows.
+
+    OpenCV's finder expects the straight lines of a perspective image: far from the axis of a
+    fisheye it is off by pixels.
+    """
+    found = find_corners(board, image, mirrored)
+    if found is None or board.kind != "chessboard":
+        return found
+    apart = np.linalg.norm(found.pixels[:, None] - found.pixels, axis=2)
+    nearest = (apart + np.diag(np.full(len(apart), np.inf))).min(axis=1)
+    return Corners(found.ids, _refined(image, found.pixels, _WINDOW_OF_SQUARE * nearest))
+
+
 def find_corners(board: Board, image: Image, mirrored: bool = False) -> Corners | None:
     """Corners of the board in a grey image (height, width) uint8; None where it is not found.
 
@@ -143,17 +158,23 @@ def _aprilgrid(board: Board, image: Image) -> Corners | None:
     if own.sum() < _LEAST_TAGS:
         return None
     pixels = np.asarray(corners, float).reshape(-1, _CORNERS_OF_TAG, 2)[own]
-    return _turned_tags(board, tags[own], _refined(image, pixels))
-
-
-def _refined(image: Image, pixels: FloatArray) -> FloatArray:
-    """Tag corners (n, 4, 2) to a fraction of a pixel: saddles, since dark squares touch there."""
     sides = np.linalg.norm(pixels - np.roll(pixels, 1, axis=1), axis=2).min(axis=1)
+    windows = np.repeat(_WINDOW_OF_TAG * sides, _CORNERS_OF_TAG)
+    refined = _refined(image, pixels.reshape(-1, 2), windows).reshape(pixels.shape)
+    return _turned_tags(board, tags[own], refined)
+
+
+def _refined(image: Image, pixels: FloatArray, windows: FloatArray) -> FloatArray:
+    """Corners (n, 2) to a fraction of a pixel: saddles, since dark squares touch there.
+
+    ``windows``: (n,) half the side of the window that each is looked for in, pixels.
+    """
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-3)
     out = pixels.astype(np.float32)
-    for k, side in enumerate(sides):
-        half = int(np.clip(round(_WINDOW_OF_TAG * side), 2, 10))
-        out[k] = cv2.cornerSubPix(image, out[k][:, None].copy(), (half, half), (-1, -1), stop)[:, 0]
+    for k, window in enumerate(windows):
+        half = int(np.clip(round(window), 2, 10))
+        near = out[k][None, None].copy()
+        out[k] = cv2.cornerSubPix(image, near, (half, half), (-1, -1), stop)[0, 0]
     return np.asarray(out, np.float64)
 
 

@@ -14,7 +14,7 @@ import yaml
 from fgslam.cameras.assembly import assembled
 from fgslam.cameras.board_calibration import View, calibrate
 from fgslam.cameras.board_check import held_out, held_out_alone
-from fgslam.cameras.boards import Board, Corners, find_corners, sizes_that_fit
+from fgslam.cameras.boards import Board, Corners, find_corners, find_corners_of_wide, sizes_that_fit
 from fgslam.cameras.formats.own import raw_values
 from fgslam.cameras.omni.mirrors import MirrorFrame
 from fgslam.cameras.omni.ring_calibration import calibrate_from_rings, find_mirror_circle
@@ -141,7 +141,7 @@ def calibrate_wide_camera(
         raise ConfigError(f"{out}: a camera file is written as .yaml; give such a name")
     files = _files_of_one(folder)
     bits, held = bits_of([moment[0] for moment in files])
-    finder = partial(find_corners, board, mirrored=lens.mount == "mirror")
+    finder = partial(find_corners_of_wide, board, mirrored=lens.mount == "mirror")
     views, size = _views(files, bits, finder, progress)
     _require_found(views, files, bits, board)
     found = calibrate(board, views, size, lens.model)

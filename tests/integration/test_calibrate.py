@@ -238,9 +238,9 @@ def test_a_fisheye_is_calibrated_from_images_of_a_board(
     for word in ("corners ", "camera ", "equidistant: k1", "worst ", "held out", "verdict", "up: "):
         assert word in told
     (camera,) = read_calibration_file(tmp_path / "camera_lens.json").cameras
-    # OpenCV finds half of the boards, and corners at the rim of these to half a pixel or worse.
-    assert camera.focal_px == pytest.approx(FISHEYE.focal_px, rel=0.015)
-    assert median_apart_px(camera, FISHEYE, 60.0) < 2.0
+    # Unrefined, corners that OpenCV finds far from the axis gave 0.9 % and 1.2 px.
+    assert camera.focal_px == pytest.approx(FISHEYE.focal_px, rel=0.005)
+    assert median_apart_px(camera, FISHEYE, 60.0) < 0.3
     assert (tmp_path / "camera_lens.png").read_bytes().startswith(b"\x89PNG")
     images = list(csv.DictReader((tmp_path / "camera_lens_images.csv").open(encoding="utf-8")))
     assert [row["image"] for row in images] == [f"board{k:02d}.png" for k in range(14)]
