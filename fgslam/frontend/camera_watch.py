@@ -69,8 +69,11 @@ class CameraWatch:
         self._sums = [-1] * rig.cameras
         self._frames = 0
 
-    def look(self, images: tuple[Image, ...]) -> str:
-        """Takes in a frame; what is wrong with its images, in words; empty where nothing is."""
+    def look(self, images: tuple[Image, ...], number: int | None = None) -> str:
+        """Takes in a frame; what is wrong with its images, in words; empty where nothing is.
+
+        ``number``: of the frame, as remarks give it; None counts the frames taken in.
+        """
         now = Shrunk(images, self._factor)
         repeated = self._repeated(images)
         swapped = ""
@@ -78,7 +81,7 @@ class CameraWatch:
         across = [followed(now.images[0], other, points) for other in now.images[1:]]
         shown = np.logical_or.reduce([kept for _, kept in across])
         moved: Followed | None = None
-        lines: list[tuple[FloatArray, FloatArray]] = []
+        seen: list[LineRows] = []
         for camera, (pair, (found, kept)) in enumerate(zip(self._pairs, across, strict=True), 1):
             here, there = points[kept], found[kept]
             self._order(pair, self._factor * (there - here)[:, camera - 1])
@@ -86,22 +89,25 @@ class CameraWatch:
                 swapped = (
                     f"the images of the right and the {CAMERA_NAMES[camera]} camera are swapped"
                 )
-            offset = self._factor * (there - here)[:, pair.model.across]
-            lines.append((offset, self._factor * there))
             self._weigh(pair, now.grey[0], now.grey[camera], here, there)
-            if self._before and not repeated and not swapped:
+            if repeated or swapped:
+                continue
+            if self._before:
                 moved = moved or _followed_of(now.images[0], self._before[0], points, shown)
-                self._judge(camera, now, (here, there), (moved[0][kept], moved[1][kept]))
+                since = moved[0][kept], moved[1][kept]
+                seen.append(self._judge(camera, now, (here, there), since))
+            else:
+                seen.append(self._still(pair, here, there))
         fault = repeated or swapped or self._old()
         if not fault:
-            self._turns.take(self._frames, *zip(*lines, strict=True))
+            self._turns.take(self._frames if number is None else number, seen)
         self._before, self._frames = now.images, self._frames + 1
         return fault
 
     @property
     def knocked(self) -> bool:
-        """Whether a camera was turned during the drive."""
-        return bool(self._turns.knocks)
+        """Whether remarks report that a camera was turned during the drive."""
+        return bool(self._turns.remarks())
 
     def remarks(self) -> tuple[str, ...]:
         """What is to be said of images that are used all the same."""
@@ -150,10 +156,11 @@ class CameraWatch:
 
     def _judge(
         self, camera: int, now: Shrunk, places: tuple[FloatArray, FloatArray], moved: Followed
-    ) -> None:
-        """Whether the other camera, or the reference, shows an earlier moment than the other.
+    ) -> LineRows:
+        """Judges whether the other camera, or the reference, shows an earlier moment.
 
         Of points in the reference and the other image; and where the reference saw them before.
+        Gives the points by the reference's motion.
         """
         pair, (here, there) = self._pairs[camera - 1], places
         offset = (there - here)[:, pair.model.across]
@@ -162,10 +169,17 @@ class CameraWatch:
         sure = newest.sigma < _KNOWN and abs(newest.frames) < _ALIKE
         if not sure or any(self._late):
             moved = followed(now.images[camera], self._before[camera], there)
-            rows = self._shifted(moved, there, -offset, there, pair)
-            self._take(pair, 0, 1, rows)
+            of_other = self._shifted(moved, there, -offset, there, pair)
+            self._take(pair, 0, 1, of_other)
         else:
             pair.rows[1].clear()
+        return rows
+
+    def _still(self, pair: _Pair, here: FloatArray, there: FloatArray) -> LineRows:
+        """Points (n, 2) of a first frame, as if at rest: how far they moved is not known."""
+        every = here, np.ones(len(here), np.bool_)
+        offset = (there - here)[:, pair.model.across]
+        return self._shifted(every, here, offset, there, pair)
 
     def _shifted(
         self,
@@ -240,7 +254,7 @@ class CameraWatch:
         self._before = list(state["before"])
         self._turns = TurnWatch(self._rig, self._spread)
         own = [name for name in state if name.startswith("turns/")]
-        if own:
+        if own:  # not in states of versions that did not look for turns
             self._turns.restore({name.removeprefix("turns/"): state[name] for name in own})
         for k, pair in enumerate(self._pairs):
             pair.swapped = bool(state["swapped"][k])

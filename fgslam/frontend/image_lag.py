@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, Rows
-from fgslam.core.quantiles import middle
 from fgslam.core.rig_correction import TERMS, camera_displacements, prior_information
+from fgslam.core.robust import KERNEL, cauchy_fit
 from fgslam.core.sensors import CameraRig
 
 _POINTS = 80
@@ -33,8 +33,6 @@ _SEARCH = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
 _MIN_EIGENVALUE = 1e-3
 _MAX_BACK_PX = 0.5  # from where a point began, followed there and back
 _FEWEST = 12  # points: more than the unknowns
-_ROUNDS = 6  # of robust least squares
-_KERNEL = 2.0  # spreads of the residuals at which Cauchy's kernel bends
 _LEAST_SPREAD_PX = 0.1  # of points followed on sharp images
 _SIGNAL = 3.0
 """Spreads that the shift must amount to. Both sides err alike by the noise of the present image's
@@ -99,26 +97,20 @@ class LagModel:
         design = np.column_stack([rows.shift, of_place[:, self.across, self._own]])
         prior = np.zeros((design.shape[1],) * 2)
         prior[0, 0], prior[1:, 1:] = _UNKNOWN_LAG**-2, self._prior
-        found = np.zeros(design.shape[1])
-        for _ in range(_ROUNDS):
-            residual = rows.offset - design @ found
-            spread = max(spread_px, 1.4826 * middle(np.abs(residual)))
-            weighted = design.T * (1.0 / (1.0 + (residual / (_KERNEL * spread)) ** 2))
-            information = weighted @ design + spread**2 * prior
-            found = np.linalg.solve(information, weighted @ rows.offset)
-        if np.sqrt(np.mean(rows.shift**2)) < _SIGNAL * spread:
+        fit = cauchy_fit(design, rows.offset, prior, spread_px)
+        if np.sqrt(np.mean(rows.shift**2)) < _SIGNAL * fit.spread:
             return Lag(np.nan, np.nan)
-        residual = rows.offset - design @ found
-        return Lag(float(found[0]), _sigma(design, residual, spread, prior))
+        residual = rows.offset - design @ fit.found
+        return Lag(float(fit.found[0]), _sigma(design, residual, fit.spread, prior))
 
 
 def _sigma(design: FloatArray, residual: FloatArray, spread: float, prior: FloatArray) -> float:
     """Standard deviation of the first unknown: the sandwich of Cauchy's M-estimator."""
-    squared = (residual / (_KERNEL * spread)) ** 2
+    squared = (residual / (KERNEL * spread)) ** 2
     weight = 1.0 / (1.0 + squared)
     slope = (1.0 - squared) * weight**2  # derivative of the influence weight * residual
     freedom = len(design) / max(len(design) - design.shape[1], 1)
-    noise = freedom * np.maximum((weight * residual) ** 2, (weight * spread) ** 2 / _KERNEL**2)
+    noise = freedom * np.maximum((weight * residual) ** 2, (weight * spread) ** 2 / KERNEL**2)
     bread = np.linalg.inv((design.T * slope) @ design + spread**2 * prior)
     meat = (design.T * noise) @ design + spread**4 * prior
     return float(np.sqrt((bread @ meat @ bread)[0, 0]))

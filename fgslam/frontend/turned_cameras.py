@@ -2,8 +2,9 @@
 
 In a rectified rig a point lies in one line of both images. How far it does not (for left and right
 camera the vertical disparity) is linear in the turn of the camera and known from the point's place
-(:mod:`fgslam.core.rig_correction`). Windows of frames tell that turn, whatever is matched or
-tracked; two in a row that contradict all those before tell a knock.
+(:mod:`fgslam.core.rig_correction`), and in the time by which one camera is late
+(:mod:`fgslam.frontend.image_lag`). Windows of frames give that turn, whatever is matched or
+tracked; three in a row that contradict all those before, and agree, are a knock.
 docs/derivations/camera_faults.md.
 """
 
@@ -15,27 +16,36 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, StateArrays
-from fgslam.core.quantiles import chi_square_quantile, middle
+from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import TERMS, camera_displacements
+from fgslam.core.robust import cauchy_fit
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.frontend.image_lag import LineRows
 
 WINDOW = 6
 """Frames that are judged together."""
 
+_AGREEING = 3
+"""Windows in a row that agree on a new state: what lasts no longer than two windows fills one of
+three at most, and gives another turn in each of the others."""
+
 _AXES = ("pitch", "yaw", "roll")  # about a camera's x, y and z axis
 _COLUMNS = [TERMS.index(name) for name in _AXES]
 _FEWEST = 20  # points of a frame
-_ROUNDS = 5  # of robust least squares
-_KERNEL = 2.0  # spreads of the residuals at which Cauchy's kernel bends
-_CHANCE = 1e-7
+_CHANCE = 1e-7  # of a window that contradicts those before
+_CHANCE_APART = 1e-3  # of one that disagrees with others of the same state
 _SETTLED = 2  # windows before which none can contradict them
 _PRIOR_WINDOWS = 4.0  # of the noise that is stated
 _STATED_NOISE = float(WINDOW)
 """Of the points' own: a window's frames show the same points, with the same errors."""
 _LEAST_DEG = 0.1  # turns below are followed by the self-calibration
 _UNKNOWN_RAD = 0.05  # deviation of a turn's prior: none to speak of
-_TOLD_SIGMAS = 3.0
-_TOLD_DEG = 0.05  # about an axis beside the largest
+_UNKNOWN_LAG = 0.5
+"""Frames, deviation of the prior of the time between the cameras' images: at more than half a frame
+a camera is nearer to one frame late than to none, and its images are refused."""
+_REPORTED_SIGMAS = 3.0
+_REPORTED_DEG = 0.05  # about an axis beside the largest
+_FEW = 2  # knocks that are reported one by one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,40 +74,31 @@ class Turns:
         return np.asarray(turns, np.float64), np.asarray(covariance, np.float64)
 
 
-def turns_of(
-    rig: CameraRig, offsets: Sequence[FloatArray], places: Sequence[FloatArray], spread_px: float
-) -> Turns:
-    """What one frame shows, by Cauchy's M-estimator.
+def turns_of(rig: CameraRig, seen: Sequence[LineRows], spread_px: float) -> Turns:
+    """What one frame shows, by Cauchy's M-estimator, whatever the time between the images is.
 
     Args:
         rig: as calibrated.
-        offsets: for each camera beside the reference (n,), how far points are off their lines.
-        places: (n, 2) of each, where that camera shows them, pixels.
+        seen: for each camera beside the reference, the points of the frame.
         spread_px: least deviation of an offset.
     """
-    shown = [
-        _turn_of(rig, camera, offset, place, spread_px)
-        for camera, (offset, place) in enumerate(zip(offsets, places, strict=True), 1)
-    ]
+    shown = [_turn_of(rig, camera, rows, spread_px) for camera, rows in enumerate(seen, 1)]
     return Turns(np.array([a for a, _ in shown]), np.array([b for _, b in shown]))
 
 
 def _turn_of(
-    rig: CameraRig, camera: int, offset: FloatArray, place: FloatArray, spread_px: float
+    rig: CameraRig, camera: int, rows: LineRows, spread_px: float
 ) -> tuple[FloatArray, FloatArray]:
+    """Information (3, 3) and score (3,) of the turn; the lag of the frame is marginalised."""
     across = 1 if camera == 1 else 0
     first = len(TERMS) * (camera - 1)
-    unit = camera_displacements(rig, camera, place)[:, across, first : first + len(TERMS)]
-    design = unit[:, _COLUMNS]
-    found: FloatArray = np.zeros(3)
-    for _ in range(_ROUNDS):
-        residual = offset - design @ found
-        spread = max(spread_px, 1.4826 * middle(np.abs(residual)))
-        weighted = design.T / (spread**2 * (1.0 + (residual / (_KERNEL * spread)) ** 2))
-        information = weighted @ design
-        known = information + np.eye(3) / _UNKNOWN_RAD**2
-        found = np.asarray(np.linalg.solve(known, weighted @ offset), np.float64)
-    return information, weighted @ offset
+    unit = camera_displacements(rig, camera, rows.place)[:, across, first : first + len(TERMS)]
+    design = np.column_stack([unit[:, _COLUMNS], rows.shift])
+    prior = np.diag([_UNKNOWN_RAD**-2] * 3 + [_UNKNOWN_LAG**-2])
+    fit = cauchy_fit(design, rows.offset, prior, spread_px)
+    information, score = fit.normal / fit.spread**2, fit.moment / fit.spread**2
+    gain = information[:3, 3] / (information[3, 3] + prior[3, 3])
+    return information[:3, :3] - np.outer(gain, information[3, :3]), score[:3] - gain * score[3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +107,25 @@ class Knock:
 
     frame: int
     before: Turns
+
+
+@dataclass(frozen=True, slots=True)
+class _Change:
+    """A knock as it is reported: of which camera (0: right), by how much, radians.
+
+    ``turn`` and ``sigma`` (3,); ``axes`` are those that are sure, the largest first.
+    """
+
+    frame: int
+    camera: int
+    turn: FloatArray
+    sigma: FloatArray
+    axes: list[int]
+
+    @property
+    def degrees(self) -> float:
+        """About the axis of the largest turn."""
+        return float(np.rad2deg(abs(self.turn[self.axes[0]])))
 
 
 class TurnWatch:
@@ -117,68 +137,114 @@ class TurnWatch:
         others = rig.cameras - 1
         self._window, self._shown, self._begins = Turns.none(others), 0, 0
         self._known, self._windows = Turns.none(others), 0
-        self._suspected, self._since = Turns.none(others), -1
+        self._suspected, self._agreed, self._since = Turns.none(others), 0, -1
         self._noise = np.array([_PRIOR_WINDOWS * _STATED_NOISE, _PRIOR_WINDOWS])
         self.knocks: list[Knock] = []
 
-    def take(self, frame: int, offsets: Sequence[FloatArray], places: Sequence[FloatArray]) -> None:
+    def take(self, frame: int, seen: Sequence[LineRows]) -> None:
         """Takes in a frame by its number; as :func:`turns_of`."""
-        if min(map(len, offsets)) < _FEWEST:
+        if min(map(len, seen)) < _FEWEST:
             return
         if not self._shown:
             self._begins = frame
-        self._window = self._window.plus(turns_of(self._rig, offsets, places, self._spread))
+        self._window = self._window.plus(turns_of(self._rig, seen, self._spread))
         self._shown += 1
         if self._shown == WINDOW:
             self._judge(self._window)
-            self._window, self._shown = Turns.none(len(offsets)), 0
+            self._window, self._shown = Turns.none(len(seen)), 0
 
     def _judge(self, window: Turns) -> None:
-        """Adds a window to those before, or suspects a knock, or finds one at the second."""
+        """Adds a window to those before, or to a suspected new state, which the last one proves."""
         if self._windows < _SETTLED or not self._contradicts(window):
-            self._known = self._known.plus(window)  # what was suspected once has passed
-            self._windows, self._since = self._windows + 1, -1
-        elif self._since < 0:
-            self._suspected, self._since = window, self._begins
-        else:
+            self._known = self._known.plus(window)  # what was suspected has passed
+            self._windows, self._agreed = self._windows + 1, 0
+            return
+        if not (self._agreed and self._agrees(window)):
+            self._suspected, self._agreed = Turns.none(len(window.score)), 0
+            self._since = self._begins
+        self._suspected, self._agreed = self._suspected.plus(window), self._agreed + 1
+        if self._agreed == _AGREEING:
             self.knocks.append(Knock(self._since, self._known))
-            self._known, self._windows, self._since = window, 1, -1
+            self._known, self._windows, self._agreed = self._suspected, _AGREEING, 0
 
     def _contradicts(self, window: Turns) -> bool:
+        """Whether a window is apart from the known state; one that is not is learnt from.
+
+        A change that is significant and small enters the noise as the largest that chance gives.
+        """
         change, covariance = _change(self._known, window)
         squared = _squared(change, covariance)
-        noise = max(self._noise[0] / self._noise[1], 1.0)
+        largest = self._factor * float(chi_square_quantile(1.0 - _CHANCE, change.size))
         least = np.rad2deg(np.linalg.norm(change, axis=1).max()) > _LEAST_DEG
-        if least and squared > noise * float(chi_square_quantile(1.0 - _CHANCE, change.size)):
+        if least and squared > largest:
             return True
-        self._noise = self._noise + np.array([squared / change.size, 1.0])
+        self._noise = self._noise + np.array([min(squared, largest) / change.size, 1.0])
         return False
 
+    def _agrees(self, window: Turns) -> bool:
+        """Whether a window shows the suspected state."""
+        change, covariance = _change(self._suspected, window)
+        largest = self._factor * float(chi_square_quantile(1.0 - _CHANCE_APART, change.size))
+        return _squared(change, covariance) <= largest
+
+    @property
+    def _factor(self) -> float:
+        """Of the noise of windows, over that of their points."""
+        return max(float(self._noise[0] / self._noise[1]), 1.0)
+
     def remarks(self) -> tuple[str, ...]:
-        """A line for each knock: which camera, by how much about which axis, since when."""
-        noise = max(self._noise[0] / self._noise[1], 1.0)
-        after = [*(knock.before for knock in self.knocks), self._known][1:]
+        """A line for each knock: which camera, by how much about which axis, since when.
+
+        Of more than two, a line for each camera. Knocks without a sure axis are left out.
+        """
+        changes = self._changes()
+        if len(changes) <= _FEW:
+            return tuple(map(self._of_one, changes))
+        of_camera = [[x for x in changes if x.camera == k] for k in range(self._rig.cameras)]
         return tuple(
-            self._told(knock, *_change(knock.before, then), noise)
-            for knock, then in zip(self.knocks, after, strict=True)
+            self._of_many(own) if len(own) > 1 else self._of_one(own[0]) for own in of_camera if own
         )
 
-    def _told(self, knock: Knock, change: FloatArray, covariance: FloatArray, noise: float) -> str:
-        camera, turn, spread = _who(change, noise * covariance)
-        sigma = np.sqrt(np.diag(spread))
-        order = np.argsort(-np.abs(turn)).tolist()
-        least = np.maximum(_TOLD_SIGMAS * sigma, np.deg2rad(_TOLD_DEG))
-        sure = [k for k in order if abs(turn[k]) > least[k]] or order[:1]
+    def _changes(self) -> list[_Change]:
+        """The knocks that have a sure axis."""
+        after = [*(knock.before for knock in self.knocks), self._known][1:]
+        out = []
+        for knock, then in zip(self.knocks, after, strict=True):
+            change, covariance = _change(knock.before, then)
+            camera, turn, spread = _who(change, self._factor * covariance)
+            sigma = np.sqrt(np.diag(spread))
+            least = np.maximum(_REPORTED_SIGMAS * sigma, np.deg2rad(_REPORTED_DEG))
+            axes = [k for k in np.argsort(-np.abs(turn)).tolist() if abs(turn[k]) > least[k]]
+            if axes:
+                out.append(_Change(knock.frame, camera, turn, sigma, axes))
+        return out
+
+    def _of_one(self, change: _Change) -> str:
         parts = ", ".join(
-            f"{np.rad2deg(turn[k]):.2f} degrees in {_AXES[k]} ({abs(turn[k]) / sigma[k]:.0f} sigma)"
-            for k in sure
+            f"{np.rad2deg(change.turn[k]):.2f} degrees in {_AXES[k]} "
+            f"({abs(change.turn[k]) / change.sigma[k]:.0f} sigma)"
+            for k in change.axes
         )
-        against = " against the right one (or that one by the opposite)" * (len(change) == 1)
         return (
-            f"the {CAMERA_NAMES[camera]} camera was turned by {parts}{against} at about frame "
-            f"{knock.frame} of the run, as points off their lines show: fasten it and calibrate "
-            "the rig again; what is measured from there on may be wrong"
+            f"the {CAMERA_NAMES[change.camera]} camera was turned by {parts}{self._against} at "
+            f"about frame {change.frame} of the run, as points off their lines show: fasten it and "
+            "calibrate the rig again; what is measured from there on may be wrong"
         )
+
+    def _of_many(self, changes: list[_Change]) -> str:
+        largest = max(change.degrees for change in changes)
+        return (
+            f"the {CAMERA_NAMES[changes[0].camera]} camera is loose: it turned {len(changes)} "
+            f"times, by up to {largest:.2f} degrees{self._against}, from about frame "
+            f"{changes[0].frame} to {changes[-1].frame} of the run, as points off their lines "
+            "show: fasten it and calibrate the rig again; what is measured from there on may be "
+            "wrong"
+        )
+
+    @property
+    def _against(self) -> str:
+        pair = self._rig.cameras == 2
+        return " against the right one (or that one by the opposite)" * pair
 
     # ----------------------------------------------------------------------------------------
 
@@ -188,7 +254,8 @@ class TurnWatch:
         return {
             "information": np.array([one.information for one in sums]),
             "score": np.array([one.score for one in sums]),
-            "counts": np.array([self._shown, self._begins, self._windows, self._since]),
+            "counts": np.array([self._shown, self._begins, self._windows, self._agreed]),
+            "since": np.array(self._since),
             "noise": self._noise,
             "knocks": np.array([knock.frame for knock in self.knocks], np.int64),
         }
@@ -197,7 +264,8 @@ class TurnWatch:
         """Continues from :meth:`state`."""
         pairs = zip(state["information"], state["score"], strict=True)
         self._window, self._known, self._suspected, *before = (Turns(a, b) for a, b in pairs)
-        self._shown, self._begins, self._windows, self._since = state["counts"].tolist()
+        self._shown, self._begins, self._windows, self._agreed = state["counts"].tolist()
+        self._since = int(state["since"])
         self._noise = state["noise"]
         frames = state["knocks"].tolist()
         self.knocks = [Knock(*one) for one in zip(frames, before, strict=True)]

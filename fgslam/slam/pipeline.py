@@ -125,7 +125,7 @@ class SlamPipeline:
         """
         watch = Stopwatch()
         before = self._before(found)
-        found = self._watched(found)
+        found = self._watched(found, index)
         watch.lap("watch")
         correction = self._correction()
         recalibrated(self.estimator, None if correction is None else correction.values)
@@ -224,11 +224,11 @@ class SlamPipeline:
         parts = self.watch, self.motion, self.key_frames
         return [(part, part.state()) for part in parts if isinstance(part, Resumable)]
 
-    def _watched(self, found: FeatureFrame) -> FeatureFrame:
+    def _watched(self, found: FeatureFrame, index: int) -> FeatureFrame:
         """The frame, without its images where these are not of one moment and this one."""
         if self.watch is None or found.frame is None:
             return found
-        fault = self.watch.look(found.frame.images)
+        fault = self.watch.look(found.frame.images, index)
         if not fault:
             return found
         return dataclasses.replace(found, frame=None, features=(), problem=fault, refused=True)
@@ -238,7 +238,7 @@ class SlamPipeline:
         if self.watch is None:
             return False
         before = self.watch.state()
-        refused = self._watched(found).refused
+        refused = self._watched(found, found.i).refused
         self.watch.restore(before)
         return refused
 

@@ -123,9 +123,9 @@ def test_a_real_fisheye_alone_agrees_with_its_pair(
     told = capfd.readouterr().out
     (camera,) = read_calibration_file(tmp_path / "camera_lens.json").cameras
     pair = read_calibration_file(stated, size=camera.size).cameras[side == "right"]
-    # The pair's calibrations differ by as much: 226.4 stated, 228.4 by calibrate stereo (right).
-    assert camera.focal_px == pytest.approx(pair.focal_px, rel=0.02)
-    assert median_apart_px(camera, pair, 60.0) < 3.0
+    # The pair's calibrations differ by 0.9 %: 226.4 stated, 228.4 by calibrate stereo (right).
+    assert camera.focal_px == pytest.approx(pair.focal_px, rel=0.015)
+    assert median_apart_px(camera, pair, 60.0) < 2.0
     assert "held out" in told
     assert isinstance(fg.load_camera(out), LensCamera)
 

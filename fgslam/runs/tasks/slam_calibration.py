@@ -89,7 +89,7 @@ def calibration_numbers(calibration: SelfCalibration) -> dict[str, JsonValue]:
 def calibration_note(calibration: SelfCalibration | None, knocked: bool = False) -> str:
     """What the drive showed of the calibration, in a sentence; empty where it showed nothing.
 
-    ``knocked``: a camera was seen to be turned; then no calibration holds for the whole drive.
+    ``knocked``: a turned camera is reported; then no calibration holds for the whole drive.
     """
     if calibration is None or not calibration.windows:
         return ""

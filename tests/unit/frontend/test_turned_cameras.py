@@ -17,7 +17,8 @@ from fgslam.core.geometry import so3_exp
 from fgslam.core.rig_correction import TERMS, camera_displacements
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.frontend.camera_watch import CameraWatch
-from fgslam.frontend.turned_cameras import WINDOW, TurnWatch
+from fgslam.frontend.image_lag import LineRows
+from fgslam.frontend.turned_cameras import WINDOW, Knock, Turns, TurnWatch, turns_of
 
 KNOCKED_AT = 5 * WINDOW
 FRAMES = 10 * WINDOW
@@ -42,6 +43,18 @@ def turned(rig: CameraRig, image: Image, turn_deg: FloatArray) -> Image:
     return np.asarray(
         cv2.warpPerspective(image, homography, size, borderMode=cv2.BORDER_REPLICATE), np.uint8
     )
+
+
+def test_frames_are_named_by_their_own_numbers(lab: tuple[CameraRig, list[Images]]) -> None:
+    """Frames without images count, too: every second one, say."""
+    rig, frames = lab
+    watch = CameraWatch(rig)
+    for k, images in enumerate(frames):
+        left = turned(rig, images[1], about(0)) if k >= KNOCKED_AT else images[1]
+        watch.look((images[0], left, images[2]), 100 + 2 * k)
+    (line,) = watch.remarks()
+    assert f"at about frame {100 + 2 * KNOCKED_AT} of" in line
+    assert watch.knocked
 
 
 def said_of(rig: CameraRig, frames: list[Images], camera: int, turn_deg: FloatArray) -> list[str]:
@@ -96,6 +109,20 @@ def test_of_a_pair_the_turn_of_one_against_the_other_is_said(
     assert "against the right one (or that one by the opposite)" in line
 
 
+@pytest.mark.parametrize("apparent_deg", [0.2, 0.3])
+def test_nothing_is_said_of_cameras_out_of_step_on_a_pitching_robot(
+    lab: tuple[CameraRig, list[Images]], apparent_deg: float
+) -> None:
+    rig, frames = lab
+    pair, lag, rate = dataclasses.replace(rig, vertical_baseline=None), 0.4, 2.0 * np.pi / 60.0
+    watch, size_deg = CameraWatch(pair), apparent_deg / (lag * rate)
+    for k, images in enumerate(frames):
+        pitch = [size_deg * np.sin(rate * t) * np.eye(3)[0] for t in (k, k - lag)]
+        shown = [turned(rig, *one) for one in zip(images, pitch, strict=False)]
+        assert watch.look(tuple(shown)) == ""
+    assert watch.remarks() == ()
+
+
 def test_nothing_is_said_of_a_sound_drive(lab: tuple[CameraRig, list[Images]]) -> None:
     assert said_of(*lab, 1, np.zeros(3)) == []
 
@@ -105,15 +132,102 @@ def test_nothing_is_said_of_a_sound_drive(lab: tuple[CameraRig, list[Images]]) -
 
 
 PAIR = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, None, np.eye(4))
-YAW, ROLL = TERMS.index("yaw"), TERMS.index("roll")
+NOISE_PX = 0.15
+
+
+def seen(
+    rng: np.random.Generator, turn_deg: FloatArray, shift_px: float = 0.0, lag: float = 0.0
+) -> LineRows:
+    """Sixty points of a left camera that is turned, and late by ``lag`` frames."""
+    place = rng.uniform([0.0, 0.0], [320.0, 240.0], (60, 2))
+    unit = camera_displacements(PAIR, 1, place)[:, 1]
+    columns = [TERMS.index(axis) for axis in AXES]
+    shift = shift_px + rng.normal(0.0, 0.3, 60)  # of points that are near and far
+    offset = unit[:, columns] @ np.deg2rad(turn_deg) + lag * shift
+    return LineRows(offset + rng.normal(0.0, NOISE_PX, 60), shift, place)
 
 
 def show(watch: TurnWatch, frame: int, rng: np.random.Generator, roll_deg: float = 0.0) -> None:
-    """Sixty points of a left camera that is turned."""
-    place = rng.uniform([0.0, 0.0], [320.0, 240.0], (60, 2))
-    unit = camera_displacements(PAIR, 1, place)[:, 1]
-    offset = unit[:, ROLL] * np.deg2rad(roll_deg) + rng.normal(0.0, 0.15, 60)
-    watch.take(frame, [offset], [place])
+    watch.take(frame, [seen(rng, np.array([0.0, 0.0, roll_deg]))])
+
+
+def disturbed(first: int, length: int, turns_deg: FloatArray, axis: int) -> TurnWatch:
+    """A watch after a drive in which a camera is turned for ``length`` frames."""
+    rng, watch = np.random.default_rng(length), TurnWatch(PAIR, 0.1)
+    for frame in range(8 * WINDOW):
+        turn = turns_deg[frame - first] if first <= frame < first + length else 0.0
+        watch.take(frame, [seen(rng, turn * np.eye(3)[axis])])
+    return watch
+
+
+@pytest.mark.parametrize("length", range(2, 9))
+def test_disturbance_of_few_frames_is_no_knock(length: int) -> None:
+    for offset, size in itertools.product(range(WINDOW), (0.3, 2.0)):
+        watch = disturbed(4 * WINDOW + offset, length, np.full(length, size), offset % 3)
+        assert watch.knocks == [], (offset, size)
+
+
+def test_opposite_disturbances_in_consecutive_windows_are_no_knock() -> None:
+    turns = np.repeat([1.0, -1.0, 1.0, -1.0], WINDOW)
+    for count in (2, 3, 4):
+        assert disturbed(3 * WINDOW, count * WINDOW, turns, 0).knocks == []
+
+
+@pytest.mark.parametrize("lag", [0.1, -0.3, 0.5])
+@pytest.mark.parametrize("apparent_deg", [0.2, 0.3])
+def test_pitching_robot_with_cameras_out_of_step_is_no_knock(
+    apparent_deg: float, lag: float, rng: np.random.Generator
+) -> None:
+    """Each camera shows its own moment: points are off their lines by lag times their shift."""
+    watch, apparent_px = TurnWatch(PAIR, 0.1), PAIR.fy * np.deg2rad(apparent_deg)
+    for frame in range(300):
+        shift = apparent_px / lag * np.sin(2.0 * np.pi * frame / 60.0)
+        watch.take(frame, [seen(rng, np.zeros(3), shift, lag)])
+    assert watch.knocks == []
+
+
+@pytest.mark.parametrize("offset", range(WINDOW))
+@pytest.mark.parametrize("lag", [0.0, 0.3])
+def test_knock_is_found_wherever_it_lies_in_a_window(
+    lag: float, offset: int, rng: np.random.Generator
+) -> None:
+    watch, at = TurnWatch(PAIR, 0.1), 5 * WINDOW + offset
+    for frame in range(12 * WINDOW):
+        turn = np.array([0.3, 0.0, 0.0]) * (frame >= at)
+        watch.take(frame, [seen(rng, turn, 2.0 * np.sin(frame), lag)])
+    (line,) = watch.remarks()
+    size, words = line.removeprefix("the left camera was turned by ").split(" degrees in ", 1)
+    assert words.startswith("pitch")
+    assert float(size) == pytest.approx(0.3, abs=0.05)
+    assert abs(watch.knocks[0].frame - at) <= WINDOW
+
+
+def test_knock_is_found_after_a_change_too_small_to_report(rng: np.random.Generator) -> None:
+    """The step of 0.08 degrees is no measure of the noise of the windows."""
+    watch = TurnWatch(PAIR, 0.1)
+    for frame in range(16 * WINDOW):
+        show(watch, frame, rng, (0.0, 0.08, 0.08, 0.28)[frame // (4 * WINDOW)])
+    assert [knock.frame for knock in watch.knocks] == [12 * WINDOW]
+
+
+def test_knocks_without_a_sure_axis_are_not_reported(rng: np.random.Generator) -> None:
+    watch = TurnWatch(PAIR, 0.1)
+    for frame in range(5 * WINDOW):
+        show(watch, frame, rng)
+    same = Turns.none(1)
+    for _ in range(5 * WINDOW):
+        same = same.plus(turns_of(PAIR, [seen(rng, np.zeros(3))], 0.1))
+    watch.knocks.append(Knock(WINDOW, same))
+    assert watch.remarks() == ()
+
+
+def test_camera_that_turns_again_and_again_is_loose(rng: np.random.Generator) -> None:
+    watch = TurnWatch(PAIR, 0.1)
+    for frame in range(20 * WINDOW):
+        show(watch, frame, rng, (0.0, 0.4, -0.2, 0.2)[frame // (5 * WINDOW)])
+    (line,) = watch.remarks()
+    assert line.startswith("the left camera is loose: it turned 3 times, by up to 0.60 degrees")
+    assert f"from about frame {5 * WINDOW} to {15 * WINDOW} of the run" in line
 
 
 def test_what_passes_within_a_window_is_no_knock(rng: np.random.Generator) -> None:
@@ -146,7 +260,8 @@ def test_frames_with_few_points_count_for_nothing(rng: np.random.Generator) -> N
     watch = TurnWatch(PAIR, 0.1)
     few = np.zeros(19)
     for frame in range(20 * WINDOW):
-        watch.take(frame, [few + float(frame)], [rng.uniform(0.0, 240.0, (19, 2))])
+        place = rng.uniform(0.0, 240.0, (19, 2))
+        watch.take(frame, [LineRows(few + float(frame), few, place)])
     assert not watch.knocks
 
 
@@ -162,7 +277,7 @@ def test_a_watch_goes_on_from_its_state_to_the_bit() -> None:
 
     whole = watched(None)
     assert len(whole.knocks) == 1
-    for stop in (3 * WINDOW + 2, 5 * WINDOW, 7 * WINDOW + 1):
+    for stop in (3 * WINDOW + 2, 5 * WINDOW, 6 * WINDOW + 3, 8 * WINDOW + 1):
         again = watched(stop)
         assert again.remarks() == whole.remarks()
         for name, value in whole.state().items():
