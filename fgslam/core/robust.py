@@ -40,11 +40,11 @@ def cauchy_fit(
         prior: (p, p) information of the unknowns, whose prior mean is zero.
         least_spread: of the residuals: that of exact data.
     """
-    found = np.zeros(design.shape[1])
+    found: FloatArray = np.zeros(design.shape[1])
     for _ in range(_ROUNDS):
         residual = values - design @ found
         spread = max(least_spread, 1.4826 * middle(np.abs(residual)))
         weighted = design.T * (1.0 / (1.0 + (residual / (KERNEL * spread)) ** 2))
         normal, moment = weighted @ design, weighted @ values
-        found = np.linalg.solve(normal + spread**2 * prior, moment)
+        found = np.asarray(np.linalg.solve(normal + spread**2 * prior, moment), np.float64)
     return RobustFit(found, spread, normal, moment)
