@@ -282,7 +282,7 @@ def test_another_place_is_said(
     assert "damaged or of another size" in page
     rows = rows_of(tmp_path / "run" / "follow.csv")
     assert [row["name"] for row in rows] == ["0.png", "1.png", "2.png"]
-    assert (rows[2]["image"], rows[2]["time_s"], rows[2]["state"]) == ("2", "0.2", "")
+    assert (rows[2]["image"], rows[2]["time_s"], rows[2]["state"]) == ("2", "0.200000000", "")
     assert "2.png has 200x91 pixels, the first one 301x91" in rows[2]["refusal"]
 
 
@@ -300,7 +300,8 @@ def test_poses_of_another_clock_or_without_times_are_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     given = ("--camera", data / "camera.yaml", "--out", "r.fgpath", "--poses")
-    said = mistake(capfd, monkeypatch, "teach", data / "again", *given, data / "final.tum")
+    untimed = folder_of(tmp_path / "untimed", np.arange(0.0, 2.0, 0.8))
+    said = mistake(capfd, monkeypatch, "teach", untimed, *given, data / "final.tum")
     assert "its images have no times" in said
     late = tmp_path / "late.tum"
     late.write_text("105 0 0 0 0 0 0 1\n106 1 0 0 0 0 0 1\n", encoding="utf-8")

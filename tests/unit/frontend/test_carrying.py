@@ -7,7 +7,9 @@ import pytest
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import project
+from fgslam.frontend.features.patches import crowding
 from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.patch_stereo import PATCH_PX
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.carrying import NOISE_SHARE, Carried, LandmarkCarrier
@@ -134,7 +136,9 @@ def test_looks_are_those_expected_and_noise_is_stated() -> None:
     one = stereo._map @ stereo._map.T
     share = features.measurement_covariance[0] / one
     sigma = StereoSettings().pixel_sigma * NOISE_SHARE
-    np.testing.assert_allclose(share[[0, 1, 2], [0, 1, 2]], sigma**2, rtol=1e-9, atol=0)
+    crowded = crowding(features.pixels[:, 0], PATCH_PX)[0]
+    stated = crowded * sigma**2
+    np.testing.assert_allclose(share[[0, 1, 2], [0, 1, 2]], stated, rtol=1e-9, atol=0)
 
 
 def test_a_restored_carrier_goes_on_to_the_same_bits() -> None:
