@@ -45,7 +45,7 @@ class Spread:
 
 def tables() -> list[Table]:
     """Noise within one frame, and between frames."""
-    config = experiment("lab_loop")
+    config = experiment("lab_loop", ("frontend.tracking=sift",))
     found = find_features(config)
     sequence = found.sequence
     if not isinstance(sequence, RenderedLabSequence):

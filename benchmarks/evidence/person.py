@@ -182,7 +182,7 @@ class _Follower:
 
 
 def _errors_without() -> tuple[FloatArray, float]:
-    config = experiment("lab_loop")
+    config = experiment("lab_loop", ("frontend.tracking=sift",))
     found = find_features(config)
     pipeline = make_system(config, found.sequence)
     for _ in process(found, pipeline):

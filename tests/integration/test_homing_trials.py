@@ -59,9 +59,10 @@ def test_counting_target_bearings_again_ruins_consistency() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("outliers", [0.0, 0.1, 0.2, 0.3])
-def test_graph_reaches_its_bounds(outliers: float) -> None:
-    summary = summarise_homings([homed(case, GRAPH) for case in cases(200, outliers)])
+@pytest.mark.parametrize(("outliers", "count"), [(0.0, 200), (0.1, 1000), (0.2, 200), (0.3, 200)])
+def test_graph_reaches_its_bounds(outliers: float, count: int) -> None:
+    """At ten percent the median is so near to its bound that 200 homings do not decide."""
+    summary = summarise_homings([homed(case, GRAPH) for case in cases(count, outliers)])
     assert summary.diverged == 0
     assert summary.robot is not None
     assert summary.target is not None
