@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 
 import fgslam as fg
+from benchmarks.evidence.hybrid import KINDS
 from benchmarks.evidence.street import LIGHTS, RIGS, taken
 from benchmarks.evidence.street_world import RIG, Street
-from benchmarks.runs import LOCATED, say
+from benchmarks.runs import LOCATED, plain_sift, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.estimates import Trajectory
@@ -22,9 +23,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
-from fgslam.frontend.features.sift import EDGE_THRESHOLD
 
-KINDS: tuple[Literal["sift", "hybrid"], ...] = ("sift", "hybrid")
 ESTIMATOR = "isam2"
 _RAW_EVERY = 5  # frames between those on which SIFT alone is timed
 _NOISE_LEVELS = 8.0
@@ -147,11 +146,7 @@ def _ate_cm(found: Trajectory, truth: Trajectory) -> float:
 
 def _raw_seconds(shots: Shots) -> float:
     """CPU seconds a frame that OpenCV's SIFT takes for all its images."""
-    settings = SiftSettings()
-    alone = cv2.SIFT.create(
-        settings.max_features, settings.octave_layers, settings.contrast_threshold, EDGE_THRESHOLD,
-        settings.base_sigma_px, cv2.CV_8U, True,
-    )  # fmt: skip
+    alone = plain_sift(SiftSettings())
     start = time.process_time()
     some = shots[::_RAW_EVERY]
     for _, images in some:

@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
-import cv2
 import numpy as np
 
-from benchmarks.runs import LOCATED, described, experiment, make_system, say
+from benchmarks.runs import LOCATED, described, experiment, make_system, plain_sift, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
-from fgslam.frontend.features.sift import EDGE_THRESHOLD
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_extractor
@@ -70,11 +68,7 @@ def find(config: ExperimentConfig) -> Found:
     """Features of all frames, and CPU times of finding them, of SIFT alone among them."""
     say(f"finding the features of {config.name}")
     sequence, extract = open_sequence(config), make_extractor(config.frontend)
-    sift = config.frontend.sift
-    alone = cv2.SIFT.create(
-        sift.max_features, sift.octave_layers, sift.contrast_threshold, EDGE_THRESHOLD,
-        sift.base_sigma_px, cv2.CV_8U, True,
-    )  # fmt: skip
+    alone = plain_sift(config.frontend.sift)
     frames, seconds, raw = [], [], []
     for i in range(len(sequence)):
         frame = sequence.frame(i)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 import fgslam as fg
+from benchmarks.evidence.hybrid import KINDS
 from benchmarks.evidence.street_world import FRAMES, RIG, Float32, Street
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
@@ -18,7 +19,6 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
 
 SEEDS = range(6)
-KINDS: tuple[Literal["sift", "hybrid"], ...] = ("sift", "hybrid")
 LIGHTS = {
     "full": (1.0, 0.0),
     "noise of 8 grey levels": (1.0, 8.0),

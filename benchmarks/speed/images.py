@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import cv2
 
-from benchmarks.runs import EXPERIMENTS
+from benchmarks.runs import EXPERIMENTS, plain_sift
 from benchmarks.speed.blocks import Memory
 from fgslam.cli.console import progress_bar
 from fgslam.core.arrays import FloatArray, Image
@@ -27,7 +27,6 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.features.sift import EDGE_THRESHOLD
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_pipeline, make_stream
@@ -118,16 +117,7 @@ def timed(work: Callable[..., object], *arguments: object) -> float:
 
 def raw_sift(config: ExperimentConfig) -> list[Callable[[Iterable[Frame]], None]]:
     """Ways to run `cv2.SIFT` over frames: OpenCV's threads, a pool an image, a pool over all."""
-    s = config.frontend.sift
-    sift = cv2.SIFT.create(
-        s.max_features,
-        s.octave_layers,
-        s.contrast_threshold,
-        EDGE_THRESHOLD,
-        s.base_sigma_px,
-        cv2.CV_8U,
-        True,
-    )
+    sift = plain_sift(config.frontend.sift)
 
     def one(image: Image) -> None:
         sift.detectAndCompute(image, None)

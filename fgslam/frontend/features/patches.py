@@ -18,12 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
+from fgslam.frontend.features.matching import pairs_within
 
 Float32 = npt.NDArray[np.float32]
 
 _SPREAD = 4.3  # sides of the patch over the sigma of its Gaussian weight
 _FLAT = 1e-3  # keeps patches without any contrast solvable
 _GAIN = (0.2, 5.0)  # of light against the first patch; beyond, it is another thing
+_FARTHEST_REACH = 6.1  # beyond, a correlation is less than the rounding of one
 _FARTHEST_PX = 4.0  # of one alignment; the tracker was closer than this, or elsewhere
 
 
@@ -151,8 +153,9 @@ def crowding(places: FloatArray, size: int) -> FloatArray:
     if not len(places):
         return np.empty(0)
     reach = 2.0 * size / _SPREAD
-    apart = ((places[:, None] - places) ** 2).sum(axis=2) / reach**2
-    return np.asarray(np.exp(-apart).sum(axis=1))
+    i, j = pairs_within(places[:, 0], _FARTHEST_REACH * reach, places[:, 0])
+    alike = np.exp(-((places[i] - places[j]) ** 2).sum(axis=1) / reach**2)
+    return np.asarray(np.bincount(i, alike, len(places)), np.float64)
 
 
 def _inverse(maps: FloatArray) -> FloatArray:
