@@ -110,6 +110,35 @@ Words = npt.NDArray[np.int16]
 """(v,) the cell of the vocabulary (``frontend.features.vocabulary``) of each descriptor."""
 
 
+PATCH_PX = 15
+"""Side of a landmark's patch."""
+CUT_PIXELS = (PATCH_PX + 2) ** 2
+"""Grey values of a patch with the rim that its slopes need."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LandmarkPatches(Rows):
+    """Landmarks' own patches: what the reference image showed around each when it was first seen.
+
+    Attributes:
+        grey: (n, :data:`CUT_PIXELS`) grey values; (n, 0) where none are kept.
+        distances: (n,) by which sizes shrink, metres, when it was seen so; 0 without a patch.
+    """
+
+    grey: ByteArray
+    distances: FloatArray
+
+    @staticmethod
+    def none(count: int, pixels: int = CUT_PIXELS) -> LandmarkPatches:
+        """Of landmarks without a patch."""
+        return LandmarkPatches(np.zeros((count, pixels), np.uint8), np.zeros(count))
+
+    @property
+    def kept(self) -> bool:
+        """Whether there is room for any."""
+        return int(self.grey.shape[1]) > 0
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LandmarkAppearances(Rows):
     """Appearances of landmarks, one row a stored view; there may be several (Se et al. 6.3).

@@ -21,25 +21,29 @@ from fgslam.core.array_values import require_covariances, require_finite
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.files import replacing
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CameraRig
 
 FILE = ArrayFile(
     name="fgslam map",
-    versions=(1, 2),  # version 1 did not say which frames are in the map
+    versions=(1, 2, 3),  # 1 did not say which frames are in the map, 2 knew no patches
     error=MapError,
     give="give a file that fgslam run --map-out wrote",
     again="make the map again",
 )
 _SESSION = "session/"
 _EVIDENCE = "evidence_frame"
+_PATCH, _PATCH_DISTANCE = "landmark_patch", "landmark_patch_distance"
 _UPPER = np.triu_indices(3)
 _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: equal maps give equal bytes
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _VIEW = "view"  # written where it is cylindrical
 _SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
+
+_SINCE = {"evidence": 2, "patches": 3}
+"""Versions since which a file may have these; it is of the oldest that has what it holds."""
 
 # Arrays by what their first axis counts, with type and the shape of an item.
 _ITEMS: dict[str, Items] = {
@@ -61,6 +65,7 @@ _ITEMS: dict[str, Items] = {
     },
     "poses": {"pose_time": ("f", ()), "pose": ("f", (4, 4))},
     "evidence": {_EVIDENCE: ("i", ())},
+    "patches": {_PATCH: ("u", (CUT_PIXELS,)), _PATCH_DISTANCE: ("f", ())},
 }
 
 
@@ -81,6 +86,7 @@ class SavedMap:
         session: state of the run that made it, for continuing it to the bit; may be empty.
         evidence: (f,) the frames whose measurements are in it (``Frame.digest``), ascending; None
             where the file is older and does not say.
+        patches: the landmarks' own; None where they were not carried, or the file is older.
     """
 
     rig: CameraRig
@@ -94,6 +100,7 @@ class SavedMap:
     about: dict[str, Any]
     session: StateArrays
     evidence: IntArray | None = None
+    patches: LandmarkPatches | None = None
 
     def __len__(self) -> int:
         return len(self.landmarks)
@@ -191,8 +198,15 @@ def _to_arrays(saved: SavedMap) -> StateArrays:
         "pose_time": saved.trajectory.timestamps,
         "pose": saved.trajectory.poses,
         **({} if saved.evidence is None else {_EVIDENCE: saved.evidence}),
+        **_patch_arrays(saved.patches),
         **{f"{_SESSION}{name}": array for name, array in sorted(saved.session.items())},
     }
+
+
+def _patch_arrays(patches: LandmarkPatches | None) -> StateArrays:
+    if patches is None or not patches.kept:
+        return {}
+    return {_PATCH: patches.grey, _PATCH_DISTANCE: patches.distances}
 
 
 def _from_arrays(header: dict[str, Any], arrays: StateArrays, where: str) -> SavedMap:
@@ -219,6 +233,9 @@ def _from_arrays(header: dict[str, Any], arrays: StateArrays, where: str) -> Sav
             if name.startswith(_SESSION)
         },
         evidence=arrays.get(_EVIDENCE),
+        patches=LandmarkPatches(arrays[_PATCH], arrays[_PATCH_DISTANCE])
+        if _PATCH in arrays
+        else None,
     )
 
 
@@ -279,15 +296,18 @@ def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> St
 
 
 def _header(saved: SavedMap, where: str) -> dict[str, Any]:
+    optional = {} if saved.evidence is None else {"evidence": len(saved.evidence)}
+    if _patch_arrays(saved.patches):
+        optional["patches"] = len(saved)
     header = {
         "format": FILE.name,
-        "version": 1 if saved.evidence is None else 2,
+        "version": max((_SINCE[name] for name in optional), default=1),
         "counts": {
             "landmarks": len(saved),
             "views": len(saved.appearances),
             "poses": len(saved.trajectory),
         }
-        | ({} if saved.evidence is None else {"evidence": len(saved.evidence)}),
+        | optional,
         "rig": _rig_values(saved.rig),
         "about": saved.about,
     }
@@ -327,11 +347,12 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
     """Raises MapError unless all arrays are there, of the right type and size, and fit."""
     expected = of_rows(4, {"rig_bTc": ("f", (4,))})
     for counted, items in _ITEMS.items():
-        if counted != "evidence" or header["version"] > 1:
+        if counted not in _SINCE or counted in header["counts"]:
             expected |= of_rows(header["counts"].get(counted), items)
     FILE.require(arrays, expected, where)
     ids, views = arrays["landmark_id"], arrays["view_landmark"]
-    finite = ("rig_bTc", "landmark_position", "landmark_covariance", "pose", "pose_time")
+    finite = ["rig_bTc", "landmark_position", "landmark_covariance", "pose", "pose_time"]
+    finite += [_PATCH_DISTANCE] if _PATCH_DISTANCE in arrays else []
     for name, sound in {
         "landmark_id": bool((np.diff(ids) > 0).all()),
         "view_landmark": bool((np.diff(views) >= 0).all() and np.isin(views, ids).all()),

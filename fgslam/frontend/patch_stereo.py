@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
-from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.features import PATCH_PX, Features, StereoFeatures
 from fgslam.core.recordings import Frame, clearance
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, vertical_to_horizontal
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 from fgslam.frontend.stereo import StereoMatcher
 
-PATCH_PX = 15  # side of a patch
 GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
 DEFORMATION = 0.05  # sigma of a patch's stretching between two images
 ALIGNMENTS_ACROSS = 3  # in another camera's image, from a disparity known to a pixel or two

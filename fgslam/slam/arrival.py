@@ -138,7 +138,7 @@ def saved_map(
     landmarks = estimate.landmarks
     if places is not None:  # no later frame of this run ends them
         landmarks = landmarks.without(places.ending)
-    rows = book.rows(landmarks.ids)
+    rows, patches = book.rows(landmarks.ids), book.patches(landmarks.ids)
     return SavedMap(
         rig=rig,
         landmarks=landmarks,
@@ -147,6 +147,7 @@ def saved_map(
         misses=book.misses[rows],
         permanent=book.lasting[rows],
         colour=book.colour[rows],
+        patches=patches if patches.kept else None,
         trajectory=estimate.trajectory,
         about=about,
         session=session or {},

@@ -26,6 +26,7 @@ from fgslam.backend.settings import (
 )
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Prediction, Relocalisation
+from fgslam.core.features import CUT_PIXELS
 from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import MeasurementType
 from fgslam.core.recordings import Sequence
@@ -113,7 +114,9 @@ def make_stereo(rig: CameraRig, settings: FrontendSettings) -> RigStereo:
 
 def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     """The landmark database with its matchers and the ego-motion."""
-    database = LandmarkDatabase(rig, settings.database, settings.stereo.largest_disparity_px)
+    pixels = 0 if settings.tracking == "sift" else CUT_PIXELS
+    largest = settings.stereo.largest_disparity_px
+    database = LandmarkDatabase(rig, settings.database, largest, pixels)
     solver = EgoMotionSolver(rig, settings.ego_motion)
     matcher = MapMatcher(settings.matching, settings.appearance)
     tracker = LandmarkTracker(rig, database, matcher, solver)

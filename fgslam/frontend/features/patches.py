@@ -76,21 +76,32 @@ class ReferencePatches(Rows):
         return np.asarray(np.sqrt(np.einsum("nij,nij->n", change, change)))
 
 
+def cut_out(grey: Image, places: FloatArray, size: int) -> Float32:
+    """(n, (size + 2)^2) grey values of a view (h, w) around places (n, 2): column, row.
+
+    What :func:`anchor_at` makes patches of; the rim is for their slopes.
+    """
+    return _sampled(grey, places, _undeformed(len(places)), size + 2)
+
+
 def anchor(
     grey: Image, places: FloatArray, size: int, noise: float, deformation: float
 ) -> ReferencePatches:
-    """Patches around places (n, 2) of a view.
+    """Patches around places (n, 2), column and row, of a view (h, w); else :func:`anchor_at`."""
+    return anchor_at(cut_out(grey, places, size), size, noise, deformation)
+
+
+def anchor_at(cut: Float32, size: int, noise: float, deformation: float) -> ReferencePatches:
+    """Patches of what was cut out of a view.
 
     Args:
-        grey: (h, w) the view.
-        places: column, row.
+        cut: (n, (size + 2)^2) by :func:`cut_out`.
         size: side of a patch, pixels; odd.
         noise: sigma of a grey value, including what no affine map explains.
         deformation: sigma of each entry of the map from one image to the next; it keeps patches
             with little contrast from being deformed arbitrarily.
     """
-    maps = np.broadcast_to(np.eye(2), (len(places), 2, 2)).copy()
-    first, across, down = _with_slopes(grey, places, maps, size)
+    first, across, down = _with_slopes(cut, size)
     x, y = _offsets(size)
     slopes = np.stack([across, down, across * x, across * y, down * x, down * y], axis=1)
     weight = _weight(size)
@@ -100,7 +111,7 @@ def anchor(
     curvature = (weighted @ slopes_only.transpose(0, 2, 1)).astype(np.float64) + prior
     step = np.linalg.inv(curvature).astype(np.float32) @ weighted
     spread = _spread(first - _mean(first, weight).astype(np.float32)[:, None], weight)
-    return ReferencePatches(size, first, light, step, spread, maps)
+    return ReferencePatches(size, first, light, step, spread, _undeformed(len(cut)))
 
 
 def align(
@@ -171,11 +182,14 @@ def _inverse(maps: FloatArray) -> FloatArray:
     return out
 
 
-def _with_slopes(
-    grey: Image, places: FloatArray, maps: FloatArray, size: int
-) -> tuple[Float32, Float32, Float32]:
+def _undeformed(count: int) -> FloatArray:
+    """(n, 2, 2) identities."""
+    return np.broadcast_to(np.eye(2), (count, 2, 2)).copy()
+
+
+def _with_slopes(cut: Float32, size: int) -> tuple[Float32, Float32, Float32]:
     """Grey values (n, m) of patches, and their derivatives along columns and rows."""
-    wide = _sampled(grey, places, maps, size + 2).reshape(len(places), size + 2, size + 2)
+    wide = cut.reshape(len(cut), size + 2, size + 2)
     middle = slice(1, -1)
     across = 0.5 * (wide[:, middle, 2:] - wide[:, middle, :-2])
     down = 0.5 * (wide[:, 2:, middle] - wide[:, :-2, middle])

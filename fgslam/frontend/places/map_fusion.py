@@ -11,7 +11,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.geometry import congruence, inverse_spd3, point_pose_jacobian, transform_to_world
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.places.map_alignment import Alignment
@@ -59,6 +59,7 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
         about={"drives": [*a.about.get("drives", ()), *b.about.get("drives", ())]},
         session={},
         evidence=_all_evidence(a, b),
+        patches=_patches(a, b, rest),
     )
 
 
@@ -83,6 +84,14 @@ def shared_moments(a: SavedMap, b: SavedMap) -> int:
 def adds_nothing(b: SavedMap, a: SavedMap) -> bool:
     """Whether every frame of ``b`` is in ``a`` already, as far as both say."""
     return b.evidence is not None and shared_frames(a, b) == len(b.evidence)
+
+
+def _patches(a: SavedMap, b: SavedMap, rest: IntArray) -> LandmarkPatches | None:
+    """Those of a, and of the others of b."""
+    if a.patches is None and b.patches is None:
+        return None
+    mine = a.patches or LandmarkPatches.none(len(a))
+    return mine.join((b.patches or LandmarkPatches.none(len(b))).select(rest))
 
 
 def _all_evidence(a: SavedMap, b: SavedMap) -> IntArray | None:

@@ -18,12 +18,25 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows, StateArrays
 from fgslam.core.cylindrical import size_distances
-from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.features import (
+    CUT_PIXELS,
+    PATCH_PX,
+    Features,
+    LandmarkPatches,
+    StereoFeatures,
+)
 from fgslam.core.geometry import triangulate
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.features.patches import ReferencePatches, align, anchor, crowding
-from fgslam.frontend.patch_stereo import DEFORMATION, GREY_NOISE, PATCH_PX, across
+from fgslam.frontend.features.patches import (
+    Float32,
+    ReferencePatches,
+    align,
+    anchor_at,
+    crowding,
+    cut_out,
+)
+from fgslam.frontend.patch_stereo import DEFORMATION, GREY_NOISE, across
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 
@@ -34,6 +47,7 @@ _PYRAMID_LEVELS = 2
 _SEARCH = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
 _MIN_EIGENVALUE = 1e-4
 _ALIGNMENTS = 2  # in the reference image, after the search
+_FIRST_ALIGNMENTS = 4  # where SIFT finds a landmark again: nothing has refined its place before
 _FARTHEST_FLOW = 0.06
 """Of the image's width: where the landmarks are expected to have moved farther in the median,
 patches are not looked for at all: half of them would be lost (EuRoC's key frames)."""
@@ -65,16 +79,59 @@ class Carried(Rows):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Points(Rows):
-    """Landmarks in the last reference image: identities (ascending), places (n, 2), depths."""
+class Points(Rows):
+    """Landmarks in a reference image: identities (n,) ascending, places (n, 2), depths (n,)."""
 
     ids: IntArray
     places: FloatArray
     depths: FloatArray
 
     @staticmethod
-    def none() -> _Points:
-        return _Points(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
+    def none() -> Points:
+        """No landmark."""
+        return Points(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Begun(Rows):
+    """Landmarks that are carried from a reference image on, with their own patches.
+
+    Attributes:
+        points: where they are in it.
+        cut: (n, m) grey values of their patches with a rim, as first seen.
+        growth: (n,) sizes in this image over those in the patch.
+        known: (n,) whose patch is of an earlier image: they may look different by now.
+    """
+
+    points: Points
+    cut: Float32
+    growth: FloatArray
+    known: BoolArray
+
+    @staticmethod
+    def none() -> Begun:
+        """No landmark."""
+        cut = np.empty((0, CUT_PIXELS), np.float32)
+        return Begun(Points.none(), cut, np.empty(0), np.empty(0, np.bool_))
+
+    @staticmethod
+    def new(image: Image, points: Points) -> Begun:
+        """First seen in this image, of which their patches are cut."""
+        cut = cut_out(image, points.places, PATCH_PX)
+        return Begun(points, cut, np.ones(len(cut)), np.zeros(len(cut), np.bool_))
+
+    @staticmethod
+    def again(points: Points, patches: LandmarkPatches) -> Begun:
+        """Seen before: those that have a patch."""
+        growth = patches.distances / points.depths
+        known = np.ones(len(growth), np.bool_)
+        every = Begun(points, patches.grey.astype(np.float32), growth, known)
+        return every.select(np.isfinite(growth) & (growth > 0.0))
+
+    @property
+    def patches(self) -> LandmarkPatches:
+        """As they are kept."""
+        return LandmarkPatches(np.rint(self.cut).astype(np.uint8), self.growth * self.points.depths)
 
 
 class LandmarkCarrier:
@@ -85,22 +142,23 @@ class LandmarkCarrier:
         self._rig = rig
         self._stereo = stereo
         self._last: Image | None = None
-        self._points = _Points.none()
+        self._points = Points.none()
         self._patches = ReferencePatches.none(PATCH_PX)
-        self._fresh = _Points.none()  # of the last image, their patches yet to be taken
+        self._fresh = Begun.none()  # of the last image, their patches yet to be looked for
 
     @property
     def ids(self) -> IntArray:
         """(n,) landmarks with a patch, ascending."""
-        return np.union1d(self._points.ids, self._fresh.ids)
+        return np.union1d(self._points.ids, self._fresh.points.ids)
 
-    def begin(self, image: Image, ids: IntArray, places: FloatArray, depths: FloatArray) -> None:
-        """Takes patches of landmarks seen in the reference image (ascending), in place of older.
+    def begin(self, image: Image, begun: Begun) -> None:
+        """Landmarks seen in the reference image are carried from here, in place of older ones.
 
-        Only when they are looked for: a frame that is given up before costs nothing.
+        Their patches are worked on only when they are looked for: a frame that is given up before
+        costs nothing.
         """
-        self._keep(~np.isin(self._points.ids, ids))
-        self._last, self._fresh = image, _Points(ids, places, depths)
+        self._keep(~np.isin(self._points.ids, begun.points.ids))
+        self._last, self._fresh = image, begun
 
     def forget(self, ids: IntArray) -> None:
         """Carries these no further."""
@@ -121,9 +179,9 @@ class LandmarkCarrier:
         """
         last, self._last = self._last, images[0]
         self._keep(np.isin(self._points.ids, expected.ids))
-        self._fresh = self._fresh.select(np.isin(self._fresh.ids, expected.ids))
+        self._fresh = self._fresh.select(np.isin(self._fresh.points.ids, expected.ids))
         if last is None or not self._within_reach(expected):
-            self._points = self._fresh = _Points.none()
+            self._points, self._fresh = Points.none(), Begun.none()
             self._patches = ReferencePatches.none(PATCH_PX)
             return None
         patches = self._anchored(last)
@@ -148,23 +206,24 @@ class LandmarkCarrier:
         )
         good[good] = consistent
         features = features.noisier(crowding(places[good], PATCH_PX))
-        self._points = _Points(self._points.ids[good], places[good], depths[good])
+        self._points = Points(self._points.ids[good], places[good], depths[good])
         self._patches = patches.select(good)
         return Carried(self._points.ids, rows[good], features)
 
     def state(self) -> StateArrays:
         """All that is carried over."""
         points, fresh = self._points, self._fresh
-        out: StateArrays = {f"fresh_{name}": getattr(fresh, name) for name in fresh.__slots__}
-        out |= {name: getattr(points, name) for name in points.__slots__}
+        out: StateArrays = {name: getattr(points, name) for name in _POINTS}
+        out |= {f"fresh_{name}": getattr(fresh.points, name) for name in _POINTS}
+        out |= {f"fresh_{name}": getattr(fresh, name) for name in _BEGUN}
         out["last"] = np.empty((0, 0), np.uint8) if self._last is None else self._last
         return out | {f"patch_{name}": getattr(self._patches, name) for name in _PATCH_ARRAYS}
 
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`, to the same bits."""
-        names = _Points.__slots__
-        self._points = _Points(**{name: state[name] for name in names})
-        self._fresh = _Points(**{name: state[f"fresh_{name}"] for name in names})
+        self._points = Points(**{name: state[name] for name in _POINTS})
+        fresh = Points(**{name: state[f"fresh_{name}"] for name in _POINTS})
+        self._fresh = Begun(fresh, **{name: state[f"fresh_{name}"] for name in _BEGUN})
         self._last = state["last"] if state["last"].size else None
         patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
         self._patches = ReferencePatches(PATCH_PX, **patches)
@@ -178,21 +237,40 @@ class LandmarkCarrier:
     def _within_reach(self, expected: ExpectedLandmarks) -> bool:
         """False where there is nothing to look for, or the image has moved too far."""
         flow = []
-        for points in (self._points, self._fresh):
+        for points in (self._points, self._fresh.points):
             there = expected.measurement[np.searchsorted(expected.ids, points.ids), :2]
             flow.append(np.linalg.norm(there - points.places, axis=1))
         moved = np.concatenate(flow)
         return bool(len(moved)) and float(np.median(moved)) <= _FARTHEST_FLOW * self._rig.width
 
     def _anchored(self, last: Image) -> ReferencePatches:
-        """The patches of all points, those of the fresh ones taken now."""
-        fresh, self._fresh = self._fresh, _Points.none()
-        if len(fresh):
-            new = anchor(last, fresh.places, PATCH_PX, GREY_NOISE, DEFORMATION)
-            patches, points = self._patches.join(new), self._points.join(fresh)
+        """The patches of all points, those of the fresh ones found in the last image first."""
+        fresh, self._fresh = self._fresh, Begun.none()
+        if len(fresh.points):
+            new, begun = self._found_again(last, fresh)
+            patches, points = self._patches.join(new), self._points.join(begun)
             order = np.argsort(points.ids)
             self._points, self._patches = points.select(order), patches.select(order)
         return self._patches
+
+    def _found_again(self, last: Image, fresh: Begun) -> tuple[ReferencePatches, Points]:
+        """Patches and places of landmarks begun in an image; what looks different by now is left.
+
+        Those known from before are placed by their own patch, not by SIFT.
+        """
+        patches = anchor_at(fresh.cut, PATCH_PX, GREY_NOISE, DEFORMATION)
+        patches = dataclasses.replace(patches, maps=patches.maps * fresh.growth[:, None, None])
+        points = fresh.points
+        at = points.places
+        deformed, places, correlation = _aligned(patches, last, at, _FIRST_ALIGNMENTS)
+        alike = (correlation >= _MIN_CORRELATION) & self._inside(places, _MARGIN_PX)
+        alike &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
+        known = fresh.known
+        maps = np.where(known[:, None, None], deformed.maps, patches.maps)
+        places = np.where(known[:, None], places, at)
+        points = dataclasses.replace(points, places=places)
+        keep = alike | ~known
+        return dataclasses.replace(patches, maps=maps).select(keep), points.select(keep)
 
     def _in_reference(
         self, last: Image, image: Image, patches: ReferencePatches, predicted: FloatArray
@@ -220,6 +298,8 @@ class LandmarkCarrier:
         return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
 
 
+_POINTS = Points.__slots__
+_BEGUN = ("cut", "growth", "known")
 _PATCH_ARRAYS = ("first", "light", "step", "contrast", "maps")
 
 

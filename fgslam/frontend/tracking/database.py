@@ -35,13 +35,23 @@ up to about this angle (docs/concepts/maps.md)."""
 class LandmarkDatabase(LandmarkTable):
     """Landmark table updated frame by frame: hits n, misses m, consecutive misses l."""
 
-    def __init__(self, rig: CameraRig, settings: DatabaseSettings, max_disparity_px: float) -> None:
-        """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected."""
+    def __init__(
+        self,
+        rig: CameraRig,
+        settings: DatabaseSettings,
+        max_disparity_px: float,
+        patch_pixels: int = 0,
+    ) -> None:
+        """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected.
+
+        Landmarks that are carried need ``patch_pixels`` for their own patch.
+        """
         viewpoints = settings.viewpoints
         if viewpoints is None:
-            super().__init__(max_views=1, view_angle=0.0)
+            super().__init__(1, 0.0, patch_pixels)
         else:
-            super().__init__(viewpoints.max_views, float(np.deg2rad(_VIEW_ANGLE_DEG)))
+            angle = float(np.deg2rad(_VIEW_ANGLE_DEG))
+            super().__init__(viewpoints.max_views, angle, patch_pixels)
         self._settings = settings
         self._rig = rig
         self._field_of_view = FieldOfView(rig, settings, max_disparity_px)
@@ -119,10 +129,11 @@ class LandmarkDatabase(LandmarkTable):
         self._frame += 1
 
     def record_misses(self, ids: IntArray) -> None:
-        """Type II: expected in view and not matched."""
+        """Type II: expected in view and not matched, by a frame that stands for those before it."""
         rows = self.rows(ids)
-        self.missed[rows] += 1
-        self.misses[rows] += 1
+        frames = self._frames_unseen(rows)
+        self.missed[rows] += frames
+        self.misses[rows] += frames
 
     def weigh(
         self,
@@ -150,7 +161,7 @@ class LandmarkDatabase(LandmarkTable):
         against = seen_past(places, seen) | np.isin(ids, rejected)
         ids = ids[against]
         rows = self.rows(ids)
-        self._columns["contradicted"][rows] += 1
+        self._columns["contradicted"][rows] += self._frames_unseen(rows)
         self.demote(ids[self._columns["contradicted"][rows] >= permanence.contradicted_after])
 
     def demote(self, ids: IntArray) -> None:
@@ -187,12 +198,22 @@ class LandmarkDatabase(LandmarkTable):
         if forget_after is not None:
             gone |= ~self.valid & (self._frame >= self._columns["seen"] + forget_after)
         gone &= ~self.permanent
+        self._looked = self._frame
         self._frame += 1
         pruned = self.ids[gone]
         self._remove(gone)
         return pruned
 
     # ----------------------------------------------------------------------------------------
+
+    def _frames_unseen(self, rows: IntArray) -> IntArray:
+        """(k,) frames that a miss in this one stands for: since the last hit, or the last look.
+
+        One where every frame looks for landmarks. Between key frames those that are carried are
+        hit in each frame; the others are looked for by the next key frame only.
+        """
+        since = np.maximum(self._columns["seen"][rows], self._looked)
+        return np.asarray(np.maximum(self._frame - since, 1))
 
     def _hit(self, ids: IntArray) -> IntArray:
         """Counts a hit; returns the rows."""

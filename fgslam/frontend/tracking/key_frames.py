@@ -18,7 +18,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, StateArra
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.frontend.tracking.carrying import Carried, LandmarkCarrier
+from fgslam.frontend.tracking.carrying import Begun, Carried, LandmarkCarrier, Points
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 
@@ -126,7 +126,7 @@ class KeyFrameTracker:
         return tracked, features
 
     def begin(self, image: Image, features: StereoFeatures, association: Association) -> None:
-        """After a key frame: its landmarks are carried from here, those in use by their patch.
+        """After a key frame: its landmarks are carried from here, each by its own patch.
 
         Args:
             image: the reference image.
@@ -138,10 +138,22 @@ class KeyFrameTracker:
         self._carrier.forget(np.setdiff1d(self._carrier.ids, observed.ids))
         self._count = int(good.sum())
         self._cells = len(_cells(observed.pixels[good, 0], image))
-        fresh = np.flatnonzero(good & ~np.isin(observed.ids, self._carrier.ids))
-        fresh = fresh[np.argsort(observed.ids[fresh])]
+        fresh = good & ~np.isin(observed.ids, self._carrier.ids)
         distances = features.distances[association.features[fresh]]
-        self._carrier.begin(image, observed.ids[fresh], observed.pixels[fresh, 0], distances)
+        points = Points(observed.ids[fresh], observed.pixels[fresh, 0], distances)
+        self._carrier.begin(image, self._with_patches(image, points, observed.is_new[fresh]))
+
+    def _with_patches(self, image: Image, points: Points, new: BoolArray) -> Begun:
+        """Those that can be carried: new ones by what they show here, others by their own patch.
+
+        SIFT finds a landmark again some tenths of a pixel off. A patch cut out there would repeat
+        that error in every frame to come, as if all of them had seen it.
+        """
+        database, old = self._tracker.database, points.select(~new)
+        begun = Begun.new(image, points.select(new))
+        database.keep_patches(begun.points.ids, begun.patches)
+        begun = begun.join(Begun.again(old, database.patches(old.ids)))
+        return begun.select(np.argsort(begun.points.ids))
 
     def state(self) -> StateArrays:
         """What the last key frame was like, and what is carried."""

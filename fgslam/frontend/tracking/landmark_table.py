@@ -14,11 +14,13 @@ from fgslam.core.arrays import (
     StateArrays,
 )
 from fgslam.core.errors import MapError
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.tracking.views import Places, ViewPool, Views
 
 _COUNTS = ("hits", "misses", "missed", "seen", "contradicted")
+_PATCH = ("patch", "patch_distance")
+_HELD = ("ids", "colour", "permanent", *_PATCH, *_COUNTS)
 _PLACES = "places"
 _VIEWS = ("size", "orientation", "descriptors", "direction", "used")
 
@@ -29,17 +31,23 @@ class LandmarkTable:
     The arrays over landmarks are read only by agreement, and good until the next change.
     """
 
-    def __init__(self, max_views: int, view_angle: float) -> None:
-        """Starts empty; see ``views.ViewPool`` for the views (radians)."""
+    def __init__(self, max_views: int, view_angle: float, patch_pixels: int = 0) -> None:
+        """Starts empty; see ``views.ViewPool`` for the views (radians).
+
+        With ``patch_pixels`` there is room for each landmark's own patch of so many grey values.
+        """
         self._pool = ViewPool(max_views, view_angle)
         self._next_id = 0
         self._frame = 0
+        self._looked = -1  # the last frame that looked for all landmarks in view
         count = np.empty(0, np.int64)
         self._columns = GrowingColumns(
             ids=count,
             colour=np.empty(0, np.uint8),
             permanent=np.empty(0, np.bool_),
             places=np.empty((0, max_views), np.int32),
+            patch=np.empty((0, patch_pixels), np.uint8),
+            patch_distance=np.empty(0),
             **dict.fromkeys(_COUNTS, count),
         )
 
@@ -75,6 +83,22 @@ class LandmarkTable:
     def permanent(self) -> BoolArray:
         """(n,) never pruned for being missed (6.2)."""
         return self._columns["permanent"]
+
+    @property
+    def patch_pixels(self) -> int:
+        """Grey values of an own patch; 0 where none are kept."""
+        return int(self._columns["patch"].shape[1])
+
+    def patches(self, ids: IntArray) -> LandmarkPatches:
+        """Landmarks' own patches (k,)."""
+        rows = self.rows(ids)
+        return LandmarkPatches(*(self._columns[name][rows] for name in _PATCH))
+
+    def keep_patches(self, ids: IntArray, patches: LandmarkPatches) -> None:
+        """Landmarks (k,) get their own patches."""
+        rows = self.rows(ids)
+        self._columns["patch"][rows] = patches.grey
+        self._columns["patch_distance"][rows] = patches.distances
 
     def appearances(
         self, ids: IntArray | None = None, with_words: bool = False
@@ -181,10 +205,12 @@ class LandmarkTable:
                 "missed": zeros,
                 "seen": zeros,
                 "contradicted": zeros,
+                **self._as_columns(saved.patches, len(ids)),
             }
         )
         self._next_id = int(ids[-1]) + 1 if len(ids) else 0
         self._frame = 0
+        self._looked = -1
 
     def unseen_for(self, frames: int) -> BoolArray:
         """(n,) landmarks that none of the last ``frames`` frames matched."""
@@ -193,8 +219,7 @@ class LandmarkTable:
     def held_aside(self, ids: IntArray) -> StateArrays:
         """All entries of landmarks (ascending) and their views, as arrays; nothing changes."""
         rows = self.rows(ids)
-        names = ("ids", "colour", "permanent", *_COUNTS)
-        out: StateArrays = {name: self._columns[name][rows] for name in names}
+        out: StateArrays = {name: self._columns[name][rows] for name in _HELD}
         owner, places = self._places_of(rows)
         views = self._pool.at(places)
         out |= {name: getattr(views, name) for name in _VIEWS}
@@ -212,8 +237,7 @@ class LandmarkTable:
         before = len(self)
         views = Views(**{name: held[name] for name in _VIEWS})
         places = self._pool.load(held["view_counts"], views)
-        names = ("ids", "colour", "permanent", *_COUNTS)
-        self._columns.append({name: held[name] for name in names} | {_PLACES: places})
+        self._columns.append({name: held[name] for name in _HELD} | {_PLACES: places})
         self._columns.keep_ascending("ids", before)
 
     def state(self) -> StateArrays:
@@ -224,6 +248,7 @@ class LandmarkTable:
         out |= {name: getattr(views, name) for name in _VIEWS}
         out["next_id"] = np.array(self._next_id)
         out["frame"] = np.array(self._frame)
+        out["looked"] = np.array(self._looked)
         if self._pool.several:
             out["view_counts"] = np.asarray((self._places >= 0).sum(axis=1))
         return out
@@ -236,6 +261,7 @@ class LandmarkTable:
         self._columns.restore(state | {_PLACES: places})
         self._next_id = int(state["next_id"])
         self._frame = int(state["frame"])
+        self._looked = int(state["looked"])
 
     def _append(self, ids: IntArray, views: Views, colour: ByteArray) -> None:
         """New landmarks (k,), seen once, in this frame."""
@@ -251,8 +277,16 @@ class LandmarkTable:
                 "missed": zeros,
                 "seen": zeros + self._frame,
                 "contradicted": zeros,
+                **self._as_columns(None, len(ids)),
             }
         )
+
+    def _as_columns(self, patches: LandmarkPatches | None, count: int) -> StateArrays:
+        """Own patches as this table keeps them; none where they are not known, or not kept."""
+        pixels = self.patch_pixels
+        if patches is None or not (pixels and patches.kept):
+            patches = LandmarkPatches.none(count, pixels)
+        return {"patch": patches.grey, "patch_distance": patches.distances}
 
     @property
     def _places(self) -> Places:

@@ -15,7 +15,7 @@ from fgslam.backend.filters.set_aside import SetAside
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
 
@@ -73,6 +73,7 @@ def write_submap(submap: SubMap, rig: CameraRig, path: Path) -> None:
         trajectory=Trajectory(geometry.timestamps, geometry.poses),
         about={"submap": int(path.stem)},
         session=session | {name: held[name] for name in _OF_DATABASE},
+        patches=LandmarkPatches(held["patch"], held["patch_distance"]),
     )
     save_map(saved, path)
 
@@ -115,7 +116,10 @@ def _geometry(saved: SavedMap) -> SetAside:
 
 def _entries(saved: SavedMap) -> StateArrays:
     views = saved.appearances
+    patches = saved.patches or LandmarkPatches.none(len(saved), 0)
     return {
+        "patch": patches.grey,
+        "patch_distance": patches.distances,
         "ids": saved.landmarks.ids,
         "hits": saved.hits,
         "misses": saved.misses,

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, IntArray, StateArrays
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.files import clear_output_errors
 from fgslam.frontend.tracking.database import LandmarkDatabase
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fgslam.slam.submaps.files import SubMap
 
 _VIEWS = ("descriptors", "size", "orientation", "direction")
-_COLUMNS = ("hits", "misses", "permanent", "colour")
+_COLUMNS = ("hits", "misses", "permanent", "colour", "patch", "patch_distance")
 
 
 class LandmarkBook(Protocol):
@@ -75,6 +75,10 @@ class LandmarkBook(Protocol):
         """All views, or those of the named landmarks (ascending)."""
         ...
 
+    def patches(self, ids: IntArray) -> LandmarkPatches:
+        """Own patches (k,) of the named landmarks (ascending)."""
+        ...
+
 
 Pieces = Callable[[], Iterator[tuple[LandmarkMap, "SubMap"]]]
 """All parts of the map, one after the other: landmarks where they are now, and what they are."""
@@ -104,6 +108,7 @@ class WholeMap:
             "direction": make((v, 3), np.float64),
         }
         columns: StateArrays = {name: np.zeros(n, kind) for name, kind in _KINDS.items()}
+        columns["patch"] = make((n, database.patch_pixels), np.uint8)
         for landmarks, submap in pieces():
             rows = np.searchsorted(ids, landmarks.ids)
             places[rows], covariances[rows] = landmarks.positions, landmarks.covariances
@@ -163,8 +168,19 @@ class WholeMap:
         whole = ids is None or len(ids) == len(self.ids)
         return self.views if whole or ids is None else self.views.of(ids)
 
+    def patches(self, ids: IntArray) -> LandmarkPatches:
+        """Own patches (k,) of the named landmarks (ascending)."""
+        patches = LandmarkPatches(self.columns["patch"], self.columns["patch_distance"])
+        return patches if len(ids) == len(self.ids) else patches.select(self.rows(ids))
 
-_KINDS = {"hits": np.int64, "misses": np.int64, "permanent": np.bool_, "colour": np.uint8}
+
+_KINDS = {
+    "hits": np.int64,
+    "misses": np.int64,
+    "permanent": np.bool_,
+    "colour": np.uint8,
+    "patch_distance": np.float64,
+}
 
 
 class _Scratch:

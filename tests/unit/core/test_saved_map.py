@@ -15,10 +15,10 @@ from fgslam.core import files as whole_files
 from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
 from fgslam.core.array_files import load_arrays
-from fgslam.core.arrays import StateArrays
+from fgslam.core.arrays import IntArray, StateArrays
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
 from fgslam.core.sensors import CameraRig
@@ -110,6 +110,37 @@ def rewritten(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], Non
 
 def test_a_map_comes_back_to_the_bit(saved: SavedMap, file: Path) -> None:
     assert_same(load_map(file), saved)
+
+
+@pytest.mark.parametrize("evidence", [None, np.array([3, 8])])
+def test_own_patches_come_back_to_the_bit(
+    evidence: IntArray | None, saved: SavedMap, rng: np.random.Generator, tmp_path: Path
+) -> None:
+    grey = rng.integers(0, 256, (len(saved), CUT_PIXELS)).astype(np.uint8)
+    patches = LandmarkPatches(grey, rng.random(len(saved)))
+    carried = replace(saved, patches=patches, evidence=evidence)
+    save_map(carried, tmp_path / "m.fgmap")
+    assert_same(load_map(tmp_path / "m.fgmap"), carried)
+    with pytest.raises(MapError, match="landmark_patch_distance is not finite"):
+        save_map(
+            replace(carried, patches=LandmarkPatches(grey, np.full(len(saved), np.nan))),
+            tmp_path / "m.fgmap",
+        )
+
+
+def test_a_file_is_of_the_oldest_version_that_has_what_it_holds(
+    saved: SavedMap, tmp_path: Path
+) -> None:
+    """Maps without patches can be read by fgslam 0.1."""
+    path = tmp_path / "m.fgmap"
+    frames, patches = np.array([3, 8]), LandmarkPatches.none(len(saved))
+    for version, one in (
+        (1, saved),
+        (2, replace(saved, evidence=frames)),
+        (3, replace(saved, patches=patches)),
+    ):
+        save_map(one, path)
+        assert json.loads(str(load_arrays(path)["header"]))["version"] == version
 
 
 @pytest.mark.parametrize("n", [0, 1])
@@ -204,7 +235,7 @@ def test_a_newer_file_is_refused(file: Path) -> None:
     def change(header: dict[str, Any], arrays: dict[str, Any]) -> None:
         header["version"] = 99
 
-    with pytest.raises(MapError, match="map of version 99, this fgslam reads versions 1 to 2"):
+    with pytest.raises(MapError, match="map of version 99, this fgslam reads versions 1 to 3"):
         load_map(rewritten(file, change))
 
 

@@ -6,13 +6,19 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.features import PATCH_PX, LandmarkPatches
 from fgslam.core.geometry import project
 from fgslam.frontend.features.patches import crowding
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.patch_stereo import PATCH_PX
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.carrying import NOISE_SHARE, Carried, LandmarkCarrier
+from fgslam.frontend.tracking.carrying import (
+    NOISE_SHARE,
+    Begun,
+    Carried,
+    LandmarkCarrier,
+    Points,
+)
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
 
@@ -47,8 +53,21 @@ def begun(images: tuple[Image, ...], place: FloatArray) -> LandmarkCarrier:
     stereo = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
     carrier = LandmarkCarrier(RIG, stereo)
     seen = measurements(place)
-    depths = np.full(len(GRID), WALL_M - place[2])
-    carrier.begin(images[0], 10 + np.arange(len(GRID)), seen[:, :2], depths)
+    carrier.begin(images[0], Begun.new(images[0], points(seen[:, :2], place)))
+    return carrier
+
+
+def points(places: FloatArray, place: FloatArray) -> Points:
+    """The grid at places of an image taken from a place."""
+    return Points(10 + np.arange(len(GRID)), places, np.full(len(GRID), WALL_M - place[2]))
+
+
+def begun_again(place: FloatArray, off: FloatArray) -> LandmarkCarrier:
+    """Landmarks first seen from here that SIFT finds again elsewhere, off (n, 2) pixels."""
+    carrier, now = begun(pictures(HERE), HERE), pictures(place)
+    first = Begun.new(pictures(HERE)[0], points(measurements(HERE)[:, :2], HERE))
+    found = points(measurements(place)[:, :2] + off, place)
+    carrier.begin(now[0], Begun.again(found, first.patches))
     return carrier
 
 
@@ -89,6 +108,32 @@ def test_errors_do_not_add_up() -> None:
         assert error.std(axis=0).max() < 0.12, k
         assert np.abs(np.median(error, axis=0)).max() < 0.06, k
     assert len(found) >= 25
+
+
+def test_a_landmark_found_again_is_held_to_its_own_patch() -> None:
+    """Half a pixel off where features found it again, nearer by a tenth."""
+    off = np.random.default_rng(4).normal(0.0, 0.5, (len(GRID), 2))
+    there, next_to = np.array([0.02, 0.0, 0.2]), np.array([0.03, 0.01, 0.22])
+    found = followed(begun_again(there, off), next_to)
+    error = found.features.measurement - measurements(next_to)[found.ids - 10]
+    assert len(found) >= 40
+    assert error.std(axis=0).max() < 0.12
+    assert np.abs(np.median(error, axis=0)).max() < 0.08
+
+
+def test_what_looks_different_by_now_is_not_carried() -> None:
+    off = np.where(np.arange(len(GRID))[:, None] % 2, [9.0, -7.0], 0.0)
+    found = followed(begun_again(np.array([0.02, 0.0, 0.0]), off), np.array([0.03, 0.0, 0.0]))
+    assert np.isin(found.ids - 10, np.flatnonzero(off[:, 0] == 0.0)).mean() > 0.9
+    assert len(found) >= 20
+
+
+def test_a_landmark_without_a_patch_is_not_carried() -> None:
+    image = pictures(HERE)[0]
+    first = Begun.new(image, points(measurements(HERE)[:, :2], HERE))
+    distances = np.where(np.arange(len(GRID)) < 5, first.patches.distances, 0.0)
+    again = Begun.again(first.points, LandmarkPatches(first.patches.grey, distances))
+    assert again.points.ids.tolist() == [10, 11, 12, 13, 14]
 
 
 def test_what_is_covered_in_one_image_is_not_carried() -> None:

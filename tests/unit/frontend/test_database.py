@@ -12,7 +12,7 @@ from simulated import RIG, assert_same_bits
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.features import StereoFeatures
+from fgslam.core.features import LandmarkPatches, StereoFeatures
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import DatabaseSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
@@ -191,6 +191,57 @@ def test_landmark_ids_may_differ_from_row_numbers() -> None:
     np.testing.assert_array_equal(expected.descriptors, stereo_features(points).descriptors[kept])
 
 
+def test_a_miss_on_a_key_frame_stands_for_the_frames_since_the_last_look() -> None:
+    """Three frames carried, one landmark in the first of them: misses of 3 and of 4 frames."""
+    database = LandmarkDatabase(RIG, DatabaseSettings(prune_after_misses=4), 40.0)
+    points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20)])
+    database.add(stereo_features(points), np.arange(3), np.zeros(3, np.uint8))
+    database.prune()
+    database.record_carried(np.array([1, 2]))
+    database.record_carried(np.array([2]))
+    database.record_carried(np.array([2]))
+    database.record_misses(np.array([0, 1, 2]))
+    assert database.missed.tolist() == database.misses.tolist() == [4, 3, 1]
+    assert database.prune().tolist() == [0]
+    database.record_misses(np.array([1, 2]))
+    assert database.missed.tolist() == [4, 2]  # one frame later, which looked for all
+
+
+def test_counts_go_on_as_before_after_a_restart_between_key_frames() -> None:
+    database = LandmarkDatabase(RIG, DatabaseSettings(), 40.0)
+    points = at_pixels([(80, 60, 8), (100, 110, 12)])
+    database.add(stereo_features(points), np.arange(2), np.zeros(2, np.uint8))
+    database.prune()
+    database.record_misses(np.array([0]))
+    database.prune()
+    database.record_carried(np.array([1]))
+    again = LandmarkDatabase(RIG, DatabaseSettings(), 40.0)
+    again.restore(database.state())
+    for one in (database, again):
+        one.record_misses(np.array([0]))
+        assert one.missed.tolist() == [3, 0]
+
+
+def test_own_patches_stay_with_their_landmarks() -> None:
+    """Through the end of others, a restart, and a time on disk."""
+    database = LandmarkDatabase(RIG, DatabaseSettings(prune_after_misses=1), 40.0, patch_pixels=4)
+    points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20)])
+    ids = database.add(stereo_features(points), np.arange(3), np.zeros(3, np.uint8))
+    assert database.patches(ids).distances.tolist() == [0.0, 0.0, 0.0]
+    own = np.arange(8, dtype=np.uint8).reshape(2, 4)
+    database.keep_patches(ids[1:], LandmarkPatches(own, np.array([2.0, 3.0])))
+    database.record_misses(ids[:1])
+    database.prune()
+    again = LandmarkDatabase(RIG, DatabaseSettings(), 40.0, patch_pixels=4)
+    again.restore(database.state())
+    held = again.held_aside(ids[1:2])
+    again.give_up(ids[1:2])
+    again.take_back(held)
+    patches = again.patches(ids[1:])
+    np.testing.assert_array_equal(patches.grey, own)
+    assert patches.distances.tolist() == [2.0, 3.0]
+
+
 def test_predicted_covariance_matches_monte_carlo() -> None:
     rng = np.random.default_rng(3)
     point = np.array([[0.4, -0.3, 3.0]])
@@ -315,7 +366,7 @@ def test_a_hit_refreshes_the_appearance() -> None:
     np.testing.assert_array_equal(database.appearances().descriptors[1], seen.descriptors[1])
     others = np.array([0, 2])
     for name in before:
-        if name not in ("next_id", "frame"):
+        if name not in ("next_id", "frame", "looked"):
             np.testing.assert_array_equal(database.state()[name][others], before[name][others])
 
 

@@ -12,7 +12,7 @@ from test_database import at_pixels, database_of, landmark_map, stereo_features
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import CUT_PIXELS, LandmarkAppearances
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.settings import (
     DatabaseSettings,
@@ -285,7 +285,9 @@ def test_an_empty_map() -> None:
 
 def test_memory_a_landmark_is_as_documented() -> None:
     """docs/concepts/maps.md tells it."""
-    assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0)._columns.bytes_per_row() == 54
+    assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0)._columns.bytes_per_row() == 62
+    carried = LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)
+    assert carried._columns.bytes_per_row() == 62 + 289
     several = LandmarkDatabase(RIG, VIEWS, 40.0)
     assert several._pool.bytes_per_view() == 166
-    assert several._columns.bytes_per_row() == 54 + 2 * 4
+    assert several._columns.bytes_per_row() == 62 + 2 * 4

@@ -19,9 +19,10 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers import recorded_inputs
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import ConfigError, MapError, OutputError, SessionError
 from fgslam.core.estimates import EgoMotionStatus
+from fgslam.core.features import CUT_PIXELS, LandmarkPatches
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Frame
 from fgslam.core.saved_map import load_map
@@ -103,13 +104,28 @@ def drive_round(estimator: str, tmp_path_factory: pytest.TempPathFactory) -> Dri
     recorder = RunRecorder(MeasurementLog(RIG, MOTION))
     reports, in_memory, half, files = [], [], {}, {}
     for found in frames(poses):
-        reports.append(pipeline.process(found, found.i, float(found.i)))
+        reports.append(step(pipeline, found))
         recorder.add(reports[-1], 0.0, float("nan"))
         in_memory.append(len(pipeline.tracker.database))
         if found.i == HALF - 1:
             half = states(pipeline)
             files = {path.name: path.read_bytes() for path in folder.iterdir()}
     return Driven(estimator, poses, pipeline, reports, in_memory, recorder, half, folder, files)
+
+
+def step(pipeline: SlamPipeline, found: FeatureFrame) -> FrameReport:
+    """One frame; what is new gets a patch, as if there were images."""
+    report = pipeline.process(found, found.i, float(found.i))
+    seen = report.increment.observations
+    new = seen.ids[seen.is_new]
+    pipeline.tracker.database.keep_patches(new, own_patches(new))
+    return report
+
+
+def own_patches(ids: IntArray) -> LandmarkPatches:
+    """(n,) that tell landmarks apart."""
+    grey = np.tile((ids % 251)[:, None], CUT_PIXELS).astype(np.uint8)
+    return LandmarkPatches(grey, 1.0 + ids)
 
 
 def states(pipeline: SlamPipeline) -> StateArrays:
@@ -162,14 +178,17 @@ def test_the_whole_map_is_that_of_one_map_fed_the_same_measurements(driven: Driv
 
 def test_the_whole_map_has_the_looks_that_memory_and_files_have(driven: Driven) -> None:
     pipeline = driven.pipeline
-    saved = saved_map(pipeline, RIG, pipeline.estimate(), {})
     database, submaps = pipeline.tracker.database, submaps_of(pipeline)
+    saved = saved_map(pipeline, RIG, pipeline.estimate(), {})
     assert_same_bits(saved.appearances.of(database.ids), database.appearances())
     number = int(submaps.state()["numbers"][0, 0])
     stored = load_map(file_of(driven.folder, number))
     assert_same_bits(saved.appearances.of(stored.landmarks.ids), stored.appearances)
     kept = np.isin(saved.landmarks.ids, stored.landmarks.ids)
     np.testing.assert_array_equal(saved.hits[kept], stored.hits)
+    for one in (saved, stored):
+        assert one.patches is not None
+        assert_same_bits(one.patches, own_patches(one.landmarks.ids))
 
 
 def test_a_resumed_drive_ends_with_the_same_bytes(
@@ -192,7 +211,8 @@ def test_a_resumed_drive_ends_with_the_same_bytes(
     pipeline.places.restore(part(driven.half, "places"), log)
     submaps_of(pipeline).restore(part(driven.half, "submaps"))
     assert not (folder / "000999.fgmap").exists()
-    drive(pipeline, frames(driven.poses, HALF))
+    for found in frames(driven.poses, HALF):
+        step(pipeline, found)
     ended, meant = states(pipeline), states(driven.pipeline)
     assert ended.keys() == meant.keys()
     for name, array in meant.items():

@@ -12,7 +12,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import LandmarkAppearances
+from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places import map_alignment
@@ -210,6 +210,23 @@ def test_views_turn_with_their_map(world: World) -> None:
     merged = merge_maps(a, b, found)
     added = merged.appearances.of(merged.landmarks.ids[len(a) :])
     np.testing.assert_allclose(added.direction - found.aTb[:3, 2], 0.0, atol=1e-12)
+
+
+def test_patches_are_the_first_map_s_and_those_of_the_rest(world: World) -> None:
+    """A map that has none adds landmarks without."""
+    a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(100, 300), BTA)
+    found = align(a, b)
+    assert merge_maps(a, b, found).patches is None
+    grey = np.arange(len(b), dtype=np.uint8)[:, None] * np.ones(CUT_PIXELS, np.uint8)
+    patched = replace(b, patches=LandmarkPatches(grey, 1.0 + np.arange(len(b))))
+    added = merge_maps(a, patched, found).patches
+    rest = np.setdiff1d(np.arange(len(b)), found.pairs[:, 1])
+    assert added is not None
+    assert added.distances.tolist() == [0.0] * len(a) + (1.0 + rest).tolist()
+    np.testing.assert_array_equal(added.grey[len(a) :], grey[rest])
+    first = merge_maps(replace(a, patches=LandmarkPatches.none(len(a))), patched, found).patches
+    assert first is not None
+    np.testing.assert_array_equal(first.grey, added.grey)
 
 
 def test_overlapping_drives_keep_the_first_trajectory(world: World) -> None:
