@@ -12,7 +12,9 @@ import fgslam as fg
 from benchmarks.evidence import euroc_raw, lenses
 from benchmarks.evidence.lens_views import loaded, raw_cameras
 from fgslam.core.arrays import FloatArray
+from fgslam.core.geometry import se3_exp
 from fgslam.core.trajectories import Trajectory, read_covariances
+from fgslam.evaluation.trajectory import moved
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.lab_settings import LabRigSettings
 
@@ -52,13 +54,27 @@ SHORT = ("dataset.stop=120",)
 
 @pytest.mark.slow
 @pytest.mark.data
-@pytest.mark.parametrize("estimator", ["landmark_kalman"])  # iSAM2 misses it: 1.85 against 0.96 cm
-def test_raw_images_of_euroc_are_no_worse_than_rectified_ones(
-    shared_data: Path, estimator: str
-) -> None:
-    half, raw = (euroc_raw.of_set(shared_data, 0, kind, [estimator])[0] for kind in (False, True))
-    assert raw[1] >= half[1]
-    assert raw[0] <= 1.1 * half[0]
+def test_raw_images_of_euroc_are_no_worse_than_rectified_ones(shared_data: Path) -> None:
+    """The drive of iSAM2 is 1 % too short by the raw images, 0.3 % by the others, 0.8 % by both as
+    their calibration is stated: without its scale it is held to the bound, as the filter is with.
+    """
+    half, raw = (
+        euroc_raw.of_set(shared_data, 0, kind, ["landmark_kalman", "isam2"])
+        for kind in (False, True)
+    )
+    assert (raw[:, 1] >= half[:, 1]).all()
+    assert raw[0, 0] <= 1.1 * half[0, 0]
+    assert raw[1, 3] <= 1.1 * half[1, 3]
+
+
+def test_scale_is_told_from_the_rest() -> None:
+    rng = np.random.default_rng(2)
+    truth = np.array([se3_exp(pose) for pose in rng.normal(size=(50, 6))])
+    other = moved(se3_exp(np.array([0.3, -1.0, 0.2, 4.0, 5.0, 6.0])), truth)
+    other[:, :3, 3] = 0.99 * other[:, :3, 3] + 0.01 * rng.normal(size=(50, 3))
+    scale, rest = euroc_raw.without_scale(other, truth)
+    assert scale == pytest.approx(1.0 / 0.99, abs=3e-3)
+    assert rest == pytest.approx(0.01 * np.sqrt(3.0), rel=0.15)
 
 
 def extent_m(positions: FloatArray) -> float:
