@@ -6,7 +6,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,15 @@ class FoundFeatures:
     sequence: Sequence
     frames: list[FeatureFrame]
 
+    def whole(self, frame: FeatureFrame) -> FeatureFrame:
+        """A frame with the features of all its images that are asked for them."""
+        return frame if frame.frame is None else self.frames[frame.i]
+
+    def reference(self, frame: FeatureFrame) -> FeatureFrame:
+        """A frame with the features of its reference image alone."""
+        known = self.whole(frame)
+        return replace(known, features=known.features[:1])
+
 
 def find_features(config: ExperimentConfig) -> FoundFeatures:
     """Opens the recording and finds the features of all frames."""
@@ -128,8 +137,10 @@ def make_system(config: ExperimentConfig, sequence: Sequence) -> SlamPipeline:
 
 
 def process(found: FoundFeatures, pipeline: SlamPipeline) -> Iterator[FrameReport]:
-    """The SLAM loop over features found before."""
-    for frame in found.frames:
+    """The SLAM loop over features found before; it is given those that a run would find."""
+    pipeline.describe, pipeline.describe_reference = found.whole, found.reference
+    for whole in found.frames:
+        frame = replace(whole, features=())
         timestamp = float(found.sequence.timestamps[frame.i])
         body = body_motion(found.sequence, frame.i, pipeline.motion)
         yield pipeline.process(frame, frame.i, timestamp, body)

@@ -161,6 +161,7 @@ def load_rig(
     """
     asked = asked_view(fov_deg, view)
     require_options(size, unit_m)
+    _require_cameras(cameras)
     file = as_path(path, CalibrationError)
     file2 = None if path2 is None else as_path(path2, CalibrationError, "path2")
     own = _own_rectified(file, cameras, unit_m) if file2 is None else None
@@ -276,6 +277,13 @@ def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> C
     return replace(calibration, cameras=chosen, view=None)
 
 
+def _require_cameras(cameras: object) -> None:
+    if cameras is not None and not isinstance(cameras, list | tuple | range):
+        raise CalibrationError(
+            f"cameras is a {type(cameras).__name__}; give a list of two or three numbers, or None"
+        )
+
+
 def require_options(size: object, unit_m: object) -> None:
     """Raises CalibrationError where what is said beside a file cannot be meant."""
     pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
@@ -288,8 +296,9 @@ def require_options(size: object, unit_m: object) -> None:
 
 def asked_view(fov_deg: object, kind: object) -> ViewAsked:
     """The view that is asked for. Raises CalibrationError where there is none of that kind."""
-    if kind not in get_args(RigView):
-        raise CalibrationError(f"view is {kind!r}; give {' or '.join(get_args(RigView))}")
+    if not isinstance(kind, str) or kind not in get_args(RigView):
+        given = repr(kind) if isinstance(kind, str) else f"a {type(kind).__name__}"
+        raise CalibrationError(f"view is {given}; give {' or '.join(get_args(RigView))}")
     if fov_deg is None:
         return ViewAsked(None, kind)  # type: ignore[arg-type]
     cylinder = kind == "cylindrical"

@@ -46,6 +46,13 @@ def later_time(time: object, last: float | None, what: str, error: type[FgslamEr
     return seconds
 
 
+def require_flag(value: object, what: str) -> None:
+    """Raises ConfigError for what is neither true nor false."""
+    if not isinstance(value, bool | np.bool_):
+        given = f"a {type(value).__name__}" if hasattr(value, "__len__") else repr(value)
+        raise ConfigError(f"{what} is {given}; give True or False")
+
+
 def require_seed(seed: object, where: str) -> None:
     """Raises ConfigError where a random generator cannot begin with it."""
     if not isinstance(seed, Integral) or isinstance(seed, bool) or seed < 0:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.checks import require_flag
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.quantiles import student_quantile
@@ -86,7 +87,7 @@ def compare(
 
     Raises:
         ConfigError: one of the answers is none, or they have no names, or the truth is no
-            trajectory.
+            trajectory, or ``full`` is neither true nor false.
     """
     require_named(answers, truth)
     if not isinstance(landmark_truth, LandmarkTruth | None):
@@ -94,6 +95,7 @@ def compare(
             f"the landmarks' truth is a {type(landmark_truth).__name__}; give a LandmarkTruth, or "
             "None"
         )
+    require_flag(full, "full")
     known = Truth(truth, landmark_truth)
     table = _frame({name: _judged(name, one, known) for name, one in answers.items()})
     if full:

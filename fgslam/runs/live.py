@@ -13,6 +13,7 @@ import yaml
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.core import __version__
+from fgslam.core.checks import require_flag
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.saved_map import load_map
 from fgslam.core.sensors import CameraRig
@@ -113,6 +114,7 @@ class Slam(Session):
                 the seed is negative, or a setting of the front-end is not known or not usable.
             MapError: other cameras made the map, or it is empty.
         """
+        require_flag(extend_map, "extend_map")
         if isinstance(start_map, Map):
             start_map = MapStart(start_map.saved, MapSettings(extend=extend_map))
         elif start_map is None and not extend_map:

@@ -95,7 +95,10 @@ def read_calibration(given: tuple[Path, Path | None]) -> Pair:
 def _said(chain: dict[str, dict[str, Any]]) -> np.ndarray[Any, Any]:
     cameras = (chain["cam0"], chain["cam1"])
     each = [[*c["intrinsics"], *c["distortion_coeffs"], *c["resolution"]] for c in cameras]
-    return np.concatenate([*each, np.ravel(chain["cam1"]["T_cn_cnm1"])])
+    motion = np.array(chain["cam1"]["T_cn_cnm1"], np.float64)
+    if not motion[3].any():  # of tools that never look at it: means the same
+        motion[3, 3] = 1.0
+    return np.concatenate([*each, motion.ravel()])
 
 
 def _found(calibration: Calibration) -> np.ndarray[Any, Any]:

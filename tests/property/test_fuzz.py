@@ -29,7 +29,10 @@ def test_hundreds_of_odd_inputs_are_read_or_refused_in_one_line(kind: Kind) -> N
     assert faults(kind, range(1000, 1400))[1] == []
 
 
-MENDED = [("bag", 17), ("bag", 1178), ("bag", 1358), ("omni_camera", 39), ("omni_camera", 1401)]
+MENDED = [
+    ("bag", 17), ("bag", 1178), ("bag", 1358), ("bag", 7001015), ("omni_camera", 39),
+    ("omni_camera", 1401), ("calibration_digit", 7000755),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "seed"), MENDED)

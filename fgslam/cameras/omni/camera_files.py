@@ -36,7 +36,7 @@ from fgslam.cameras.omni.settings import (
 )
 from fgslam.cameras.raw_cameras import RawCamera
 from fgslam.core.errors import CalibrationError, shortened
-from fgslam.core.files import read_lines
+from fgslam.core.files import as_path, read_lines
 from fgslam.core.settings import make_settings
 from fgslam.core.yaml_text import read_yaml
 
@@ -144,7 +144,7 @@ def make_camera(
 
 def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
     """Settings in or for a file, and its folder; of a bare kind its defaults."""
-    path = Path(source)
+    path = as_path(source, CalibrationError, "camera")
     if str(source) in _KINDS and not path.is_file():
         return _KINDS[str(source)](), None
     if not path.is_file():

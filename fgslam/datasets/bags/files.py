@@ -59,6 +59,8 @@ class BagFiles:
         counts: dict[tuple[str, str], int] = {}
         for each in self._reader.connections:
             key = (each.topic, each.msgtype)
+            if None in key:  # a damaged table of topics
+                continue
             counts[key] = counts.get(key, 0) + each.msgcount
         self.topics = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
 

@@ -16,6 +16,7 @@ from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.estimates import Prediction
 from fgslam.errors import (
+    CalibrationError,
     ConfigError,
     DatasetError,
     EstimatorError,
@@ -243,6 +244,10 @@ def as_any(value: object) -> Any:
     return value
 
 
+def _rig() -> fg.StereoRig:
+    return fg.StereoRig(width=320, height=240, fx=200.0, fy=200.0, cx=159.5, cy=119.5, baseline=0.1)
+
+
 def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
     return {
         "experiment": (ConfigError, "comes with fgslam", lambda _: fg.run("lab_lop")),
@@ -278,6 +283,31 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
             ConfigError,
             "estimator = 'ekf2' is not usable: give a group of keys, .*; kinds: odometry, ",
             lambda p: fg.run("lab_loop", p, {"estimator": "ekf2"}),
+        ),
+        "no flag": (
+            ConfigError,
+            "extend_map is a ndarray; give True or False",
+            lambda _: fg.Slam(_rig(), extend_map=as_any(np.zeros(3))),
+        ),
+        "no columns": (
+            ConfigError,
+            "full is 2; give True or False",
+            lambda _: fg.compare({}, full=as_any(2)),
+        ),
+        "one camera": (
+            CalibrationError,
+            "cameras is a int; give a list",
+            lambda p: fg.load_rig(p / "calib.json", cameras=as_any(0)),
+        ),
+        "no view": (
+            CalibrationError,
+            "view is a ndarray; give perspective or cylindrical",
+            lambda p: fg.load_rig(p / "calib.json", view=as_any(np.zeros((0, 0)))),
+        ),
+        "long name": (
+            CalibrationError,
+            "camera: x+.*: the name is too long",
+            lambda _: fg.load_camera("x" * 5000),
         ),
         "begins in a map": (
             ConfigError,
