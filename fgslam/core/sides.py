@@ -17,7 +17,8 @@ _LETTER = re.compile(
 _CAMERA_NUMBER = re.compile(
     r"(?:(?<=cam)|(?<=camera)|(?<=infra)|(?<=infrared))[_-]?(\d+)(?!\d)", re.IGNORECASE
 )
-_NUMBER = re.compile(r"(\d+)")
+_NUMBER = re.compile(r"(?<!\d)(\d{1,3})(?!\d)")
+"""Of a camera. Longer ones are counters, of clips (GX010001) or pictures."""
 _NO_VIEW = re.compile(
     r"depth|dispar|theora|segment|semantic"
     r"|(?<![a-z])(?:mask|debug|label|heat|thumb|normals|(?:disp|flow)(?![a-z]))",

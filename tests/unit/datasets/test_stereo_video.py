@@ -20,7 +20,7 @@ from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import pose
-from fgslam.core.sides import camera_trio
+from fgslam.core.sides import camera_pairs, camera_trio
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni
@@ -309,6 +309,21 @@ def test_three_clips_of_one_camera_are_no_three_cameras(
     three_films(tmp_path, names)
     with pytest.raises(DatasetError, match="neither one film nor one of a left and one of a right"):
         opened(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("names", "pairs"),
+    [
+        (("GX010001", "GX010002"), ()),
+        (("20240101_120000", "20240101_120001"), ()),
+        (("cam0", "cam1"), (("cam0", "cam1"),)),
+        (("video_02", "video_03"), (("video_02", "video_03"),)),
+    ],
+)
+def test_counters_of_clips_tell_no_side(
+    names: tuple[str, ...], pairs: tuple[tuple[str, str], ...]
+) -> None:
+    assert camera_pairs(names) == pairs
 
 
 @pytest.mark.parametrize(
