@@ -109,20 +109,6 @@ def test_of_a_pair_the_turn_of_one_against_the_other_is_said(
     assert "against the right one (or that one by the opposite)" in line
 
 
-@pytest.mark.parametrize("apparent_deg", [0.2, 0.3])
-def test_nothing_is_said_of_cameras_out_of_step_on_a_pitching_robot(
-    lab: tuple[CameraRig, list[Images]], apparent_deg: float
-) -> None:
-    rig, frames = lab
-    pair, lag, rate = dataclasses.replace(rig, vertical_baseline=None), 0.4, 2.0 * np.pi / 60.0
-    watch, size_deg = CameraWatch(pair), apparent_deg / (lag * rate)
-    for k, images in enumerate(frames):
-        pitch = [size_deg * np.sin(rate * t) * np.eye(3)[0] for t in (k, k - lag)]
-        shown = [turned(rig, *one) for one in zip(images, pitch, strict=False)]
-        assert watch.look(tuple(shown)) == ""
-    assert watch.remarks() == ()
-
-
 def test_nothing_is_said_of_a_sound_drive(lab: tuple[CameraRig, list[Images]]) -> None:
     assert said_of(*lab, 1, np.zeros(3)) == []
 
