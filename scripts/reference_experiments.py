@@ -21,8 +21,8 @@ REASONS = {
     "odometry.translation_sigma_fraction": "the data: truth and stated noise stand in for odometry",
     "odometry.rotation_sigma_deg": "the data: as above",
     "frontend.ego_motion.dof": "the robot: it drives on a flat floor",
-    "frontend.tracking": "the subject: how long landmarks last, which `hybrid` counts on key "
-    "frames alone",
+    "frontend.tracking": "the subject: how long landmarks last, which few key frames of `hybrid` "
+    "would decide",
     "frontend.database.permanence": "the subject: landmarks that last",
     "frontend.database.viewpoints": "the subject: landmarks seen from several sides",
     "frontend.database.forget_unconfirmed_after": "the subject: a passer-by is forgotten",

@@ -346,13 +346,17 @@ def _digest_of(name: str, array: np.ndarray[Any, Any]) -> bytes:
 def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str) -> None:
     """Raises MapError unless all arrays are there, of the right type and size, and fit."""
     expected = of_rows(4, {"rig_bTc": ("f", (4,))})
+    counts = header["counts"]
     for counted, items in _ITEMS.items():
-        if counted not in _SINCE or counted in header["counts"]:
-            expected |= of_rows(header["counts"].get(counted), items)
+        if counted not in _SINCE or _holds(header, arrays, counted):
+            expected |= of_rows(counts.get("landmarks" if counted == "patches" else counted), items)
     FILE.require(arrays, expected, where)
     ids, views = arrays["landmark_id"], arrays["view_landmark"]
     finite = ["rig_bTc", "landmark_position", "landmark_covariance", "pose", "pose_time"]
-    finite += [_PATCH_DISTANCE] if _PATCH_DISTANCE in arrays else []
+    if _PATCH_DISTANCE in arrays:
+        finite.append(_PATCH_DISTANCE)
+        if (arrays[_PATCH_DISTANCE] < 0.0).any():
+            raise MapError(f"{where}: array {_PATCH_DISTANCE} is negative; make the map again")
     for name, sound in {
         "landmark_id": bool((np.diff(ids) > 0).all()),
         "view_landmark": bool((np.diff(views) >= 0).all() and np.isin(views, ids).all()),
@@ -364,6 +368,12 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
     require_finite(FILE, arrays, finite, where)
     covariances = arrays["landmark_covariance"]
     require_covariances(FILE, "landmark_covariance", covariances, where, definite=False)
+
+
+def _holds(header: dict[str, Any], arrays: StateArrays, part: str) -> bool:
+    """Whether a map has what came with a later version; of its own version it must have it."""
+    newest = header["version"] == _SINCE[part]
+    return newest or part in header["counts"] or not _ITEMS[part].keys().isdisjoint(arrays)
 
 
 def _rig_values(rig: CameraRig) -> dict[str, Any]:

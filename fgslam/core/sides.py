@@ -83,9 +83,9 @@ def _readings(name: str, any_number: bool) -> Iterable[tuple[tuple[str, str], in
         for match in pattern.finditer(name):
             side = 0 if match[1][0] in "lL" else 1
             yield (pattern.pattern, _without(name, match)), side
-    number = _NUMBER if any_number else _CAMERA_NUMBER
-    for match in number.finditer(name):
-        yield (number.pattern, _without(name, match)), int(match[1])
+    for number in (_CAMERA_NUMBER, *([_NUMBER] if any_number else [])):
+        for match in number.finditer(name):
+            yield (number.pattern, _without(name, match)), int(match[1])
 
 
 def _without(name: str, match: re.Match[str]) -> str:

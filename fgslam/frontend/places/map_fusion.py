@@ -59,7 +59,7 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
         about={"drives": [*a.about.get("drives", ()), *b.about.get("drives", ())]},
         session={},
         evidence=_all_evidence(a, b),
-        patches=_patches(a, b, rest),
+        patches=_patches(a, b, alignment.pairs, rest),
     )
 
 
@@ -86,12 +86,15 @@ def adds_nothing(b: SavedMap, a: SavedMap) -> bool:
     return b.evidence is not None and shared_frames(a, b) == len(b.evidence)
 
 
-def _patches(a: SavedMap, b: SavedMap, rest: IntArray) -> LandmarkPatches | None:
-    """Those of a, and of the others of b."""
+def _patches(a: SavedMap, b: SavedMap, pairs: IntArray, rest: IntArray) -> LandmarkPatches | None:
+    """Those of a, or where it has none of the same landmark of b, then those of b alone."""
     if a.patches is None and b.patches is None:
         return None
-    mine = a.patches or LandmarkPatches.none(len(a))
-    return mine.join((b.patches or LandmarkPatches.none(len(b))).select(rest))
+    ours, theirs = (one.patches or LandmarkPatches.none(len(one)) for one in (a, b))
+    mine, yours = pairs[ours.distances[pairs[:, 0]] == 0.0].T
+    grey, distances = ours.grey.copy(), ours.distances.copy()
+    grey[mine], distances[mine] = theirs.grey[yours], theirs.distances[yours]
+    return LandmarkPatches(grey, distances).join(theirs.select(rest))
 
 
 def _all_evidence(a: SavedMap, b: SavedMap) -> IntArray | None:

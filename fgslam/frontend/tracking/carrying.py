@@ -43,6 +43,7 @@ from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 _MIN_CORRELATION = 0.65  # of a patch with its first look, gain and offset taken out
 _FARTHEST_PX = 2.0  # between what the search found and the patch: beyond, it is another thing
 _MARGIN_PX = 4.0  # of the patch's middle to the border of the reference image
+_WHOLE_PX = 6.0  # of a patch's middle: what lies beyond has a fifteenth of its weight
 _PYRAMID_LEVELS = 2
 _SEARCH = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
 _MIN_EIGENVALUE = 1e-4
@@ -128,10 +129,16 @@ class Begun(Rows):
         every = Begun(points, patches.grey.astype(np.float32), growth, known)
         return every.select(np.isfinite(growth) & (growth > 0.0))
 
-    @property
-    def patches(self) -> LandmarkPatches:
-        """As they are kept."""
-        return LandmarkPatches(np.rint(self.cut).astype(np.uint8), self.growth * self.points.depths)
+    def patches(self, image: Image) -> LandmarkPatches:
+        """As they are kept; none of those that reach beyond the border of the image by far.
+
+        What is repeated there would pull what is found again to the image's side.
+        """
+        last = np.array([image.shape[1], image.shape[0]]) - 1.0
+        places = self.points.places
+        whole = ((places >= _WHOLE_PX) & (places <= last - _WHOLE_PX)).all(axis=1)
+        grey = np.rint(self.cut).astype(np.uint8)
+        return LandmarkPatches(grey, np.where(whole, self.growth * self.points.depths, 0.0))
 
 
 class LandmarkCarrier:
@@ -259,17 +266,15 @@ class LandmarkCarrier:
         Those known from before are placed by their own patch, not by SIFT.
         """
         patches = anchor_at(fresh.cut, PATCH_PX, GREY_NOISE, DEFORMATION)
-        patches = dataclasses.replace(patches, maps=patches.maps * fresh.growth[:, None, None])
-        points = fresh.points
-        at = points.places
-        deformed, places, correlation = _aligned(patches, last, at, _FIRST_ALIGNMENTS)
-        alike = (correlation >= _MIN_CORRELATION) & self._inside(places, _MARGIN_PX)
-        alike &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
-        known = fresh.known
-        maps = np.where(known[:, None, None], deformed.maps, patches.maps)
-        places = np.where(known[:, None], places, at)
+        known, points = fresh.known, fresh.points
+        old, at = patches.select(known), points.places[known]
+        old = dataclasses.replace(old, maps=old.maps * fresh.growth[known, None, None])
+        old, found, correlation = _aligned(old, last, at, _FIRST_ALIGNMENTS)
+        alike = (correlation >= _MIN_CORRELATION) & self._inside(found, _MARGIN_PX)
+        maps, places, keep = patches.maps.copy(), points.places.copy(), ~known
+        maps[known], places[known] = old.maps, found
+        keep[known] = alike & (np.linalg.norm(found - at, axis=1) < _FARTHEST_PX)
         points = dataclasses.replace(points, places=places)
-        keep = alike | ~known
         return dataclasses.replace(patches, maps=maps).select(keep), points.select(keep)
 
     def _in_reference(

@@ -31,6 +31,9 @@ _VIEW_ANGLE_DEG = 20.0
 """A direction farther than this from every view becomes a view of its own: SIFT descriptors match
 up to about this angle (docs/concepts/maps.md)."""
 
+_LEAST_LOOKS = 4
+"""Of key frames, until what they miss is gone."""
+
 
 class LandmarkDatabase(LandmarkTable):
     """Landmark table updated frame by frame: hits n, misses m, consecutive misses l."""
@@ -123,15 +126,21 @@ class LandmarkDatabase(LandmarkTable):
             counts = self.hits[rows], self.misses[rows]
             self.permanent[rows] |= self._reliable(*counts, permanence)
 
-    def record_carried(self, ids: IntArray) -> None:
-        """A whole frame between key frames: landmarks hit whose looks nobody has described anew."""
+    def record_carried(self, ids: IntArray, not_carried: IntArray) -> None:
+        """A whole frame between key frames.
+
+        Args:
+            ids: landmarks hit, whose looks nobody has described anew.
+            not_carried: those expected well in view that nobody looked for.
+        """
         self._hit(ids)
+        self._columns["unlooked"][self.rows(not_carried)] += 1
         self._frame += 1
 
     def record_misses(self, ids: IntArray) -> None:
-        """Type II: expected in view and not matched, by a frame that stands for those before it."""
+        """Type II: expected in view and not matched, in this frame and those that it stands for."""
         rows = self.rows(ids)
-        frames = self._frames_unseen(rows)
+        frames = self._stood_for(rows, self._settings.prune_after_misses)
         self.missed[rows] += frames
         self.misses[rows] += frames
 
@@ -161,8 +170,9 @@ class LandmarkDatabase(LandmarkTable):
         against = seen_past(places, seen) | np.isin(ids, rejected)
         ids = ids[against]
         rows = self.rows(ids)
-        self._columns["contradicted"][rows] += self._frames_unseen(rows)
-        self.demote(ids[self._columns["contradicted"][rows] >= permanence.contradicted_after])
+        enough = permanence.contradicted_after
+        self._columns["contradicted"][rows] += self._stood_for(rows, enough)
+        self.demote(ids[self._columns["contradicted"][rows] >= enough])
 
     def demote(self, ids: IntArray) -> None:
         """Permanent landmarks become ordinary ones, which go once they have been missed for long.
@@ -198,7 +208,7 @@ class LandmarkDatabase(LandmarkTable):
         if forget_after is not None:
             gone |= ~self.valid & (self._frame >= self._columns["seen"] + forget_after)
         gone &= ~self.permanent
-        self._looked = self._frame
+        self._columns["unlooked"][:] = 0
         self._frame += 1
         pruned = self.ids[gone]
         self._remove(gone)
@@ -206,14 +216,14 @@ class LandmarkDatabase(LandmarkTable):
 
     # ----------------------------------------------------------------------------------------
 
-    def _frames_unseen(self, rows: IntArray) -> IntArray:
-        """(k,) frames that a miss in this one stands for: since the last hit, or the last look.
+    def _stood_for(self, rows: IntArray, enough: int) -> IntArray:
+        """(k,) frames that a miss in this one counts: this, and those before that did not look.
 
-        One where every frame looks for landmarks. Between key frames those that are carried are
-        hit in each frame; the others are looked for by the next key frame only.
+        One where every frame looks for landmarks. Several looks must decide, whatever the gap
+        between key frames: one adds at most a part of the frames that are ``enough``.
         """
-        since = np.maximum(self._columns["seen"][rows], self._looked)
-        return np.asarray(np.maximum(self._frame - since, 1))
+        most = -(-enough // _LEAST_LOOKS)
+        return np.asarray(np.minimum(1 + self._columns["unlooked"][rows], most))
 
     def _hit(self, ids: IntArray) -> IntArray:
         """Counts a hit; returns the rows."""
@@ -221,6 +231,7 @@ class LandmarkDatabase(LandmarkTable):
         self.missed[rows] = 0
         self._columns["contradicted"][rows] = 0
         self._columns["seen"][rows] = self._frame
+        self._columns["unlooked"][rows] = 0
         self.hits[rows] += 1
         return rows
 

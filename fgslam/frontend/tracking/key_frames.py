@@ -151,7 +151,7 @@ class KeyFrameTracker:
         """
         database, old = self._tracker.database, points.select(~new)
         begun = Begun.new(image, points.select(new))
-        database.keep_patches(begun.points.ids, begun.patches)
+        database.keep_patches(begun.points.ids, begun.patches(image))
         begun = begun.join(Begun.again(old, database.patches(old.ids)))
         return begun.select(np.argsort(begun.points.ids))
 

@@ -18,11 +18,24 @@ from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.tracking.views import Places, ViewPool, Views
 
-_COUNTS = ("hits", "misses", "missed", "seen", "contradicted")
+_COUNTS = ("hits", "misses", "missed", "unlooked", "seen", "contradicted")
 _PATCH = ("patch", "patch_distance")
 _HELD = ("ids", "colour", "permanent", *_PATCH, *_COUNTS)
 _PLACES = "places"
 _VIEWS = ("size", "orientation", "descriptors", "direction", "used")
+
+
+def _no_columns(max_views: int, patch_pixels: int) -> GrowingColumns:
+    count = np.empty(0, np.int64)
+    return GrowingColumns(
+        ids=count,
+        colour=np.empty(0, np.uint8),
+        permanent=np.empty(0, np.bool_),
+        places=np.empty((0, max_views), np.int32),
+        patch=np.empty((0, patch_pixels), np.uint8),
+        patch_distance=np.empty(0),
+        **dict.fromkeys(_COUNTS, count),
+    )
 
 
 class LandmarkTable:
@@ -39,17 +52,7 @@ class LandmarkTable:
         self._pool = ViewPool(max_views, view_angle)
         self._next_id = 0
         self._frame = 0
-        self._looked = -1  # the last frame that looked for all landmarks in view
-        count = np.empty(0, np.int64)
-        self._columns = GrowingColumns(
-            ids=count,
-            colour=np.empty(0, np.uint8),
-            permanent=np.empty(0, np.bool_),
-            places=np.empty((0, max_views), np.int32),
-            patch=np.empty((0, patch_pixels), np.uint8),
-            patch_distance=np.empty(0),
-            **dict.fromkeys(_COUNTS, count),
-        )
+        self._columns = _no_columns(max_views, patch_pixels)
 
     def __len__(self) -> int:
         return len(self._columns)
@@ -160,7 +163,11 @@ class LandmarkTable:
             np.add.at(self._columns[name], to_rows, self._columns[name][from_rows])
         seen = self._columns["seen"]
         np.maximum.at(seen, to_rows, seen[from_rows])
-        for name in ("missed", "contradicted"):
+        lacking = self._columns["patch_distance"][to_rows] == 0.0
+        for name in _PATCH:
+            column = self._columns[name]
+            column[to_rows[lacking]] = column[from_rows[lacking]]
+        for name in ("missed", "unlooked", "contradicted"):
             np.minimum.at(self._columns[name], to_rows, self._columns[name][from_rows])
         np.logical_or.at(self.permanent, to_rows, self.permanent[from_rows])
         for row, into in zip(from_rows.tolist(), to_rows.tolist(), strict=True):
@@ -193,7 +200,7 @@ class LandmarkTable:
             direction=appearances.direction.astype(np.float32),
             used=np.arange(len(appearances)) - last,
         )
-        self._clear()
+        self._clear(0 if saved.patches is None else saved.patches.grey.shape[1])
         self._columns.append(
             {
                 "ids": ids,
@@ -203,6 +210,7 @@ class LandmarkTable:
                 "hits": saved.hits,
                 "misses": saved.misses,
                 "missed": zeros,
+                "unlooked": zeros,
                 "seen": zeros,
                 "contradicted": zeros,
                 **self._as_columns(saved.patches, len(ids)),
@@ -210,7 +218,6 @@ class LandmarkTable:
         )
         self._next_id = int(ids[-1]) + 1 if len(ids) else 0
         self._frame = 0
-        self._looked = -1
 
     def unseen_for(self, frames: int) -> BoolArray:
         """(n,) landmarks that none of the last ``frames`` frames matched."""
@@ -248,7 +255,6 @@ class LandmarkTable:
         out |= {name: getattr(views, name) for name in _VIEWS}
         out["next_id"] = np.array(self._next_id)
         out["frame"] = np.array(self._frame)
-        out["looked"] = np.array(self._looked)
         if self._pool.several:
             out["view_counts"] = np.asarray((self._places >= 0).sum(axis=1))
         return out
@@ -256,12 +262,11 @@ class LandmarkTable:
     def restore(self, state: StateArrays) -> None:
         """Continues from :meth:`state`."""
         counts = state["view_counts"] if self._pool.several else np.ones(len(state["ids"]), int)
-        self._clear()
+        self._clear(state["patch"].shape[1])
         places = self._pool.load(counts, Views(**{name: state[name] for name in _VIEWS}))
         self._columns.restore(state | {_PLACES: places})
         self._next_id = int(state["next_id"])
         self._frame = int(state["frame"])
-        self._looked = int(state["looked"])
 
     def _append(self, ids: IntArray, views: Views, colour: ByteArray) -> None:
         """New landmarks (k,), seen once, in this frame."""
@@ -275,6 +280,7 @@ class LandmarkTable:
                 "hits": zeros + 1,
                 "misses": zeros,
                 "missed": zeros,
+                "unlooked": zeros,
                 "seen": zeros + self._frame,
                 "contradicted": zeros,
                 **self._as_columns(None, len(ids)),
@@ -336,5 +342,11 @@ class LandmarkTable:
             self._pool.release(self._places[gone])
             self._columns.drop(gone)
 
-    def _clear(self) -> None:
+    def _clear(self, patch_pixels: int) -> None:
+        """No landmark; room for patches of so many pixels, at least, whoever began in them.
+
+        A session that carries none keeps those of its map for the next one.
+        """
         self._remove(np.ones(len(self), np.bool_))
+        if patch_pixels > self.patch_pixels:
+            self._columns = _no_columns(self._places.shape[1], patch_pixels)

@@ -253,7 +253,10 @@ class LandmarkTracker:
         matched = _matched(tracked.expected, tracked.matches, features)
         inliers, none = tracked.ego_motion.inliers, np.empty(0, np.int64)
         if not self.keeps_map:
-            self.database.record_carried(matched.ids[inliers])
+            hit = np.zeros(len(tracked.expected), np.bool_)
+            hit[tracked.matches.landmarks[inliers]] = True
+            not_carried = self.database.missing(tracked.expected, hit)
+            self.database.record_carried(matched.ids[inliers], not_carried)
         return Association(matched, ~inliers, none, none, tracked.matches.features)
 
     def _upright(self, features: StereoFeatures, wTc: FloatArray) -> StereoFeatures:

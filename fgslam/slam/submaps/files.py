@@ -20,7 +20,7 @@ from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
 
 _OF_ESTIMATOR = ("counts", "homes", "lasts", "frames", "doubt_gain", "doubt_information")
-_OF_DATABASE = ("missed", "seen", "contradicted", "view_counts", "used")
+_OF_DATABASE = ("missed", "unlooked", "seen", "contradicted", "view_counts", "used")
 _TRACK = "track/"
 FILES = "[0-9]" * 6 + ".fgmap"
 

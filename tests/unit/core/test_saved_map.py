@@ -128,6 +128,45 @@ def test_own_patches_come_back_to_the_bit(
         )
 
 
+def test_patches_that_do_not_fit_are_refused(saved: SavedMap, tmp_path: Path) -> None:
+    grey = np.zeros((len(saved), CUT_PIXELS), np.uint8)
+    carried = replace(saved, patches=LandmarkPatches(grey, np.ones(len(saved))))
+
+    def fewer(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        header["counts"]["patches"] = 5
+        for name in ("landmark_patch", "landmark_patch_distance"):
+            arrays[name] = arrays[name][:5]
+
+    def alone(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        del header["counts"]["patches"], arrays["landmark_patch_distance"]
+
+    def negative(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        arrays["landmark_patch_distance"] = -arrays["landmark_patch_distance"]
+
+    def none(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        for name in ("landmark_patch", "landmark_patch_distance"):
+            del arrays[name]
+
+    for change in (fewer, alone, negative, none):
+        save_map(carried, tmp_path / "m.fgmap")
+        with pytest.raises(MapError, match="landmark_patch"):
+            load_map(rewritten(tmp_path / "m.fgmap", change))
+
+
+def test_evidence_that_does_not_fit_its_version_is_refused(saved: SavedMap, tmp_path: Path) -> None:
+    def none(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        del header["counts"]["evidence"], arrays["evidence_frame"]
+
+    def words(header: dict[str, Any], arrays: dict[str, Any]) -> None:
+        del header["counts"]["evidence"]
+        arrays["evidence_frame"] = np.array(["a", "b"])
+
+    for change in (none, words):
+        save_map(replace(saved, evidence=np.array([3, 8])), tmp_path / "m.fgmap")
+        with pytest.raises(MapError, match="evidence_frame"):
+            load_map(rewritten(tmp_path / "m.fgmap", change))
+
+
 def test_a_file_is_of_the_oldest_version_that_has_what_it_holds(
     saved: SavedMap, tmp_path: Path
 ) -> None:

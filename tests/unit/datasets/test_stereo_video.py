@@ -318,6 +318,7 @@ def test_three_clips_of_one_camera_are_no_three_cameras(
         (("20240101_120000", "20240101_120001"), ()),
         (("cam0", "cam1"), (("cam0", "cam1"),)),
         (("video_02", "video_03"), (("video_02", "video_03"),)),
+        (("cam_0001", "cam_0002"), (("cam_0001", "cam_0002"),)),
     ],
 )
 def test_counters_of_clips_tell_no_side(

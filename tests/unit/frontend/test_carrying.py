@@ -8,7 +8,7 @@ import pytest
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import PATCH_PX, LandmarkPatches
 from fgslam.core.geometry import project
-from fgslam.frontend.features.patches import crowding
+from fgslam.frontend.features.patches import ReferencePatches, crowding
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
@@ -62,13 +62,13 @@ def points(places: FloatArray, place: FloatArray) -> Points:
     return Points(10 + np.arange(len(GRID)), places, np.full(len(GRID), WALL_M - place[2]))
 
 
-def begun_again(place: FloatArray, off: FloatArray) -> LandmarkCarrier:
-    """Landmarks first seen from here that SIFT finds again elsewhere, off (n, 2) pixels."""
-    carrier, now = begun(pictures(HERE), HERE), pictures(place)
-    first = Begun.new(pictures(HERE)[0], points(measurements(HERE)[:, :2], HERE))
-    found = points(measurements(place)[:, :2] + off, place)
-    carrier.begin(now[0], Begun.again(found, first.patches))
-    return carrier
+def found_again(place: FloatArray, off: FloatArray) -> tuple[ReferencePatches, Points]:
+    """What was first seen from here, as SIFT finds it again elsewhere, off (n, 2) pixels."""
+    here, now = pictures(HERE)[0], pictures(place)
+    first = Begun.new(here, points(measurements(HERE)[:, :2], HERE))
+    again = points(measurements(place)[:, :2] + off, place)
+    carrier = begun(now, place)
+    return carrier._found_again(now[0], Begun.again(again, first.patches(here)))
 
 
 def followed(carrier: LandmarkCarrier, place: FloatArray, off: float = 0.0) -> Carried:
@@ -110,30 +110,44 @@ def test_errors_do_not_add_up() -> None:
     assert len(found) >= 25
 
 
-def test_a_landmark_found_again_is_held_to_its_own_patch() -> None:
-    """Half a pixel off where features found it again, nearer by a tenth."""
+@pytest.mark.parametrize(("nearer", "least"), [(0.2, 40), (0.9, 10)])
+def test_a_landmark_found_again_is_placed_by_its_own_patch(nearer: float, least: int) -> None:
+    """Half a pixel off where features found it; larger by a tenth, or nearly twice as large."""
     off = np.random.default_rng(4).normal(0.0, 0.5, (len(GRID), 2))
-    there, next_to = np.array([0.02, 0.0, 0.2]), np.array([0.03, 0.01, 0.22])
-    found = followed(begun_again(there, off), next_to)
-    error = found.features.measurement - measurements(next_to)[found.ids - 10]
-    assert len(found) >= 40
+    place = np.array([0.02, 0.0, nearer])
+    patches, at = found_again(place, off)
+    error = at.places - measurements(place)[at.ids - 10, :2]
+    assert len(at) >= least
     assert error.std(axis=0).max() < 0.12
     assert np.abs(np.median(error, axis=0)).max() < 0.08
+    sizes = np.sqrt(np.linalg.det(patches.maps))
+    np.testing.assert_allclose(np.median(sizes), WALL_M / (WALL_M - nearer), rtol=0.02)
 
 
-def test_what_looks_different_by_now_is_not_carried() -> None:
+def test_what_looks_different_by_now_is_not_found_again() -> None:
+    """Every second one is taken for what lies ten pixels beside it."""
     off = np.where(np.arange(len(GRID))[:, None] % 2, [9.0, -7.0], 0.0)
-    found = followed(begun_again(np.array([0.02, 0.0, 0.0]), off), np.array([0.03, 0.0, 0.0]))
-    assert np.isin(found.ids - 10, np.flatnonzero(off[:, 0] == 0.0)).mean() > 0.9
-    assert len(found) >= 20
+    _, at = found_again(np.array([0.02, 0.0, 0.0]), off)
+    same = np.isin(at.ids - 10, np.flatnonzero(off[:, 0] == 0.0))
+    assert same.sum() >= 25
+    assert (~same).sum() <= 2
 
 
 def test_a_landmark_without_a_patch_is_not_carried() -> None:
     image = pictures(HERE)[0]
     first = Begun.new(image, points(measurements(HERE)[:, :2], HERE))
-    distances = np.where(np.arange(len(GRID)) < 5, first.patches.distances, 0.0)
-    again = Begun.again(first.points, LandmarkPatches(first.patches.grey, distances))
+    patches = first.patches(image)
+    distances = np.where(np.arange(len(GRID)) < 5, patches.distances, 0.0)
+    again = Begun.again(first.points, LandmarkPatches(patches.grey, distances))
     assert again.points.ids.tolist() == [10, 11, 12, 13, 14]
+
+
+def test_no_patch_is_kept_that_reaches_beyond_the_border() -> None:
+    """Its repeated pixels would pull the landmark to the border wherever it is found again."""
+    image = pictures(HERE)[0]
+    at = np.array([[2.0, 100.0], [6.0, 100.0], [160.0, 4.0], [160.0, 120.0], [315.0, 237.0]])
+    begun = Begun.new(image, Points(np.arange(5), at, np.full(5, 2.0)))
+    assert begun.patches(image).distances.tolist() == [0.0, 2.0, 0.0, 2.0, 0.0]
 
 
 def test_what_is_covered_in_one_image_is_not_carried() -> None:

@@ -191,20 +191,34 @@ def test_landmark_ids_may_differ_from_row_numbers() -> None:
     np.testing.assert_array_equal(expected.descriptors, stereo_features(points).descriptors[kept])
 
 
-def test_a_miss_on_a_key_frame_stands_for_the_frames_since_the_last_look() -> None:
-    """Three frames carried, one landmark in the first of them: misses of 3 and of 4 frames."""
-    database = LandmarkDatabase(RIG, DatabaseSettings(prune_after_misses=4), 40.0)
-    points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20)])
-    database.add(stereo_features(points), np.arange(3), np.zeros(3, np.uint8))
+def test_a_miss_on_a_key_frame_counts_the_frames_in_view_that_did_not_look() -> None:
+    """Three frames carry the third of four landmarks; the last is not in their view."""
+    database = LandmarkDatabase(RIG, DatabaseSettings(), 40.0)
+    points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20), (90, 90, 9)])
+    database.add(stereo_features(points), np.arange(4), np.zeros(4, np.uint8))
     database.prune()
-    database.record_carried(np.array([1, 2]))
-    database.record_carried(np.array([2]))
-    database.record_carried(np.array([2]))
-    database.record_misses(np.array([0, 1, 2]))
-    assert database.missed.tolist() == database.misses.tolist() == [4, 3, 1]
-    assert database.prune().tolist() == [0]
+    database.record_carried(np.array([1, 2]), np.array([0]))
+    database.record_carried(np.array([2]), np.array([0, 1]))
+    database.record_carried(np.array([2]), np.array([0, 1]))
+    database.record_misses(np.array([0, 1, 2, 3]))
+    assert database.missed.tolist() == database.misses.tolist() == [4, 3, 1, 1]
+    database.prune()
     database.record_misses(np.array([1, 2]))
-    assert database.missed.tolist() == [4, 2]  # one frame later, which looked for all
+    assert database.missed.tolist() == [4, 4, 2, 1]  # one frame later, which looked for all
+
+
+def test_several_key_frames_decide_whatever_the_gap_between_them() -> None:
+    database = LandmarkDatabase(RIG, DatabaseSettings(prune_after_misses=10), 40.0)
+    database.add(stereo_features(at_pixels([(80, 60, 8)])), np.arange(1), np.zeros(1, np.uint8))
+    ids, none, looks = np.array([0]), np.empty(0, np.int64), 0
+    database.prune()
+    while len(database):
+        for _ in range(30):
+            database.record_carried(none, ids)
+        database.record_misses(ids)
+        database.prune()
+        looks += 1
+    assert looks == 4
 
 
 def test_counts_go_on_as_before_after_a_restart_between_key_frames() -> None:
@@ -214,7 +228,7 @@ def test_counts_go_on_as_before_after_a_restart_between_key_frames() -> None:
     database.prune()
     database.record_misses(np.array([0]))
     database.prune()
-    database.record_carried(np.array([1]))
+    database.record_carried(np.array([1]), np.array([0]))
     again = LandmarkDatabase(RIG, DatabaseSettings(), 40.0)
     again.restore(database.state())
     for one in (database, again):
@@ -240,6 +254,18 @@ def test_own_patches_stay_with_their_landmarks() -> None:
     patches = again.patches(ids[1:])
     np.testing.assert_array_equal(patches.grey, own)
     assert patches.distances.tolist() == [2.0, 3.0]
+
+
+def test_a_landmark_that_stays_takes_the_patch_that_it_lacks() -> None:
+    database = LandmarkDatabase(RIG, DatabaseSettings(), 40.0, patch_pixels=4)
+    points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20), (90, 90, 9)])
+    ids = database.add(stereo_features(points), np.arange(4), np.zeros(4, np.uint8))
+    own = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    database.keep_patches(ids[1:], LandmarkPatches(own, np.array([2.0, 3.0, 4.0])))
+    database.merge(np.array([[1, 0], [3, 2]]))
+    kept = database.patches(np.array([0, 2]))
+    assert kept.distances.tolist() == [2.0, 3.0]
+    np.testing.assert_array_equal(kept.grey, own[:2])
 
 
 def test_predicted_covariance_matches_monte_carlo() -> None:
@@ -366,7 +392,7 @@ def test_a_hit_refreshes_the_appearance() -> None:
     np.testing.assert_array_equal(database.appearances().descriptors[1], seen.descriptors[1])
     others = np.array([0, 2])
     for name in before:
-        if name not in ("next_id", "frame", "looked"):
+        if name not in ("next_id", "frame"):
             np.testing.assert_array_equal(database.state()[name][others], before[name][others])
 
 

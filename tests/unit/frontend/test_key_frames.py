@@ -9,12 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
-from fgslam.core.features import StereoFeatures
-from fgslam.frontend.tracking.carrying import Carried
+from fgslam.core.features import CUT_PIXELS, StereoFeatures
+from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.settings import DatabaseSettings, StereoSettings
+from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.tracking.carrying import Begun, Carried, LandmarkCarrier
+from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
 from fgslam.frontend.tracking.map_matching import MapMatches
-from fgslam.frontend.tracking.tracker import Tracked
+from fgslam.frontend.tracking.tracker import Association, Tracked
+from tests.textured_wall import HERE, RIG, pictures
 
 ENOUGH = 40
 
@@ -79,6 +85,46 @@ def starting(
     )  # fmt: skip
     tracked = Tracked(SimpleNamespace(), MapMatches(np.arange(len(seen)), seen, had), pose)  # type: ignore[arg-type]
     return np.flatnonzero(~spread(tracked, features).matches.had_candidates).tolist()
+
+
+def test_a_landmark_found_again_keeps_the_patch_of_its_first_key_frame() -> None:
+    """The second key frame finds it half a pixel off, at half the distance."""
+    images = [pictures(HERE)[0], pictures(np.array([0.0, 0.0, 1.0]))[0]]
+    database = LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)
+    stereo = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
+    tracker: Any = SimpleNamespace(database=database)
+    carrier = LandmarkCarrier(RIG, stereo)
+    key_frames = KeyFrameTracker(tracker, carrier)
+    first = seen_at([(100.0, 90.0), (200.0, 120.0)], 2.0)
+    ids = database.add(first, np.arange(2), np.zeros(2, np.uint8))
+    key_frames.begin(images[0], first, association(first, ids, is_new=True))
+    kept = database.patches(ids)
+    assert kept.distances.tolist() == [2.0, 2.0]
+    carrier.forget(ids)
+    carrier.begin(images[1], Begun.none())
+    second = seen_at([(100.5, 90.0), (200.0, 119.5)], 1.0)
+    key_frames.begin(images[1], second, association(second, ids, is_new=False))
+    again = database.patches(ids)
+    np.testing.assert_array_equal(again.grey, kept.grey)
+    np.testing.assert_array_equal(again.distances, kept.distances)
+    state = key_frames.state()
+    np.testing.assert_array_equal(state["fresh_cut"], kept.grey)
+    assert state["fresh_growth"].tolist() == [2.0, 2.0]
+    assert state["fresh_known"].all()
+
+
+def seen_at(places: list[tuple[float, float]], distance: float) -> StereoFeatures:
+    """Features of the reference image at places, so far away."""
+    features = features_at(places, [2.0] * len(places))
+    pixels = np.repeat(features.measurement[:, None, :2], 3, axis=1)
+    away = np.tile([0.0, 0.0, distance], (len(places), 1))
+    return replace(features, pixels=pixels, position=away)
+
+
+def association(features: StereoFeatures, ids: IntArray, is_new: bool) -> Association:
+    every, none = np.arange(len(ids)), np.empty(0, np.int64)
+    observed = features.observations(every, ids, is_new)
+    return Association(observed, np.zeros(len(ids), np.bool_), none, none, every)
 
 
 def test_of_two_features_in_one_place_the_finer_begins_a_landmark() -> None:

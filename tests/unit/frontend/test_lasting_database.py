@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from test_database import at_pixels, database_of, landmark_map, stereo_features
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import Trajectory
-from fgslam.core.features import CUT_PIXELS, LandmarkAppearances
+from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.settings import (
     DatabaseSettings,
@@ -226,6 +227,22 @@ def saved(database: LandmarkDatabase, positions: FloatArray) -> SavedMap:
     )
 
 
+def test_a_visit_that_carries_none_keeps_the_patches_of_its_map() -> None:
+    first = seen_around()
+    given = saved(first, PLACES)
+    patches = LandmarkPatches(
+        np.tile(np.arange(4, dtype=np.uint8)[:, None], CUT_PIXELS), 1.0 + np.arange(4)
+    )
+    second = LandmarkDatabase(RIG, VIEWS, 40.0)
+    second.load(dataclasses.replace(given, patches=patches))
+    assert_same_bits(second.patches(given.landmarks.ids), patches)
+    added = second.add(stereo_features(PLACES), np.array([3]), np.array([9], np.uint8), towards(10))
+    assert second.patches(added).distances.tolist() == [0.0]
+    third = LandmarkDatabase(RIG, VIEWS, 40.0)
+    third.restore(second.state())
+    assert_same_bits(third.patches(given.landmarks.ids), patches)
+
+
 def test_a_saved_map_s_database() -> None:
     """All but what belongs to the visit: rows of misses, frame numbers."""
     first = seen_around()
@@ -285,9 +302,9 @@ def test_an_empty_map() -> None:
 
 def test_memory_a_landmark_is_as_documented() -> None:
     """docs/concepts/maps.md tells it."""
-    assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0)._columns.bytes_per_row() == 62
+    assert LandmarkDatabase(RIG, DatabaseSettings(), 40.0)._columns.bytes_per_row() == 70
     carried = LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)
-    assert carried._columns.bytes_per_row() == 62 + 289
+    assert carried._columns.bytes_per_row() == 70 + 289
     several = LandmarkDatabase(RIG, VIEWS, 40.0)
     assert several._pool.bytes_per_view() == 166
-    assert several._columns.bytes_per_row() == 62 + 2 * 4
+    assert several._columns.bytes_per_row() == 70 + 2 * 4

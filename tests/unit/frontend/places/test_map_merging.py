@@ -212,21 +212,27 @@ def test_views_turn_with_their_map(world: World) -> None:
     np.testing.assert_allclose(added.direction - found.aTb[:3, 2], 0.0, atol=1e-12)
 
 
-def test_patches_are_the_first_map_s_and_those_of_the_rest(world: World) -> None:
-    """A map that has none adds landmarks without."""
+def test_patches_are_the_first_map_s_where_it_has_some(world: World) -> None:
     a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(100, 300), BTA)
     found = align(a, b)
     assert merge_maps(a, b, found).patches is None
     grey = np.arange(len(b), dtype=np.uint8)[:, None] * np.ones(CUT_PIXELS, np.uint8)
     patched = replace(b, patches=LandmarkPatches(grey, 1.0 + np.arange(len(b))))
-    added = merge_maps(a, patched, found).patches
-    rest = np.setdiff1d(np.arange(len(b)), found.pairs[:, 1])
-    assert added is not None
-    assert added.distances.tolist() == [0.0] * len(a) + (1.0 + rest).tolist()
-    np.testing.assert_array_equal(added.grey[len(a) :], grey[rest])
-    first = merge_maps(replace(a, patches=LandmarkPatches.none(len(a))), patched, found).patches
-    assert first is not None
-    np.testing.assert_array_equal(first.grey, added.grey)
+    own = LandmarkPatches.none(len(a))
+    own.distances[:150], own.grey[:150] = 1000.0, 255
+    mine, yours = found.pairs.T
+    rest = np.setdiff1d(np.arange(len(b)), yours)
+    for first in (a, replace(a, patches=own)):
+        merged = merge_maps(first, patched, found).patches
+        assert merged is not None
+        expected = np.zeros(len(a)) if first is a else own.distances.copy()
+        lacking = expected[mine] == 0.0
+        assert lacking.any()
+        expected[mine[lacking]] = 1.0 + yours[lacking]
+        assert merged.distances.tolist() == [*expected, *(1.0 + rest)]
+        np.testing.assert_array_equal(merged.grey[mine[lacking]], grey[yours[lacking]])
+        np.testing.assert_array_equal(merged.grey[len(a) :], grey[rest])
+    assert (own.distances[150:] == 0.0).all()
 
 
 def test_overlapping_drives_keep_the_first_trajectory(world: World) -> None:
