@@ -26,8 +26,6 @@ from fgslam.core.settings import RigView
 
 MapArray: TypeAlias = npt.NDArray[np.float32]
 
-SAMPLING = cv2.INTER_CUBIC
-"""Of images between their pixels: linearly they are blurred by where between, and patches shift."""
 _OUTSIDE = -1e4  # coordinate that is outside of any image, so that it stays black
 # A perspective view stretches its rim by 1 / cos^2: at 60 degrees off the axis by 4.
 _WIDEST_DEG = 120.0
@@ -69,11 +67,11 @@ class Rectifier(Brief):
     calibration: Calibration | None = field(default=None, repr=False)
 
     def rectify(self, camera: int, image: Image) -> Image:
-        """Rectified image (h, w) of camera 0 (right), 1 (left) or 2 (top)."""
+        """Rectified image (h, w) of camera 0 (right), 1 (left) or 2 (top), bilinear."""
         if not self.maps:
             return image
         columns, rows = self.maps[camera]
-        return np.asarray(cv2.remap(image, columns, rows, SAMPLING), np.uint8)
+        return np.asarray(cv2.remap(image, columns, rows, cv2.INTER_LINEAR), np.uint8)
 
     def images(self, raw: Sequence[Image]) -> tuple[Image, ...]:
         """Rectified (right, left[, top]) of raw images given in that order."""

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.raw_cameras import RawCamera
-from fgslam.cameras.rectification import SAMPLING, MapArray, View, pixel_grid, sampling_maps
+from fgslam.cameras.rectification import MapArray, View, pixel_grid, sampling_maps
 from fgslam.core.arrays import Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.sensors import CameraRig
@@ -74,7 +74,7 @@ class Undistorted:
 
     def image(self, image: Image) -> Image:
         """The image, with its pixels between others blended."""
-        return np.asarray(cv2.remap(image, self.columns, self.rows, SAMPLING), np.uint8)
+        return np.asarray(cv2.remap(image, self.columns, self.rows, cv2.INTER_LINEAR), np.uint8)
 
     def depth(self, metres: Depth) -> Depth:
         """The depths, of each pixel the nearest: between two surfaces there is none."""
