@@ -9,6 +9,7 @@
 #     python live_robot.py my_bag.mcap
 
 # %%
+import contextlib
 import signal
 import sys
 import threading
@@ -59,9 +60,10 @@ def camera(wire: Connection) -> None:
 
 # %%
 def receive(wire: Connection, frames: fg.NewestFrame) -> None:
-    """Puts what is sent, until the camera ends."""
-    while (sent := wire.recv()) is not None:
-        frames.put(*sent)
+    """Puts what is sent, until the camera ends, or its process does."""
+    with contextlib.suppress(EOFError, OSError):
+        while (sent := wire.recv()) is not None:
+            frames.put(*sent)
     frames.close()
 
 

@@ -358,16 +358,21 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
         if (arrays[_PATCH_DISTANCE] < 0.0).any():
             raise MapError(f"{where}: array {_PATCH_DISTANCE} is negative; make the map again")
     for name, sound in {
-        "landmark_id": bool((np.diff(ids) > 0).all()),
+        "landmark_id": _ascending(ids),
         "view_landmark": bool((np.diff(views) >= 0).all() and np.isin(views, ids).all()),
-        "pose_time": bool((np.diff(arrays["pose_time"]) > 0).all()),
-        _EVIDENCE: bool((np.diff(arrays.get(_EVIDENCE, ids[:0])) > 0).all()),
+        "pose_time": _ascending(arrays["pose_time"]),
+        _EVIDENCE: _ascending(arrays.get(_EVIDENCE, ids[:0])),
     }.items():
         if not sound:
             raise MapError(f"{where}: array {name} is out of order; make the map again")
     require_finite(FILE, arrays, finite, where)
     covariances = arrays["landmark_covariance"]
     require_covariances(FILE, "landmark_covariance", covariances, where, definite=False)
+
+
+def _ascending(values: np.ndarray[Any, Any]) -> bool:
+    """Whether each value is larger than the one before; differences of digests may overflow."""
+    return bool((values[1:] > values[:-1]).all())
 
 
 def _holds(header: dict[str, Any], arrays: StateArrays, part: str) -> bool:

@@ -113,10 +113,7 @@ class RunRecorder:
         return out
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
-        """Continues from :meth:`state` and the log of as many frames.
-
-        A checkpoint of an earlier version holds no noise: it is NaN in those frames.
-        """
+        """Continues from :meth:`state` and the log of as many frames."""
         columns = [state[name].tolist() for name in FrameRow._fields]
         self.rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
         self.most_stereo = max((row.stereo for row in self.rows), default=0)
@@ -124,8 +121,7 @@ class RunRecorder:
         self.online_poses = list(state["online_poses"])
         self.online_covariances = list(state["online_covariances"])
         self.stage_ms = list(state["stage_ms"])
-        known = state["noise"].tolist() if "noise" in state else [()] * len(self.rows)
-        self.noise = [FrameNoise(*row) for row in known]
+        self.noise = [FrameNoise(*row) for row in state["noise"].tolist()]
         self.frame_digests = state["frame_digests"].tolist()
         self.log.continue_with(itertools.islice(log, len(self.rows)))
 

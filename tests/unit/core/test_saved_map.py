@@ -167,6 +167,15 @@ def test_evidence_that_does_not_fit_its_version_is_refused(saved: SavedMap, tmp_
             load_map(rewritten(tmp_path / "m.fgmap", change))
 
 
+def test_digests_far_apart_are_in_order(saved: SavedMap, tmp_path: Path) -> None:
+    """Of 64 bits each, with a sign: their difference has 65."""
+    evidence = np.array([-(2**63), -5, 2**63 - 1])
+    save_map(replace(saved, evidence=evidence), tmp_path / "m.fgmap")
+    assert load_map(tmp_path / "m.fgmap").evidence is not None
+    with pytest.raises(MapError, match="evidence_frame is out of order"):
+        save_map(replace(saved, evidence=evidence[::-1]), tmp_path / "m.fgmap")
+
+
 def test_a_file_is_of_the_oldest_version_that_has_what_it_holds(
     saved: SavedMap, tmp_path: Path
 ) -> None:
