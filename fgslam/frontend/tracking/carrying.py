@@ -177,7 +177,9 @@ class LandmarkCarrier:
         expected: ExpectedLandmarks,
         correction: RigCorrection | None = None,
     ) -> Carried | None:
-        """The landmarks in the next frame; the others are forgotten. None: all have moved too far.
+        """The landmarks in the next frame; the others are forgotten.
+
+        None where there are none to look for, or all have moved too far.
 
         Args:
             images: right, left[, top].
@@ -192,6 +194,8 @@ class LandmarkCarrier:
             self._patches = ReferencePatches.none(PATCH_PX)
             return None
         patches = self._anchored(last)
+        if not len(self._points):  # all that was to be carried looks different by now
+            return None
         rows = np.searchsorted(expected.ids, self._points.ids)
         predicted = expected.measurement[rows]
         depths = self._distances(predicted)

@@ -143,18 +143,6 @@ def test_state_survives_a_file(count: int, tmp_path: Path) -> None:
     np.testing.assert_array_equal(after.noise, before.noise)
 
 
-def test_a_checkpoint_without_noise_goes_on_with_unknown_noise() -> None:
-    before = recorder_of(3)
-    state = before.state()
-    del state["noise"]
-    after = RunRecorder(MeasurementLog(RIG, {}))
-    after.restore(state, before.log)
-    after.add(report(3, 13), 5.0, float("nan"))
-    noise = after.state()["noise"]
-    assert np.isnan(noise[:3]).all()
-    np.testing.assert_array_equal(noise[3], report(3, 13).noise)
-
-
 def test_a_restored_recorder_goes_on_and_drops_what_came_after_the_state() -> None:
     early, late = recorder_of(3), recorder_of(6)
     after = RunRecorder(MeasurementLog(RIG, {}))
