@@ -33,6 +33,9 @@ EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 """Where the real recordings are looked for, one folder beside the checkout."""
 
+EVERY_FRAME = ("frontend.tracking=sift",)
+"""Evidence on SIFT itself, and on landmarks that a miss in each frame judges."""
+
 LOCATED = {EgoMotionStatus.FIRST, EgoMotionStatus.OK, EgoMotionStatus.CAPPED}
 """How the pose of a frame is found where the map before it tells it."""
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.evidence.person import position_errors
 from benchmarks.runs import (
+    EVERY_FRAME,
     FoundFeatures,
     experiment,
     find_features,
@@ -31,7 +32,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "without permanence": ("frontend.database.permanence=null",),
 }
 # Nothing is pruned, so that every landmark's whole life is seen.
-_KEEP_ALL = ("frontend.tracking=sift", "frontend.database.prune_after_misses=1000000")
+_KEEP_ALL = (*EVERY_FRAME, "frontend.database.prune_after_misses=1000000")
 _ENOUGH = 10  # times expected, before its absence says anything
 _LIMITS = (5, 10, 15, 20, 25)
 _HITS = (3, 5, 10)
@@ -169,7 +170,7 @@ class Visits:
 
 def visit_twice() -> Visits:
     """Drives three times; the latter two in the map of the first."""
-    found = find_features(experiment("lab_loop", ("frontend.tracking=sift",)))
+    found = find_features(experiment("lab_loop", EVERY_FRAME))
     pipeline = make_system(experiment("lab_loop", _KEEP_ALL), found.sequence)
     reports = list(_with_places(found, pipeline))
     lives = Lives(int(pipeline.tracker.database.state()["next_id"]))

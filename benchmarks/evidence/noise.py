@@ -6,7 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.runs import FoundFeatures, experiment, find_features, make_system, process, say
+from benchmarks.runs import (
+    EVERY_FRAME,
+    FoundFeatures,
+    experiment,
+    find_features,
+    make_system,
+    process,
+    say,
+)
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse, transform_to_camera
@@ -45,7 +53,7 @@ class Spread:
 
 def tables() -> list[Table]:
     """Noise within one frame, and between frames."""
-    config = experiment("lab_loop", ("frontend.tracking=sift",))
+    config = experiment("lab_loop", EVERY_FRAME)
     found = find_features(config)
     sequence = found.sequence
     if not isinstance(sequence, RenderedLabSequence):

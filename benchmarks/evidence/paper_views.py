@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from benchmarks.evidence.views import LabViews, View, ViewPair, make_pair
-from benchmarks.runs import experiment, say
+from benchmarks.runs import EVERY_FRAME, experiment, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, Trajectory
@@ -21,7 +21,6 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
 
-_EVERY_FRAME = ("frontend.tracking=sift",)  # as the paper's, whose numbers stand beside
 STARTS = range(0, 250, 10)
 """Frames of the drive from which the two small motions start; the first one is the example."""
 
@@ -59,7 +58,7 @@ Triple = tuple[View, View, View]
 def tables() -> list[Table]:
     """All five, from the same rendered views."""
     say(f"rendering {3 * len(STARTS)} views")
-    lab = LabViews(experiment("lab_loop", _EVERY_FRAME))
+    lab = LabViews(experiment("lab_loop", EVERY_FRAME))
     triples = [lab.triple(i) for i in STARTS if i < len(lab.sequence)]
     moves = {name: _moves(lab, triples, options) for name, options in _MODES.items()}
     return [
@@ -73,7 +72,7 @@ def tables() -> list[Table]:
 
 def default_moves() -> BothMoves:
     """Both small motions from every place of the drive, matched and tracked by defaults."""
-    lab = LabViews(experiment("lab_loop", _EVERY_FRAME))
+    lab = LabViews(experiment("lab_loop", EVERY_FRAME))
     triples = [lab.triple(i) for i in STARTS if i < len(lab.sequence)]
     return _moves(lab, triples, _MODES["`descriptor` (default)"])
 
@@ -137,7 +136,7 @@ def _modes_twice() -> tuple[str, ...]:
 
 def _stereo_counts(lab: LabViews, triples: list[Triple], mode: str) -> FloatArray:
     """(n, 3, 3) per triple and view: right-left matches, final ones, fewest features."""
-    settings = experiment("lab_loop", [*_EVERY_FRAME, f"frontend.appearance.mode={mode}"]).frontend
+    settings = experiment("lab_loop", [*EVERY_FRAME, f"frontend.appearance.mode={mode}"]).frontend
     matcher = StereoMatcher(lab.rig, settings.stereo, settings.appearance)
     counts = [[_counts(matcher, view) for view in triple] for triple in triples]
     return np.array(counts, np.float64)
@@ -150,7 +149,7 @@ def _counts(matcher: StereoMatcher, view: View) -> tuple[int, int, int]:
 
 def sweep_table(lab: LabViews, views: list[View]) -> Table:
     """Wider gates need not give more matches where ambiguity discards."""
-    stereo = experiment("lab_loop", _EVERY_FRAME).frontend.stereo
+    stereo = experiment("lab_loop", EVERY_FRAME).frontend.stereo
     columns = (
         "all gates, times", "right-left", "right-left, start", "three images",
         "three images, start", "`descriptor`, three images",
@@ -237,7 +236,7 @@ class BothMoves:
 
 
 def _moves(lab: LabViews, triples: list[Triple], options: tuple[str, ...]) -> BothMoves:
-    config = experiment("lab_loop", [*_EVERY_FRAME, *options])
+    config = experiment("lab_loop", [*EVERY_FRAME, *options])
     forward, clockwise = [], []
     for number, (start, ahead, turned) in enumerate(triples):
         rng = np.random.default_rng([lab.seed, number])

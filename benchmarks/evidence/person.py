@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.runs import (
+    EVERY_FRAME,
     experiment,
     find_features,
     make_system,
@@ -182,7 +183,7 @@ class _Follower:
 
 
 def _errors_without() -> tuple[FloatArray, float]:
-    config = experiment("lab_loop", ("frontend.tracking=sift",))
+    config = experiment("lab_loop", EVERY_FRAME)
     found = find_features(config)
     pipeline = make_system(config, found.sequence)
     for _ in process(found, pipeline):

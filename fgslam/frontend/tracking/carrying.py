@@ -134,9 +134,8 @@ class Begun(Rows):
 
         What is repeated there would pull what is found again to the image's side.
         """
-        last = np.array([image.shape[1], image.shape[0]]) - 1.0
-        places = self.points.places
-        whole = ((places >= _WHOLE_PX) & (places <= last - _WHOLE_PX)).all(axis=1)
+        height, width = image.shape[:2]
+        whole = _inside(self.points.places, _WHOLE_PX, (width, height))
         grey = np.rint(self.cut).astype(np.uint8)
         return LandmarkPatches(grey, np.where(whole, self.growth * self.points.depths, 0.0))
 
@@ -303,8 +302,13 @@ class LandmarkCarrier:
         return np.asarray(self._rig.fx * self._rig.baseline / predicted[:, 2])
 
     def _inside(self, places: FloatArray, margin: float) -> BoolArray:
-        last = np.array([self._rig.width, self._rig.height]) - 1.0 - margin
-        return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
+        return _inside(places, margin, (self._rig.width, self._rig.height))
+
+
+def _inside(places: FloatArray, margin: float, size: tuple[int, int]) -> BoolArray:
+    """Which places (n, 2) lie so far from the border of an image of this width and height."""
+    last = np.array(size) - 1.0 - margin
+    return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
 
 
 _POINTS = Points.__slots__

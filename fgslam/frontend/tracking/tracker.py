@@ -223,9 +223,7 @@ class LandmarkTracker:
         if self.keeps_map:
             none = np.empty(0, np.int64)
             return Association(matched, ~inliers, none, none, matches.features)
-        hit = np.zeros(len(expected), np.bool_)
-        hit[matches.landmarks[inliers]] = True
-        missed_ids = self.database.missing(expected, hit)
+        missed_ids = self._missing(tracked)
         directions = directions_to(tracked.ego_motion.wTc, features.position)
         upright = self._upright(features, tracked.ego_motion.wTc)
         seen = matches.features[inliers]
@@ -253,11 +251,14 @@ class LandmarkTracker:
         matched = _matched(tracked.expected, tracked.matches, features)
         inliers, none = tracked.ego_motion.inliers, np.empty(0, np.int64)
         if not self.keeps_map:
-            hit = np.zeros(len(tracked.expected), np.bool_)
-            hit[tracked.matches.landmarks[inliers]] = True
-            not_carried = self.database.missing(tracked.expected, hit)
-            self.database.record_carried(matched.ids[inliers], not_carried)
+            self.database.record_carried(matched.ids[inliers], self._missing(tracked))
         return Association(matched, ~inliers, none, none, tracked.matches.features)
+
+    def _missing(self, tracked: Tracked) -> IntArray:
+        """Landmarks expected well in view that the frame does not show, as far as it tells."""
+        hit = np.zeros(len(tracked.expected), np.bool_)
+        hit[tracked.matches.landmarks[tracked.ego_motion.inliers]] = True
+        return self.database.missing(tracked.expected, hit)
 
     def _upright(self, features: StereoFeatures, wTc: FloatArray) -> StereoFeatures:
         """The features with their orientations as a level camera sees them."""
