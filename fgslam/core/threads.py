@@ -7,12 +7,13 @@ machine; and matrices of a frame's size are too small to share: on a busy machin
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import scipy.linalg  # noqa: F401  its BLAS is not NumPy's, and a limit reaches what is loaded
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 
 class _Limits:
@@ -26,12 +27,20 @@ class _Limits:
         self._lock = threading.Lock()
         self._set: list[threadpool_limits] = []
         self._left: set[int] = set()
+        self._loaded: ThreadpoolController | None = None
+        self._modules = 0  # imported when the libraries were last looked for
 
     def enter(self) -> threadpool_limits:
         with self._lock:
-            limits = threadpool_limits(limits=1, user_api="blas")
+            limits = self._libraries().limit(limits=1, user_api="blas")
             self._set.append(limits)
             return limits
+
+    def _libraries(self) -> ThreadpoolController:
+        """Looking for them takes a millisecond or two, in every frame: only after an import."""
+        if self._loaded is None or self._modules != len(sys.modules):
+            self._loaded, self._modules = ThreadpoolController(), len(sys.modules)
+        return self._loaded
 
     def leave(self, limits: threadpool_limits) -> None:
         with self._lock:
