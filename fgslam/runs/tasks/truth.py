@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -29,6 +30,9 @@ _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03
 """Relative spread of the four depths around a pixel that one surface may have."""
 
+_PATCH_REACH_PX = 6
+"""From the middle of a landmark's patch; what lies beyond has a fifteenth of its weight."""
+
 _NORMAL_MAD = 1.4826  # median absolute deviation to standard deviation, normal distribution
 _MEDIAN_TO_MEAN = 1.2533  # standard error of a median over that of the mean
 
@@ -50,6 +54,8 @@ def rendered_landmark_truth(
     Each sighting that the run did not reject gives the point where the ray of its pixel meets the
     rendered surface. The truth has an error of its own: a feature's pixel is known to a fraction
     of a pixel only, and at a curved or slanted surface the blob that is matched is no point.
+    Where patches show two surfaces, one behind the other, there is no true point at all: their
+    contrast may be of either. A landmark is left out where most of its sightings are such.
 
     Args:
         sequence: the recording; frame k is the log's.
@@ -57,7 +63,7 @@ def rendered_landmark_truth(
 
     Returns:
         Positions in the world of the ground truth, and the standard error (n,) of each in metres,
-        from the scatter of its sightings; landmarks with fewer than three are left out. None
+        from the scatter of its sightings; landmarks with fewer than three are left out, too. None
         where the recording knows no depth.
     """
     truth = sequence.ground_truth
@@ -65,14 +71,17 @@ def rendered_landmark_truth(
         return None
     ids: list[IntArray] = [np.empty(0, np.int64)]
     points: list[FloatArray] = [np.empty((0, 3))]
+    split: list[BoolArray] = [np.empty(0, np.bool_)]
     for k, increment in enumerate(log):
-        seen = increment.observations.select(~increment.rejected)
+        seen = increment.kept
         if not len(seen):
             continue
-        local, known = points_under(sequence.rig, sequence.depth(k), seen.measurement[:, :2])
+        depth, pixels = sequence.depth(k), seen.measurement[:, :2]
+        local, known = points_under(sequence.rig, depth, pixels)
         ids.append(seen.ids[known])
         points.append(transform_to_world(truth.poses[k], local[known]))
-    return _medians(np.concatenate(ids), np.concatenate(points))
+        split.append(at_edges(depth, pixels[known]))
+    return _medians(np.concatenate(ids), np.concatenate(points), np.concatenate(split))
 
 
 def points_under(
@@ -101,12 +110,35 @@ def points_under(
     return np.column_stack([x * z, y * z, z]), known
 
 
-def _medians(ids: IntArray, points: FloatArray) -> tuple[LandmarkTruth, FloatArray]:
-    """Median and its standard error of each landmark's points, those seen often enough."""
+def at_edges(depth: FloatArray, pixels: FloatArray) -> BoolArray:
+    """Which places (n, 2) in a depth image (h, w) have an edge of depth within a patch's reach.
+
+    The inverse depth is linear in the image on a plane: where it jumps, its second difference is.
+    """
+    inverse = 1.0 / depth
+    bend = np.zeros_like(inverse)
+    bend[:, 1:-1] = np.abs(np.diff(inverse, 2, axis=1))
+    bend[1:-1] = np.maximum(bend[1:-1], np.abs(np.diff(inverse, 2, axis=0)))
+    jumps = ~(bend <= _SAME_SURFACE * inverse)  # an unknown depth is no surface
+    side = 2 * _PATCH_REACH_PX + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    near = cv2.dilate(jumps.astype(np.uint8), disc)
+    column, row = np.rint(pixels).astype(np.int64).T
+    return np.asarray(near[row, column] > 0)
+
+
+def _medians(
+    ids: IntArray, points: FloatArray, split: BoolArray
+) -> tuple[LandmarkTruth, FloatArray]:
+    """Median and its standard error of each landmark's points, those seen often enough.
+
+    ``split`` (n,) are the sightings at edges of depth.
+    """
     order = np.argsort(ids, kind="stable")
-    unique, start = np.unique(ids[order], return_index=True)
+    unique, start, times = np.unique(ids[order], return_index=True, return_counts=True)
     groups = np.split(points[order], start[1:])
-    kept = [k for k, group in enumerate(groups) if len(group) >= _LEAST_SIGHTINGS]
+    edges = np.add.reduceat(split[order].astype(np.int64), start) if len(start) else start
+    kept = np.flatnonzero((times >= _LEAST_SIGHTINGS) & (2 * edges <= times)).tolist()
     medians = np.array([np.median(groups[k], axis=0) for k in kept]).reshape(-1, 3)
     sigma = [_standard_error(groups[k], median) for k, median in zip(kept, medians, strict=True)]
     return LandmarkTruth(unique[kept], medians), np.array(sigma)

@@ -47,7 +47,7 @@ from fgslam.runs.metric_tables import (
     page_tables,
 )
 from fgslam.runs.slam_comparison import judged_apart, named
-from fgslam.runs.tasks.truth import points_under
+from fgslam.runs.tasks.truth import _medians, at_edges, points_under
 from fgslam.runs.trials import Trial, summarise, together, write_trials
 from fgslam.runs.trials import _result as trials_result
 
@@ -387,6 +387,21 @@ def test_at_an_edge_or_without_depth_the_point_is_not_known() -> None:
     assert known.tolist() == [False, True, False, False, False]
     assert np.isnan(points[~known]).all()
     assert points[1, 2] == pytest.approx(2.0)
+
+
+def test_a_place_is_at_an_edge_where_a_patch_around_it_shows_two_surfaces() -> None:
+    columns = np.tile(np.arange(RIG.width), (RIG.height, 1))
+    depth = 4.0 / (1.0 + 2e-3 * columns)  # slanted: no edge
+    depth[100:, 150:] /= 1.5  # something before it
+    pixels = np.array([[20.2, 30.0], [140.0, 150.0], [146.0, 150.0], [160.0, 96.3], [160.0, 110.0]])
+    assert at_edges(depth, pixels).tolist() == [False, False, True, True, False]
+
+
+def test_landmarks_mostly_seen_at_edges_have_no_truth() -> None:
+    ids, points = np.repeat([7, 8, 9], [5, 4, 2]), np.zeros((11, 3))
+    split = np.array([True, True, True, False, False, True, True, False, False, False, False])
+    truth, _ = _medians(ids, points, split)
+    assert truth.ids.tolist() == [8]  # half of the sightings do; the last one has too few
 
 
 # --------------------------------------------------------------------------------------------
