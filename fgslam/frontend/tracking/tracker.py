@@ -28,6 +28,9 @@ from fgslam.frontend.tracking.other_motion import OtherMotion
 from fgslam.frontend.tracking.regaining import Regainer
 from fgslam.frontend.tracking.resection import Resection
 
+_FEW_MATCHED = 0.2
+"""Of a frame's features: landmarks in the pose's favour, below which it is looked for anew too."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
@@ -115,7 +118,7 @@ class LandmarkTracker:
             rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
-        if self._matcher.rescues and self._doubtful(tracked.ego_motion):
+        if self._matcher.rescues and self._doubtful(tracked, features):
             anew = self._regained(landmarks, features)
             if anew is not None and _used(anew) >= 2 * _used(tracked):
                 return anew
@@ -125,9 +128,16 @@ class LandmarkTracker:
             tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
 
-    def _doubtful(self, found: EgoMotion) -> bool:
-        """Whether all of what was matched around the prediction contradicts the pose, or most."""
-        return not found.status.measured or not (found.coherent or self.expects_returns)
+    def _doubtful(self, tracked: Tracked, features: StereoFeatures) -> bool:
+        """Whether what was matched around the prediction contradicts the pose, or is little.
+
+        In the wrong place a few dozen matches may agree: some right ones, of things far off or
+        close together, and others by chance.
+        """
+        found = tracked.ego_motion
+        contradicted = not (found.coherent or self.expects_returns)
+        few = _used(tracked) < _FEW_MATCHED * len(features)
+        return not found.status.measured or contradicted or few
 
     def _regained(self, landmarks: LandmarkMap, features: StereoFeatures) -> Tracked | None:
         """The frame found by what was seen lately, without the prediction; None where it is not."""

@@ -90,6 +90,20 @@ def test_a_stiff_wrong_prediction_does_not_win_by_a_handful_of_matches(scene: Sc
     np.testing.assert_allclose(g.se3_log(g.inverse(step) @ found.wTc), 0.0, atol=4e-3)
 
 
+def test_a_few_matches_where_they_were_predicted_do_not_hide_all_others(scene: Scene) -> None:
+    """A tenth of the landmarks, moved with the camera, fit the wrong pose that was predicted."""
+    few = scene.world.points[:, 0] < np.quantile(scene.world.points[:, 0], 0.1)
+    scene.world.points[few] = g.transform_to_world(TURNED, scene.world.points[few])
+    stereo = scene._stereo.match(scene.world.features(TURNED, sigma_px=0.1))
+    around = Prediction(np.eye(4), CERTAIN)
+    wrong = scene.tracker._attempt(around, around, scene.map, stereo).ego_motion
+    assert wrong.status is EgoMotionStatus.OK
+    assert wrong.coherent
+    found = scene.tracker.track(around, scene.map, stereo).ego_motion
+    assert found.status is EgoMotionStatus.RELOCALISED
+    np.testing.assert_allclose(g.se3_log(g.inverse(TURNED) @ found.wTc), 0.0, atol=4e-3)
+
+
 def test_only_what_was_seen_lately_is_looked_for(scene: Scene) -> None:
     """A map from which the run has seen nothing for long is the business of place recognition."""
     rng = np.random.default_rng(5)
