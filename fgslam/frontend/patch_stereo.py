@@ -15,6 +15,7 @@ from fgslam.core.features import PATCH_PX, Features, StereoFeatures
 from fgslam.core.recordings import Frame, clearance
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig, vertical_to_horizontal
+from fgslam.frontend.features.fine_image import FineImage
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 from fgslam.frontend.stereo import StereoMatcher
 
@@ -63,27 +64,27 @@ class PatchStereo:
         coarse = self._coarse(frame.images, found.xy)
         known = np.isfinite(coarse)
         found, coarse = found.select(known), coarse[known]
+        views = [FineImage(image) for image in frame.images] if len(found.xy) else []
         pixels = np.empty((len(found.xy), len(frame.images), 2))
         good: BoolArray = np.empty(len(found.xy), np.bool_)
         for first in range(0, len(found.xy), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
-            pixels[some], good[some] = self._aligned(frame, found.xy[some], coarse[some])
+            pixels[some], good[some] = self._aligned(frame, views, found.xy[some], coarse[some])
         rest = (found.scale, found.orientation, found.descriptors)
-        views = tuple(
+        in_each = tuple(
             Features(pixels[:, camera], *rest).select(good) for camera in range(len(frame.images))
         )
-        return self._stereo.measured(views, self._stereo.by_reference(), correction)[0]
+        return self._stereo.measured(in_each, self._stereo.by_reference(), correction)[0]
 
     def _aligned(
-        self, frame: Frame, places: FloatArray, coarse: FloatArray
+        self, frame: Frame, views: list[FineImage], places: FloatArray, coarse: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
         """Pixels (n, cameras, 2) of places (n, 2) in each image, and which all of them show."""
-        patches = anchor(frame.images[0], places, PATCH_PX, GREY_NOISE, DEFORMATION)
+        patches = anchor(views[0], places, PATCH_PX, GREY_NOISE, DEFORMATION)
         good: BoolArray = np.ones(len(places), np.bool_)
         pixels = [places]
-        for camera in range(1, len(frame.images)):
-            image = frame.images[camera]
-            seen, alike = across(self._rig, image, camera, patches, places, coarse)
+        for camera, view in enumerate(views[1:], 1):
+            seen, alike = across(self._rig, view, camera, patches, places, coarse)
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
         for margin, seen in zip(frame.margins, pixels, strict=False):  # none: all are full
@@ -116,7 +117,7 @@ class PatchStereo:
 
 def across(
     rig: CameraRig,
-    image: Image,
+    view: FineImage,
     camera: int,
     patches: ReferencePatches,
     places: FloatArray,
@@ -126,7 +127,7 @@ def across(
 
     Args:
         rig: the cameras.
-        image: of the other camera.
+        view: of the other camera.
         camera: 1 left, 2 top.
         patches: of the points, as they look in the reference image.
         places: (n, 2) there.
@@ -139,7 +140,7 @@ def across(
         seen[:, 1] += disparity / vertical_to_horizontal(rig)
     correlation = np.empty(0)
     for _ in range(ALIGNMENTS_ACROSS):
-        patches, seen, correlation = align(patches, image, seen)
+        patches, seen, correlation = align(patches, view, seen)
     last = np.array([rig.width, rig.height]) - 1.0
     inside = ((seen >= 0.0) & (seen <= last)).all(axis=1)
     return seen, np.where(inside, correlation, -1.0)

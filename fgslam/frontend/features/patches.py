@@ -12,15 +12,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
+from fgslam.frontend.features.fine_image import PER_PIXEL, FineImage
 from fgslam.frontend.features.matching import pairs_within
 
 Float32 = npt.NDArray[np.float32]
+
+View: TypeAlias = Image | FineImage
+"""What patches are sampled in: grey values (h, w), between them on straight lines; or finely."""
 
 _SPREAD = 4.3  # sides of the patch over the sigma of its Gaussian weight
 _FLAT = 1e-3  # keeps patches without any contrast solvable
@@ -76,19 +81,19 @@ class ReferencePatches(Rows):
         return np.asarray(np.sqrt(np.einsum("nij,nij->n", change, change)))
 
 
-def cut_out(grey: Image, places: FloatArray, size: int) -> Float32:
+def cut_out(view: View, places: FloatArray, size: int) -> Float32:
     """(n, (size + 2)^2) grey values of a view (h, w) around places (n, 2): column, row.
 
     What :func:`anchor_at` makes patches of; the rim is for their slopes.
     """
-    return _sampled(grey, places, _undeformed(len(places)), size + 2)
+    return _sampled(view, places, _undeformed(len(places)), size + 2)
 
 
 def anchor(
-    grey: Image, places: FloatArray, size: int, noise: float, deformation: float
+    view: View, places: FloatArray, size: int, noise: float, deformation: float
 ) -> ReferencePatches:
     """Patches around places (n, 2), column and row, of a view (h, w); else :func:`anchor_at`."""
-    return anchor_at(cut_out(grey, places, size), size, noise, deformation)
+    return anchor_at(cut_out(view, places, size), size, noise, deformation)
 
 
 def anchor_at(cut: Float32, size: int, noise: float, deformation: float) -> ReferencePatches:
@@ -115,13 +120,13 @@ def anchor_at(cut: Float32, size: int, noise: float, deformation: float) -> Refe
 
 
 def align(
-    patches: ReferencePatches, grey: Image, places: FloatArray
+    patches: ReferencePatches, view: View, places: FloatArray
 ) -> tuple[ReferencePatches, FloatArray, FloatArray]:
     """Moves places so that the patches fit the view.
 
     Args:
         patches: of the points.
-        grey: (h, w) the present view.
+        view: the present one.
         places: (n, 2) where the points are thought to be, within a few pixels.
 
     Returns:
@@ -130,7 +135,7 @@ def align(
     """
     if not len(patches):
         return patches, places, np.empty(0)
-    seen = _sampled(grey, places, patches.maps, patches.size)
+    seen = _sampled(view, places, patches.maps, patches.size)
     level = (patches.light @ seen[:, :, None])[:, :, 0]
     gain = np.clip(level[:, 1:], *_GAIN)
     rest = (seen - level[:, :1]) / gain - patches.first
@@ -237,7 +242,7 @@ def _weight(size: int) -> Float32:
     return np.asarray(weight, dtype=np.float32)
 
 
-def _sampled(grey: Image, places: FloatArray, maps: FloatArray, size: int) -> Float32:
+def _sampled(view: View, places: FloatArray, maps: FloatArray, size: int) -> Float32:
     """(n, m) grey values of patches around places (n, 2), deformed by maps (n, 2, 2)."""
     if not len(places):
         return np.empty((0, size * size), np.float32)  # OpenCV refuses empty maps
@@ -245,8 +250,10 @@ def _sampled(grey: Image, places: FloatArray, maps: FloatArray, size: int) -> Fl
     at, turned = places.astype(np.float32), maps.astype(np.float32)
     columns = at[:, :1] + turned[:, 0, :1] * x + turned[:, 0, 1:] * y
     rows = at[:, 1:] + turned[:, 1, :1] * x + turned[:, 1, 1:] * y
-    # A straight line between two pixels shifts what lies between them by up to a twentieth.
-    seen = cv2.remap(grey, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    grey = view.grey if isinstance(view, FineImage) else view
+    if isinstance(view, FineImage):
+        columns, rows = PER_PIXEL * columns, PER_PIXEL * rows
+    seen = cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(seen, dtype=np.float32)
 
 

@@ -28,6 +28,7 @@ from fgslam.core.features import (
 from fgslam.core.geometry import triangulate
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
+from fgslam.frontend.features.fine_image import FineImage
 from fgslam.frontend.features.patches import (
     Float32,
     ReferencePatches,
@@ -118,7 +119,7 @@ class Begun(Rows):
     @staticmethod
     def new(image: Image, points: Points) -> Begun:
         """First seen in this image, of which their patches are cut."""
-        cut = cut_out(image, points.places, PATCH_PX)
+        cut = cut_out(FineImage(image), points.places, PATCH_PX)
         return Begun(points, cut, np.ones(len(cut)), np.zeros(len(cut), np.bool_))
 
     @staticmethod
@@ -136,7 +137,7 @@ class Begun(Rows):
         """
         height, width = image.shape[:2]
         whole = _inside(self.points.places, _WHOLE_PX, (width, height))
-        grey = np.rint(self.cut).astype(np.uint8)
+        grey = np.clip(np.rint(self.cut), 0, 255).astype(np.uint8)  # between pixels it overshoots
         return LandmarkPatches(grey, np.where(whole, self.growth * self.points.depths, 0.0))
 
 
@@ -205,7 +206,7 @@ class LandmarkCarrier:
         pixels = [places]
         for camera in range(1, len(images)):
             seen, alike = across(
-                self._rig, images[camera], camera, patches, places, predicted[:, 2]
+                self._rig, FineImage(images[camera]), camera, patches, places, predicted[:, 2]
             )
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
@@ -272,7 +273,7 @@ class LandmarkCarrier:
         known, points = fresh.known, fresh.points
         old, at = patches.select(known), points.places[known]
         old = dataclasses.replace(old, maps=old.maps * fresh.growth[known, None, None])
-        old, found, correlation = _aligned(old, last, at, _FIRST_ALIGNMENTS)
+        old, found, correlation = _aligned(old, FineImage(last), at, _FIRST_ALIGNMENTS)
         alike = (correlation >= _MIN_CORRELATION) & self._inside(found, _MARGIN_PX)
         maps, places, keep = patches.maps.copy(), points.places.copy(), ~known
         maps[known], places[known] = old.maps, found
@@ -290,7 +291,7 @@ class LandmarkCarrier:
             _PYRAMID_LEVELS, _SEARCH, cv2.OPTFLOW_USE_INITIAL_FLOW, _MIN_EIGENVALUE,
         )  # fmt: skip
         at = np.asarray(found, np.float64)
-        patches, places, correlation = _aligned(patches, image, at, _ALIGNMENTS)
+        patches, places, correlation = _aligned(patches, FineImage(image), at, _ALIGNMENTS)
         good = (status[:, 0] == 1) & (correlation >= _MIN_CORRELATION)
         good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
         return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))
@@ -317,10 +318,10 @@ _PATCH_ARRAYS = ("first", "light", "step", "contrast", "maps")
 
 
 def _aligned(
-    patches: ReferencePatches, image: Image, places: FloatArray, times: int
+    patches: ReferencePatches, view: FineImage, places: FloatArray, times: int
 ) -> tuple[ReferencePatches, FloatArray, FloatArray]:
     """Patches, places and correlations after so many alignments."""
     correlation = np.empty(0)
     for _ in range(times):
-        patches, places, correlation = align(patches, image, places)
+        patches, places, correlation = align(patches, view, places)
     return patches, places, correlation
