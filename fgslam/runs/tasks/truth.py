@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -120,11 +119,19 @@ def at_edges(depth: FloatArray, pixels: FloatArray) -> BoolArray:
     bend[:, 1:-1] = np.abs(np.diff(inverse, 2, axis=1))
     bend[1:-1] = np.maximum(bend[1:-1], np.abs(np.diff(inverse, 2, axis=0)))
     jumps = ~(bend <= _SAME_SURFACE * inverse)  # an unknown depth is no surface
-    side = 2 * _PATCH_REACH_PX + 1
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
-    near = cv2.dilate(jumps.astype(np.uint8), disc)
+    count = np.zeros((depth.shape[0] + 1, depth.shape[1] + 1), np.int64)
+    count[1:, 1:] = jumps.cumsum(axis=0).cumsum(axis=1)
     column, row = np.rint(pixels).astype(np.int64).T
-    return np.asarray(near[row, column] > 0)
+    left, right = _within(column, depth.shape[1])
+    top, bottom = _within(row, depth.shape[0])
+    near = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
+    return np.asarray(near > 0)
+
+
+def _within(middle: IntArray, size: int) -> tuple[IntArray, IntArray]:
+    """The first pixel that a patch reaches in an image of this size, and that after the last."""
+    low = np.clip(middle - _PATCH_REACH_PX, 0, size)
+    return low, np.clip(middle + _PATCH_REACH_PX + 1, 0, size)
 
 
 def _medians(
