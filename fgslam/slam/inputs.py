@@ -46,6 +46,8 @@ def _is_colour(image: np.ndarray) -> bool:
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     """Grey rectified images (right, left[, top]) of the rig's size from (left, right[, top]).
 
+    Copies: tracking looks back at the last images, and a camera loop may fill the same ones again.
+
     Raises:
         FrameError: another number of images, or one of another size, type or shape.
     """
@@ -76,7 +78,7 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
                 f"{name} image is {width}x{height}, the rig's are {size[0]}x{size[1]}; give images "
                 "of that size, or the calibration of these"
             )
-        grey.append(converted)
+        grey.append(converted.copy())
     left, right, *top = grey
     inside = (right, left, *top)
     return rig.rectified(inside) if isinstance(rig, StereoRig) else inside

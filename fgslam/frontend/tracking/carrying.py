@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -94,6 +95,19 @@ class Points(Rows):
         return Points(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
 
 
+class ReferenceImage:
+    """A reference image, and its fine one, made once and only where it is asked for."""
+
+    def __init__(self, image: Image) -> None:
+        """Of the image (h, w) as it is."""
+        self.image = image
+
+    @cached_property
+    def fine(self) -> FineImage:
+        """The same with values between its pixels."""
+        return FineImage(self.image)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Begun(Rows):
     """Landmarks that are carried from a reference image on, with their own patches.
@@ -117,9 +131,9 @@ class Begun(Rows):
         return Begun(Points.none(), cut, np.empty(0), np.empty(0, np.bool_))
 
     @staticmethod
-    def new(image: Image, points: Points) -> Begun:
+    def new(reference: ReferenceImage, points: Points) -> Begun:
         """First seen in this image, of which their patches are cut."""
-        cut = cut_out(FineImage(image), points.places, PATCH_PX)
+        cut = cut_out(reference.fine, points.places, PATCH_PX)
         return Begun(points, cut, np.ones(len(cut)), np.zeros(len(cut), np.bool_))
 
     @staticmethod
@@ -148,7 +162,7 @@ class LandmarkCarrier:
         """Carries nothing yet; ``stereo`` measures, by its gates."""
         self._rig = rig
         self._stereo = stereo
-        self._last: Image | None = None
+        self._last: ReferenceImage | None = None
         self._points = Points.none()
         self._patches = ReferencePatches.none(PATCH_PX)
         self._fresh = Begun.none()  # of the last image, their patches yet to be looked for
@@ -158,6 +172,15 @@ class LandmarkCarrier:
         """(n,) landmarks with a patch, ascending."""
         return np.union1d(self._points.ids, self._fresh.points.ids)
 
+    def reference(self, image: Image) -> ReferenceImage:
+        """The image as the last reference: that of the frame which was followed, if it is the same.
+
+        A frame's image is one array from beginning to end, and the next frame's is another.
+        """
+        if self._last is None or self._last.image is not image:
+            self._last = ReferenceImage(image)
+        return self._last
+
     def begin(self, image: Image, begun: Begun) -> None:
         """Landmarks seen in the reference image are carried from here, in place of older ones.
 
@@ -165,7 +188,8 @@ class LandmarkCarrier:
         costs nothing.
         """
         self._keep(~np.isin(self._points.ids, begun.points.ids))
-        self._last, self._fresh = image, begun
+        self._fresh = begun
+        self.reference(image)
 
     def forget(self, ids: IntArray) -> None:
         """Carries these no further."""
@@ -186,7 +210,8 @@ class LandmarkCarrier:
             expected: landmarks of the map where the predicted pose expects them.
             correction: of the rig; None where its calibration is taken as stated.
         """
-        last, self._last = self._last, images[0]
+        last, now = self._last, ReferenceImage(images[0])
+        self._last = now
         self._keep(np.isin(self._points.ids, expected.ids))
         self._fresh = self._fresh.select(np.isin(self._fresh.points.ids, expected.ids))
         if last is None or not self._within_reach(expected):
@@ -202,7 +227,7 @@ class LandmarkCarrier:
         # What comes nearer grows.
         maps = patches.maps * (self._points.depths / depths)[:, None, None]
         patches = dataclasses.replace(patches, maps=maps)
-        patches, places, good = self._in_reference(last, images[0], patches, predicted)
+        patches, places, good = self._in_reference(last, now, patches, predicted)
         pixels = [places]
         for camera in range(1, len(images)):
             seen, alike = across(
@@ -227,7 +252,7 @@ class LandmarkCarrier:
         out: StateArrays = {name: getattr(points, name) for name in _POINTS}
         out |= {f"fresh_{name}": getattr(fresh.points, name) for name in _POINTS}
         out |= {f"fresh_{name}": getattr(fresh, name) for name in _BEGUN}
-        out["last"] = np.empty((0, 0), np.uint8) if self._last is None else self._last
+        out["last"] = np.empty((0, 0), np.uint8) if self._last is None else self._last.image
         return out | {f"patch_{name}": getattr(self._patches, name) for name in _PATCH_ARRAYS}
 
     def restore(self, state: StateArrays) -> None:
@@ -235,7 +260,7 @@ class LandmarkCarrier:
         self._points = Points(**{name: state[name] for name in _POINTS})
         fresh = Points(**{name: state[f"fresh_{name}"] for name in _POINTS})
         self._fresh = Begun(fresh, **{name: state[f"fresh_{name}"] for name in _BEGUN})
-        self._last = state["last"] if state["last"].size else None
+        self._last = ReferenceImage(state["last"]) if state["last"].size else None
         patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
         self._patches = ReferencePatches(PATCH_PX, **patches)
 
@@ -254,7 +279,7 @@ class LandmarkCarrier:
         moved = np.concatenate(flow)
         return bool(len(moved)) and float(np.median(moved)) <= _FARTHEST_FLOW * self._rig.width
 
-    def _anchored(self, last: Image) -> ReferencePatches:
+    def _anchored(self, last: ReferenceImage) -> ReferencePatches:
         """The patches of all points, those of the fresh ones found in the last image first."""
         fresh, self._fresh = self._fresh, Begun.none()
         if len(fresh.points):
@@ -264,7 +289,7 @@ class LandmarkCarrier:
             self._points, self._patches = points.select(order), patches.select(order)
         return self._patches
 
-    def _found_again(self, last: Image, fresh: Begun) -> tuple[ReferencePatches, Points]:
+    def _found_again(self, last: ReferenceImage, fresh: Begun) -> tuple[ReferencePatches, Points]:
         """Patches and places of landmarks begun in an image; what looks different by now is left.
 
         Those known from before are placed by their own patch, not by SIFT.
@@ -273,7 +298,7 @@ class LandmarkCarrier:
         known, points = fresh.known, fresh.points
         old, at = patches.select(known), points.places[known]
         old = dataclasses.replace(old, maps=old.maps * fresh.growth[known, None, None])
-        old, found, correlation = _aligned(old, FineImage(last), at, _FIRST_ALIGNMENTS)
+        old, found, correlation = _aligned(old, last.fine, at, _FIRST_ALIGNMENTS)
         alike = (correlation >= _MIN_CORRELATION) & self._inside(found, _MARGIN_PX)
         maps, places, keep = patches.maps.copy(), points.places.copy(), ~known
         maps[known], places[known] = old.maps, found
@@ -282,16 +307,20 @@ class LandmarkCarrier:
         return dataclasses.replace(patches, maps=maps).select(keep), points.select(keep)
 
     def _in_reference(
-        self, last: Image, image: Image, patches: ReferencePatches, predicted: FloatArray
+        self,
+        last: ReferenceImage,
+        now: ReferenceImage,
+        patches: ReferencePatches,
+        predicted: FloatArray,
     ) -> tuple[ReferencePatches, FloatArray, BoolArray]:
         """Patches as deformed now, places (n, 2), and which (n,) are the same things."""
         found, status, _ = cv2.calcOpticalFlowPyrLK(
-            last, image, self._points.places.astype(np.float32),
+            last.image, now.image, self._points.places.astype(np.float32),
             predicted[:, :2].astype(np.float32), None, None, (PATCH_PX, PATCH_PX),
             _PYRAMID_LEVELS, _SEARCH, cv2.OPTFLOW_USE_INITIAL_FLOW, _MIN_EIGENVALUE,
         )  # fmt: skip
         at = np.asarray(found, np.float64)
-        patches, places, correlation = _aligned(patches, FineImage(image), at, _ALIGNMENTS)
+        patches, places, correlation = _aligned(patches, now.fine, at, _ALIGNMENTS)
         good = (status[:, 0] == 1) & (correlation >= _MIN_CORRELATION)
         good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
         return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))

@@ -150,7 +150,7 @@ class KeyFrameTracker:
         that error in every frame to come, as if all of them had seen it.
         """
         database, old = self._tracker.database, points.select(~new)
-        begun = Begun.new(image, points.select(new))
+        begun = Begun.new(self._carrier.reference(image), points.select(new))
         database.keep_patches(begun.points.ids, begun.patches(image))
         begun = begun.join(Begun.again(old, database.patches(old.ids)))
         return begun.select(np.argsort(begun.points.ids))

@@ -35,6 +35,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.slam.inputs import checked_images
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.replay import replay
 from fgslam.slam.results import SessionResult
@@ -242,6 +243,17 @@ def test_a_frame_without_images_is_placed_by_odometry(views: Views) -> None:
     expected = g.inverse(views.poses[0]) @ views.poses[3]
     np.testing.assert_allclose(step.wTc[:3, 3], expected[:3, 3], rtol=0, atol=0.05)
     assert slam.track(2.0, views.images(4), views.odometry(4)).status is EgoMotionStatus.OK
+
+
+def test_a_camera_loop_may_fill_the_same_images_again(views: Views) -> None:
+    """Tracking looks back at the last images: they are not those that were given."""
+    buffers = views.images(0)
+    taken = checked_images(buffers, RIG)
+    before = [image.copy() for image in taken]
+    for buffer in buffers:
+        buffer[:] = 77
+    for image, then in zip(taken, before, strict=True):
+        np.testing.assert_array_equal(image, then)
 
 
 def test_the_log_counts_frames_as_their_recording_does(views: Views) -> None:
