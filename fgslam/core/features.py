@@ -112,6 +112,8 @@ Words = npt.NDArray[np.int16]
 
 PATCH_PX = 15
 """Side of a landmark's patch."""
+WHOLE_PX = 6
+"""Reach of a patch from its middle, pixels: what lies beyond has a fifteenth of its weight."""
 CUT_PIXELS = (PATCH_PX + 2) ** 2
 """Grey values of a patch with the rim that its slopes need."""
 

@@ -11,9 +11,17 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import scipy.linalg  # noqa: F401  its BLAS is not NumPy's, and a limit reaches what is loaded
-from threadpoolctl import ThreadpoolController, threadpool_limits
+from threadpoolctl import ThreadpoolController
+
+
+class _Limit(Protocol):
+    """A limit that is set, as threadpoolctl gives it."""
+
+    def restore_original_limits(self) -> None:
+        """Undoes it."""
 
 
 class _Limits:
@@ -25,24 +33,25 @@ class _Limits:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._set: list[threadpool_limits] = []
+        self._set: list[_Limit] = []
         self._left: set[int] = set()
         self._loaded: ThreadpoolController | None = None
         self._modules = 0  # imported when the libraries were last looked for
 
-    def enter(self) -> threadpool_limits:
+    def enter(self) -> _Limit:
         with self._lock:
-            limits = self._libraries().limit(limits=1, user_api="blas")
+            limits: _Limit = self._libraries().limit(limits=1, user_api="blas")
             self._set.append(limits)
             return limits
 
     def _libraries(self) -> ThreadpoolController:
         """Looking for them takes a millisecond or two, in every frame: only after an import."""
-        if self._loaded is None or self._modules != len(sys.modules):
-            self._loaded, self._modules = ThreadpoolController(), len(sys.modules)
+        modules = len(sys.modules)  # before the search: what is imported meanwhile counts next time
+        if self._loaded is None or self._modules != modules:
+            self._loaded, self._modules = ThreadpoolController(), modules
         return self._loaded
 
-    def leave(self, limits: threadpool_limits) -> None:
+    def leave(self, limits: _Limit) -> None:
         with self._lock:
             self._left.add(id(limits))
             while self._set and id(self._set[-1]) in self._left:

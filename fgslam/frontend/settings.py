@@ -102,7 +102,7 @@ class MapMatchingSettings:
     ] = True
     rescue: Annotated[
         bool,
-        Field(description="where matching fails, search without the prediction"),
+        Field(description="where matching fails, or finds little, search without the prediction"),
     ] = True
 
 

@@ -158,18 +158,15 @@ def _remarks(values: Mapping[str, Any]) -> list[tuple[str, str]]:
         if len(remarks) > _REMARKS_SHOWN:
             more = len(remarks) - _REMARKS_SHOWN
             lines.append(("remark", f"{title}: and {more} more, see metrics.json"))
-    judged = next((m for m in values.values() if value_at(m, "landmark_truth_sigma_m")), None)
-    if judged is not None:
-        sigma, known, all_of_them = (
-            value_at(judged, name)
-            for name in ("landmark_truth_sigma_m", "landmarks_with_truth", "landmarks")
-        )
-        lines.append(("note", f"the landmarks' truth itself is known to {1e3 * sigma:.1f} mm"))
+    sigma = next((s for m in values.values() if (s := value_at(m, "landmark_truth_sigma_m"))), None)
+    if sigma is not None:
+        known = max(value_at(m, "landmarks_with_truth") or 0 for m in values.values())
         lines.append(
             (
                 "note",
-                f"{known} of {all_of_them} landmarks are judged: of the others, seen less than "
-                "three times or where one surface ends before another, no true point is known",
+                f"{known:,} landmarks are judged, by a truth that itself is known to "
+                f"{1e3 * sigma:.1f} mm; of others, seen too seldom or where a surface ends before "
+                "another, no true point is known",
             )
         )
     return lines

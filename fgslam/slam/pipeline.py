@@ -331,17 +331,16 @@ class SlamPipeline:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:
             tracked, stereo = self.key_frames.beside(carried, prediction, landmarks, stereo)
-        relocalised = tracked.ego_motion.status is EgoMotionStatus.RELOCALISED
-        maps_on = True
+        located, maps_on = False, True
         if found.i == 0 and self.located is not None:
             anew = self.tracker.track_anew(self.located, landmarks, stereo)
-            relocalised = anew.ego_motion.status.measured
-            tracked = anew if relocalised else tracked
+            located = anew.ego_motion.status.measured
+            tracked = anew if located else tracked
         elif self.places is not None and found.i > 0:
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
             tracked, located = self.places.recover(tracked, landmarks, stereo.whole, guessed)
-            relocalised |= located
             maps_on = self.places.maps_on
+        relocalised = located or tracked.ego_motion.status is EgoMotionStatus.RELOCALISED
         if self.key_frames is not None:
             tracked = spread(tracked, stereo)
         image = found.frame.images[0]

@@ -31,12 +31,12 @@ class FineImage:
         """``image`` (h, w) uint8."""
         height, width = image.shape
         values = image.astype(np.float32)  # not rounded: a dark image has few grey values
-        self.grey: Float32 = np.empty((PER_PIXEL * height, PER_PIXEL * width), np.float32)
-        """(2 h, 2 w): the pixel (column, row) of the image is at (2 column, 2 row)."""
+        self.grey: Float32 = np.empty((PER_PIXEL * height - 1, PER_PIXEL * width - 1), np.float32)
+        """(2 h - 1, 2 w - 1): the pixel (column, row) of the image is at (2 column, 2 row)."""
         self.grey[::2, ::2] = values
-        self.grey[::2, 1::2] = _filtered(values, across=True, down=False)
-        self.grey[1::2, ::2] = _filtered(values, across=False, down=True)
-        self.grey[1::2, 1::2] = _filtered(values, across=True, down=True)
+        self.grey[::2, 1::2] = _filtered(values, across=True, down=False)[:, :-1]
+        self.grey[1::2, ::2] = _filtered(values, across=False, down=True)[:-1]
+        self.grey[1::2, 1::2] = _filtered(values, across=True, down=True)[:-1, :-1]
 
 
 def _filtered(values: Float32, *, across: bool, down: bool) -> Float32:

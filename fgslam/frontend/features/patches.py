@@ -16,13 +16,10 @@ from typing import TypeAlias
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
-from fgslam.frontend.features.fine_image import PER_PIXEL, FineImage
+from fgslam.frontend.features.fine_image import PER_PIXEL, FineImage, Float32
 from fgslam.frontend.features.matching import pairs_within
-
-Float32 = npt.NDArray[np.float32]
 
 View: TypeAlias = Image | FineImage
 """What patches are sampled in: grey values (h, w), between them on straight lines; or finely."""
@@ -82,7 +79,7 @@ class ReferencePatches(Rows):
 
 
 def cut_out(view: View, places: FloatArray, size: int) -> Float32:
-    """(n, (size + 2)^2) grey values of a view (h, w) around places (n, 2): column, row.
+    """(n, (size + 2)^2) grey values of a view around places (n, 2): column, row.
 
     What :func:`anchor_at` makes patches of; the rim is for their slopes.
     """
@@ -92,7 +89,7 @@ def cut_out(view: View, places: FloatArray, size: int) -> Float32:
 def anchor(
     view: View, places: FloatArray, size: int, noise: float, deformation: float
 ) -> ReferencePatches:
-    """Patches around places (n, 2), column and row, of a view (h, w); else :func:`anchor_at`."""
+    """Patches around places (n, 2), column and row, of a view; else :func:`anchor_at`."""
     return anchor_at(cut_out(view, places, size), size, noise, deformation)
 
 
@@ -250,10 +247,10 @@ def _sampled(view: View, places: FloatArray, maps: FloatArray, size: int) -> Flo
     at, turned = places.astype(np.float32), maps.astype(np.float32)
     columns = at[:, :1] + turned[:, 0, :1] * x + turned[:, 0, 1:] * y
     rows = at[:, 1:] + turned[:, 1, :1] * x + turned[:, 1, 1:] * y
-    grey = view.grey if isinstance(view, FineImage) else view
-    if isinstance(view, FineImage):
-        columns, rows = PER_PIXEL * columns, PER_PIXEL * rows
-    seen = cv2.remap(grey, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    grey, scale = (view.grey, PER_PIXEL) if isinstance(view, FineImage) else (view, 1)
+    seen = cv2.remap(
+        grey, scale * columns, scale * rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return np.asarray(seen, dtype=np.float32)
 
 

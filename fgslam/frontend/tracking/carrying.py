@@ -22,6 +22,7 @@ from fgslam.core.cylindrical import size_distances
 from fgslam.core.features import (
     CUT_PIXELS,
     PATCH_PX,
+    WHOLE_PX,
     Features,
     LandmarkPatches,
     StereoFeatures,
@@ -29,9 +30,8 @@ from fgslam.core.features import (
 from fgslam.core.geometry import triangulate
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.features.fine_image import FineImage
+from fgslam.frontend.features.fine_image import FineImage, Float32
 from fgslam.frontend.features.patches import (
-    Float32,
     ReferencePatches,
     align,
     anchor_at,
@@ -45,7 +45,6 @@ from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 _MIN_CORRELATION = 0.65  # of a patch with its first look, gain and offset taken out
 _FARTHEST_PX = 2.0  # between what the search found and the patch: beyond, it is another thing
 _MARGIN_PX = 4.0  # of the patch's middle to the border of the reference image
-_WHOLE_PX = 6.0  # of a patch's middle: what lies beyond has a fifteenth of its weight
 _PYRAMID_LEVELS = 2
 _SEARCH = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)
 _MIN_EIGENVALUE = 1e-4
@@ -150,7 +149,7 @@ class Begun(Rows):
         What is repeated there would pull what is found again to the image's side.
         """
         height, width = image.shape[:2]
-        whole = _inside(self.points.places, _WHOLE_PX, (width, height))
+        whole = _inside(self.points.places, WHOLE_PX, (width, height))
         grey = np.clip(np.rint(self.cut), 0, 255).astype(np.uint8)  # between pixels it overshoots
         return LandmarkPatches(grey, np.where(whole, self.growth * self.points.depths, 0.0))
 

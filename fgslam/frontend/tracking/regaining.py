@@ -1,5 +1,8 @@
 """The pose of a frame whose prediction failed: a sudden turn, a gap, a blurred or dark image.
 
+It failed where too few match around it, or most of what matches contradicts the pose, or few of
+the frame's features agree with it.
+
 What was in view lately is looked for by its descriptor alone, wherever the prediction expects it.
 The pose that most of it agrees with is believed where chance does not explain so many agreeing
 matches (a-contrario test of Moisan and Stival, IJCV 57(3), 2004), and where no other pose has half

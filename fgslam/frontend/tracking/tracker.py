@@ -94,7 +94,8 @@ class LandmarkTracker:
         Which part of the map is which is booked in ``parts`` by whoever drives.
         With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in. With
         ``expects_returns`` place recognition tells old landmarks from recent ones where they
-        contradict each other; without, the prediction was wrong.
+        contradict each other; without, the prediction was wrong. It was in either case where few
+        features agree with the pose.
         """
         self.keeps_map = False
         self.expects_returns = False

@@ -11,7 +11,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import StereoFeatures
+from fgslam.core.features import WHOLE_PX, StereoFeatures
 from fgslam.core.geometry import inverse, transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth, Sequence
@@ -27,10 +27,8 @@ from fgslam.runs.opening import open_sequence
 
 _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03
-"""Relative spread of the four depths around a pixel that one surface may have."""
-
-_PATCH_REACH_PX = 6
-"""From the middle of a landmark's patch; what lies beyond has a fifteenth of its weight."""
+"""Relative spread of the four depths around a pixel, and bend of the inverse depth from pixel to
+pixel, that one surface may have."""
 
 _NORMAL_MAD = 1.4826  # median absolute deviation to standard deviation, normal distribution
 _MEDIAN_TO_MEAN = 1.2533  # standard error of a median over that of the mean
@@ -54,7 +52,7 @@ def rendered_landmark_truth(
     rendered surface. The truth has an error of its own: a feature's pixel is known to a fraction
     of a pixel only, and at a curved or slanted surface the blob that is matched is no point.
     Where patches show two surfaces, one behind the other, there is no true point at all: their
-    contrast may be of either. A landmark is left out where most of its sightings are such.
+    contrast may be of either. A landmark is left out where most of its known points are such.
 
     Args:
         sequence: the recording; frame k is the log's.
@@ -112,7 +110,7 @@ def points_under(
 def at_edges(depth: FloatArray, pixels: FloatArray) -> BoolArray:
     """Which places (n, 2) in a depth image (h, w) have an edge of depth within a patch's reach.
 
-    The inverse depth is linear in the image on a plane: where it jumps, its second difference is.
+    On a plane the inverse depth is linear in the image; at a jump its second difference is large.
     """
     inverse = 1.0 / depth
     bend = np.zeros_like(inverse)
@@ -130,8 +128,8 @@ def at_edges(depth: FloatArray, pixels: FloatArray) -> BoolArray:
 
 def _within(middle: IntArray, size: int) -> tuple[IntArray, IntArray]:
     """The first pixel that a patch reaches in an image of this size, and that after the last."""
-    low = np.clip(middle - _PATCH_REACH_PX, 0, size)
-    return low, np.clip(middle + _PATCH_REACH_PX + 1, 0, size)
+    low = np.clip(middle - WHOLE_PX, 0, size)
+    return low, np.clip(middle + WHOLE_PX + 1, 0, size)
 
 
 def _medians(

@@ -6,10 +6,12 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
-from threadpoolctl import threadpool_info, threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_info, threadpool_limits
 
+from fgslam.core import threads
 from fgslam.core.threads import one_blas_thread
 
 ROOT = Path(__file__).parents[3]
@@ -79,6 +81,25 @@ def test_nested_thread_limits_end_independently() -> None:
         assert set(blas_threads()) == {1}
         second.__exit__(None, None, None)
         assert max(blas_threads()) == 2
+
+
+def test_libraries_are_looked_for_only_after_an_import(monkeypatch: pytest.MonkeyPatch) -> None:
+    searches = []
+
+    class Counted(ThreadpoolController):  # type: ignore[misc]
+        def __init__(self) -> None:
+            searches.append(1)
+            super().__init__()
+
+    monkeypatch.setattr(threads, "ThreadpoolController", Counted)
+    limits = threads._Limits()
+    for _ in range(2):
+        limits.leave(limits.enter())
+    assert len(searches) == 1
+    monkeypatch.setitem(sys.modules, "a_library_with_a_blas", ModuleType("a"))
+    for _ in range(2):
+        limits.leave(limits.enter())
+    assert len(searches) == 2
 
 
 @pytest.mark.slow

@@ -104,6 +104,29 @@ def test_a_few_matches_where_they_were_predicted_do_not_hide_all_others(scene: S
     np.testing.assert_allclose(g.se3_log(g.inverse(TURNED) @ found.wTc), 0.0, atol=4e-3)
 
 
+@pytest.mark.parametrize("returns", [False, True])
+def test_new_ground_is_no_reason_to_look(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, returns: bool
+) -> None:
+    """A sound pose that a third of the features agree with, where two thirds are seen first."""
+    monkeypatch.setattr(regaining.Regainer, "find", lambda *_: pytest.fail("looked for"))
+    scene.tracker.expects_returns = returns
+    known = scene.map.without(np.delete(scene.map.ids, np.s_[::3]))
+    stereo = scene._stereo.match(scene.world.features(np.eye(4), sigma_px=0.1))
+    found = scene.tracker.track(Prediction(np.eye(4), CERTAIN), known, stereo).ego_motion
+    assert found.status is EgoMotionStatus.OK
+    assert found.inliers.sum() < 0.4 * len(stereo)
+
+
+@pytest.mark.parametrize("returns", [False, True])
+def test_few_matches_are_a_reason_whoever_else_looks(scene: Scene, returns: bool) -> None:
+    scene.tracker.expects_returns = returns
+    few = scene.world.points[:, 0] < np.quantile(scene.world.points[:, 0], 0.1)
+    scene.world.points[few] = g.transform_to_world(TURNED, scene.world.points[few])
+    found = tracked_at(scene, np.eye(4)).ego_motion
+    assert found.status is EgoMotionStatus.RELOCALISED
+
+
 def test_only_what_was_seen_lately_is_looked_for(scene: Scene) -> None:
     """A map from which the run has seen nothing for long is the business of place recognition."""
     rng = np.random.default_rng(5)

@@ -17,9 +17,11 @@ from simulated import RIG, Drive, simulate
 
 from fgslam.backend.settings import Isam2Settings, LandmarkKalmanSettings
 from fgslam.cli.console import rich_table
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.estimates import LandmarkMap
+from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import Answer, seen_often
@@ -47,7 +49,12 @@ from fgslam.runs.metric_tables import (
     page_tables,
 )
 from fgslam.runs.slam_comparison import judged_apart, named
-from fgslam.runs.tasks.truth import _medians, at_edges, points_under
+from fgslam.runs.tasks.truth import (
+    _medians,
+    at_edges,
+    points_under,
+    rendered_landmark_truth,
+)
 from fgslam.runs.trials import Trial, summarise, together, write_trials
 from fgslam.runs.trials import _result as trials_result
 
@@ -391,10 +398,15 @@ def test_at_an_edge_or_without_depth_the_point_is_not_known() -> None:
 
 def test_a_place_is_at_an_edge_where_a_patch_around_it_shows_two_surfaces() -> None:
     columns = np.tile(np.arange(RIG.width), (RIG.height, 1))
-    depth = 4.0 / (1.0 + 2e-3 * columns)  # slanted: no edge
-    depth[100:, 150:] /= 1.5  # something before it
-    pixels = np.array([[20.2, 30.0], [140.0, 150.0], [146.0, 150.0], [160.0, 96.3], [160.0, 110.0]])
-    assert at_edges(depth, pixels).tolist() == [False, False, True, True, False]
+    depth = 4.0 / (1.0 + 0.1 * columns)  # slanted by up to 9 % a pixel: no edge
+    depth[100:, 150:] /= 1.5  # something before it, from the pixel 150 on; it bends at 149
+    depth[20, 20] = np.nan
+    places = {
+        (60.2, 30.0): False, (142.0, 150.0): False, (143.0, 150.0): True, (156.0, 150.0): True,
+        (157.0, 150.0): False, (170.0, 92.3): False, (170.0, 93.0): True, (170.0, 110.0): False,
+        (26.0, 20.0): True, (30.0, 20.0): False, (0.0, 0.0): False,
+    }  # fmt: skip
+    assert at_edges(depth, np.array(list(places))).tolist() == list(places.values())
 
 
 def test_landmarks_mostly_seen_at_edges_have_no_truth() -> None:
@@ -402,6 +414,37 @@ def test_landmarks_mostly_seen_at_edges_have_no_truth() -> None:
     split = np.array([True, True, True, False, False, True, True, False, False, False, False])
     truth, _ = _medians(ids, points, split)
     assert truth.ids.tolist() == [8]  # half of the sightings do; the last one has too few
+
+
+class OneWall:
+    """Three frames from one place, and something before the right half of what they see."""
+
+    rig = RIG
+    ground_truth = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+
+    def depth(self, i: int) -> FloatArray:
+        depth = np.full((RIG.height, RIG.width), 4.0)
+        depth[:, 150:] = 2.0
+        return depth
+
+
+def test_rendered_truth_is_of_landmarks_on_one_surface() -> None:
+    places = np.array([[60.0, 50.0, 1.0], [147.0, 50.0, 1.0], [200.0, 80.0, 1.0]])
+    none = np.empty(0, np.int64)
+    seen = Observations(
+        np.arange(3), places, np.tile(np.eye(3), (3, 1, 1)), np.full((3, 3, 2), np.nan),
+        np.zeros(3, np.bool_),
+    )  # fmt: skip
+    frames = [
+        Increment(k, float(k), None, seen, np.zeros(3, np.bool_), none, none) for k in range(3)
+    ]
+    log = MeasurementLog(RIG, {}, frames)
+    found = rendered_landmark_truth(OneWall(), log)  # type: ignore[arg-type]
+    assert found is not None
+    truth, sigma = found
+    assert truth.ids.tolist() == [0, 2]
+    np.testing.assert_allclose(truth.positions[:, 2], [4.0, 2.0])
+    np.testing.assert_array_equal(sigma, 0.0)
 
 
 # --------------------------------------------------------------------------------------------

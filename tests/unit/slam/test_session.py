@@ -35,6 +35,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
+from fgslam.frontend.tracking.tracker import Tracked
 from fgslam.slam.inputs import checked_images
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.replay import replay
@@ -254,6 +255,24 @@ def test_a_camera_loop_may_fill_the_same_images_again(views: Views) -> None:
         buffer[:] = 77
     for image, then in zip(taken, before, strict=True):
         np.testing.assert_array_equal(image, then)
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_the_pose_that_is_used_says_whether_it_was_found_anew(
+    views: Views, monkeypatch: pytest.MonkeyPatch, anew: bool
+) -> None:
+    """Recent landmarks may place a frame again: with them the prediction, or without it."""
+    slam = session(views, frontend={"tracking": "sift", "loops": {}})
+    push(slam, views, range(3))
+    status = EgoMotionStatus.RELOCALISED if anew else EgoMotionStatus.OK
+
+    def by_recent(self: object, tracked: Tracked, *_: object) -> Tracked:
+        found = dataclasses.replace(tracked.ego_motion, status=status)
+        return dataclasses.replace(tracked, ego_motion=found)
+
+    monkeypatch.setattr(type(slam.pipeline.places), "placed_by_recent", by_recent)
+    slam.track(1.5, views.images(3), views.odometry(3))
+    assert slam.log.increments[-1].relocalised is anew
 
 
 def test_the_log_counts_frames_as_their_recording_does(views: Views) -> None:

@@ -17,7 +17,7 @@ def test_pixels_stay_and_what_is_straight_stays_straight() -> None:
     noise = np.random.default_rng(0).integers(0, 256, ROWS.shape).astype(np.uint8)
     np.testing.assert_array_equal(FineImage(noise).grey[::2, ::2], noise)
     ramp = np.asarray(2 * COLUMNS + ROWS, dtype=np.uint8)
-    rows, columns = np.mgrid[0:120, 0:160] / 2.0
+    rows, columns = np.mgrid[0:119, 0:159] / 2.0
     expected = 2.0 * columns + rows
     np.testing.assert_allclose(
         FineImage(ramp).grey[INSIDE, INSIDE], expected[INSIDE, INSIDE], atol=1e-3
