@@ -64,7 +64,7 @@ class PatchStereo:
         coarse = self._coarse(frame.images, found.xy)
         known = np.isfinite(coarse)
         found, coarse = found.select(known), coarse[known]
-        views = [FineImage(image) for image in frame.images] if len(found.xy) else []
+        views = [FineImage(image) for image in frame.images]
         pixels = np.empty((len(found.xy), len(frame.images), 2))
         good: BoolArray = np.empty(len(found.xy), np.bool_)
         for first in range(0, len(found.xy), _AT_ONCE):

@@ -8,6 +8,8 @@ Dubuc 1989, Symmetric iterative interpolation processes), and between its values
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -25,18 +27,23 @@ _BEFORE = 2  # of the six pixels: those before the one that the place lies behin
 
 
 class FineImage:
-    """The values of a grey image at its pixels and halfway between them."""
+    """A grey image, and its values halfway between its pixels, found where they are asked for."""
 
     def __init__(self, image: Image) -> None:
         """``image`` (h, w) uint8."""
-        height, width = image.shape
-        values = image.astype(np.float32)  # not rounded: a dark image has few grey values
-        self.grey: Float32 = np.empty((PER_PIXEL * height - 1, PER_PIXEL * width - 1), np.float32)
+        self.image = image
+
+    @cached_property
+    def grey(self) -> Float32:
         """(2 h - 1, 2 w - 1): the pixel (column, row) of the image is at (2 column, 2 row)."""
-        self.grey[::2, ::2] = values
-        self.grey[::2, 1::2] = _filtered(values, across=True, down=False)[:, :-1]
-        self.grey[1::2, ::2] = _filtered(values, across=False, down=True)[:-1]
-        self.grey[1::2, 1::2] = _filtered(values, across=True, down=True)[:-1, :-1]
+        height, width = self.image.shape
+        values = self.image.astype(np.float32)  # not rounded: a dark image has few grey values
+        out = np.empty((PER_PIXEL * height - 1, PER_PIXEL * width - 1), np.float32)
+        out[::2, ::2] = values
+        out[::2, 1::2] = _filtered(values, across=True, down=False)[:, :-1]
+        out[1::2, ::2] = _filtered(values, across=False, down=True)[:-1]
+        out[1::2, 1::2] = _filtered(values, across=True, down=True)[:-1, :-1]
+        return out
 
 
 def _filtered(values: Float32, *, across: bool, down: bool) -> Float32:

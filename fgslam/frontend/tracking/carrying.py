@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -94,19 +93,6 @@ class Points(Rows):
         return Points(np.empty(0, np.int64), np.empty((0, 2)), np.empty(0))
 
 
-class ReferenceImage:
-    """A reference image, and its fine one, made once and only where it is asked for."""
-
-    def __init__(self, image: Image) -> None:
-        """Of the image (h, w) as it is."""
-        self.image = image
-
-    @cached_property
-    def fine(self) -> FineImage:
-        """The same with values between its pixels."""
-        return FineImage(self.image)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Begun(Rows):
     """Landmarks that are carried from a reference image on, with their own patches.
@@ -130,9 +116,9 @@ class Begun(Rows):
         return Begun(Points.none(), cut, np.empty(0), np.empty(0, np.bool_))
 
     @staticmethod
-    def new(reference: ReferenceImage, points: Points) -> Begun:
+    def new(reference: FineImage, points: Points) -> Begun:
         """First seen in this image, of which their patches are cut."""
-        cut = cut_out(reference.fine, points.places, PATCH_PX)
+        cut = cut_out(reference, points.places, PATCH_PX)
         return Begun(points, cut, np.ones(len(cut)), np.zeros(len(cut), np.bool_))
 
     @staticmethod
@@ -161,7 +147,7 @@ class LandmarkCarrier:
         """Carries nothing yet; ``stereo`` measures, by its gates."""
         self._rig = rig
         self._stereo = stereo
-        self._last: ReferenceImage | None = None
+        self._last: FineImage | None = None
         self._points = Points.none()
         self._patches = ReferencePatches.none(PATCH_PX)
         self._fresh = Begun.none()  # of the last image, their patches yet to be looked for
@@ -171,13 +157,13 @@ class LandmarkCarrier:
         """(n,) landmarks with a patch, ascending."""
         return np.union1d(self._points.ids, self._fresh.points.ids)
 
-    def reference(self, image: Image) -> ReferenceImage:
+    def reference(self, image: Image) -> FineImage:
         """The image as the last reference: that of the frame which was followed, if it is the same.
 
         A frame's image is one array from beginning to end, and the next frame's is another.
         """
         if self._last is None or self._last.image is not image:
-            self._last = ReferenceImage(image)
+            self._last = FineImage(image)
         return self._last
 
     def begin(self, image: Image, begun: Begun) -> None:
@@ -187,8 +173,7 @@ class LandmarkCarrier:
         costs nothing.
         """
         self._keep(~np.isin(self._points.ids, begun.points.ids))
-        self._fresh = begun
-        self.reference(image)
+        self._last, self._fresh = self.reference(image), begun
 
     def forget(self, ids: IntArray) -> None:
         """Carries these no further."""
@@ -209,7 +194,7 @@ class LandmarkCarrier:
             expected: landmarks of the map where the predicted pose expects them.
             correction: of the rig; None where its calibration is taken as stated.
         """
-        last, now = self._last, ReferenceImage(images[0])
+        last, now = self._last, FineImage(images[0])
         self._last = now
         self._keep(np.isin(self._points.ids, expected.ids))
         self._fresh = self._fresh.select(np.isin(self._fresh.points.ids, expected.ids))
@@ -259,7 +244,7 @@ class LandmarkCarrier:
         self._points = Points(**{name: state[name] for name in _POINTS})
         fresh = Points(**{name: state[f"fresh_{name}"] for name in _POINTS})
         self._fresh = Begun(fresh, **{name: state[f"fresh_{name}"] for name in _BEGUN})
-        self._last = ReferenceImage(state["last"]) if state["last"].size else None
+        self._last = FineImage(state["last"]) if state["last"].size else None
         patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
         self._patches = ReferencePatches(PATCH_PX, **patches)
 
@@ -278,7 +263,7 @@ class LandmarkCarrier:
         moved = np.concatenate(flow)
         return bool(len(moved)) and float(np.median(moved)) <= _FARTHEST_FLOW * self._rig.width
 
-    def _anchored(self, last: ReferenceImage) -> ReferencePatches:
+    def _anchored(self, last: FineImage) -> ReferencePatches:
         """The patches of all points, those of the fresh ones found in the last image first."""
         fresh, self._fresh = self._fresh, Begun.none()
         if len(fresh.points):
@@ -288,7 +273,7 @@ class LandmarkCarrier:
             self._points, self._patches = points.select(order), patches.select(order)
         return self._patches
 
-    def _found_again(self, last: ReferenceImage, fresh: Begun) -> tuple[ReferencePatches, Points]:
+    def _found_again(self, last: FineImage, fresh: Begun) -> tuple[ReferencePatches, Points]:
         """Patches and places of landmarks begun in an image; what looks different by now is left.
 
         Those known from before are placed by their own patch, not by SIFT.
@@ -297,7 +282,7 @@ class LandmarkCarrier:
         known, points = fresh.known, fresh.points
         old, at = patches.select(known), points.places[known]
         old = dataclasses.replace(old, maps=old.maps * fresh.growth[known, None, None])
-        old, found, correlation = _aligned(old, last.fine, at, _FIRST_ALIGNMENTS)
+        old, found, correlation = _aligned(old, last, at, _FIRST_ALIGNMENTS)
         alike = (correlation >= _MIN_CORRELATION) & self._inside(found, _MARGIN_PX)
         maps, places, keep = patches.maps.copy(), points.places.copy(), ~known
         maps[known], places[known] = old.maps, found
@@ -307,8 +292,8 @@ class LandmarkCarrier:
 
     def _in_reference(
         self,
-        last: ReferenceImage,
-        now: ReferenceImage,
+        last: FineImage,
+        now: FineImage,
         patches: ReferencePatches,
         predicted: FloatArray,
     ) -> tuple[ReferencePatches, FloatArray, BoolArray]:
@@ -319,7 +304,7 @@ class LandmarkCarrier:
             _PYRAMID_LEVELS, _SEARCH, cv2.OPTFLOW_USE_INITIAL_FLOW, _MIN_EIGENVALUE,
         )  # fmt: skip
         at = np.asarray(found, np.float64)
-        patches, places, correlation = _aligned(patches, now.fine, at, _ALIGNMENTS)
+        patches, places, correlation = _aligned(patches, now, at, _ALIGNMENTS)
         good = (status[:, 0] == 1) & (correlation >= _MIN_CORRELATION)
         good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
         return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))

@@ -8,6 +8,7 @@ import pytest
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import PATCH_PX, LandmarkPatches
 from fgslam.core.geometry import project
+from fgslam.frontend.features.fine_image import FineImage
 from fgslam.frontend.features.patches import ReferencePatches, crowding
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
@@ -18,7 +19,6 @@ from fgslam.frontend.tracking.carrying import (
     Carried,
     LandmarkCarrier,
     Points,
-    ReferenceImage,
 )
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
@@ -54,7 +54,7 @@ def begun(images: tuple[Image, ...], place: FloatArray) -> LandmarkCarrier:
     stereo = StereoMatcher(RIG, StereoSettings(), AppearanceSettings())
     carrier = LandmarkCarrier(RIG, stereo)
     seen = measurements(place)
-    carrier.begin(images[0], Begun.new(ReferenceImage(images[0]), points(seen[:, :2], place)))
+    carrier.begin(images[0], Begun.new(FineImage(images[0]), points(seen[:, :2], place)))
     return carrier
 
 
@@ -66,10 +66,10 @@ def points(places: FloatArray, place: FloatArray) -> Points:
 def found_again(place: FloatArray, off: FloatArray) -> tuple[ReferencePatches, Points]:
     """What was first seen from here, as SIFT finds it again elsewhere, off (n, 2) pixels."""
     here, now = pictures(HERE)[0], pictures(place)
-    first = Begun.new(ReferenceImage(here), points(measurements(HERE)[:, :2], HERE))
+    first = Begun.new(FineImage(here), points(measurements(HERE)[:, :2], HERE))
     again = points(measurements(place)[:, :2] + off, place)
     carrier = begun(now, place)
-    return carrier._found_again(ReferenceImage(now[0]), Begun.again(again, first.patches(here)))
+    return carrier._found_again(FineImage(now[0]), Begun.again(again, first.patches(here)))
 
 
 def dark(place: FloatArray) -> tuple[Image, ...]:
@@ -151,7 +151,7 @@ def test_what_looks_different_by_now_is_not_found_again() -> None:
 
 def test_where_all_look_different_by_now_nothing_is_carried() -> None:
     here, now = pictures(HERE)[0], pictures(np.array([0.02, 0.0, 0.0]))
-    first = Begun.new(ReferenceImage(here), points(measurements(HERE)[:, :2], HERE))
+    first = Begun.new(FineImage(here), points(measurements(HERE)[:, :2], HERE))
     other = np.random.default_rng(6).integers(0, 256, first.cut.shape).astype(np.uint8)
     carrier = begun(now, np.array([0.02, 0.0, 0.0]))
     patches = LandmarkPatches(other, first.patches(here).distances)
@@ -164,7 +164,7 @@ def test_where_all_look_different_by_now_nothing_is_carried() -> None:
 
 def test_a_landmark_without_a_patch_is_not_carried() -> None:
     image = pictures(HERE)[0]
-    first = Begun.new(ReferenceImage(image), points(measurements(HERE)[:, :2], HERE))
+    first = Begun.new(FineImage(image), points(measurements(HERE)[:, :2], HERE))
     patches = first.patches(image)
     distances = np.where(np.arange(len(GRID)) < 5, patches.distances, 0.0)
     again = Begun.again(first.points, LandmarkPatches(patches.grey, distances))
@@ -175,7 +175,7 @@ def test_no_patch_is_kept_that_reaches_beyond_the_border() -> None:
     """Its repeated pixels would pull the landmark to the border wherever it is found again."""
     image = pictures(HERE)[0]
     at = np.array([[2.0, 100.0], [6.0, 100.0], [160.0, 4.0], [160.0, 120.0], [315.0, 237.0]])
-    begun = Begun.new(ReferenceImage(image), Points(np.arange(5), at, np.full(5, 2.0)))
+    begun = Begun.new(FineImage(image), Points(np.arange(5), at, np.full(5, 2.0)))
     assert begun.patches(image).distances.tolist() == [0.0, 2.0, 0.0, 2.0, 0.0]
 
 
