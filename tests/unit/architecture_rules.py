@@ -82,8 +82,9 @@ SAFE_YAML = frozenset(
         "SequenceNode",
     }
 )
-MAX_MODULE_LINES = 450
-MAX_FUNCTION_LINES = 50
+MAX_MODULE_LINES = 700
+"""Code lines of one subject: neither blank, comment, docstring nor import."""
+MAX_FUNCTION_LINES = 80
 
 _COMPUTED_IMPORT = "import_module of a computed name"
 
@@ -118,7 +119,7 @@ class Module:
 
     name: str
     path: str
-    lines: int
+    source: str = field(repr=False)
     tree: ast.Module = field(repr=False)
     is_package: bool
 
@@ -126,6 +127,20 @@ class Module:
     def nodes(self) -> tuple[ast.AST, ...]:
         """All of the tree, found once."""
         return tuple(ast.walk(self.tree))
+
+    @property
+    def code_lines(self) -> int:
+        """Lines that are neither blank, comment, docstring nor import."""
+        skipped: set[int] = set()
+        for node in self.nodes:
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                skipped.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+            elif isinstance(node, ast.Module | ast.ClassDef | FunctionNode):
+                skipped.update(_docstring_lines(node))
+        return sum(
+            number not in skipped and bool(line.strip()) and not line.strip().startswith("#")
+            for number, line in enumerate(self.source.splitlines(), 1)
+        )
 
     @property
     def layer(self) -> str:
@@ -144,7 +159,7 @@ def load_package(root: Path) -> list[Module]:
             Module(
                 name=".".join(parts[:-1] if is_package else parts),
                 path=path.relative_to(root.parent).as_posix(),
-                lines=len(source.splitlines()),
+                source=source,
                 tree=ast.parse(source, str(path)),
                 is_package=is_package,
             )
@@ -342,11 +357,10 @@ def _route_back(start: str, edges: dict[str, set[str]]) -> list[str]:
 
 def size_violations(module: Module) -> Iterator[Violation]:
     """Modules and functions that are too long; a function's docstring does not count."""
-    if module.lines > MAX_MODULE_LINES:
+    lines = module.code_lines
+    if lines > MAX_MODULE_LINES:
         yield Violation(
-            module.path,
-            module.lines,
-            f"module of {module.lines} lines (at most {MAX_MODULE_LINES})",
+            module.path, 1, f"module of {lines} code lines (at most {MAX_MODULE_LINES})"
         )
     for node in module.nodes:
         if isinstance(node, FunctionNode):
@@ -361,10 +375,15 @@ def size_violations(module: Module) -> Iterator[Violation]:
 
 def _length_without_docstring(node: FunctionNode) -> int:
     length = (node.end_lineno or node.lineno) - node.lineno + 1
-    if ast.get_docstring(node) is not None:
-        docstring = node.body[0]
-        length -= (docstring.end_lineno or docstring.lineno) - docstring.lineno + 1
-    return length
+    return length - len(_docstring_lines(node))
+
+
+def _docstring_lines(node: ast.Module | ast.ClassDef | FunctionNode) -> range:
+    """Lines of a docstring; none without one."""
+    if ast.get_docstring(node) is None:
+        return range(0)
+    docstring = node.body[0]
+    return range(docstring.lineno, (docstring.end_lineno or docstring.lineno) + 1)
 
 
 def statement_violations(module: Module) -> Iterator[Violation]:

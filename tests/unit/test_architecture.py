@@ -203,12 +203,14 @@ def test_cycles_are_found_with_their_route(tmp_path: Path) -> None:
 def test_sizes_are_limited(tmp_path: Path) -> None:
     body = "    x = 1\n"
     docstring = '    """One.\n' + "\n" * 20 + '    """\n'
-    fine = "def f():\n" + docstring + 49 * body
+    fine = "def f():\n" + docstring + 79 * body
     assert findings(tmp_path / "fine", {"frontend/a.py": fine}) == []
-    long_function = findings(tmp_path / "f", {"frontend/a.py": "def f():\n" + 50 * body})
-    assert long_function == ["fgslam/frontend/a.py:1: function f of 51 lines (at most 50)"]
-    long_module = findings(tmp_path / "m", {"frontend/a.py": "x = 1\n" * 451})
-    assert long_module == ["fgslam/frontend/a.py:451: module of 451 lines (at most 450)"]
+    long_function = findings(tmp_path / "f", {"frontend/a.py": "def f():\n" + 80 * body})
+    assert long_function == ["fgslam/frontend/a.py:1: function f of 81 lines (at most 80)"]
+    long_module = findings(
+        tmp_path / "m", {"frontend/a.py": "import cv2\n\n# why\n" + "x = 1\n" * 701}
+    )
+    assert long_module == ["fgslam/frontend/a.py:1: module of 701 code lines (at most 700)"]
 
 
 def test_a_new_room_needs_a_place_in_the_order(tmp_path: Path) -> None:
