@@ -53,7 +53,7 @@ def run_experiment(
     return run_task(opener_of(config, watch), config, folder, existing, progress, stopped)
 
 
-def opener_of(  # noqa: C901, PLR0911 - one a task
+def opener_of(  # noqa: PLR0911 - one a task
     config: Experiment, watch: Watch | None = None
 ) -> Opener[RunResult]:
     """What opens the data of a configuration; each task is imported when it is run."""

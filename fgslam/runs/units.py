@@ -264,7 +264,7 @@ def load_value(path: Path, kind: Any) -> Any:
         ) from None
 
 
-def _pack(value: Any, arrays: list[np.ndarray]) -> Any:  # noqa: PLR0911 - one a sort of value
+def _pack(value: Any, arrays: list[np.ndarray]) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, Enum):
@@ -294,7 +294,7 @@ def _names(kind: type) -> list[str]:
     return list(names)
 
 
-def _unpack(tree: Any, kind: Any, arrays: StateArrays) -> Any:  # noqa: PLR0911 - one a sort
+def _unpack(tree: Any, kind: Any, arrays: StateArrays) -> Any:
     if isinstance(tree, dict) and _ARRAY in tree:
         return arrays[f"a{tree[_ARRAY]}"]
     if isinstance(tree, dict) and _BYTES in tree:
