@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, Count, Index, NonNegative, Positive
 
 Family: TypeAlias = Literal["filter", "smoother", "other"]
 """Whether past poses are revised; paired tests compare smoothers with filters, and no others.
@@ -29,46 +29,40 @@ _FAMILIES: dict[str, Family] = {
 class FloorSettings:
     """How an estimator uses the floor under the robot."""
 
-    mode: Annotated[
-        Literal["auto", "none", "soft", "hard"],
-        Field(
-            description="`auto` as frontend.ego_motion.dof; `none`; `hard` exact; `soft` with the "
-            "deviations below"
-        ),
-    ] = "auto"
-    height_sigma_m: Annotated[
-        float, Field(gt=0.0, description="soft: deviation of the camera's height a frame, metres")
-    ] = 0.005
-    tilt_sigma_deg: Annotated[
-        float, Field(gt=0.0, description="soft: deviation of pitch and of roll a frame, degrees")
-    ] = 0.2
+    mode: Literal["auto", "none", "soft", "hard"] = Field(
+        default="auto",
+        description="`auto` as frontend.ego_motion.dof; `none`; `hard` exact; `soft` with the "
+        "deviations below",
+    )
+    height_sigma_m: Positive = Field(
+        default=0.005, description="soft: deviation of the camera's height a frame, metres"
+    )
+    tilt_sigma_deg: Positive = Field(
+        default=0.2, description="soft: deviation of pitch and of roll a frame, degrees"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class KernelSettings:
     """Robust loss over a whitened residual, so that single wrong matches lose their pull."""
 
-    name: Annotated[
-        Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"],
-        Field(description="the M-estimator; `none` is least squares"),
-    ] = "cauchy"
-    width: Annotated[
-        float,
-        Field(gt=0.0, description="its scale, in standard deviations of the whole measurement"),
-    ] = 3.0
+    name: Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"] = Field(
+        default="cauchy", description="the M-estimator; `none` is least squares"
+    )
+    width: Positive = Field(
+        default=3.0, description="its scale, in standard deviations of the whole measurement"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class NamedSettings:
     """What every estimator has."""
 
-    label: Annotated[
-        str | None,
-        Field(
-            pattern=r"^[A-Za-z0-9][\w.+-]*$",
-            description="name of its folder and row; null: its kind",
-        ),
-    ] = None
+    label: str | None = Field(
+        default=None,
+        pattern=r"^[A-Za-z0-9][\w.+-]*$",
+        description="name of its folder and row; null: its kind",
+    )
 
     @property
     def title(self) -> str:
@@ -87,10 +81,9 @@ class DeadReckoningSettings(NamedSettings):
 class PerLandmarkSettings(NamedSettings):
     """What the paper's filter and the same filter as factor graphs share."""
 
-    pose_covariance: Annotated[
-        bool,
-        Field(description="add the pose's covariance to the observation's"),
-    ] = True
+    pose_covariance: bool = Field(
+        default=True, description="add the pose's covariance to the observation's"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -98,12 +91,10 @@ class LandmarkKalmanSettings(PerLandmarkSettings):
     """The paper's estimator: least-squares pose, one 3x3 filter per landmark (6.4)."""
 
     kind: Literal["landmark_kalman"] = "landmark_kalman"
-    update: Annotated[
-        Literal["pixel", "world", "running_mean", "half"],
-        Field(
-            description="`pixel` Kalman on (c, r, d); `world` on positions (6.4); averages of 4.1"
-        ),
-    ] = "pixel"
+    update: Literal["pixel", "world", "running_mean", "half"] = Field(
+        default="pixel",
+        description="`pixel` Kalman on (c, r, d); `world` on positions (6.4); averages of 4.1",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -111,10 +102,10 @@ class LandmarkKalmanGraphSettings(PerLandmarkSettings):
     """The same estimator as factor graphs: equal to ``landmark_kalman`` up to rounding."""
 
     kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
-    update: Annotated[
-        Literal["pixel", "world", "running_mean", "half"],
-        Field(description="as landmark_kalman's; the averaging of 4.1 by factors of equal weight"),
-    ] = "pixel"
+    update: Literal["pixel", "world", "running_mean", "half"] = Field(
+        default="pixel",
+        description="as landmark_kalman's; the averaging of 4.1 by factors of equal weight",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -123,20 +114,13 @@ class EkfSettings(NamedSettings):
 
     kind: Literal["ekf"] = "ekf"
     floor: FloorSettings = FloorSettings()
-    gate_sigmas: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="gate on a match's innovation, standard deviations; 0: none",
-        ),
-    ] = 5.0
-    max_landmarks: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="more are refused; memory 72 n^2 bytes, up to half more in reserve",
-        ),
-    ] = 4000
+    gate_sigmas: NonNegative = Field(
+        default=5.0, description="gate on a match's innovation, standard deviations; 0: none"
+    )
+    max_landmarks: Count = Field(
+        default=4000,
+        description="more are refused; memory 72 n^2 bytes, up to half more in reserve",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -145,20 +129,15 @@ class GraphSettings(NamedSettings):
 
     floor: FloorSettings = FloorSettings()
     kernel: KernelSettings = KernelSettings()
-    noise_factor: Annotated[
-        Annotated[float, Field(gt=0.0)] | None,
-        Field(
-            description="factor on the stated deviations of landmarks; null: estimated from the "
-            "residuals",
-        ),
-    ] = None
-    gate_px: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="leave out matches the frame rejected above this residual, px; 0: none",
-        ),
-    ] = 12.0
+    noise_factor: Positive | None = Field(
+        default=None,
+        description="factor on the stated deviations of landmarks; null: estimated from the "
+        "residuals",
+    )
+    gate_px: NonNegative = Field(
+        default=12.0,
+        description="leave out matches the frame rejected above this residual, px; 0: none",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -167,12 +146,12 @@ class FixedLagSettings(GraphSettings):
 
     kind: Literal["fixed_lag"] = "fixed_lag"
     kernel: KernelSettings = KernelSettings("huber", 4.0)
-    lag_frames: Annotated[
-        int | None, Field(ge=1, description="lag in frames; null: the lag is given in seconds")
-    ] = 10
-    lag_s: Annotated[
-        float | None, Field(gt=0.0, description="lag in seconds; used where lag_frames is null")
-    ] = None
+    lag_frames: Count | None = Field(
+        default=10, description="lag in frames; null: the lag is given in seconds"
+    )
+    lag_s: Positive | None = Field(
+        default=None, description="lag in seconds; used where lag_frames is null"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -180,27 +159,15 @@ class Isam2Settings(GraphSettings):
     """iSAM2 over all poses and landmarks."""
 
     kind: Literal["isam2"] = "isam2"
-    update_every: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="frames between updates; a tracker answers in between",
-        ),
-    ] = 5
-    ordering_window: Annotated[
-        int,
-        Field(
-            ge=0,
-            description="last poses kept at the root of the Bayes tree; 0: GTSAM's order",
-        ),
-    ] = 30
-    keyframe_every: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="frames to a keyframe; 1: every frame is a variable",
-        ),
-    ] = 1
+    update_every: Count = Field(
+        default=5, description="frames between updates; a tracker answers in between"
+    )
+    ordering_window: Index = Field(
+        default=30, description="last poses kept at the root of the Bayes tree; 0: GTSAM's order"
+    )
+    keyframe_every: Count = Field(
+        default=1, description="frames to a keyframe; 1: every frame is a variable"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -208,11 +175,10 @@ class SlidingWindowSettings(GraphSettings):
     """Sliding window online, old landmarks taken back into it; in the end everything at once."""
 
     kind: Literal["sliding_window"] = "sliding_window"
-    window: Annotated[int, Field(ge=2, description="frames that are solved together online")] = 20
-    update_every: Annotated[
-        int,
-        Field(ge=1, description="frames between solutions; a tracker answers in between"),
-    ] = 5
+    window: int = Field(default=20, ge=2, description="frames that are solved together online")
+    update_every: Count = Field(
+        default=5, description="frames between solutions; a tracker answers in between"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -220,31 +186,22 @@ class BatchSettings(GraphSettings):
     """Everything at once, the reference of the comparison."""
 
     kind: Literal["batch"] = "batch"
-    gate_px: Annotated[
-        float,
-        Field(ge=0.0, description="as isam2's; 0: the whole problem decides what fits"),
-    ] = 0.0
-    trim: Annotated[
-        bool,
-        Field(
-            description="at the end drop observations beyond the 99.9 % quantile and solve without "
-            "kernel"
-        ),
-    ] = True
-    method: Annotated[
-        Literal["levenberg_marquardt", "gnc"],
-        Field(
-            description="Levenberg-Marquardt with the kernel, or graduated non-convexity "
-            "(truncated least squares) without"
-        ),
-    ] = "levenberg_marquardt"
-    solve_every: Annotated[
-        int,
-        Field(
-            ge=0,
-            description="live: frames between solutions; 0: at the end only",
-        ),
-    ] = 0
+    gate_px: NonNegative = Field(
+        default=0.0, description="as isam2's; 0: the whole problem decides what fits"
+    )
+    trim: bool = Field(
+        default=True,
+        description="at the end drop observations beyond the 99.9 % quantile and solve without "
+        "kernel",
+    )
+    method: Literal["levenberg_marquardt", "gnc"] = Field(
+        default="levenberg_marquardt",
+        description="Levenberg-Marquardt with the kernel, or graduated non-convexity "
+        "(truncated least squares) without",
+    )
+    solve_every: Index = Field(
+        default=0, description="live: frames between solutions; 0: at the end only"
+    )
 
 
 EstimatorSettings: TypeAlias = Annotated[

@@ -17,6 +17,13 @@ S = TypeVar("S")
 STRICT = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Unknown keys, NaN and infinity are refused."""
 
+Positive: TypeAlias = Annotated[float, Field(gt=0.0)]
+NonNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
+Share: TypeAlias = Annotated[float, Field(ge=0.0, le=1.0)]
+Degrees: TypeAlias = Annotated[float, Field(gt=0.0, le=180.0)]
+Count: TypeAlias = Annotated[int, Field(ge=1)]
+Index: TypeAlias = Annotated[int, Field(ge=0)]
+
 RigView: TypeAlias = Literal["perspective", "cylindrical"]
 """How images are laid out when they are rectified."""
 
@@ -56,8 +63,8 @@ def make_settings(kind: type[S], values: Mapping[str, Any], where: str) -> S:
 class FrameSelection:
     """Which frames of a recording are used, as a Python slice."""
 
-    start: Annotated[int, Field(ge=0, description="first frame used, counted from 0")] = 0
-    stop: Annotated[
-        int | None, Field(ge=1, description="frame before which to stop; null: to the end")
-    ] = None
-    stride: Annotated[int, Field(ge=1, description="use every n-th frame")] = 1
+    start: Index = Field(default=0, description="first frame used, counted from 0")
+    stop: Count | None = Field(
+        default=None, description="frame before which to stop; null: to the end"
+    )
+    stride: Count = Field(default=1, description="use every n-th frame")

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, NonNegative, Positive
 
 PositiveVector3: TypeAlias = tuple[
     Annotated[float, Field(gt=0.0)],
@@ -28,23 +28,20 @@ class ConstantVelocitySettings:
     """
 
     kind: Literal["constant_velocity"] = "constant_velocity"
-    rotation_sigma_dps2: Annotated[
-        PositiveVector3,
-        Field(description="at first, about the camera's axes x, y, z, degrees/s^2"),
-    ] = (100.0, 100.0, 100.0)
-    translation_sigma_mps2: Annotated[
-        PositiveVector3, Field(description="at first, along the camera's axes x, y, z, m/s^2")
-    ] = (3.0, 3.0, 3.0)
-    start_speed_sigma_mps: Annotated[
-        float, Field(gt=0.0, description="speed per axis before the first motion is known, m/s")
-    ] = 15.0
-    start_rotation_sigma_dps: Annotated[
-        float, Field(gt=0.0, description="turn per axis before the first motion is known, deg/s")
-    ] = 20.0
-    adapt: Annotated[
-        bool,
-        Field(description="estimate the acceleration from the frames"),
-    ] = True
+    rotation_sigma_dps2: PositiveVector3 = Field(
+        default=(100.0, 100.0, 100.0),
+        description="at first, about the camera's axes x, y, z, degrees/s^2",
+    )
+    translation_sigma_mps2: PositiveVector3 = Field(
+        default=(3.0, 3.0, 3.0), description="at first, along the camera's axes x, y, z, m/s^2"
+    )
+    start_speed_sigma_mps: Positive = Field(
+        default=15.0, description="speed per axis before the first motion is known, m/s"
+    )
+    start_rotation_sigma_dps: Positive = Field(
+        default=20.0, description="turn per axis before the first motion is known, deg/s"
+    )
+    adapt: bool = Field(default=True, description="estimate the acceleration from the frames")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -57,56 +54,51 @@ class RecordedOdometrySettings:
     """
 
     kind: Literal["recorded"] = "recorded"
-    gap: Annotated[
-        ConstantVelocitySettings,
-        Field(description="what stands in over steps without odometry"),
-    ] = ConstantVelocitySettings()
-    time_offset_s: Annotated[
-        float, Field(ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds")
-    ] = 0.0
-    max_gap_s: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="longest gap in the odometry that is bridged",
-        ),
-    ] = 0.5
-    max_speed_mps: Annotated[
-        float, Field(gt=0.0, description="a faster sample is refused as absurd, m/s")
-    ] = 60.0
-    max_turn_dps: Annotated[
-        float, Field(gt=0.0, description="a faster turn is refused as absurd, degrees/s")
-    ] = 720.0
-    track_m: Annotated[
-        float | None, Field(gt=0.0, description="speeds or ticks of two wheels: their distance, m")
-    ] = None
-    metres_per_tick: Annotated[
-        float | None, Field(gt=0.0, description="ticks of two wheels: how far one of them goes, m")
-    ] = None
-    speed_sigma_mps: Annotated[
-        float, Field(gt=0.0, description="speed and yaw rate: noise of the forward speed, m/s")
-    ] = 0.10
-    lateral_sigma_mps: Annotated[
-        float, Field(gt=0.0, description="speed and yaw rate: unmeasured sideways speed, m/s")
-    ] = 0.08
-    vertical_sigma_mps: Annotated[
-        float, Field(gt=0.0, description="speed and yaw rate: unmeasured vertical speed, m/s")
-    ] = 0.12
-    yaw_rate_sigma_dps: Annotated[
-        float, Field(gt=0.0, description="speed and yaw rate: noise of the yaw rate, degrees/s")
-    ] = 0.30
-    pitch_rate_sigma_dps: Annotated[
-        float, Field(gt=0.0, description="speed and yaw rate: unmeasured pitch rate, degrees/s")
-    ] = 1.9
-    roll_rate_sigma_dps: Annotated[
-        float, Field(gt=0.0, description="speed and yaw rate: unmeasured roll rate, degrees/s")
-    ] = 1.3
-    translation_sigma_fraction: Annotated[
-        float, Field(ge=0.0, description="poses: noise per axis as a fraction of the step's length")
-    ] = 0.02
-    rotation_sigma_fraction: Annotated[
-        float, Field(ge=0.0, description="poses: noise per axis as a fraction of the step's angle")
-    ] = 0.05
+    gap: ConstantVelocitySettings = Field(
+        default=ConstantVelocitySettings(), description="what stands in over steps without odometry"
+    )
+    time_offset_s: float = Field(
+        default=0.0, ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds"
+    )
+    max_gap_s: Positive = Field(
+        default=0.5, description="longest gap in the odometry that is bridged"
+    )
+    max_speed_mps: Positive = Field(
+        default=60.0, description="a faster sample is refused as absurd, m/s"
+    )
+    max_turn_dps: Positive = Field(
+        default=720.0, description="a faster turn is refused as absurd, degrees/s"
+    )
+    track_m: Positive | None = Field(
+        default=None, description="speeds or ticks of two wheels: their distance, m"
+    )
+    metres_per_tick: Positive | None = Field(
+        default=None, description="ticks of two wheels: how far one of them goes, m"
+    )
+    speed_sigma_mps: Positive = Field(
+        default=0.10, description="speed and yaw rate: noise of the forward speed, m/s"
+    )
+    lateral_sigma_mps: Positive = Field(
+        default=0.08, description="speed and yaw rate: unmeasured sideways speed, m/s"
+    )
+    vertical_sigma_mps: Positive = Field(
+        default=0.12, description="speed and yaw rate: unmeasured vertical speed, m/s"
+    )
+    yaw_rate_sigma_dps: Positive = Field(
+        default=0.30, description="speed and yaw rate: noise of the yaw rate, degrees/s"
+    )
+    pitch_rate_sigma_dps: Positive = Field(
+        default=1.9, description="speed and yaw rate: unmeasured pitch rate, degrees/s"
+    )
+    roll_rate_sigma_dps: Positive = Field(
+        default=1.3, description="speed and yaw rate: unmeasured roll rate, degrees/s"
+    )
+    translation_sigma_fraction: NonNegative = Field(
+        default=0.02, description="poses: noise per axis as a fraction of the step's length"
+    )
+    rotation_sigma_fraction: NonNegative = Field(
+        default=0.05, description="poses: noise per axis as a fraction of the step's angle"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -117,12 +109,10 @@ class SyntheticOdometrySettings:
     """
 
     kind: Literal["synthetic"] = "synthetic"
-    translation_sigma_fraction: Annotated[
-        float, Field(ge=0.0, description="per axis, as a fraction of the step's length")
-    ] = 0.02
-    rotation_sigma_deg: Annotated[
-        float, Field(ge=0.0, description="per axis and step, degrees")
-    ] = 1.0
+    translation_sigma_fraction: NonNegative = Field(
+        default=0.02, description="per axis, as a fraction of the step's length"
+    )
+    rotation_sigma_deg: NonNegative = Field(default=1.0, description="per axis and step, degrees")
 
 
 OdometrySettings: TypeAlias = Annotated[

@@ -25,14 +25,12 @@ class PanoramasSettings(RecordingSettings):
 
     kind: Literal["panoramas"] = "panoramas"
     camera: EquirectangularSettings = EquirectangularSettings()
-    width: Annotated[
-        int | None,
-        Field(
-            ge=64,
-            le=16384,
-            description="pictures are reduced to this width; null: as they are",
-        ),
-    ] = None
+    width: int | None = Field(
+        default=None,
+        ge=64,
+        le=16384,
+        description="pictures are reduced to this width; null: as they are",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -41,14 +39,12 @@ class OmniPathSettings(RecordingSettings):
 
     kind: Literal["omni_path"] = "omni_path"
     camera: OmniCameraSettings = HyperbolicMirrorSettings()
-    pattern: Annotated[
-        str,
-        Field(
-            min_length=1,
-            pattern=r"^[^/\\]+$",
-            description="names of the pictures, ordered by the numbers in them",
-        ),
-    ] = "*"
+    pattern: str = Field(
+        default="*",
+        min_length=1,
+        pattern=r"^[^/\\]+$",
+        description="names of the pictures, ordered by the numbers in them",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -57,10 +53,9 @@ class OmniVideoSettings(RecordingSettings):
 
     kind: Literal["omni_video"] = "omni_video"
     camera: OmniCameraSettings = BloggieSettings()
-    frame_rate_hz: Annotated[
-        float | None,
-        Field(gt=0.0, le=1000.0, description="frames a second; null: as the file says"),
-    ] = None
+    frame_rate_hz: float | None = Field(
+        default=None, gt=0.0, le=1000.0, description="frames a second; null: as the file says"
+    )
 
 
 OmniDatasetSettings: TypeAlias = Annotated[

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, FrameSelection, RigView
+from fgslam.core.settings import STRICT, Count, FrameSelection, Index, Positive, RigView
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings as ConstantVelocitySettings
 from fgslam.datasets.odometry_settings import OdometrySettings as OdometrySettings
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings as RecordedOdometrySettings
@@ -33,61 +33,49 @@ Vector3: TypeAlias = tuple[float, float, float]
 class RecordingSettings(FrameSelection):
     """What every recording on disk has: where it lies and which of its frames are used."""
 
-    path: Annotated[str, Field(min_length=1, description="folder of the recording")]
-    scale: Annotated[
-        float,
-        Field(gt=0.0, le=1.0, description="images are made smaller by this, the calibration too"),
-    ] = 1.0
+    path: str = Field(min_length=1, description="folder of the recording")
+    scale: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=1.0,
+        description="images are made smaller by this, the calibration too",
+    )
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class CalibratedSettings(RecordingSettings):
     """What a recording has whose calibration may be another file than its own."""
 
-    camera_file: Annotated[
-        str | None,
-        Field(
-            description="calibration in place of the recording's own (docs/howto/your_camera.md)"
-        ),
-    ] = None
-    resized: Annotated[
-        bool,
-        Field(
-            description="the images were made smaller or larger as a whole after calibration: "
-            "scale it to them"
-        ),
-    ] = False
-    fov_deg: Annotated[
-        float | None,
-        Field(
-            gt=0.0,
-            lt=170.0,
-            description="horizontal angle of the rectified view; null: as wide as cameras fill",
-        ),
-    ] = None
-    view: Annotated[RigView, Field(description="`cylindrical` for two fisheyes")] = "perspective"
-    unit_m: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="metres of one unit of the calibration's lengths: 0.001 for millimetres, "
-            "the side of a square for one in squares",
-        ),
-    ] = 1.0
-    camera_yaw_deg: Annotated[
-        float | None,
-        Field(
-            description="heading of the camera in the body, degrees to the left; null: as "
-            "calibrated"
-        ),
-    ] = None
-    lever_arm_m: Annotated[
-        Vector3 | None,
-        Field(
-            description="position of the right camera in the body, forward, left, up; null: as "
-            "calibrated"
-        ),
-    ] = None
+    camera_file: str | None = Field(
+        default=None,
+        description="calibration in place of the recording's own (docs/howto/your_camera.md)",
+    )
+    resized: bool = Field(
+        default=False,
+        description="the images were made smaller or larger as a whole after calibration: "
+        "scale it to them",
+    )
+    fov_deg: float | None = Field(
+        default=None,
+        gt=0.0,
+        lt=170.0,
+        description="horizontal angle of the rectified view; null: as wide as cameras fill",
+    )
+    view: RigView = Field(default="perspective", description="`cylindrical` for two fisheyes")
+    unit_m: Positive = Field(
+        default=1.0,
+        description="metres of one unit of the calibration's lengths: 0.001 for millimetres, "
+        "the side of a square for one in squares",
+    )
+    camera_yaw_deg: float | None = Field(
+        default=None,
+        description="heading of the camera in the body, degrees to the left; null: as calibrated",
+    )
+    lever_arm_m: Vector3 | None = Field(
+        default=None,
+        description="position of the right camera in the body, forward, left, up; null: as "
+        "calibrated",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -95,16 +83,12 @@ class ImageFolderSettings(CalibratedSettings):
     """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/image_folder.md."""
 
     kind: Literal["image_folder"] = "image_folder"
-    use_top: Annotated[bool, Field(description="use the third camera where the folder has one")] = (
-        True
+    use_top: bool = Field(default=True, description="use the third camera where the folder has one")
+    odometry_file: str | None = Field(
+        default=None,
+        description="odometry inside the folder: .csv (speed, yaw rate) or .txt (TUM poses of "
+        "the body)",
     )
-    odometry_file: Annotated[
-        str | None,
-        Field(
-            description="odometry inside the folder: .csv (speed, yaw rate) or .txt (TUM poses of "
-            "the body)"
-        ),
-    ] = None
 
 
 OdometryFile = Annotated[
@@ -121,26 +105,20 @@ PairingTolerance = Annotated[
 class LooseImagesSettings(CalibratedSettings):
     """Folders of images with any names, with or without times (docs/datasets/loose_images.md)."""
 
-    path: Annotated[
-        str, Field(min_length=1, description="the folder, or a pattern of file names in it")
-    ]
+    path: str = Field(min_length=1, description="the folder, or a pattern of file names in it")
     kind: Literal["loose_images"] = "loose_images"
-    fps: Annotated[
-        float | None,
-        Field(
-            gt=0.0,
-            le=1e4,
-            description="frames a second; null: by the list of times or by names, else 10",
-        ),
-    ] = None
-    pairing_tolerance_ms: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            le=1000.0,
-            description="largest time between the images of a pair, where only times name them, ms",
-        ),
-    ] = 20.0
+    fps: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=1e4,
+        description="frames a second; null: by the list of times or by names, else 10",
+    )
+    pairing_tolerance_ms: float = Field(
+        default=20.0,
+        gt=0.0,
+        le=1000.0,
+        description="largest time between the images of a pair, where only times name them, ms",
+    )
     odometry_file: OdometryFile = None
 
 
@@ -148,19 +126,14 @@ class LooseImagesSettings(CalibratedSettings):
 class VideoSettings(CalibratedSettings):
     """Stereo films: one of both views, or one a camera (docs/datasets/video.md)."""
 
-    path: Annotated[
-        str,
-        Field(min_length=1, description="the film, a folder of one to three, or a pattern"),
-    ]
+    path: str = Field(min_length=1, description="the film, a folder of one to three, or a pattern")
     kind: Literal["video"] = "video"
-    views: Annotated[
-        Literal["side_by_side", "over_under"] | None,
-        Field(description="how one film shows both views; null: by its size"),
-    ] = None
-    fps: Annotated[
-        float | None,
-        Field(gt=0.0, le=1e4, description="frames a second, in place of the film's own rate"),
-    ] = None
+    views: Literal["side_by_side", "over_under"] | None = Field(
+        default=None, description="how one film shows both views; null: by its size"
+    )
+    fps: float | None = Field(
+        default=None, gt=0.0, le=1e4, description="frames a second, in place of the film's own rate"
+    )
     pairing_tolerance_ms: PairingTolerance = 20.0
 
 
@@ -169,21 +142,14 @@ class RgbdSettings(CalibratedSettings):
     """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md)."""
 
     kind: Literal["rgbd"] = "rgbd"
-    depth_scale: Annotated[
-        float | None,
-        Field(
-            gt=0.0,
-            description="depth units in a metre; null: by the calibration's file, else 5000 (TUM), "
-            "1000 (16 bits), 1 (floats)",
-        ),
-    ] = None
-    depth_sigma_m: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="noise of a depth of 1 m, growing with its square",
-        ),
-    ] = 1.425e-3
+    depth_scale: Positive | None = Field(
+        default=None,
+        description="depth units in a metre; null: by the calibration's file, else 5000 (TUM), "
+        "1000 (16 bits), 1 (floats)",
+    )
+    depth_sigma_m: Positive = Field(
+        default=1.425e-3, description="noise of a depth of 1 m, growing with its square"
+    )
     pairing_tolerance_ms: PairingTolerance = 20.0
     odometry_file: OdometryFile = None
 
@@ -199,14 +165,12 @@ class KittiRawSettings(CalibratedSettings):
 class BagSettings(CalibratedSettings):
     """ROS 1 and ROS 2 bags: .bag, .db3, .mcap (docs/datasets/bags.md)."""
 
-    path: Annotated[
-        str, Field(min_length=1, description="the bag, its folder, or a pattern of file names")
-    ]
+    path: str = Field(min_length=1, description="the bag, its folder, or a pattern of file names")
     kind: Literal["bag"] = "bag"
-    topics: Annotated[
-        tuple[str, ...],
-        Field(description="topics: left, right[, top] images, odometry; empty: by type and name"),
-    ] = ()
+    topics: tuple[str, ...] = Field(
+        default=(),
+        description="topics: left, right[, top] images, odometry; empty: by type and name",
+    )
     pairing_tolerance_ms: PairingTolerance = 20.0
 
 
@@ -215,9 +179,9 @@ class KittiSettings(RecordingSettings):
     """KITTI odometry in its native layout (docs/datasets/kitti.md)."""
 
     kind: Literal["kitti"] = "kitti"
-    sequence: Annotated[
-        str, Field(pattern=r"^\d{2}$", description='which drive, two digits in quotes: "06"')
-    ] = "00"
+    sequence: str = Field(
+        default="00", pattern=r"^\d{2}$", description='which drive, two digits in quotes: "06"'
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -225,10 +189,12 @@ class EurocSettings(CalibratedSettings):
     """EuRoC MAV in its native layout, rectified on reading (docs/datasets/euroc.md)."""
 
     kind: Literal["euroc"] = "euroc"
-    pairing_tolerance_ms: Annotated[
-        float,
-        Field(ge=0.0, le=50.0, description="largest time between the two images of a pair, ms"),
-    ] = 2.0
+    pairing_tolerance_ms: float = Field(
+        default=2.0,
+        ge=0.0,
+        le=50.0,
+        description="largest time between the two images of a pair, ms",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -236,20 +202,16 @@ class LightFieldSettings(RecordingSettings):
     """A gantry's grid of views read as a trinocular walk (docs/datasets/light_field.md)."""
 
     kind: Literal["light_field"] = "light_field"
-    row: Annotated[int, Field(ge=0, description="grid row along which the reference walks")] = 8
-    spacing: Annotated[int, Field(ge=1, description="grid steps to the left and the top view")] = 4
-    use_top: Annotated[bool, Field(description="use the vertical neighbour as third camera")] = True
-    focal_length_px: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="nominal focal length; scales depth, not the trajectory",
-        ),
-    ] = 800.0
-    shift_px_per_step: Annotated[
-        float,
-        Field(description="shift of each view per grid step, so that disparities are positive"),
-    ] = 1.0
+    row: Index = Field(default=8, description="grid row along which the reference walks")
+    spacing: Count = Field(default=4, description="grid steps to the left and the top view")
+    use_top: bool = Field(default=True, description="use the vertical neighbour as third camera")
+    focal_length_px: Positive = Field(
+        default=800.0, description="nominal focal length; scales depth, not the trajectory"
+    )
+    shift_px_per_step: float = Field(
+        default=1.0,
+        description="shift of each view per grid step, so that disparities are positive",
+    )
 
 
 # --------------------------------------------------------------------------------------------
@@ -261,48 +223,41 @@ class StereoTracksSettings(FrameSelection):
     """Stereo feature tracks of KITTI drives, inside GTSAM (docs/datasets/stereo_tracks.md)."""
 
     kind: Literal["stereo_tracks"] = "stereo_tracks"
-    file: Annotated[
-        str,
-        Field(
-            min_length=1,
-            description='"00s", "00" or "large" of gtsam; or a file VO_stereo_factors*.txt',
-        ),
-    ] = "00s"
-    pixel_sigma: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="noise of one image coordinate, pixels (measured: docs/datasets/"
-            "stereo_tracks.md)",
-        ),
-    ] = 0.25
-    frame_period_s: Annotated[
-        float,
-        Field(gt=0.0, description="time between frames, which the files lack; KITTI's is 0.1 s"),
-    ] = 0.1
+    file: str = Field(
+        default="00s",
+        min_length=1,
+        description='"00s", "00" or "large" of gtsam; or a file VO_stereo_factors*.txt',
+    )
+    pixel_sigma: Positive = Field(
+        default=0.25,
+        description="noise of one image coordinate, pixels (measured: docs/datasets/"
+        "stereo_tracks.md)",
+    )
+    frame_period_s: Positive = Field(
+        default=0.1, description="time between frames, which the files lack; KITTI's is 0.1 s"
+    )
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class UtiasStereoSettings(RecordingSettings):
     """UTIAS "Starry Night": stereo pixels, body rates, truth (docs/datasets/utias.md)."""
 
-    path: Annotated[str, Field(min_length=1, description="the .mat file of dataset 3")]
+    path: str = Field(min_length=1, description="the .mat file of dataset 3")
     kind: Literal["utias_stereo"] = "utias_stereo"
-    left_right_correlation: Annotated[
-        tuple[Correlation, Correlation],
-        Field(description="correlation of both images' noise, columns and rows"),
-    ] = (0.86, 0.99)
+    left_right_correlation: tuple[Correlation, Correlation] = Field(
+        default=(0.86, 0.99), description="correlation of both images' noise, columns and rows"
+    )
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class UtiasRangeBearingSettings(RecordingSettings):
     """UTIAS "Lost in the Woods": laser ranges, wheel odometry, truth (docs/datasets/utias.md)."""
 
-    path: Annotated[str, Field(min_length=1, description="the .mat file of dataset 2")]
+    path: str = Field(min_length=1, description="the .mat file of dataset 2")
     kind: Literal["utias_range_bearing"] = "utias_range_bearing"
-    max_range_m: Annotated[
-        float, Field(gt=0.0, description="readings farther than this are left out, metres")
-    ] = 5.0
+    max_range_m: Positive = Field(
+        default=5.0, description="readings farther than this are left out, metres"
+    )
 
 
 # --------------------------------------------------------------------------------------------

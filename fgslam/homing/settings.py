@@ -6,12 +6,12 @@ Where the paper leaves a number open, `docs/concepts/homing.md` says where the d
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, Index, NonNegative, Positive
 from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 
@@ -20,54 +20,47 @@ from fgslam.frontend.homing.settings import HomingVectorSettings
 class HomingControlSettings:
     """When a target is reached, when matching begins anew, and when to stop."""
 
-    switch_fraction: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            lt=0.5,
-            description="part of the leg left when the target counts as reached",
-        ),
-    ] = 0.07
-    retry_s: Annotated[
-        float, Field(ge=0.0, description="between two attempts to match the target anew")
-    ] = 0.5
+    switch_fraction: float = Field(
+        default=0.07,
+        gt=0.0,
+        lt=0.5,
+        description="part of the leg left when the target counts as reached",
+    )
+    retry_s: NonNegative = Field(
+        default=0.5, description="between two attempts to match the target anew"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class SteeringSettings:
     """From the direction of home to speed and turning rate of a wheelchair."""
 
-    max_speed_mps: Annotated[float, Field(gt=0.0, description="on the open way")] = 0.4
-    max_turn_deg_s: Annotated[float, Field(gt=0.0, description="largest turning rate")] = 40.0
+    max_speed_mps: Positive = Field(default=0.4, description="on the open way")
+    max_turn_deg_s: Positive = Field(default=40.0, description="largest turning rate")
 
 
 @dataclass(frozen=True, config=STRICT)
 class AvoidanceSettings:
     """A range scan overrides the steering (IV)."""
 
-    method: Annotated[
-        Literal["corridors", "none"],
-        Field(description="`corridors`: the free direction nearest to home; `none`: no sensor"),
-    ] = "corridors"
-    half_width_m: Annotated[
-        float,
-        Field(gt=0.0, description="half the corridor needed: the robot's radius and a margin"),
-    ] = 0.42
-    body_m: Annotated[
-        float, Field(gt=0.0, description="half width of the bare robot, for ways out of corners")
-    ] = 0.37
+    method: Literal["corridors", "none"] = Field(
+        default="corridors",
+        description="`corridors`: the free direction nearest to home; `none`: no sensor",
+    )
+    half_width_m: Positive = Field(
+        default=0.42, description="half the corridor needed: the robot's radius and a margin"
+    )
+    body_m: Positive = Field(
+        default=0.37, description="half width of the bare robot, for ways out of corners"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class ClosedLoopSettings:
     """The loop of camera, homing, steering and drive."""
 
-    images_per_s: Annotated[float, Field(gt=0.0, description="images, and commands, a second")] = (
-        10.0
-    )
-    longest_s: Annotated[float, Field(gt=0.0, description="a drive that takes longer is ended")] = (
-        900.0
-    )
+    images_per_s: Positive = Field(default=10.0, description="images, and commands, a second")
+    longest_s: Positive = Field(default=900.0, description="a drive that takes longer is ended")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -90,14 +83,12 @@ class FrontEndSettings:
 
     features: OmniFeatureSettings = OmniFeatureSettings()
     homing_vector: HomingVectorSettings = HomingVectorSettings()
-    wrong_matches: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=0.9,
-            description="share of wrong matches mixed in, to test robustness",
-        ),
-    ] = 0.0
+    wrong_matches: float = Field(
+        default=0.0,
+        ge=0.0,
+        lt=0.9,
+        description="share of wrong matches mixed in, to test robustness",
+    )
 
 
 DRIVING = FrontEndSettings(
@@ -122,23 +113,19 @@ Between images that are only compared the defaults are stricter.
 class TopologicalMapSettings:
     """Edges where homing succeeds, and when an edge is accepted."""
 
-    candidates: Annotated[
-        int,
-        Field(
-            ge=0,
-            description="images that each one is tried against, by similarity; 0: all",
-        ),
-    ] = 0
+    candidates: Index = Field(
+        default=0, description="images that each one is tried against, by similarity; 0: all"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class LocalisationSettings:
     """Bayesian localisation over a map's nodes."""
 
-    candidates: Annotated[
-        int, Field(ge=0, description="nodes that an image is matched with; 0: all")
-    ] = 10
-    leap: Annotated[
-        float,
-        Field(gt=0.0, le=1.0, description="chance to be anywhere at all: carried off, or wrong"),
-    ] = 0.02
+    candidates: Index = Field(default=10, description="nodes that an image is matched with; 0: all")
+    leap: float = Field(
+        default=0.02,
+        gt=0.0,
+        le=1.0,
+        description="chance to be anywhere at all: carried off, or wrong",
+    )

@@ -58,9 +58,9 @@ class Baseline(BaseModel):
     format: Literal["fgslam baseline"]
     version: Literal[1]
     relative_tolerances: dict[str, float]
-    runs: Annotated[
-        dict[str, Annotated[dict[str, dict[str, float]], Field(min_length=1)]], Field(min_length=1)
-    ]
+    runs: dict[str, Annotated[dict[str, dict[str, float]], Field(min_length=1)]] = Field(
+        min_length=1
+    )
 
     @model_validator(mode="after")
     def _all_have_tolerances(self) -> Self:

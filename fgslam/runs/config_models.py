@@ -13,6 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
+from fgslam.core.settings import Count, Index, NonNegative
 from fgslam.datasets.omni_settings import (
     OmniDatasetSettings,
     OmniHouseSettings,
@@ -74,18 +75,14 @@ class Experiment(BaseModel):
     taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "trials", "first", "units")
     """Folders of a run that no estimator may be called."""
 
-    name: Annotated[
-        str,
-        Field(
-            pattern=r"^[.-]*\w[\w.-]*$",  # with a letter or digit: `.` and `..` are other folders
-            description="short name; the default run folder's",
-        ),
-    ]
-    seed: Annotated[int, Field(ge=0, description="of everything random in the run")] = 0
-    provenance: Annotated[
-        dict[str, Any] | None,
-        Field(description="written into a run's own config.yaml: versions and data; not read"),
-    ] = None
+    name: str = Field(
+        pattern=r"^[.-]*\w[\w.-]*$", description="short name; the default run folder's"
+    )
+    seed: Index = Field(default=0, description="of everything random in the run")
+    provenance: dict[str, Any] | None = Field(
+        default=None,
+        description="written into a run's own config.yaml: versions and data; not read",
+    )
 
     def as_values(self) -> dict[str, Any]:
         """Plain values for YAML or JSON, every default filled in."""
@@ -136,13 +133,10 @@ class ExperimentConfig(Experiment):
     odometry: OdometrySettings = RecordedOdometrySettings()
     frontend: FrontendSettings = FrontendSettings()
     estimator: LiveEstimator = LandmarkKalmanSettings()
-    compare: Annotated[
-        tuple[ComparedEstimator, ...],
-        Field(
-            description="estimators that replay the run's log: kinds, or groups as under "
-            "`estimator`"
-        ),
-    ] = ()
+    compare: tuple[ComparedEstimator, ...] = Field(
+        default=(),
+        description="estimators that replay the run's log: kinds, or groups as under `estimator`",
+    )
     map: MapSettings = MapSettings()
     output: OutputSettings = OutputSettings()
 
@@ -199,7 +193,7 @@ def _map_problem(config: ExperimentConfig) -> str:
 class LocalisationConfig(Experiment):
     """Frames of a recording, sought in a map without any prior."""
 
-    task: Annotated[Literal["localisation"], Field(description="SLAM has no such key")]
+    task: Literal["localisation"] = Field(description="SLAM has no such key")
     map: KnownMapSettings
     dataset: DatasetSettings
     odometry: OdometrySettings = RecordedOdometrySettings()
@@ -246,12 +240,9 @@ class HomingExperiment(Experiment):
 
     taken_folders: ClassVar[tuple[str, ...]] = ("pictures", "compare", "logs", "runs", "units")
 
-    task: Annotated[str, Field(description="which kind of homing experiment")]
+    task: str = Field(description="which kind of homing experiment")
     output: HomingOutputSettings = HomingOutputSettings()
-    jobs: Annotated[
-        int | None,
-        Field(ge=1, description="processes at a time; null: one a core"),
-    ] = None
+    jobs: Count | None = Field(default=None, description="processes at a time; null: one a core")
 
 
 class HomingPairsConfig(HomingExperiment):
@@ -261,9 +252,9 @@ class HomingPairsConfig(HomingExperiment):
     dataset: OmniDatasetSettings
     features: OmniFeatureSettings = OmniFeatureSettings()
     homing_vector: HomingVectorSettings = HomingVectorSettings()
-    reference: Annotated[
-        bool, Field(description="plain SIFT and two-point RANSAC beside it, for comparison")
-    ] = True
+    reference: bool = Field(
+        default=True, description="plain SIFT and two-point RANSAC beside it, for comparison"
+    )
 
 
 class TopologicalMapConfig(HomingExperiment):
@@ -275,20 +266,14 @@ class TopologicalMapConfig(HomingExperiment):
     homing_vector: HomingVectorSettings = HomingVectorSettings()
     map: TopologicalMapSettings = TopologicalMapSettings()
     localisation: LocalisationSettings = LocalisationSettings()
-    ordered: Annotated[bool, Field(description="views follow each other on a way")] = False
-    routes: Annotated[
-        tuple[Annotated[tuple[ViewName, ...], Field(min_length=2)], ...],
-        Field(
-            description="ways to find, by the views' numbers: start and goal, or a chain of nodes"
-        ),
-    ] = ()
-    held_out_every: Annotated[
-        int | None,
-        Field(
-            ge=2,
-            description="localise every so many views on a map of the others",
-        ),
-    ] = None
+    ordered: bool = Field(default=False, description="views follow each other on a way")
+    routes: tuple[Annotated[tuple[ViewName, ...], Field(min_length=2)], ...] = Field(
+        default=(),
+        description="ways to find, by the views' numbers: start and goal, or a chain of nodes",
+    )
+    held_out_every: int | None = Field(
+        default=None, ge=2, description="localise every so many views on a map of the others"
+    )
 
 
 class OmniVideoConfig(HomingExperiment):
@@ -296,10 +281,10 @@ class OmniVideoConfig(HomingExperiment):
 
     task: Annotated[Literal["omni_video"], _TASK]
     dataset: OmniDatasetSettings
-    least_points: Annotated[
-        int, Field(ge=1, description="with fewer points left, new ones are added")
-    ] = 110
-    most_points: Annotated[int, Field(ge=1, description="up to so many")] = 160
+    least_points: Count = Field(
+        default=110, description="with fewer points left, new ones are added"
+    )
+    most_points: Count = Field(default=160, description="up to so many")
 
 
 class TeachConfig(HomingExperiment):
@@ -307,16 +292,14 @@ class TeachConfig(HomingExperiment):
 
     task: Annotated[Literal["teach"], _TASK]
     dataset: OmniDatasetSettings
-    route: Annotated[
-        str | None, Field(description="file to write; null: RUN/route.fgpath alone")
-    ] = None
-    poses: Annotated[
-        str | None,
-        Field(
-            description="trajectory of SLAM on the same drive, by the same clock: a TUM file; a "
-            "covariance.csv beside it is taken, too; null: a route without metres"
-        ),
-    ] = None
+    route: str | None = Field(
+        default=None, description="file to write; null: RUN/route.fgpath alone"
+    )
+    poses: str | None = Field(
+        default=None,
+        description="trajectory of SLAM on the same drive, by the same clock: a TUM file; a "
+        "covariance.csv beside it is taken, too; null: a route without metres",
+    )
 
 
 class FollowConfig(HomingExperiment):
@@ -324,11 +307,10 @@ class FollowConfig(HomingExperiment):
 
     task: Annotated[Literal["follow"], _TASK]
     dataset: OmniDatasetSettings
-    route: Annotated[str, Field(description="file that a route was taught into")]
-    taught_camera: Annotated[
-        bool,
-        Field(description="use the route's camera in place of `dataset.camera`"),
-    ] = True
+    route: str = Field(description="file that a route was taught into")
+    taught_camera: bool = Field(
+        default=True, description="use the route's camera in place of `dataset.camera`"
+    )
     steering: SteeringSettings = SteeringSettings()
 
 
@@ -336,13 +318,10 @@ class JoinConfig(HomingExperiment):
     """Taught routes as one map, joined where their views match."""
 
     task: Annotated[Literal["join"], _TASK]
-    routes: Annotated[
-        tuple[str, ...],
-        Field(min_length=1, description="files that routes were taught into; named after them"),
-    ]
-    map: Annotated[str | None, Field(description="file to write; null: RUN/routes.fgmap alone")] = (
-        None
+    routes: tuple[str, ...] = Field(
+        min_length=1, description="files that routes were taught into; named after them"
     )
+    map: str | None = Field(default=None, description="file to write; null: RUN/routes.fgmap alone")
 
 
 class HomingTrialsConfig(HomingExperiment):
@@ -350,14 +329,12 @@ class HomingTrialsConfig(HomingExperiment):
 
     task: Annotated[Literal["homing_trials"], _TASK]
     dataset: SimulatedBearingsSettings = SimulatedBearingsSettings()
-    outliers: Annotated[
-        tuple[Annotated[float, Field(ge=0.0, lt=1.0)], ...],
-        Field(
-            min_length=1,
-            description="shares of outliers, each with its own trials",
-        ),
-    ] = (0.0, 0.1, 0.2, 0.3)
-    trials: Annotated[int, Field(ge=1, description="homings for each share")] = 200
+    outliers: tuple[Annotated[float, Field(ge=0.0, lt=1.0)], ...] = Field(
+        default=(0.0, 0.1, 0.2, 0.3),
+        min_length=1,
+        description="shares of outliers, each with its own trials",
+    )
+    trials: Count = Field(default=200, description="homings for each share")
     homing_vector: HomingVectorSettings = HomingVectorSettings()
     estimator: LiveHoming = HomingGraphSettings()
     compare: ComparedList = ()
@@ -372,24 +349,19 @@ class DrivingConfig(HomingExperiment):
     behaviour: HomingBehaviourSettings = HomingBehaviourSettings()
     estimator: LiveHoming = HomingGraphSettings()
     compare: ComparedList = ()
-    trials: Annotated[
-        int, Field(ge=1, description="drives, each with a seed of its own: path, noise, people")
-    ] = 1
-    start_offset_m: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="largest distance of the start from the path's start, turned at random",
-        ),
-    ] = 0.0
-    wrong_matches: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            lt=0.9,
-            description="share of wrong matches mixed in, to test robustness",
-        ),
-    ] = 0.0
+    trials: Count = Field(
+        default=1, description="drives, each with a seed of its own: path, noise, people"
+    )
+    start_offset_m: NonNegative = Field(
+        default=0.0,
+        description="largest distance of the start from the path's start, turned at random",
+    )
+    wrong_matches: float = Field(
+        default=0.0,
+        ge=0.0,
+        lt=0.9,
+        description="share of wrong matches mixed in, to test robustness",
+    )
 
 
 class HomingConfig(DrivingConfig):
@@ -414,9 +386,9 @@ class CrossroadsConfig(DrivingConfig):
     """Two routes taught on their own, joined, and a way over both driven in closed loop."""
 
     task: Annotated[Literal["crossroads"], _TASK]
-    back: Annotated[
-        bool, Field(description="from the second route's end to where the first one begins")
-    ] = False
+    back: bool = Field(
+        default=False, description="from the second route's end to where the first one begins"
+    )
 
 
 TASKS: dict[str | None, type[Experiment]] = {

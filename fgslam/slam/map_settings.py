@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, Count, Index, Positive
 from fgslam.datasets.settings import DatasetSettings, OdometrySettings, RecordedOdometrySettings
 
 
@@ -15,69 +15,52 @@ from fgslam.datasets.settings import DatasetSettings, OdometrySettings, Recorded
 class FirstDriveSettings:
     """A drive that makes the map, with the run's own front-end and estimator."""
 
-    dataset: Annotated[DatasetSettings, Field(description="keys as under `dataset`")]
-    odometry: Annotated[OdometrySettings, Field(description="keys as under `odometry`")] = (
-        RecordedOdometrySettings()
+    dataset: DatasetSettings = Field(description="keys as under `dataset`")
+    odometry: OdometrySettings = Field(
+        default=RecordedOdometrySettings(), description="keys as under `odometry`"
     )
-    seed: Annotated[
-        Annotated[int, Field(ge=0)] | None,
-        Field(description="of everything random in it; null: the run's own"),
-    ] = None
+    seed: Index | None = Field(
+        default=None, description="of everything random in it; null: the run's own"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class MapStartSettings:
     """How a run finds its place in the map that it is given."""
 
-    within: Annotated[
-        int,
-        Field(
-            ge=1,
-            description="frames searched for the first located one; those before are left out",
-        ),
-    ] = 30
-    sigma_m: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="sigma of the first pose per axis, as put back by hand",
-        ),
-    ] = 0.1
-    sigma_deg: Annotated[
-        float, Field(gt=0.0, lt=90.0, description="the same of its rotation, degrees")
-    ] = 3.0
+    within: Count = Field(
+        default=30,
+        description="frames searched for the first located one; those before are left out",
+    )
+    sigma_m: Positive = Field(
+        default=0.1, description="sigma of the first pose per axis, as put back by hand"
+    )
+    sigma_deg: float = Field(
+        default=3.0, gt=0.0, lt=90.0, description="the same of its rotation, degrees"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class MapSettings:
     """The map that a run is given, and the one that it leaves."""
 
-    load: Annotated[str | None, Field(description="map file to begin in; null: an empty map")] = (
-        None
+    load: str | None = Field(default=None, description="map file to begin in; null: an empty map")
+    save: str | None = Field(
+        default=None, description="map file to write when the run has finished"
     )
-    save: Annotated[
-        str | None, Field(description="map file to write when the run has finished")
-    ] = None
-    made_from: Annotated[
-        FirstDriveSettings | None,
-        Field(description="drive this first, into RUN/first, and go on with its map"),
-    ] = None
-    start: Annotated[
-        Literal["relocalise", "origin", "last", "continue"],
-        Field(description="first pose: found, the map's first or last, or the same run goes on"),
-    ] = "relocalise"
-    extend: Annotated[bool, Field(description="false: only localise, the map stays as it is")] = (
-        True
+    made_from: FirstDriveSettings | None = Field(
+        default=None, description="drive this first, into RUN/first, and go on with its map"
     )
-    session: Annotated[
-        bool,
-        Field(description="save also what `start: continue` needs"),
-    ] = True
+    start: Literal["relocalise", "origin", "last", "continue"] = Field(
+        default="relocalise",
+        description="first pose: found, the map's first or last, or the same run goes on",
+    )
+    extend: bool = Field(default=True, description="false: only localise, the map stays as it is")
+    session: bool = Field(default=True, description="save also what `start: continue` needs")
     begin: MapStartSettings = MapStartSettings()
-    active_radius_m: Annotated[
-        float | None,
-        Field(gt=0.0, description="landmarks farther away go to disk until needed; null: none"),
-    ] = None
+    active_radius_m: Positive | None = Field(
+        default=None, description="landmarks farther away go to disk until needed; null: none"
+    )
 
     @property
     def given(self) -> bool:

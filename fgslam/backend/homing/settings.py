@@ -12,28 +12,24 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.backend.settings import KernelSettings, NamedSettings
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, NonNegative, Positive
 
 
 @dataclass(frozen=True, config=STRICT)
 class FilterMotionSettings:
     """Noise of the filter's motion (eqs 4 and 5), on the acceleration; the paper states none."""
 
-    heading_deg: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="deviation of the heading after a second, degrees; must cover the "
-            "robot's turns",
-        ),
-    ] = 20.0
-    speed: Annotated[
-        float, Field(gt=0.0, description="deviation of the speed after a second, legs/s")
-    ] = 0.1
-    slip: Annotated[
-        float,
-        Field(gt=0.0, description="deviation of the position after a second, legs: wheels slip"),
-    ] = 0.02
+    heading_deg: Positive = Field(
+        default=20.0,
+        description="deviation of the heading after a second, degrees; must cover the "
+        "robot's turns",
+    )
+    speed: Positive = Field(
+        default=0.1, description="deviation of the speed after a second, legs/s"
+    )
+    slip: Positive = Field(
+        default=0.02, description="deviation of the position after a second, legs: wheels slip"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -44,42 +40,29 @@ class HomingEkfSettings(NamedSettings):
     """
 
     kind: Literal["homing_ekf"] = "homing_ekf"
-    gauge: Annotated[
-        Literal["one_distance", "unit_leg"],
-        Field(
-            description="scale: `one_distance` that of one feature, as printed; `unit_leg` start to"
-            " target"
-        ),
-    ] = "unit_leg"
-    exact_bearings: Annotated[
-        bool,
-        Field(description="bearings from the start without variance, as printed"),
-    ] = False
-    target: Annotated[
-        Literal["separate", "joint"],
-        Field(
-            description="`joint`: part of the state, bearings used once; `separate`: own filter, as"
-            " printed"
-        ),
-    ] = "joint"
-    map_covariance: Annotated[
-        bool,
-        Field(description="target separate: add the map's covariance; not printed"),
-    ] = True
-    gate_sigmas: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="gate on the innovation of a bearing; 0: none, as printed",
-        ),
-    ] = 3.0
-    max_relative_distance_sigma: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="largest relative deviation of a feature's distance in the map; 0: any",
-        ),
-    ] = 0.3
+    gauge: Literal["one_distance", "unit_leg"] = Field(
+        default="unit_leg",
+        description="scale: `one_distance` that of one feature, as printed; `unit_leg` start to"
+        " target",
+    )
+    exact_bearings: bool = Field(
+        default=False, description="bearings from the start without variance, as printed"
+    )
+    target: Literal["separate", "joint"] = Field(
+        default="joint",
+        description="`joint`: part of the state, bearings used once; `separate`: own filter, as"
+        " printed",
+    )
+    map_covariance: bool = Field(
+        default=True, description="target separate: add the map's covariance; not printed"
+    )
+    gate_sigmas: NonNegative = Field(
+        default=3.0, description="gate on the innovation of a bearing; 0: none, as printed"
+    )
+    max_relative_distance_sigma: NonNegative = Field(
+        default=0.3,
+        description="largest relative deviation of a feature's distance in the map; 0: any",
+    )
     motion: FilterMotionSettings = FilterMotionSettings()
 
 
@@ -99,15 +82,13 @@ PAPER = HomingEkfSettings(
 class GraphMotionSettings:
     """White noise on the acceleration between two images."""
 
-    forward: Annotated[
-        float, Field(gt=0.0, description="deviation of the speed after a second, legs/s")
-    ] = 0.1
-    sideways: Annotated[
-        float, Field(gt=0.0, description="the same of the sideways speed: slip")
-    ] = 0.03
-    turning_deg: Annotated[
-        float, Field(gt=0.0, description="the same of the turning rate, degrees/s")
-    ] = 60.0
+    forward: Positive = Field(
+        default=0.1, description="deviation of the speed after a second, legs/s"
+    )
+    sideways: Positive = Field(default=0.03, description="the same of the sideways speed: slip")
+    turning_deg: Positive = Field(
+        default=60.0, description="the same of the turning rate, degrees/s"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -115,32 +96,23 @@ class HomingGraphSettings(NamedSettings):
     """The same problem as one graph of bearings (design H)."""
 
     kind: Literal["homing_graph"] = "homing_graph"
-    solver: Annotated[
-        Literal["schur", "isam2", "fixed_lag", "batch"],
-        Field(description="`schur` exact, all images; `isam2`, `fixed_lag`, `batch` by GTSAM"),
-    ] = "schur"
+    solver: Literal["schur", "isam2", "fixed_lag", "batch"] = Field(
+        default="schur",
+        description="`schur` exact, all images; `isam2`, `fixed_lag`, `batch` by GTSAM",
+    )
     kernel: KernelSettings = KernelSettings("cauchy", 2.0)
-    elevations: Annotated[
-        Literal["none", "two_views", "all"],
-        Field(
-            description="`two_views`: of start and target; `none`: a prior instead; `all`: of every"
-            " image"
-        ),
-    ] = "two_views"
-    max_relative_distance_sigma: Annotated[
-        float,
-        Field(
-            gt=0.0,
-            description="a feature enters once its relative distance deviation is below this",
-        ),
-    ] = 0.3
-    gate_sigmas: Annotated[
-        float,
-        Field(
-            ge=0.0,
-            description="gate on the misfit of a bearing; 0: none",
-        ),
-    ] = 4.0
+    elevations: Literal["none", "two_views", "all"] = Field(
+        default="two_views",
+        description="`two_views`: of start and target; `none`: a prior instead; `all`: of every"
+        " image",
+    )
+    max_relative_distance_sigma: Positive = Field(
+        default=0.3,
+        description="a feature enters once its relative distance deviation is below this",
+    )
+    gate_sigmas: NonNegative = Field(
+        default=4.0, description="gate on the misfit of a bearing; 0: none"
+    )
     motion: GraphMotionSettings = GraphMotionSettings()
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT
+from fgslam.core.settings import STRICT, NonNegative, Positive
 
 Pair: TypeAlias = tuple[float, float]
 Size: TypeAlias = tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
@@ -22,12 +22,12 @@ class EquirectangularSettings:
     """A panorama; its size is that of the pictures."""
 
     kind: Literal["equirectangular"] = "equirectangular"
-    top_elevation_deg: Annotated[
-        float, Field(ge=-90.0, le=90.0, description="of the first row, degrees up")
-    ] = 90.0
-    bottom_elevation_deg: Annotated[
-        float, Field(ge=-90.0, le=90.0, description="of the last row, degrees up")
-    ] = -90.0
+    top_elevation_deg: float = Field(
+        default=90.0, ge=-90.0, le=90.0, description="of the first row, degrees up"
+    )
+    bottom_elevation_deg: float = Field(
+        default=-90.0, ge=-90.0, le=90.0, description="of the last row, degrees up"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -35,31 +35,29 @@ class CylinderSettings:
     """A panorama whose rows are proportional to the tangent of elevation."""
 
     kind: Literal["cylinder"] = "cylinder"
-    top_elevation_deg: Annotated[
-        float, Field(gt=-90.0, lt=90.0, description="of the first row, degrees up")
-    ] = 45.0
-    bottom_elevation_deg: Annotated[
-        float, Field(gt=-90.0, lt=90.0, description="of the last row, degrees up")
-    ] = -45.0
+    top_elevation_deg: float = Field(
+        default=45.0, gt=-90.0, lt=90.0, description="of the first row, degrees up"
+    )
+    bottom_elevation_deg: float = Field(
+        default=-45.0, gt=-90.0, lt=90.0, description="of the last row, degrees up"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
 class MirrorMountSettings:
     """How a mirror lies in its picture."""
 
-    ahead_deg: Annotated[
-        float,
-        Field(
-            ge=-360.0,
-            le=360.0,
-            description="direction of the robot's heading in the picture, clockwise from the right;"
-            " -90 is up",
-        ),
-    ] = -90.0
-    clockwise: Annotated[
-        bool,
-        Field(description="bearings grow clockwise, as in an upward-looking camera's raw picture"),
-    ] = True
+    ahead_deg: float = Field(
+        default=-90.0,
+        ge=-360.0,
+        le=360.0,
+        description="direction of the robot's heading in the picture, clockwise from the right;"
+        " -90 is up",
+    )
+    clockwise: bool = Field(
+        default=True,
+        description="bearings grow clockwise, as in an upward-looking camera's raw picture",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -67,40 +65,34 @@ class HyperbolicMirrorSettings(MirrorMountSettings):
     """A hyperbolic mirror as a unified sphere."""
 
     kind: Literal["mirror"] = "mirror"
-    size: Annotated[
-        Size | None, Field(description="width, height calibrated, pixels; null: any picture's")
-    ] = None
-    centre: Annotated[
-        Pair | None, Field(description="column, row of the mirror's axis; null: the middle")
-    ] = None
-    xi: Annotated[
-        float, Field(gt=0.0, le=1.0, description="2 e / (1 + e^2), e the mirror's eccentricity")
-    ] = 0.92
-    focal_px: Annotated[
-        float | None,
-        Field(
-            gt=0.0,
-            description="of the unified model: the horizon's radius times xi; null: by the "
-            "outer rim",
-        ),
-    ] = None
-    inner_radius_px: Annotated[
-        float | None,
-        Field(ge=0.0, description="nothing is seen inside; null: where its elevation is"),
-    ] = None
-    outer_radius_px: Annotated[
-        float | None,
-        Field(
-            gt=0.0,
-            description="nothing is seen outside; null: by its elevation",
-        ),
-    ] = None
-    inner_elevation_deg: Annotated[
-        float, Field(ge=-90.0, lt=90.0, description="at the inner rim, used where it says so above")
-    ] = -65.0
-    outer_elevation_deg: Annotated[
-        float, Field(gt=-90.0, lt=90.0, description="at the outer rim, used where it says so above")
-    ] = 25.0
+    size: Size | None = Field(
+        default=None, description="width, height calibrated, pixels; null: any picture's"
+    )
+    centre: Pair | None = Field(
+        default=None, description="column, row of the mirror's axis; null: the middle"
+    )
+    xi: float = Field(
+        default=0.92, gt=0.0, le=1.0, description="2 e / (1 + e^2), e the mirror's eccentricity"
+    )
+    focal_px: Positive | None = Field(
+        default=None,
+        description="of the unified model: the horizon's radius times xi; null: by the outer rim",
+    )
+    inner_radius_px: NonNegative | None = Field(
+        default=None, description="nothing is seen inside; null: where its elevation is"
+    )
+    outer_radius_px: Positive | None = Field(
+        default=None, description="nothing is seen outside; null: by its elevation"
+    )
+    inner_elevation_deg: float = Field(
+        default=-65.0,
+        ge=-90.0,
+        lt=90.0,
+        description="at the inner rim, used where it says so above",
+    )
+    outer_elevation_deg: float = Field(
+        default=25.0, gt=-90.0, lt=90.0, description="at the outer rim, used where it says so above"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -108,17 +100,14 @@ class OCamCalibSettings(MirrorMountSettings):
     """A camera calibrated with OCamCalib."""
 
     kind: Literal["ocamcalib"] = "ocamcalib"
-    file: Annotated[
-        str,
-        Field(
-            min_length=1,
-            description="calib_results.txt, looked for beside the pictures, then from here",
-        ),
-    ] = "calib_results.txt"
-    ring_px: Annotated[
-        Pair | None,
-        Field(description="inner and outer radius; null: as the file says"),
-    ] = None
+    file: str = Field(
+        default="calib_results.txt",
+        min_length=1,
+        description="calib_results.txt, looked for beside the pictures, then from here",
+    )
+    ring_px: Pair | None = Field(
+        default=None, description="inner and outer radius; null: as the file says"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -126,23 +115,19 @@ class LensSettings(MirrorMountSettings):
     """A camera of camodocal (MEI, KANNALA_BRANDT) or of Kalibr whose axis is vertical."""
 
     kind: Literal["lens"] = "lens"
-    file: Annotated[
-        str,
-        Field(
-            min_length=1, description="its calibration, looked for beside the pictures, then here"
-        ),
-    ] = "camera.yaml"
-    middle: Annotated[
-        Literal["down", "up"],
-        Field(
-            description="where the picture's middle looks: down as of a mirror above the camera, "
-            "up as of a fisheye that looks up"
-        ),
-    ] = "down"
-    ring_px: Annotated[
-        Pair | None,
-        Field(description="inner and outer radius; null: the largest circle in the picture"),
-    ] = None
+    file: str = Field(
+        default="camera.yaml",
+        min_length=1,
+        description="its calibration, looked for beside the pictures, then here",
+    )
+    middle: Literal["down", "up"] = Field(
+        default="down",
+        description="where the picture's middle looks: down as of a mirror above the camera, "
+        "up as of a fisheye that looks up",
+    )
+    ring_px: Pair | None = Field(
+        default=None, description="inner and outer radius; null: the largest circle in the picture"
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -150,21 +135,19 @@ class RadialPolynomialSettings(MirrorMountSettings):
     """The paper's polynomial of elevation over radius, or a line between two elevations."""
 
     kind: Literal["radial_polynomial"] = "radial_polynomial"
-    size: Annotated[
-        Size | None, Field(description="width, height calibrated, pixels; null: any picture's")
-    ] = None
-    centre: Annotated[
-        Pair | None, Field(description="column, row of the mirror's axis; null: the middle")
-    ] = None
-    ring_px: Annotated[Pair, Field(description="inner and outer radius, pixels")] = (20.0, 119.0)
-    coefficients_deg: Annotated[
-        tuple[float, ...],
-        Field(
-            min_length=2,
-            max_length=12,
-            description="elevation over the radius scaled to [-1, 1], from the constant upward",
-        ),
-    ] = (-20.0, 45.0)
+    size: Size | None = Field(
+        default=None, description="width, height calibrated, pixels; null: any picture's"
+    )
+    centre: Pair | None = Field(
+        default=None, description="column, row of the mirror's axis; null: the middle"
+    )
+    ring_px: Pair = Field(default=(20.0, 119.0), description="inner and outer radius, pixels")
+    coefficients_deg: tuple[float, ...] = Field(
+        default=(-20.0, 45.0),
+        min_length=2,
+        max_length=12,
+        description="elevation over the radius scaled to [-1, 1], from the constant upward",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -176,12 +159,11 @@ class BloggieSettings:
     """
 
     kind: Literal["bloggie"] = "bloggie"
-    file: Annotated[
-        str,
-        Field(
-            min_length=1, description="settings.txt, looked for beside the video, then from here"
-        ),
-    ] = "bloggie_settings.txt"
+    file: str = Field(
+        default="bloggie_settings.txt",
+        min_length=1,
+        description="settings.txt, looked for beside the video, then from here",
+    )
 
 
 OmniCameraSettings: TypeAlias = Annotated[
