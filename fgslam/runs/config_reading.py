@@ -21,7 +21,6 @@ from pydantic_core import ErrorDetails
 from fgslam.core.errors import ConfigError, shortened
 from fgslam.core.yaml_text import PlainLoader, composed, read_yaml
 from fgslam.runs.named_experiments import suggestion
-from fgslam.runs.retired_settings import RETIRED
 
 Model = TypeVar("Model", bound=BaseModel)
 Schema: TypeAlias = Mapping[str, Any]
@@ -68,11 +67,8 @@ class Reader(Generic[Model]):
         try:
             return self.model.model_validate(values)
         except ValidationError as error:
-            schema, errors = _schema_of(self.model), error.errors()
-        known = _without_retired(values, errors, schema)
-        if known is None:
-            raise ConfigError(_describe(errors, where, schema))
-        return self.parse(known, where)
+            message = _describe(error.errors(), where, _schema_of(self.model))
+            raise ConfigError(message) from None
 
     def _drop_unknown(self, inner: Any, group: str, given: set[str]) -> None:
         """Drops keys that meant something to the file's kind, not to the one an override chose.
@@ -175,39 +171,6 @@ class _Override:
                 raise ConfigError(f"--set {self.given}: {key} holds a value, not a group of keys")
             at = inner
         at[self.keys[-1]] = value
-
-
-# --------------------------------------------------------------------------------------------
-# Keys of earlier versions
-
-
-def _without_retired(
-    values: Mapping[str, Any], errors: list[ErrorDetails], schema: Schema
-) -> dict[str, Any] | None:
-    """The values without keys that are constants now and agree with these; None: there are none."""
-    retired = [tuple(e["loc"]) for e in errors if e["type"] in _UNKNOWN and _is_retired(e, schema)]
-    kept = copy.deepcopy(dict(values))
-    for location in retired:
-        group: Any = kept
-        for name in location[:-1]:  # tags of unions are no keys
-            if isinstance(name, int) or (isinstance(group, dict) and name in group):
-                group = group[name]
-        group.pop(location[-1], None)
-    return kept if retired else None
-
-
-def _is_retired(error: ErrorDetails, schema: Schema) -> bool:
-    *group, key = (str(name) for name in error["loc"])
-    _, nodes = _descend(schema, group)
-    constants = [RETIRED.get(node.get("title", ""), {}) for node in nodes]
-    return any(key in found and _agrees(error["input"], found[key]) for found in constants)
-
-
-def _agrees(given: Any, constant: Any) -> bool:
-    """Whether a value is the constant, or a group whose keys are all constants of that group."""
-    if isinstance(given, Mapping) and isinstance(constant, Mapping):
-        return all(key in constant and _agrees(given[key], constant[key]) for key in given)
-    return bool(given == constant)
 
 
 # --------------------------------------------------------------------------------------------
