@@ -92,6 +92,7 @@ def saved_map(landmarks: int) -> SavedMap:
         trajectory=Trajectory(np.zeros(1), np.eye(4)[None]),
         about={},
         session={},
+        evidence=np.empty(0, np.int64),
     )
 
 

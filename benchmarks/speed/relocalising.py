@@ -181,6 +181,7 @@ def saved(known: tuple[LandmarkMap, LandmarkAppearances], rig: CameraRig) -> Sav
         trajectory=Trajectory(np.zeros(1), np.eye(4)[None]),
         about={},
         session={},
+        evidence=np.empty(0, np.int64),
     )
 
 

@@ -110,13 +110,7 @@ class ArrayFile:
         if not isinstance(header, dict) or header.get("format") != self.name:
             raise self.error(f"{where}: not an {self.name}; {self.give}")
         if header.get("version") not in self.versions:
-            first, last = self.versions[0], self.versions[-1]
-            read = f"version {last}" if first == last else f"versions {first} to {last}"
-            raise self.error(
-                f"{where}: {self.short} of version "
-                f"{header.get('version')}, this fgslam reads {read}; {self.again} or use the "
-                "matching fgslam"
-            )
+            raise self.error(f"{where}: {self.short} made by another version; {self.again}")
         return header
 
     def damaged(self, name: str, where: str) -> FgslamError:

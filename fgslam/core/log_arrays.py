@@ -1,8 +1,6 @@
 """Frames of a measurement log as plain arrays, and back: the layout of its file.
 
-A log without loop closures and relocalised frames is written as version 2, to the same bytes as
-before there were any; one that has them is version 3, one with turns or of a rig that calibrated
-itself version 6, one with the bias of a gyroscope version 7. All are read.
+A log is of the first version that has a place for all that is in it (:func:`version_of`).
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.array_files import (
+    Items,
     from_upper,
     joined,
     of_rows,
@@ -42,7 +41,6 @@ from fgslam.core.log_layout import (
     WITH_CORRECTIONS,
     WITH_EVERYTHING,
     WITH_LOOPS,
-    WITH_SETTLED,
 )
 from fgslam.core.measurements import (
     BiasEffect,
@@ -53,7 +51,7 @@ from fgslam.core.measurements import (
     SettledRig,
 )
 from fgslam.core.rig_checks import rig_fault
-from fgslam.core.rig_correction import FIRST_TERMS, term_names, with_all_terms
+from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
 
 _UPPER = np.triu_indices(3)
@@ -99,7 +97,7 @@ def version_of(frames: Sequence[Increment]) -> int:
     if any(step.bias is not None for step in steps):
         return WITH_EVERYTHING
     if any(step.turned for step in steps) or any(s.rig_correction is not None for s in frames):
-        return WITH_SETTLED
+        return WITH_CORRECTIONS
     return WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else BEFORE_LOOPS
 
 
@@ -189,9 +187,6 @@ def _bias_arrays(frames: Sequence[Increment]) -> StateArrays:
 
 def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     header = LOG.read_header(arrays, where)
-    if header["version"] == 1:
-        rig = header.get("rig")
-        header["sensor"] = {"kind": "stereo", **rig} if isinstance(rig, dict) else None
     sensor = header.get("sensor")
     keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
     given = set(sensor if isinstance(sensor, dict) else ())
@@ -310,17 +305,15 @@ def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
 def _corrections(
     arrays: StateArrays, version: int, rig: Sensor, where: str
 ) -> list[FloatArray | None]:
-    """The rig's correction in each frame; None before version 4, and in a log of NaN.
+    """The rig's correction in each frame; None before version 6, and in a log of NaN.
 
     Raises MeasurementLogError where they are not there, or of another rig.
     """
     frames = len(arrays["frame_index"])
     if version < WITH_CORRECTIONS or not isinstance(rig, CameraRig):
         return [None] * frames
-    older = version < WITH_SETTLED
-    terms = FIRST_TERMS * (rig.cameras - 1) if older else len(term_names(rig))
-    LOG.require(arrays, {CORRECTIONS: ("f", (frames, terms))}, where)
-    rows = with_all_terms(rig, arrays[CORRECTIONS]) if older else arrays[CORRECTIONS]
+    LOG.require(arrays, {CORRECTIONS: ("f", (frames, len(term_names(rig))))}, where)
+    rows = arrays[CORRECTIONS]
     return [None] * frames if np.isnan(rows[:, :1]).all() else list(rows)
 
 
@@ -333,12 +326,15 @@ def _settled(
     """
     frames = len(arrays["frame_index"])
     terms = next((len(row) for row in corrections if row is not None), 0)
-    if version < WITH_SETTLED or not terms:
+    if version < WITH_CORRECTIONS or not terms:
         return [None] * frames
-    expected = {"rig_settled": ("f", (frames, terms)), "rig_knocks": ("i", (frames,))}
+    expected: Items = {
+        "rig_settled": ("f", (frames, terms)),
+        "rig_knocks": ("i", (frames,)),
+        "rig_field_px": ("f", (frames,)),
+    }
     LOG.require(arrays, expected, where)
-    field = arrays.get("rig_field_px", np.zeros(frames))  # not in every log of version 6 or 7
-    LOG.require({"rig_field_px": field}, {"rig_field_px": ("f", (frames,))}, where)
+    field = arrays["rig_field_px"]
     if not (np.isfinite(field) & (field >= 0.0)).all():
         raise LOG.damaged("rig_field_px", where)
     rows = zip(arrays["rig_settled"], arrays["rig_knocks"].tolist(), field.tolist(), strict=True)

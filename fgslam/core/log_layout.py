@@ -7,14 +7,13 @@ from fgslam.core.errors import MeasurementLogError
 
 LOG = ArrayFile(
     name="fgslam measurement log",
-    # Version 1 knew cameras only, 2 no loops, 3 no corrections of the rig, 4 no gyroscope, 5 no
-    # correction for all frames alike, and fewer terms, 6 no bias.
-    versions=(1, 2, 3, 4, 5, 6, 7),
+    # 2: without loops, 3: without corrections of the rig, 6: without the bias of a gyroscope.
+    versions=(2, 3, 6, 7),
     error=MeasurementLogError,
     give="give a run folder's measurements.npz",
     again="run again",
 )
-BEFORE_LOOPS, WITH_LOOPS, WITH_CORRECTIONS, WITH_SETTLED, WITH_EVERYTHING = 2, 3, 4, 6, 7
+BEFORE_LOOPS, WITH_LOOPS, WITH_CORRECTIONS, WITH_EVERYTHING = LOG.versions
 CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
 
 # Arrays by the count that their first axis has, with type and the shape of an item.

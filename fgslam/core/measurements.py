@@ -106,7 +106,7 @@ class LoopClosure(Brief):
             identities.
         merged: (m, 2) pairs (identity that ends, identity that stays) of landmarks that are one if
             this is the same place; the frame observes the first. Where the live estimator took the
-            closure, it is pruned in the next frame (older logs: in this one).
+            closure, it is pruned in the next frame.
     """
 
     frame: int
@@ -125,7 +125,7 @@ class SettledRig(Brief):
             each frame's own is no worse.
         knocks: how often the rig was found to have moved before.
         field_px: what no term of the correction follows, taken off nothing: standard deviation of
-            one coordinate in each image (:mod:`fgslam.core.rig_field`); 0 in older logs.
+            one coordinate in each image (:mod:`fgslam.core.rig_field`).
     """
 
     values: FloatArray | None
@@ -153,7 +153,7 @@ class Increment(Brief):
             (:func:`fgslam.core.rig_correction.term_names`), taken off the measurements already, not
             off the raw pixels; None where the calibration was taken as it is.
         settled_rig: what was known then of the rig for all frames alike, taken off nothing; None
-            where the calibration was taken as it is, and in older logs.
+            where the calibration was taken as it is.
     """
 
     index: int

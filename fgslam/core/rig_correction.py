@@ -35,9 +35,9 @@ TERMS = (
 )
 """Of each camera beside the reference, in units of the focal length."""
 
-FIRST_TERMS = 9
-"""How many of TERMS are taken off a frame before it is matched, and logs knew before version 6. The
-others, and COMMON, take a drive to be told apart from its motion: whole graphs have them."""
+_EARLY_TERMS = 9
+"""How many of TERMS are taken off a frame before it is matched. The others, and COMMON, take a
+drive to be told apart from its motion: whole graphs have them."""
 
 COMMON = ("radial",)
 """What is estimated of all cameras alike, the reference among them."""
@@ -70,16 +70,8 @@ def term_names(rig: CameraRig) -> tuple[str, ...]:
 
 def early_terms(rig: CameraRig) -> BoolArray:
     """Which values (p,) are taken off a frame before it is matched."""
-    own = np.tile(np.arange(len(TERMS)) < FIRST_TERMS, rig.cameras - 1)
+    own = np.tile(np.arange(len(TERMS)) < _EARLY_TERMS, rig.cameras - 1)
     return np.concatenate([own, np.zeros(len(COMMON), np.bool_)])
-
-
-def with_all_terms(rig: CameraRig, rows: FloatArray) -> FloatArray:
-    """Values (n, p) of corrections (n, q) with the first of each camera's terms; the others 0."""
-    known = rows.reshape(len(rows), rig.cameras - 1, -1)
-    out = np.zeros((*known.shape[:2], len(TERMS)))
-    out[..., : known.shape[2]] = known
-    return np.column_stack([out.reshape(len(rows), -1), np.zeros((len(rows), len(COMMON)))])
 
 
 def displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:

@@ -28,7 +28,7 @@ from fgslam.core.sensors import CameraRig
 
 FILE = ArrayFile(
     name="fgslam map",
-    versions=(1, 2, 3),  # 1 did not say which frames are in the map, 2 knew no patches
+    versions=(2, 3),  # 3 has patches
     error=MapError,
     give="give a file that fgslam run --map-out wrote",
     again="make the map again",
@@ -41,9 +41,6 @@ _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: equal maps g
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _VIEW = "view"  # written where it is cylindrical
 _SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
-
-_SINCE = {"evidence": 2, "patches": 3}
-"""Versions since which a file may have these; it is of the oldest that has what it holds."""
 
 # Arrays by what their first axis counts, with type and the shape of an item.
 _ITEMS: dict[str, Items] = {
@@ -84,9 +81,8 @@ class SavedMap:
         trajectory: the drive that made the map.
         about: where it comes from: names, versions, the recording's identity (plain JSON values).
         session: state of the run that made it, for continuing it to the bit; may be empty.
-        evidence: (f,) the frames whose measurements are in it (``Frame.digest``), ascending; None
-            where the file is older and does not say.
-        patches: the landmarks' own; None where they were not carried, or the file is older.
+        evidence: (f,) the frames whose measurements are in it (``Frame.digest``), ascending.
+        patches: the landmarks' own; None where they were not carried.
     """
 
     rig: CameraRig
@@ -99,7 +95,7 @@ class SavedMap:
     trajectory: Trajectory
     about: dict[str, Any]
     session: StateArrays
-    evidence: IntArray | None = None
+    evidence: IntArray
     patches: LandmarkPatches | None = None
 
     def __len__(self) -> int:
@@ -134,7 +130,7 @@ def load_map(path: Path) -> SavedMap:
     """Reads a map and checks its checksum.
 
     Raises:
-        MapError: the file is missing, truncated, damaged, foreign, or of a newer fgslam.
+        MapError: the file is missing, truncated, damaged, foreign, or of another version.
     """
     arrays = FILE.load(path)
     header = _read_header(arrays, str(path))
@@ -197,7 +193,7 @@ def _to_arrays(saved: SavedMap) -> StateArrays:
         "view_direction": views.direction,
         "pose_time": saved.trajectory.timestamps,
         "pose": saved.trajectory.poses,
-        **({} if saved.evidence is None else {_EVIDENCE: saved.evidence}),
+        _EVIDENCE: saved.evidence,
         **_patch_arrays(saved.patches),
         **{f"{_SESSION}{name}": array for name, array in sorted(saved.session.items())},
     }
@@ -232,7 +228,7 @@ def _from_arrays(header: dict[str, Any], arrays: StateArrays, where: str) -> Sav
             for name, array in arrays.items()
             if name.startswith(_SESSION)
         },
-        evidence=arrays.get(_EVIDENCE),
+        evidence=arrays[_EVIDENCE],
         patches=LandmarkPatches(arrays[_PATCH], arrays[_PATCH_DISTANCE])
         if _PATCH in arrays
         else None,
@@ -296,16 +292,15 @@ def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> St
 
 
 def _header(saved: SavedMap, where: str) -> dict[str, Any]:
-    optional = {} if saved.evidence is None else {"evidence": len(saved.evidence)}
-    if _patch_arrays(saved.patches):
-        optional["patches"] = len(saved)
+    optional = {"patches": len(saved)} if _patch_arrays(saved.patches) else {}
     header = {
         "format": FILE.name,
-        "version": max((_SINCE[name] for name in optional), default=1),
+        "version": 3 if optional else 2,
         "counts": {
             "landmarks": len(saved),
             "views": len(saved.appearances),
             "poses": len(saved.trajectory),
+            "evidence": len(saved.evidence),
         }
         | optional,
         "rig": _rig_values(saved.rig),
@@ -348,7 +343,7 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
     expected = of_rows(4, {"rig_bTc": ("f", (4,))})
     counts = header["counts"]
     for counted, items in _ITEMS.items():
-        if counted not in _SINCE or _holds(header, arrays, counted):
+        if counted != "patches" or _has_patches(header, arrays):
             expected |= of_rows(counts.get("landmarks" if counted == "patches" else counted), items)
     FILE.require(arrays, expected, where)
     ids, views = arrays["landmark_id"], arrays["view_landmark"]
@@ -361,7 +356,7 @@ def _require_consistent(header: dict[str, Any], arrays: StateArrays, where: str)
         "landmark_id": _ascending(ids),
         "view_landmark": bool((np.diff(views) >= 0).all() and np.isin(views, ids).all()),
         "pose_time": _ascending(arrays["pose_time"]),
-        _EVIDENCE: _ascending(arrays.get(_EVIDENCE, ids[:0])),
+        _EVIDENCE: _ascending(arrays[_EVIDENCE]),
     }.items():
         if not sound:
             raise MapError(f"{where}: array {name} is out of order; make the map again")
@@ -375,10 +370,10 @@ def _ascending(values: np.ndarray[Any, Any]) -> bool:
     return bool((values[1:] > values[:-1]).all())
 
 
-def _holds(header: dict[str, Any], arrays: StateArrays, part: str) -> bool:
-    """Whether a map has what came with a later version; of its own version it must have it."""
-    newest = header["version"] == _SINCE[part]
-    return newest or part in header["counts"] or not _ITEMS[part].keys().isdisjoint(arrays)
+def _has_patches(header: dict[str, Any], arrays: StateArrays) -> bool:
+    """Whether any of the three places that tell of patches does; then all of them must."""
+    counted = header["version"] == 3 or "patches" in header["counts"]
+    return counted or not _ITEMS["patches"].keys().isdisjoint(arrays)
 
 
 def _rig_values(rig: CameraRig) -> dict[str, Any]:

@@ -20,8 +20,8 @@ from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
 
-VERSIONS = (1, 2)
-"""Of files that hold features; written is the last."""
+VERSIONS = (2,)
+"""Of files that hold features."""
 
 _FEATURES = ArrayFile(
     name="fgslam features",
@@ -51,22 +51,6 @@ _COLUMNS: _Arrays = {
     "column_sigma_tangents": (np.uint8, (2,)),
     "column_descriptors": (np.float32, (11,)),
 }
-_SIFT_1: _Arrays = {
-    "sift_bearing": (np.float32, ()),
-    "sift_elevation": (np.float32, ()),
-    "sift_spread": (np.float16, (3,)),  # two deviations and the correlation
-    "sift_scale": (np.float32, ()),
-    "sift_descriptors": (np.uint8, (128,)),
-    "sift_colour": (np.float16, (3,)),
-}
-_COLUMNS_1: _Arrays = {
-    "column_bearing": (np.float32, ()),
-    "column_sigma_bearing": (np.float16, ()),
-    "column_tangents": (np.float32, (2,)),
-    "column_sigma_tangents": (np.float16, (2,)),
-    "column_descriptors": (np.float32, (11,)),
-}
-
 _ANGLE = 32767.0 / np.pi
 _LEAST, _MOST = 1e-5, 10.0  # of what is kept as a byte, radians
 _BYTE = 255.0 / np.log(_MOST / _LEAST)
@@ -88,26 +72,20 @@ def pack_features(images: Sequence[OmniFeatures]) -> StateArrays:
     return out
 
 
-def unpack_features(
-    arrays: Mapping[str, Any], where: str, version: int = VERSIONS[-1]
-) -> tuple[OmniFeatures, ...]:
+def unpack_features(arrays: Mapping[str, Any], where: str) -> tuple[OmniFeatures, ...]:
     """The features back.
 
     Args:
         arrays: as :func:`pack_features` made them; others among them are passed over.
         where: the file's name, for messages.
-        version: of the file.
 
     Raises:
         StoredMapError: an array is absent or damaged.
     """
-    coarse = version > 1
-    sift = _split(arrays, "sift_start", _SIFT if coarse else _SIFT_1, where)
-    columns = _split(arrays, "column_start", _COLUMNS if coarse else _COLUMNS_1, where)
+    sift = _split(arrays, "sift_start", _SIFT, where)
+    columns = _split(arrays, "column_start", _COLUMNS, where)
     if len(sift) != len(columns):
         raise _FEATURES.damaged("column_start", where)
-    if coarse:
-        sift, columns = list(map(_fine_sift, sift)), list(map(_fine_columns, columns))
     return tuple(
         OmniFeatures(_sift_of(s), _columns_of(c)) for s, c in zip(sift, columns, strict=True)
     )
@@ -202,42 +180,22 @@ def _coarse(values: FloatArray) -> Array:
 # And back
 
 
-def _fine_sift(part: dict[str, Array]) -> dict[str, Array]:
-    """Arrays of version 2 as those of version 1."""
-    spread = _of_bytes(part["sift_spread"])
-    correlation = part["sift_correlation"] / _CORRELATION
-    return part | {
-        "sift_bearing": part["sift_bearing"] / _ANGLE,
-        "sift_elevation": part["sift_elevation"] / _ANGLE,
-        "sift_spread": np.column_stack([spread, correlation]),
-        "sift_scale": _of_bytes(part["sift_scale"]),
-    }
-
-
-def _fine_columns(part: dict[str, Array]) -> dict[str, Array]:
-    return part | {
-        "column_bearing": part["column_bearing"] / _ANGLE,
-        "column_sigma_bearing": _of_bytes(part["column_sigma_bearing"]),
-        "column_sigma_tangents": _of_bytes(part["column_sigma_tangents"]),
-    }
-
-
 def _of_bytes(codes: Array) -> FloatArray:
     return np.asarray(_LEAST * np.exp(codes / _BYTE))
 
 
 def _sift_of(part: Mapping[str, Array]) -> UprightFeatures:
     n = len(part["sift_bearing"])
-    spread = _doubles(part["sift_spread"])
+    sigmas, correlation = _of_bytes(part["sift_spread"]), part["sift_correlation"] / _CORRELATION
     covariance = np.empty((n, 2, 2))
-    covariance[:, [0, 1], [0, 1]] = spread[:, :2] ** 2
-    covariance[:, 0, 1] = covariance[:, 1, 0] = spread.prod(axis=1)
+    covariance[:, [0, 1], [0, 1]] = sigmas**2
+    covariance[:, 0, 1] = covariance[:, 1, 0] = sigmas[:, 0] * sigmas[:, 1] * correlation
     return UprightFeatures(
         pixels=np.full((n, 2), np.nan),
-        bearing=_doubles(part["sift_bearing"]),
-        elevation=_doubles(part["sift_elevation"]),
+        bearing=part["sift_bearing"] / _ANGLE,
+        elevation=part["sift_elevation"] / _ANGLE,
         covariance=covariance,
-        scale=_doubles(part["sift_scale"]),
+        scale=_of_bytes(part["sift_scale"]),
         descriptors=part["sift_descriptors"],
         colour=_doubles(part["sift_colour"]),
     )
@@ -245,10 +203,10 @@ def _sift_of(part: Mapping[str, Array]) -> UprightFeatures:
 
 def _columns_of(part: Mapping[str, Array]) -> ColumnSegments:
     return ColumnSegments(
-        bearing=_doubles(part["column_bearing"]),
-        sigma_bearing=_doubles(part["column_sigma_bearing"]),
+        bearing=part["column_bearing"] / _ANGLE,
+        sigma_bearing=_of_bytes(part["column_sigma_bearing"]),
         tangents=_doubles(part["column_tangents"]),
-        sigma_tangents=_doubles(part["column_sigma_tangents"]),
+        sigma_tangents=_of_bytes(part["column_sigma_tangents"]),
         descriptors=_doubles(part["column_descriptors"]),
     )
 

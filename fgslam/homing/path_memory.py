@@ -151,7 +151,7 @@ def load_images(kind: ArrayFile, path: str | Path) -> tuple[PathMemory, StateArr
     """
     arrays = kind.load(as_path(path, StoredMapError))
     header = kind.read_header(arrays, str(path))
-    images = unpack_features(arrays, str(path), header["version"])
+    images = unpack_features(arrays, str(path))
     names, values = header.get("names"), header.get("camera")
     if not isinstance(names, list) or len(names) != len(images):
         raise StoredMapError(f"{path}: not one name an image; write the file again")

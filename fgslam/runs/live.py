@@ -190,7 +190,7 @@ class Slam(Session):
         drives = [] if self._before is None else drives_of(self._before)
         about = {"drives": [*drives, self._drive(found)]}
         evidence = evidence_of(self.pipeline, self.recorder, self._before)
-        saved = saved_map(self.pipeline, self.rig, found.estimate, about, evidence=evidence)
+        saved = saved_map(self.pipeline, self.rig, found.estimate, about, evidence)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         return Result(**values, map=Map(saved, points, self._remark))
 

@@ -230,10 +230,9 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
     require_rig_of_map(b, a.rig, str(second))
     if adds_nothing(b, a):
         size = save_map(a, out)
-        every = 0 if b.evidence is None else len(b.evidence)
         return [
-            f"all {every} frames of {second} are in {first} already, and count once: nothing to "
-            "merge",
+            f"all {len(b.evidence)} frames of {second} are in {first} already, and count once: "
+            "nothing to merge",
             f"{out}: {first} as it is, {len(a)} landmarks, {size / 1e6:.2f} MB",
         ]
     found = align_maps(a, b, np.random.default_rng(_SEED), f"{first} and {second}")
@@ -263,12 +262,6 @@ def _in_common(a: SavedMap, b: SavedMap, first: str, second: str) -> list[str]:
     """A line about the evidence that both maps hold; none where there is none."""
     from fgslam.frontend.places.map_fusion import shared_frames, shared_moments
 
-    if a.evidence is None or b.evidence is None:
-        older = first if a.evidence is None else second
-        return [
-            f"{older} does not say which frames are in it (an older fgslam's): what both hold may "
-            "be the same evidence, so no covariance shrinks; make the map again"
-        ]
     once = "they count once (covariance intersection)"
     if common := shared_frames(a, b):
         return [f"{common} of the {len(b.evidence)} frames of {second} are in {first}, too: {once}"]

@@ -121,8 +121,8 @@ def saved_map(
     rig: CameraRig,
     estimate: Estimate,
     about: dict[str, Any],
+    evidence: IntArray,
     session: StateArrays | None = None,
-    evidence: IntArray | None = None,
 ) -> SavedMap:
     """The estimator's geometry joined with the database's appearances and counts.
 
@@ -131,8 +131,8 @@ def saved_map(
         rig: the cameras that saw the map.
         estimate: the estimator's.
         about: where the map comes from; plain JSON values.
+        evidence: the frames that are in it (:func:`evidence_of`).
         session: what its run needs to go on; None for nothing.
-        evidence: the frames that are in it (:func:`evidence_of`); None where that is not known.
     """
     book, places = pipeline.book, pipeline.places
     landmarks = estimate.landmarks
@@ -155,16 +155,12 @@ def saved_map(
     )
 
 
-def evidence_of(
-    pipeline: SlamPipeline, recorder: RunRecorder, before: SavedMap | None
-) -> IntArray | None:
-    """Frames (f,) whose measurements are in a session's map, ascending; None where not known.
+def evidence_of(pipeline: SlamPipeline, recorder: RunRecorder, before: SavedMap | None) -> IntArray:
+    """Frames (f,) whose measurements are in a session's map, ascending.
 
     Those of the map that it began in count, too; a map that is only localised in takes in nothing.
     """
     own = np.array([d for d in recorder.frame_digests if d], np.int64)
     if pipeline.tracker.keeps_map:
         own = own[:0]
-    if before is None:
-        return np.unique(own)
-    return None if before.evidence is None else np.union1d(before.evidence, own)
+    return np.unique(own) if before is None else np.union1d(before.evidence, own)

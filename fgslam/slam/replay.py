@@ -224,9 +224,7 @@ def replay_motion(log: MeasurementLog) -> ConstantVelocityMotion:
     """
     values = log.motion_model.get("stand_in", log.motion_model)
     try:
-        # Logs of version 0.1 say nothing of it: their noise was fixed.
-        settings = ConstantVelocitySettings(**{"adapt": False, **values})
-        return ConstantVelocityMotion(settings)
+        return ConstantVelocityMotion(ConstantVelocitySettings(**values))
     except (TypeError, ValueError):
         raise MeasurementLogError(
             f"the log's motion model {log.motion_model} is not known to this fgslam; repeat the run"

@@ -28,10 +28,9 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
 
     Landmarks in both keep a's identity. Of maps without a frame in common, position and covariance
     are the two weighted by their own parts of the covariances, the alignment's uncertainty part of
-    b's, and hits and misses add up. Maps that share frames or moments, or do not say which frames
-    they hold, are fused without counting anything twice (covariance intersection, Julier and
-    Uhlmann 1997), with the larger counts. A ``b`` without a frame that a lacks leaves ``a`` as it
-    is.
+    b's, and hits and misses add up. Maps that share frames or moments are fused without counting
+    anything twice (covariance intersection, Julier and Uhlmann 1997), with the larger counts. A
+    ``b`` without a frame that a lacks leaves ``a`` as it is.
 
     Permanent is what either holds so, and all views are kept. Others of b get identities after a's
     last. The trajectory is both drives, where b's came later, else a's alone; a session is not
@@ -58,15 +57,13 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
         trajectory=_trajectory(a.trajectory, b.trajectory, alignment.aTb),
         about={"drives": [*a.about.get("drives", ()), *b.about.get("drives", ())]},
         session={},
-        evidence=_all_evidence(a, b),
+        evidence=np.union1d(a.evidence, b.evidence),
         patches=_patches(a, b, alignment.pairs, rest),
     )
 
 
-def shared_frames(a: SavedMap, b: SavedMap) -> int | None:
-    """How many frames are in both maps; None where one of them does not say what is in it."""
-    if a.evidence is None or b.evidence is None:
-        return None
+def shared_frames(a: SavedMap, b: SavedMap) -> int:
+    """How many frames are in both maps."""
     return len(np.intersect1d(a.evidence, b.evidence))
 
 
@@ -82,8 +79,8 @@ def shared_moments(a: SavedMap, b: SavedMap) -> int:
 
 
 def adds_nothing(b: SavedMap, a: SavedMap) -> bool:
-    """Whether every frame of ``b`` is in ``a`` already, as far as both say."""
-    return b.evidence is not None and shared_frames(a, b) == len(b.evidence)
+    """Whether every frame of ``b`` is in ``a`` already."""
+    return shared_frames(a, b) == len(b.evidence)
 
 
 def _patches(a: SavedMap, b: SavedMap, pairs: IntArray, rest: IntArray) -> LandmarkPatches | None:
@@ -95,12 +92,6 @@ def _patches(a: SavedMap, b: SavedMap, pairs: IntArray, rest: IntArray) -> Landm
     grey, distances = ours.grey.copy(), ours.distances.copy()
     grey[mine], distances[mine] = theirs.grey[yours], theirs.distances[yours]
     return LandmarkPatches(grey, distances).join(theirs.select(rest))
-
-
-def _all_evidence(a: SavedMap, b: SavedMap) -> IntArray | None:
-    if a.evidence is None or b.evidence is None:
-        return None
-    return np.union1d(a.evidence, b.evidence)
 
 
 def _moved(b: SavedMap, alignment: Alignment) -> LandmarkMap:

@@ -185,15 +185,12 @@ def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClo
 
 
 def read_closures(path: Path) -> tuple[TextTable, list[tuple[int, int]]]:
-    """The report's table of a loops.csv, and (closing, returned to) of the loops closed.
-
-    A file of an older run does not tell which were refused: there all count as taken.
-    """
+    """The report's table of a loops.csv, and (closing, returned to) of the loops closed."""
     try:
         text = path.read_text(encoding="utf-8")
         rows = list(csv.DictReader(io.StringIO(text)))
         lines = tuple((_title(row), _values(row)) for row in rows)
-        closed = [(int(row["at"]), int(row["to"])) for row in rows if _taken(row) != "no"]
+        closed = [(int(row["at"]), int(row["to"])) for row in rows if row["taken"] == "true"]
         return TextTable("places", "Places recognised", "closed at", _COLUMNS, lines), closed
     except (OSError, UnicodeDecodeError, KeyError, ValueError, TypeError) as error:
         raise DatasetError(
@@ -205,14 +202,10 @@ def _title(row: dict[str, str]) -> str:
     return f"frame {row['frame']}" + (" (false)" if row["false"] == "true" else "")
 
 
-def _taken(row: dict[str, str]) -> str:
-    return {"true": "yes", "false": "no"}.get(row.get("taken", ""), "-")
-
-
 def _values(row: dict[str, str]) -> tuple[str, ...]:
     lengths = ("correction_m", "before_m", "after_m", "error_m")
     return (
-        _taken(row),
+        "yes" if row["taken"] == "true" else "no",
         row["returned_to"],
         row["matches"],
         row["merged"],

@@ -322,7 +322,7 @@ def _saved_map(outputs: RunOutputs) -> SavedMap:
     session = _session(outputs) if outputs.config.map.session else None
     before = None if outputs.given is None else outputs.given.saved
     evidence = evidence_of(outputs.pipeline, outputs.recorder, before)
-    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, session, evidence)
+    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, evidence, session)
 
 
 def _drives_before(outputs: RunOutputs) -> list[Any]:

@@ -73,6 +73,7 @@ def write_submap(submap: SubMap, rig: CameraRig, path: Path) -> None:
         trajectory=Trajectory(geometry.timestamps, geometry.poses),
         about={"submap": int(path.stem)},
         session=session | {name: held[name] for name in _OF_DATABASE},
+        evidence=np.empty(0, np.int64),
         patches=LandmarkPatches(held["patch"], held["patch_distance"]),
     )
     save_map(saved, path)

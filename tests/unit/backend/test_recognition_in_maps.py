@@ -68,6 +68,7 @@ def half_a_ring() -> SavedMap:
         trajectory=estimate.trajectory,
         about={},
         session={},
+        evidence=np.empty(0, np.int64),
     )
 
 

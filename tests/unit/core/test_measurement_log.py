@@ -206,14 +206,12 @@ def test_pickled_objects_are_never_loaded(tmp_path: Path) -> None:
     assert not (tmp_path / "exploded").exists()
 
 
-@pytest.mark.parametrize("version", [8, 99, "1", None])
+@pytest.mark.parametrize("version", [1, 4, 5, 8, 99, "2", None])
 def test_another_version_is_refused(file: Path, version: object) -> None:
     arrays = load_arrays(file)
     header = json.loads(str(arrays["header"])) | {"version": version}
     arrays["header"] = np.array(json.dumps(header))
-    with pytest.raises(
-        MeasurementLogError, match=rf"version {version}, this fgslam reads .* 1 to 7"
-    ):
+    with pytest.raises(MeasurementLogError, match="made by another version; run again"):
         MeasurementLog.from_arrays(arrays, "x.npz")
 
 
@@ -224,8 +222,6 @@ def test_another_version_is_refused(file: Path, version: object) -> None:
         {"sensor": 7},
         {"sensor": {"kind": "stereo", "width": 3}},
         {"sensor": {"kind": "sonar", "max_range_m": 3.0}},
-        {"version": 1},
-        {"version": 1, "rig": {"width": 3}},
         {"motion": 7},
     ],
 )
@@ -254,17 +250,6 @@ def test_offsets_that_step_back_are_refused(file: Path) -> None:
     arrays["observation_start"][1] = 15
     with pytest.raises(MeasurementLogError, match="observation_start"):
         MeasurementLog.from_arrays(arrays, "x.npz")
-
-
-def test_a_log_of_version_1_is_still_read(file: Path) -> None:
-    arrays = load_arrays(file)
-    header = json.loads(str(arrays["header"]))
-    sensor = header.pop("sensor")
-    del sensor["kind"]
-    arrays["header"] = np.array(json.dumps(header | {"version": 1, "rig": sensor}))
-    old, new = MeasurementLog.from_arrays(arrays, "x.npz"), MeasurementLog.load(file)
-    assert_same(old.rig, new.rig)
-    assert_same(list(old)[4], list(new)[4])
 
 
 def test_a_log_of_a_range_sensor_round_trips(file: Path, tmp_path: Path) -> None:
@@ -382,9 +367,8 @@ def test_corrections_of_the_rig_make_version_6(log: MeasurementLog, tmp_path: Pa
     assert (settled.knocks, settled.field_px) == (2, 0.3)
     np.testing.assert_array_equal(settled.values, np.arange(1.0, 1.0 + terms))
     field = arrays.pop("rig_field_px")
-    older = MeasurementLog.from_arrays(arrays, "x.npz").increments[1].settled_rig
-    assert older is not None
-    assert older.field_px == 0.0
+    with pytest.raises(MeasurementLogError, match="rig_field_px"):
+        MeasurementLog.from_arrays(arrays, "x.npz")
     for wrong in (field[1:], -field, np.full_like(field, np.nan)):
         with pytest.raises(MeasurementLogError, match="rig_field_px"):
             MeasurementLog.from_arrays(arrays | {"rig_field_px": wrong}, "x.npz")
@@ -413,22 +397,6 @@ def test_the_bias_of_a_gyroscope_makes_version_7(log: MeasurementLog, tmp_path: 
     ):
         with pytest.raises(MeasurementLogError, match=f"array {name}.* {words}"):
             MeasurementLog.from_arrays(arrays | {name: wrong}, "x.npz")
-
-
-def test_a_correction_of_fewer_terms_has_none_of_the_others(log: MeasurementLog) -> None:
-    names = term_names(RIG)
-    later = np.array([name.endswith("_outer") or name.startswith("all.") for name in names])
-    given = np.arange(1.0, 1.0 + len(names))
-    log.increments[1] = replace(log.increments[1], rig_correction=given)
-    arrays = log.to_arrays()
-    header = json.loads(str(arrays["header"])) | {"version": 5}
-    before = arrays | {
-        "header": np.array(json.dumps(header)),
-        "rig_correction": arrays["rig_correction"][:, ~later],
-    }
-    found = MeasurementLog.from_arrays(before, "x.npz").increments[1]
-    np.testing.assert_array_equal(found.rig_correction, np.where(later, 0.0, given))
-    assert found.settled_rig is None
 
 
 # --------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from pathlib import Path
 
@@ -144,20 +143,6 @@ def test_closures_of_a_run_come_back_from_their_file(tmp_path: Path) -> None:
     assert table.rows[0][1][after] == "-"
     assert table.rows[1][1][after] == "0.0"
     assert all(len(values) == len(table.columns) for _, values in table.rows)
-
-
-def test_a_file_of_an_older_run_says_nothing_of_refusals(tmp_path: Path) -> None:
-    recorder = recorded({11: (closure(1, np.eye(4)),)})
-    write_closures(tmp_path, recorder, closures_of(recorder, (True,), None))
-    with (tmp_path / LOOPS_FILE).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    with (tmp_path / LOOPS_FILE).open("w", newline="") as file:
-        writer = csv.DictWriter(file, [n for n in rows[0] if n != "taken"], extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows(rows)
-    table, pairs = read_closures(tmp_path / LOOPS_FILE)
-    assert pairs == [(11, 1)]
-    assert table.rows[0][1][:2] == ("-", "11")
 
 
 def test_no_closure_leaves_no_file(tmp_path: Path) -> None:

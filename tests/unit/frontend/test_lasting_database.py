@@ -224,6 +224,7 @@ def saved(database: LandmarkDatabase, positions: FloatArray) -> SavedMap:
         trajectory=Trajectory(np.empty(0), np.empty((0, 4, 4))),
         about={},
         session={},
+        evidence=np.empty(0, np.int64),
     )
 
 

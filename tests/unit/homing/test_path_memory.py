@@ -77,36 +77,11 @@ def _correlation(features: UprightFeatures) -> FloatArray:
     return np.asarray(c[:, 0, 1] / np.sqrt(c[:, 0, 0] * c[:, 1, 1]))
 
 
-def test_files_of_version_1_are_read(tmp_path: Path) -> None:
-    """They had float32 throughout, and one array for deviations and correlation."""
-    image = some_features(1)
-    c = image.sift.covariance
-    sigma = np.sqrt(c[:, [0, 1], [0, 1]])
-    spread = np.column_stack([sigma, c[:, 0, 1] / sigma.prod(axis=1)])
-    sift, columns = image.sift, image.columns
-    arrays = {
-        "header": np.array('{"format": "fgslam path memory", "version": 1, "names": ["a"]}'),
-        "sift_start": np.array([0, 300]),
-        "column_start": np.array([0, 150]),
-        "sift_bearing": sift.bearing.astype(np.float32),
-        "sift_elevation": sift.elevation.astype(np.float32),
-        "sift_spread": spread.astype(np.float16),
-        "sift_scale": sift.scale.astype(np.float32),
-        "sift_descriptors": sift.descriptors,
-        "sift_colour": sift.colour.astype(np.float16),
-        "column_bearing": columns.bearing.astype(np.float32),
-        "column_sigma_bearing": columns.sigma_bearing.astype(np.float16),
-        "column_tangents": columns.tangents.astype(np.float32),
-        "column_sigma_tangents": columns.sigma_tangents.astype(np.float16),
-        "column_descriptors": columns.descriptors.astype(np.float32),
-    }
-    np.savez(tmp_path / "old.npz", allow_pickle=False, **arrays)
-    read = PathMemory.load(tmp_path / "old.npz")
-    assert read.camera is None
-    assert read.images[0].sift.bearing == pytest.approx(sift.bearing, abs=2e-7)
-    assert read.images[0].sift.scale == pytest.approx(sift.scale, abs=2e-7)
-    assert read.images[0].sift.covariance == pytest.approx(c, rel=2e-3, abs=1e-8)
-    assert read.images[0].columns.tangents == pytest.approx(columns.tangents, abs=2e-7)
+def test_a_file_of_version_1_is_refused(tmp_path: Path) -> None:
+    header = np.array('{"format": "fgslam path memory", "version": 1, "names": ["a"]}')
+    np.savez(tmp_path / "old.npz", allow_pickle=False, header=header)
+    with pytest.raises(StoredMapError, match="made by another version"):
+        PathMemory.load(tmp_path / "old.npz")
 
 
 CAMERAS = (
@@ -216,7 +191,7 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
         arrays = dict(file)
     newer = str(arrays["header"]).replace('"version": 2', '"version": 9')
     np.savez(path, **{**arrays, "header": np.array(newer)})
-    with pytest.raises(StoredMapError, match="version 9"):
+    with pytest.raises(StoredMapError, match="made by another version"):
         PathMemory.load(path)
     for name in sorted(set(arrays) - {"header"}):
         np.savez(path, **{k: v for k, v in arrays.items() if k != name})

@@ -68,6 +68,7 @@ def saved(rng: np.random.Generator) -> SavedMap:
         trajectory=Trajectory(np.empty(0), np.empty((0, 4, 4))),
         about={},
         session={},
+        evidence=np.empty(0, np.int64),
     )
 
 

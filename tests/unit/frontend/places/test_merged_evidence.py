@@ -193,20 +193,3 @@ def test_one_recording_read_in_two_ways_counts_once(
     assert any("12 poses of" in line and "count once" in line for line in lines) == counted_once
     hits = load_map(tmp_path / "both.fgmap").hits
     assert np.array_equal(hits, saved.hits if counted_once else 2 * saved.hits)
-
-
-def test_a_map_that_does_not_say_its_frames_shrinks_nothing(tmp_path: Path) -> None:
-    place = Place(2)
-    a, _ = place.visit(np.eye(4))
-    b, _ = place.visit(place.poses[3])
-    save_map(replace(a, evidence=None), tmp_path / "old.fgmap")
-    save_map(b, tmp_path / "new.fgmap")
-    assert load_map(tmp_path / "old.fgmap").evidence is None
-    lines = merge_files(tmp_path / "old.fgmap", tmp_path / "new.fgmap", tmp_path / "both.fgmap")
-    assert any("old.fgmap does not say which frames are in it" in line for line in lines)
-    both = load_map(tmp_path / "both.fgmap")
-    assert both.evidence is None
-    assert (
-        np.trace(both.landmarks.covariances[: len(a)], axis1=1, axis2=2)
-        > 0.6 * np.trace(a.landmarks.covariances, axis1=1, axis2=2)
-    ).mean() > 0.9
