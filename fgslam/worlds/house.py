@@ -166,9 +166,7 @@ class OmniWorld:
         self.reference_poses = self._planner.reference_path(
             settings.path.spacing_m, settings.path.legs, self._rng(0), within
         )
-        self._people = People(
-            self._people_routes(), self._rng(1), self.model.bank, self._lets_people_stand
-        )
+        self._people = People(self._people_routes(), self._rng(1), self.model.bank)
         self._tilt = CameraTilt(settings.tilt, self._rng(2))
         self._sensor = RangeSensor(self.model.layer.caster)
         self._scene = lit(self.model.layer, self.model.layer.light, settings.light.level)
@@ -302,9 +300,6 @@ class OmniWorld:
             route = planner.walk(tour, _PEOPLE_STEP_M, _PEOPLE_STEPS, rng)
             routes.append(places if route is None else route)
         return routes
-
-    def _lets_people_stand(self, places: FloatArray) -> BoolArray:
-        return self.clearance(places) > PERSON_RADIUS
 
     def _touches(self, place: FloatArray) -> bool:
         people = self._people.places()

@@ -1,19 +1,17 @@
 """People in the rendered places: their bodies, a walk across the view, walkers in the house.
 
-Those of the house wait for the robot, turn back or step aside.
+Those of the house wait for the robot and turn back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.planar import unit
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.driving.paths import PosesInTime, planar_poses
 from fgslam.worlds.lab_settings import LabPersonSettings, LabSettings
@@ -122,18 +120,14 @@ def person(stance: Stance) -> Thing:
 def _trunk() -> list[Patch]:
     """Torso, neck, head and hair; the body walks towards +x."""
     shirt, skin, hair = Surface("shirt", 0.5), Surface("skin", 0.3), Surface("plain_dark", 0.3)
-    out = _flattened(prism((0, 0, _HIP - 0.05), (0, 0, _SHOULDER + 0.04), 0.19, shirt, 12), 0.62)
+    torso = prism((0, 0, _HIP - 0.05), (0, 0, _SHOULDER + 0.04), 0.19, shirt, 12)
+    flat = np.array([0.62, 1.0, 1.0])  # a torso is wider than deep
+    out = [Patch(p.corner * flat, p.edge_u * flat, p.edge_v * flat, shirt) for p in torso]
     out += box((-0.06, -0.21, _SHOULDER - 0.03), (0.06, 0.21, _SHOULDER + 0.05), shirt)
     out += prism((0, 0, _SHOULDER), (0, 0, 1.55), 0.055, skin)
     out += prism((0, 0, 1.52), (0, 0, 1.74), 0.088, skin, 12)
     out += prism((0, 0, 1.66), (0, 0, 1.78), 0.097, hair, 12)
     return out
-
-
-def _flattened(patches: list[Patch], factor: float) -> list[Patch]:
-    """Narrower along x: a torso is wider than deep."""
-    scale = np.array([factor, 1.0, 1.0])
-    return [Patch(p.corner * scale, p.edge_u * scale, p.edge_v * scale, p.surface) for p in patches]
 
 
 def _limb(
@@ -166,134 +160,47 @@ _PHASES = 16
 # Nearer to the robot a person stops, and after waiting that long turns back.
 _POLITE_M, _PATIENCE_S = 1.1, 2.0
 _AHEAD_M = 0.3
-# With less way back than this a person steps aside: not through the robot (a radius each, and a
-# margin), straight for at most 1.8 m, to where it is that much farther; and comes back when it is
-# gone.
-_WAY_BACK_M, _BODIES_M, _WORTH_M, _GONE_M = 1.5, 0.75, 0.2, 2.0
-_STEPS_M = 0.2 * np.arange(1, 10)
-_WAYS = unit(2.0 * np.pi * np.arange(24) / 24)
-
-
-Free: TypeAlias = Callable[[FloatArray], BoolArray]
-"""Which of places (n, 2) a person can stand at."""
-
-
-def _anywhere(places: FloatArray) -> BoolArray:
-    return np.ones(len(places), dtype=np.bool_)
 
 
 class Walker:
-    """One person on a polyline, walking to its end and back for ever.
+    """One person on a polyline, walking to its end and back; waits for the robot, then turns."""
 
-    Who meets the robot stops, and after a while turns back. Who has no way back, as the route ends
-    there, steps aside, off the route, and comes back when the robot is gone.
-    """
-
-    def __init__(self, route: FloatArray, start: float, free: Free = _anywhere) -> None:
-        """On ``route`` (n, 2), ``start`` metres from its beginning; ``free`` is the floor."""
-        self._route, self._free = route, free
+    def __init__(self, route: FloatArray, start: float) -> None:
+        """On ``route`` (n, 2), ``start`` metres from its beginning."""
+        self._route = route
         self._length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))]
         )
         self._at, self._sign = float(start % self._length[-1]), 1.0
-        self._walked, self._waited = 0.0, 0.0
-        self._here = self._place(self._at)
-        self._trail: list[FloatArray] = []  # the way back to the route, its end last
-        self._aside: FloatArray | None = None  # a place to step aside to
-        ahead = self._next() - self._here
-        self._heading = float(np.arctan2(ahead[1], ahead[0]))
+        self._walked, self._waited, self._heading = 0.0, 0.0, 0.0
+        self._face_ahead()
 
     def stance(self) -> Stance:
         """Where the person is now."""
-        x, y = self._here
+        x, y = self._place(self._at)
         return Stance(float(x), float(y), self._heading, self._walked)
 
     def advance(self, seconds: float, robot: FloatArray) -> None:
         """Walks on unless the robot (2,) is in the way."""
-        self._move(seconds, robot)
-        ahead = self._next() - self._here
-        if np.any(ahead != 0.0):
-            self._heading = float(np.arctan2(ahead[1], ahead[0]))
-
-    def _move(self, seconds: float, robot: FloatArray) -> None:
-        if self._hindered(robot):
+        here, ahead = self._place(self._at), self._place(self._at + _AHEAD_M * self._sign)
+        nearest = float(np.linalg.norm(ahead - robot))
+        if nearest < _POLITE_M and nearest <= np.linalg.norm(here - robot):
             self._waited += seconds
             if self._waited > _PATIENCE_S:
-                self._waited = 0.0
-                self._give_way(robot)
-            return
-        self._waited = 0.0
-        if self._aside is None and self._trail and self._near(self._trail[-1], robot, _GONE_M):
-            return  # stands aside until the robot is gone
-        step = _SPEED * seconds
-        self._walked += step
-        if self._aside is not None:
-            self._aside = self._walk_to(self._aside, step)
-        elif self._trail:
-            self._trail[-1:] = [p for p in [self._walk_to(self._trail[-1], step)] if p is not None]
+                self._waited, self._sign = 0.0, -self._sign
         else:
-            self._walk_on(step)
+            self._waited = 0.0
+            self._walked += _SPEED * seconds
+            self._at += _SPEED * seconds * self._sign
+            if not 0.0 <= self._at <= self._length[-1]:
+                self._at = float(np.clip(self._at, 0.0, self._length[-1]))
+                self._sign = -self._sign
+        self._face_ahead()
 
-    def _hindered(self, robot: FloatArray) -> bool:
-        """Whether the robot is near, and nearer still in the next moment."""
-        ahead, here = self._next(), self._here
-        if self._aside is None and self._trail:
-            return self._near(here, robot, _POLITE_M)
-        far, nearing = np.linalg.norm(ahead - robot), np.linalg.norm(here - robot)
-        return bool(far < _POLITE_M and far <= nearing)
-
-    @staticmethod
-    def _near(place: FloatArray, robot: FloatArray, limit: float) -> bool:
-        return bool(np.linalg.norm(place - robot) < limit)
-
-    def _give_way(self, robot: FloatArray) -> None:
-        back = self._at if self._sign > 0.0 else self._length[-1] - self._at
-        if not self._trail and back >= _WAY_BACK_M:
-            self._sign = -self._sign
-            return
-        place = self._place_aside(robot)
-        if place is not None:
-            self._trail.append(self._here.copy())
-            self._aside = place
-        elif not self._trail:
-            self._sign = -self._sign
-
-    def _place_aside(self, robot: FloatArray) -> FloatArray | None:
-        """(2,) farthest from the robot of what can be walked to straight, not through it."""
-        now = float(np.linalg.norm(self._here - robot))
-        way = self._here + _STEPS_M[:, None, None] * _WAYS  # (steps, ways, 2)
-        far = np.linalg.norm(way - robot, axis=2)
-        open_ = self._free(way.reshape(-1, 2)).reshape(far.shape)
-        open_ &= far >= min(now, _BODIES_M)
-        reached = np.logical_and.accumulate(open_, axis=0)
-        worth = np.where(reached, far, -np.inf)
-        best = np.unravel_index(int(np.argmax(worth)), worth.shape)
-        return way[best] if worth[best] > now + _WORTH_M else None
-
-    def _walk_to(self, goal: FloatArray, step: float) -> FloatArray | None:
-        """One step; the goal, or None once it is reached."""
-        way = goal - self._here
-        left = float(np.linalg.norm(way))
-        if left <= step:
-            self._here = goal
-            return None
-        self._here = self._here + step / left * way
-        return goal
-
-    def _walk_on(self, step: float) -> None:
-        self._at += step * self._sign
-        if not 0.0 <= self._at <= self._length[-1]:
-            self._at = float(np.clip(self._at, 0.0, self._length[-1]))
-            self._sign = -self._sign
-        self._here = self._place(self._at)
-
-    def _next(self) -> FloatArray:
-        """(2,) a little ahead."""
-        goal = self._aside if self._aside is not None or not self._trail else self._trail[-1]
-        if goal is None:
-            return self._place(self._at + _AHEAD_M * self._sign)
-        way = goal - self._here
-        return self._here + way * min(1.0, _AHEAD_M / max(float(np.linalg.norm(way)), 1e-9))
+    def _face_ahead(self) -> None:
+        ahead = self._place(self._at + _AHEAD_M * self._sign) - self._place(self._at)
+        if np.any(ahead != 0.0):  # at the very end of the route the heading stays
+            self._heading = float(np.arctan2(ahead[1], ahead[0]))
 
     def _place(self, at: float) -> FloatArray:
         return np.array([np.interp(at, self._length, self._route[:, k]) for k in (0, 1)])
@@ -303,14 +210,9 @@ class People:
     """All who walk about; the renderer's bodies and the range sensor's discs."""
 
     def __init__(
-        self,
-        routes: Sequence[FloatArray],
-        rng: np.random.Generator,
-        bank: ColourBank,
-        free: Free = _anywhere,
+        self, routes: Sequence[FloatArray], rng: np.random.Generator, bank: ColourBank
     ) -> None:
-        """One person on each route (n, 2), starting somewhere on it; ``free`` is the floor."""
-        self._free = free
+        """One person on each route (n, 2), starting somewhere on it."""
         self._starts = [(route, float(rng.uniform(0.0, 100.0))) for route in routes]
         self._shirts = [int(k) for k in rng.integers(0, SHIRTS, len(routes))]
         self._bank = bank
@@ -319,7 +221,7 @@ class People:
 
     def restart(self) -> None:
         """Everybody is again where the first walk began."""
-        self._walkers = [Walker(route, start, self._free) for route, start in self._starts]
+        self._walkers = [Walker(route, start) for route, start in self._starts]
 
     def advance(self, seconds: float, robot: FloatArray) -> None:
         """Everybody walks on."""
@@ -344,17 +246,14 @@ class People:
     def _layer(self, phase: int, shirt: int) -> Layer:
         """The body in its own frame at one of the gait's phases; kept, as building it is slow."""
         if (phase, shirt) not in self._layers:
-            thing = person(Stance(0.0, 0.0, 0.0, phase * _STRIDE_M / _PHASES))
-            dressed = tuple(_dressed(patch, shirt) for patch in thing.patches)
-            patches = stack([Thing("person", dressed)])
+            body = person(Stance(0.0, 0.0, 0.0, phase * _STRIDE_M / _PHASES)).patches
+            dressed = (
+                replace(p, surface=replace(p.surface, texture=f"shirt_{shirt}"))
+                if p.surface.texture == "shirt"
+                else p
+                for p in body
+            )
+            patches = stack([Thing("person", tuple(dressed))])
             light = flat_light(patches, np.array([0.0, 0.0, 1.0]))
-            layer = Layer(patches, RayCaster(patches), light, self._bank)
-            self._layers[phase, shirt] = layer
+            self._layers[phase, shirt] = Layer(patches, RayCaster(patches), light, self._bank)
         return self._layers[phase, shirt]
-
-
-def _dressed(patch: Patch, shirt: int) -> Patch:
-    if patch.surface.texture != "shirt":
-        return patch
-    surface = Surface(f"shirt_{shirt}", patch.surface.tile_m)
-    return Patch(patch.corner, patch.edge_u, patch.edge_v, surface)

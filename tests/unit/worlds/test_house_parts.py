@@ -275,35 +275,6 @@ def test_walker_goes_to_and_fro_and_waits_for_the_robot() -> None:
     assert meeting.stance().x < 0.6
 
 
-@pytest.mark.parametrize("half_width", [0.9, 1.5])
-@pytest.mark.parametrize("end", [4.0, 3.0])
-def test_walker_at_a_dead_end_lets_the_robot_pass(half_width: float, end: float) -> None:
-    """The route ends in front of a wall, and there the robot wants to go: it gets there."""
-    walker = Walker(
-        np.array([[0.0, 0.0], [end, 0.0]]),
-        end - 0.4,
-        lambda p: (np.abs(p[:, 1]) < half_width) & (p[:, 0] > -2.0) & (p[:, 0] < 4.6),
-    )
-    robot, goal = np.array([end - 1.5, 0.0]), np.array([4.0, 0.0])
-    for _ in range(600):
-        walker.advance(0.1, robot)
-        here = np.array([walker.stance().x, walker.stance().y])
-        step = goal - robot
-        step *= 0.03 / max(float(np.linalg.norm(step)), 0.03)
-        away = np.linalg.norm(here - robot)
-        assert away > 0.7
-        if np.linalg.norm(here - robot - step) > 0.75:
-            robot = robot + step
-    assert np.linalg.norm(robot - goal) < 0.1
-    # The robot leaves: the person goes on.
-    places = []
-    for _ in range(300):
-        walker.advance(0.1, np.array([50.0, 0.0]))
-        places.append([walker.stance().x, walker.stance().y])
-    assert np.ptp([x for x, _ in places]) > end - 0.2
-    assert abs(places[-1][1]) < 1e-9
-
-
 def test_tilt_is_bounded_and_leans_the_camera() -> None:
     tilt = CameraTilt(HouseTiltSettings(constant_deg=2.0, sway_deg=0.0), rng(1))
     angles = np.rad2deg(tilt.angles(3.0))
