@@ -20,7 +20,6 @@ import fgslam
 
 _DISTRIBUTIONS = {
     "PIL": "pillow",
-    "backports": "backports-zstd",
     "cv2": "opencv-python-headless",
     "dask": "distributed",  # its other half
     "pydantic_core": "pydantic",  # its other half

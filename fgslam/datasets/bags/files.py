@@ -1,31 +1,45 @@
-"""The files of a bag, whole or cut off: which topics, their messages in order, one again by place.
+"""The files of a bag: which topics, their messages in order, one again by place.
 
 Nothing but places and stamps is held in memory.
 """
 
 from __future__ import annotations
 
+import struct
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader as Reader2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.rosbag1 import ReaderError as ReaderError1
+from rosbags.rosbag2 import ReaderError as ReaderError2
+from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.files import shown_in
-from fgslam.datasets.bags.cut import BROKEN, CutBag, CutDatabase, CutMcap, Message
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
 
 T = TypeVar("T")
-ANY_BROKEN = (AnyReaderError, *BROKEN)
+Message: TypeAlias = tuple[Connection, int, bytes]
+"""Connection, the bag's time in nanoseconds, raw bytes."""
+
+DAMAGED = (
+    *(AnyReaderError, ReaderError1, ReaderError2, SerdeError, TypesysError),
+    storage_sqlite3.apsw.Error,  # type: ignore[attr-defined]
+    storage_mcap.zstd.ZstdError,  # type: ignore[attr-defined]
+    *(ArithmeticError, AssertionError, AttributeError, EOFError, LookupError, OSError),
+    *(MemoryError, RuntimeError, TypeError, ValueError, struct.error),
+)
+"""What rosbags and its libraries raise where a file is damaged."""
+
 _KEPT = 16  # raw messages: the two images of the frames that threads ask for ahead of each other
 _WALKED = 512  # messages that are passed over rather than looked up anew
 
@@ -40,22 +54,23 @@ class Topic:
 
 
 class BagFiles:
-    """The files of one recording as one; what cannot be read whole is read as far as it goes.
+    """The files of one recording as one; a damaged one is read up to the damage.
 
     Attributes:
         paths: the files, or the folder of a ROS 2 bag.
         topics: in the order of their names.
-        notes: what was cut off.
+        notes: whether a part cannot be read.
     """
 
     def __init__(self, paths: list[Path]) -> None:
-        """Opens the files. Raises DatasetError where one of them is no bag, or holds nothing."""
+        """Opens the files. Raises DatasetError where one of them is no bag, or has no index."""
         self.paths = paths
         self.notes: tuple[str, ...] = ()
         try:
-            self._reader = _open(paths, cut=False)
-        except ANY_BROKEN as fault:
-            self._reader = self._open_cut(fault)
+            self._reader = AnyReader(paths, default_typestore=get_typestore(Stores.LATEST))
+            self._reader.open()
+        except DAMAGED as fault:
+            raise DatasetError(_unreadable(paths, fault)) from None
         counts: dict[tuple[str, str], int] = {}
         for each in self._reader.connections:
             key = (each.topic, each.msgtype)
@@ -64,60 +79,40 @@ class BagFiles:
             counts[key] = counts.get(key, 0) + each.msgcount
         self.topics = tuple(Topic(*key, count) for key, count in sorted(counts.items()))
 
-    def _open_cut(self, fault: Exception) -> AnyReader:
-        files = [file for path in self.paths for file in bag_files(path)]
-        try:
-            reader = _open(files, cut=True)
-            readable = sum(each.msgcount for each in reader.connections)
-        except ANY_BROKEN:
-            readable = 0
-        if not readable:
-            names = ", ".join(map(str, self.paths))
-            cause = " ".join(str(fault).split()) or type(fault).__name__
-            raise DatasetError(
-                f"{names}: no message can be read from it as a ROS bag ({cause}); record or copy "
-                "it again"
-            )
-        self.notes = (
-            "the bag is cut off or damaged, or its recorder was stopped: the "
-            f"{readable} messages before that are used",
-        )
-        return reader
-
     def collect(self, topics: Collection[str], take: Callable[[Message], T]) -> list[T]:
-        """What ``take`` makes of every message of these topics; once through the whole bag.
-
-        Raises:
-            DatasetError: a message cannot be read.
-        """
+        """What ``take`` makes of every message of these topics; once through the whole bag."""
+        rows: list[T] = []
         try:
-            return [take(each) for each in self.messages(topics)]
-        except ANY_BROKEN as fault:
-            if self.notes:
-                raise DatasetError(
-                    f"{self.paths[0]}: damaged in its middle ({fault}); copy it again"
-                ) from None
-            self._reader = self._open_cut(fault)  # the index was whole, what it names is not
-            return self.collect(topics, take)
+            for message in self.messages(topics):
+                rows.append(take(message))
+        except DatasetError as fault:
+            if not rows:
+                raise
+            self.notes = (f"{fault}; the {len(rows)} messages before the damage are used",)
+        return rows
 
     def messages(self, topics: Collection[str], start: int | None = None) -> Iterator[Message]:
-        """(connection, bag time in ns, raw bytes) of these topics in order of the bag's time."""
+        """Messages of these topics in order of the bag's time. Raises DatasetError at damage."""
         wanted = [each for each in self._reader.connections if each.topic in topics]
-        return self._reader.messages(wanted, start=start) if wanted else iter(())
+        if wanted:
+            try:
+                yield from self._reader.messages(wanted, start=start)
+            except DAMAGED as fault:
+                raise DatasetError(_unreadable(self.paths, fault)) from None
 
     def stated_in(self, topic: Topic) -> str:
         """The frame in which a topic's first message is stated; empty where it cannot be read."""
         try:
             connection, _, raw = next(self.messages((topic.name,)))
             return str(self.decoded(connection, raw).header.frame_id)
-        except (StopIteration, FrameError, *ANY_BROKEN):
+        except (StopIteration, FrameError, DatasetError):
             return ""
 
     def decoded(self, connection: Connection, raw: bytes) -> Any:
         """The message's fields. Raises FrameError where they are damaged."""
         try:
             return self._reader.deserialize(raw, connection.msgtype)
-        except ANY_BROKEN as fault:
+        except DAMAGED as fault:
             raise FrameError(
                 f"a message of {connection.topic} in {self.paths[0]} cannot be decoded ({fault}); "
                 "leave the frame out with dataset.start/stop/stride"
@@ -152,20 +147,20 @@ def bag_files(path: Path) -> list[Path]:
     return [file for file in shown_in(path) if is_bag(file) and file.is_file()]
 
 
-def _open(paths: list[Path], cut: bool) -> AnyReader:
-    reader = AnyReader(paths, default_typestore=get_typestore(Stores.LATEST))
-    if cut:
-        reader.readers = [_cut_reader(path) for path in paths]  # type: ignore[assignment]
-    reader.open()
-    return reader
-
-
-def _cut_reader(path: Path) -> CutBag | Reader2:
-    if path.suffix == ".bag":
-        return CutBag(path)
-    reader = Reader2(path)
-    reader.storage = CutMcap(path) if path.suffix == ".mcap" else CutDatabase(path)
-    return reader
+def _unreadable(paths: list[Path], fault: Exception) -> str:
+    """What is wrong with a bag, and the command that mends the first of its files."""
+    path = paths[0]
+    mend = {
+        ".bag": f"rosbag reindex {path.name}",
+        ".mcap": f"mcap recover {path.name} -o mended.mcap",
+        ".db3": f"sqlite3 {path.name} .recover | sqlite3 mended.db3",
+    }.get(path.suffix, f"ros2 bag reindex {path.name}")
+    cause = " ".join(str(fault).split()) or type(fault).__name__
+    names = ", ".join(map(str, paths))
+    return (
+        f"{names}: cannot be read as a ROS bag to its end ({cause}); if its recorder was stopped "
+        f"its index is missing, which {mend} writes"
+    )
 
 
 # --------------------------------------------------------------------------------------------
@@ -222,7 +217,7 @@ class MessagesByPlace:
                 self._next += 1
                 if len(self._kept) > _KEPT:
                     self._kept.popitem(last=False)
-        except (StopIteration, *ANY_BROKEN) as fault:
+        except (StopIteration, DatasetError) as fault:
             self._next = len(self._times)
             raise FrameError(
                 f"message {place} in {self._files.paths[0]} cannot be read ({fault}); leave the "

@@ -15,8 +15,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.datasets.bags import messages
 from fgslam.datasets.bags.calibration import Stated, file_cameras, rig_of_bag
-from fgslam.datasets.bags.cut import Message
-from fgslam.datasets.bags.files import BagFiles, MessagesByPlace, bag_files, paths_of
+from fgslam.datasets.bags.files import BagFiles, Message, MessagesByPlace, bag_files, paths_of
 from fgslam.datasets.bags.frames import FrameTree
 from fgslam.datasets.bags.motion import odometry_source
 from fgslam.datasets.bags.topics import Chosen, choose_topics
