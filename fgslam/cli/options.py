@@ -223,7 +223,8 @@ CameraOut = Annotated[
 Live = Annotated[
     bool,
     typer.Option(
-        "--live", help="show the run in the rerun viewer; pip install 'fgslam[viewer]' provides it"
+        "--live",
+        help="show the run in the rerun viewer; pip install 'fgslam\\[viewer]' provides it",
     ),
 ]
 SaveRrd = Annotated[
@@ -311,7 +312,8 @@ ResumeResults = Annotated[
     bool, typer.Option("--resume", help="go on with an interrupted one, to the same bytes")
 ]
 Jobs = Annotated[
-    int, typer.Option(min=1, help="processes at a time; more than 1 disturbs the times")
+    int,
+    typer.Option(min=1, help="processes at a time, at most 4 a core; more than 1 disturbs times"),
 ]
 TrialCount = Annotated[
     int | None, typer.Option("--trials", min=1, help="repeat over so many worlds of noise")
@@ -352,12 +354,17 @@ Metric = Annotated[
     ),
 ]
 Workers = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="workers of this machine; default one a core")
+    int | None,
+    typer.Option(
+        "--jobs", min=1, help="workers of this machine, at most 4 a core; default one a core"
+    ),
 ]
 Scheduler = Annotated[
     str | None,
     typer.Option(
-        metavar="ADDRESS", help="of a Dask scheduler whose workers do it, tcp://HOST:PORT"
+        metavar="ADDRESS",
+        help="of a Dask scheduler whose workers do it, tcp://HOST:PORT; whoever reaches that "
+        "address runs code as its workers' user",
     ),
 ]
 SweepFolder = Annotated[

@@ -30,7 +30,7 @@ def sweep(  # noqa: PLR0913 - each option is a parameter
     plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
     folder = out or plan.default_folder
     with stop_flag() as stopped, progress_with_table() as (progress, shown):
-        tell, crew = stoppable(progress, stopped), crew_of(jobs, scheduler)
+        tell, crew = stoppable(progress, stopped), crew_of(jobs, scheduler, len(plan.grid))
         result = run_sweep(plan, folder, crew, existing, metric, (tell, stopped, shown))
     show_all([result], same_with_resume())
     exit_as([result])

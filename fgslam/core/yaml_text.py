@@ -19,7 +19,7 @@ MOST_BYTES = 1_000_000
 _MOST_VALUES = 20_000
 _DEEPEST = 50
 _LARGEST = 2**63 - 1
-_NOT_MEANT = (ValueError, KeyError, AttributeError, TypeError, OverflowError)
+_NOT_MEANT = (ValueError, LookupError, AttributeError, TypeError, OverflowError)
 """What PyYAML lets through for scalars that are not of their tag."""
 _TIMESTAMP = "tag:yaml.org,2002:timestamp"
 

@@ -86,7 +86,7 @@ def _find(file: str) -> _Files:
         )
     suffix = tracks.stem.removeprefix(_PREFIX)
     calibration = tracks.with_name(f"VO_calibration{suffix}.txt")
-    if not calibration.is_file():
+    if not calibration.exists():
         calibration = tracks.with_name("VO_calibration.txt")  # of the `_large` one
     return _Files(tracks, calibration, tracks.with_name(f"VO_camera_poses{suffix}.txt"))
 
@@ -148,7 +148,7 @@ def _read_poses(
 
     Lines hold the frame and the left camera's ``wTl``, row by row.
     """
-    if not path.is_file():
+    if not path.exists():
         return None
     columns = ("pose", *(f"T{i}{j}" for i in range(4) for j in range(4)))
     table = read_table(path, columns)

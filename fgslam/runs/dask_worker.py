@@ -35,10 +35,13 @@ def _follow_parent(addresses: queue.SimpleQueue[str], folder: str) -> None:
 
 async def _work(scheduler: str, folder: str) -> None:
     import distributed
+    from distributed.comm import get_address_host
 
     # A thread more would share memory and the limit of BLAS; what is done here is not kept here.
+    # Without a host it would listen on every address of the machine, and run what comes.
     settings = {"nthreads": 1, "memory_limit": 0, "local_directory": folder, "dashboard": False}
-    async with distributed.Worker(scheduler, **settings, death_timeout=10) as worker:
+    host = get_address_host(scheduler)
+    async with distributed.Worker(scheduler, host=host, **settings, death_timeout=10) as worker:
         await worker.finished()
 
 

@@ -224,7 +224,8 @@ class Tints:
         inside = np.flatnonzero(
             (column >= 0) & (line >= 0) & (column < image.shape[1]) & (line < image.shape[0])
         )
-        tints = image[line[inside], column[inside]].astype(np.float64).reshape(len(inside), -1)
+        tints = image[line[inside], column[inside]].astype(np.float64)
+        tints = tints.reshape(len(inside), image[0, 0].size)
         np.add.at(self._total, model.point[own][inside], tints)  # one channel serves all three
         np.add.at(self._count, model.point[own][inside], 1.0)
 

@@ -229,7 +229,8 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
         estimators: which; None for those of each configuration.
         metric: column that curves and tests are of; None for ate_final_m where it is known.
         jobs: workers of this machine; None for one a core.
-        scheduler: address of a Dask scheduler whose workers do it instead.
+        scheduler: address of a Dask scheduler whose workers do it instead. Whoever reaches that
+            address runs code as the workers' user.
         existing: what to do where the folder holds a sweep: `refuse`, `overwrite` or `resume`.
         progress: called with what is under way, how much of it is done, and of how much.
 
@@ -246,7 +247,9 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
     folder = plan.default_folder if out is None else Path(out)
     watch = (progress, *UNWATCHED[1:])
     existing = _checked_existing(existing)
-    return run_sweep(plan, folder, crew_of(jobs, scheduler), existing, metric, watch)
+    return run_sweep(
+        plan, folder, crew_of(jobs, scheduler, len(plan.grid)), existing, metric, watch
+    )
 
 
 def replay(

@@ -184,8 +184,10 @@ def remark_of_map(saved: SavedMap) -> str:
 
 def valid_of(saved: SavedMap) -> BoolArray:
     """(n,) landmarks seen as often as the strictest of the drives asked for (Se et al. 6.1)."""
-    least = max((int(d.get("valid_hits") or 0) for d in drives_of(saved)), default=_VALID_HITS)
-    return np.asarray(saved.hits >= least)
+    asked = [drive.get("valid_hits") or 0 for drive in drives_of(saved)]
+    if not all(isinstance(hits, int) for hits in asked):
+        raise MapError(f"the map's drives have valid_hits {asked}, not whole numbers; make it anew")
+    return np.asarray(saved.hits >= max(asked, default=_VALID_HITS))
 
 
 def points_of(saved: SavedMap) -> MapPoints:

@@ -56,6 +56,15 @@ class _Worker:
     index: int = -1  # of its argument
 
 
+def worker_count(wanted: int | None, pieces: int) -> int:
+    """How many workers this machine starts for so many pieces of work; None: one a core.
+
+    Never more than there are pieces, or than four a core: those would cost memory alone.
+    """
+    cores = os.cpu_count() or 1
+    return max(1, min(wanted or cores, pieces, 4 * cores))
+
+
 class Workers:
     """Processes that wait for more work once theirs is done, until they are closed.
 
@@ -108,7 +117,7 @@ def run_apart(
     Args:
         function: of a module's top level; result and argument are handed over by multiprocessing.
         arguments: one at a time for a process.
-        jobs: how many at a time.
+        jobs: how many at a time, at most; see :func:`worker_count`.
         stopped: asked every moment; True ends the processes that run and starts no more.
         single_threaded: linear algebra on one thread a process.
         workers: processes to use and to leave behind; None: a new one for each argument.
@@ -120,6 +129,7 @@ def run_apart(
         FgslamError: what the function raised in its process.
         MemoryShortageError: it ran out of memory there.
     """
+    jobs = worker_count(jobs, len(arguments))
     waiting = list(enumerate(arguments))[::-1]
     source = workers or Workers()
     running: list[_Worker] = []

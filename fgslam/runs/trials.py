@@ -34,6 +34,7 @@ from fgslam.runs.folder import (
 )
 from fgslam.runs.metric_tables import TRIAL_COLUMNS, metrics_table
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.processes import worker_count
 from fgslam.runs.slam_comparison import named, with_odometry
 from fgslam.runs.tasks.homing_trials import open_trials
 from fgslam.runs.trial import Trial, TrialTask, perform_trial
@@ -106,7 +107,7 @@ def run_trials(
         changes: dict[str, Any] = {"trials": seeds.count, "seed": first}
         changes |= {"estimator": estimators[0], "compare": estimators[1:]}
         chosen = config.model_copy(update=changes)
-    with LocalCrew(jobs) as crew:
+    with LocalCrew(worker_count(jobs, seeds.count)) as crew:
         return run_task(opener, chosen, folder, existing, progress, stopped, jobs, crew)
 
 

@@ -7,6 +7,7 @@ where it was. The odometry of what was dropped is kept, as part of the next fram
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
 from threading import Condition
 from typing import TypeAlias
 
@@ -48,9 +49,12 @@ class NewestFrame:
     def put(self, t: float, images: Images | None, odometry: BodyMotion = None) -> None:
         """Hands a frame over; never waits. Arguments as of :meth:`fgslam.Slam.track`.
 
+        They are copied: a camera loop may fill the same arrays again.
+
         Raises:
             SessionError: closed already.
         """
+        images, odometry = deepcopy((images, odometry))
         with self._changed:
             if self._closed:
                 raise SessionError("the frames are closed; make a new NewestFrame")

@@ -13,6 +13,7 @@ import numpy as np
 import yaml
 
 from fgslam.core.errors import ConfigError
+from fgslam.core.yaml_text import plain_values
 from fgslam.runs.bare_recording import bare_experiment
 from fgslam.runs.config import make_experiment
 from fgslam.runs.config_reading import read_mapping
@@ -122,8 +123,8 @@ def _split(text: str) -> list[str]:
 
 def _plain(text: str) -> Any:
     try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError):
+        return plain_values(text)
+    except yaml.YAMLError:
         return text
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -20,6 +19,7 @@ from fgslam.runs.dask_crew import LocalCrew, crew_at
 from fgslam.runs.engine import Opening, RunResult, Status
 from fgslam.runs.folder import REPORT_FILE, ExistingFolder, digest_of, versions
 from fgslam.runs.owner import Owner
+from fgslam.runs.processes import worker_count
 from fgslam.runs.run import opener_of
 from fgslam.runs.sweeps.case import CaseResult, CaseTask, perform_case
 from fgslam.runs.sweeps.findings import Findings, find
@@ -62,6 +62,8 @@ def make_plan(
     Raises:
         FgslamError: a source cannot be used, or an axis is malformed.
     """
+    if not sources:
+        raise ConfigError("a sweep of no experiment: give the name of one, a file, or a recording")
     axes = make_axes(settings) if isinstance(settings, Mapping) else read_axes(settings)
     chosen = None if names is None else tuple(name.strip() for name in names)
     return Plan(Grid(tuple(map(read_source, sources)), axes), chosen)
@@ -86,8 +88,8 @@ class SweepResult(RunResult):
         return pandas.read_parquet(self.folder / TABLE_FILE)
 
 
-def crew_of(jobs: int | None, scheduler: str | None) -> AbstractContextManager[Crew]:
-    """Workers of a scheduler, or so many of this machine; None: one a core.
+def crew_of(jobs: int | None, scheduler: str | None, cases: int) -> AbstractContextManager[Crew]:
+    """Workers of a scheduler, or so many of this machine for the cases; None: one a core.
 
     Raises:
         ConfigError: both are given, or there would be no worker.
@@ -95,7 +97,7 @@ def crew_of(jobs: int | None, scheduler: str | None) -> AbstractContextManager[C
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs is {jobs}; give at least 1, or none for one a core")
     if scheduler is None:
-        return LocalCrew(jobs or os.cpu_count() or 1)
+        return LocalCrew(worker_count(jobs, cases))
     if jobs is not None:
         raise ConfigError("--jobs is for workers of this machine; leave it out with --scheduler")
     return crew_at(scheduler)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fgslam
 from fgslam.core import files as whole_files
 from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
@@ -338,6 +339,13 @@ def test_a_file_whose_parts_do_not_fit_is_refused(
         load_map(rewritten(file, change))
     assert str(refusal.value).startswith(str(file))
     assert "\n" not in str(refusal.value)
+
+
+def test_a_map_whose_drives_count_hits_in_words_is_refused(saved: SavedMap, tmp_path: Path) -> None:
+    path = tmp_path / "a.fgmap"
+    save_map(replace(saved, about={"drives": [{"valid_hits": "many"}]}), path)
+    with pytest.raises(MapError, match=r"valid_hits \['many'\], not whole numbers; make it anew"):
+        fgslam.Map.load(path)
 
 
 def test_an_inconsistent_map_is_not_written(saved: SavedMap, tmp_path: Path) -> None:

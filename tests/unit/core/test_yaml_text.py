@@ -31,6 +31,7 @@ def message_of(content: bytes, tmp_path: Path) -> str:
     ("text", "words"),
     [
         ("a: 1\nb: !!int x\n", "line 2: not valid YAML ('x' is no int)"),
+        ("a: 1\nb: !!int ''\n", "line 2: not valid YAML ('' is no int)"),
         ("a: 1\nb: !!float x\n", "line 2: not valid YAML ('x' is no float)"),
         ("a: 1\nb: !!bool x\n", "line 2: not valid YAML ('x' is no bool)"),
         ("a: 1\nb: !!timestamp x\n", "line 2: not valid YAML ('x' is no timestamp)"),

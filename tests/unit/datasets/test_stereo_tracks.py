@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -197,6 +198,15 @@ def test_wrong_calibration_and_poses_are_named(
         opened(tracks)
     assert name in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["stereo_factors", "calibration", "camera_poses"])
+def test_a_pipe_among_the_files_is_named_and_not_waited_for(tracks: Path, kind: str) -> None:
+    path = tracks.with_name(f"VO_{kind}_try.txt")
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DatasetError, match=rf"VO_{kind}_try\.txt: (it is a pipe|no such file)"):
+        opened(tracks)
 
 
 def test_missing_files_are_named(tracks: Path, tmp_path: Path) -> None:

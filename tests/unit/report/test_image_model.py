@@ -124,6 +124,20 @@ def test_the_map_takes_the_mean_colour_of_what_the_reference_camera_shows(
     assert (colours[neither] == points.colours[neither]).all()
 
 
+@pytest.mark.parametrize("channels", [(), (3,)])
+def test_an_image_that_shows_no_landmark_colours_none(
+    model: ImageModel, channels: tuple[int, ...]
+) -> None:
+    seen = model.image != 0
+    dark = replace(
+        model, image=model.image[seen], point=model.point[seen], pixels=model.pixels[seen]
+    )
+    tints = Tints(len(model.ids))
+    tints.sample(dark, 0, np.zeros((model.rig.height, model.rig.width, *channels), np.uint8))
+    points = map_of(model.positions)
+    np.testing.assert_array_equal(tints.on(points, dark).colours, points.colours)
+
+
 def test_a_model_that_is_not_finite_is_refused(model: ImageModel, tmp_path: Path) -> None:
     bad = model.positions.copy()
     bad[0, 0] = np.nan

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -172,6 +174,46 @@ def test_a_worker_that_crashes_is_replaced_and_its_work_done(tmp_path: Path) -> 
         ((_, ended),) = crew.do(fatal, [""], never)
     assert isinstance(ended, WorkerEnded)
     assert ended.why == "it ended its workers, perhaps for lack of memory"
+
+
+def listening(value: int) -> list[tuple[str, int]]:
+    """Address, in hexadecimal notation, and port of each socket at which this process listens."""
+    del value
+    own = set()
+    for file in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):
+            own.add(os.readlink(file))
+    found = []
+    for name in ("tcp", "tcp6"):
+        for line in Path("/proc/net", name).read_text(encoding="utf-8").splitlines()[1:]:
+            _, local, _, state, *more = line.split()
+            if state == "0A" and f"socket:[{more[5]}]" in own:
+                found.append((local.split(":")[0], int(local.split(":")[1], 16)))
+    return found
+
+
+def outer_address() -> str:
+    """An address of this machine that others reach it at; a datagram's route names it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+        except OSError:
+            pytest.skip("this machine has no other address")
+        return str(probe.getsockname()[0])
+
+
+def test_workers_of_this_machine_are_reached_from_nowhere_else() -> None:
+    before = listening(0)
+    with LocalCrew(1) as crew:
+        ((_, of_worker),) = crew.do(listening, [1], never)
+        assert isinstance(of_worker, list)
+        opened = [*of_worker, *(one for one in listening(0) if one not in before)]
+        assert len(of_worker) >= 1
+        assert len(opened) > len(of_worker)
+        assert {address for address, _ in opened} == {"0100007F"}
+        for _, port in opened:
+            with pytest.raises(ConnectionRefusedError):
+                socket.create_connection((outer_address(), port), timeout=5.0)
 
 
 def napping(seconds: float) -> int:

@@ -279,6 +279,7 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
             "jobs is 0; give at least 1",
             lambda p: fg.sweep("lab_trials", {"seed": [1, 2]}, p / "out", jobs=0),
         ),
+        "no experiment": (ConfigError, "a sweep of no experiment", lambda p: fg.sweep([], out=p)),
         "name of no kind": (
             ConfigError,
             "estimator = 'ekf2' is not usable: give a group of keys, .*; kinds: odometry, ",

@@ -17,7 +17,7 @@ import pytest
 
 from fgslam.core.errors import ConfigError, MemoryShortageError
 from fgslam.runs import processes
-from fgslam.runs.processes import WorkerEnded, Workers, run_apart
+from fgslam.runs.processes import WorkerEnded, Workers, run_apart, worker_count
 
 
 def work(what: str) -> str:
@@ -41,6 +41,14 @@ def work(what: str) -> str:
 def test_results_come_with_the_index_of_their_argument() -> None:
     found = dict(run_apart(work, ["a", "b"], jobs=2, single_threaded=True))
     assert found == {0: "a 1", 1: "b 1"}
+
+
+def test_workers_are_no_more_than_pieces_of_work_and_four_a_core(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    assert [worker_count(wanted, 1000) for wanted in (None, 1, 5, 500)] == [2, 1, 5, 8]
+    assert [worker_count(500, pieces) for pieces in (0, 1, 3)] == [1, 1, 3]
 
 
 def test_the_environment_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -32,6 +32,7 @@ IMAGES: dict[str, Any] = {"dataset": {"kind": "rendered_lab"}}
         ("a=[1, 2],[3]", ["[1, 2]", "[3]"], ["[1, 2]", "[3]"]),
         ("a='x,y',z", ["'x,y'", "z"], ["'x,y'", "z"]),
         ("a=1,none", ["1", "none"], ["1", "none"]),
+        ("a=!!int ''", ["!!int ''"], ["!!int ''"]),
     ],
 )
 def test_axes_are_read(given: str, texts: list[str], settings: list[Any]) -> None:

@@ -64,3 +64,15 @@ def test_taking_waits_for_the_camera_and_ends_with_it() -> None:
     camera.join()
     with pytest.raises(SessionError, match="closed"):
         frames.put(2.0, IMAGES)
+
+
+def test_a_camera_loop_may_fill_its_arrays_again() -> None:
+    left, step = np.full((4, 4), 9, np.uint8), np.eye(4)
+    frames = fg.NewestFrame()
+    frames.put(1.0, (left, left), step)
+    left[:], step[:] = 77, 0.0
+    taken = frames.take()
+    assert taken is not None
+    assert taken[1] is not None
+    assert (np.asarray(taken[1]) == 9).all()
+    np.testing.assert_array_equal(np.asarray(taken[2]), np.eye(4))
