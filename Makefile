@@ -58,8 +58,8 @@ BASELINE_ESTIMATORS ?= odometry,landmark_kalman,fixed_lag,isam2,batch
 baseline: .venv/.runtime-stamp ## repeat the experiments that have a committed baseline, check them (minutes)
 	@set -e; for name in $(BASELINES); do \
 	  .venv/bin/fgslam compare experiments/$$name.yaml --trials 3 --seed 0 --jobs 2 \
-	    --estimators $(BASELINE_ESTIMATORS) --out runs/baseline/$$name --overwrite \
-	    --$(BASELINE)-baseline experiments/baselines/$$name.json; \
+	    --estimators $(BASELINE_ESTIMATORS) --out runs/baseline/$$name --overwrite; \
+	  .venv/bin/python -m benchmarks.baseline $(BASELINE) runs/baseline/$$name experiments/baselines/$$name.json; \
 	done
 
 clean: ## remove the environment, caches and results

@@ -35,7 +35,7 @@ _STATUS = """
 ## Exit status
 
 - 0: done; of a comparison: at least one estimator finished.
-- 1: no estimator of a comparison finished, a trial failed, or a baseline got worse.
+- 1: no estimator of a comparison finished, or a trial failed.
 - 2: a mistake in what was given: one line on standard error says what, where, and how to fix it.
 - 3: done, but fewer than half of the frames were located (`run`; `localize`: of the queries).
 - 130, 143: ended by Ctrl-C or SIGTERM, within two seconds; all files are valid, `--resume` goes on.

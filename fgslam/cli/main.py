@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-import shlex
 import sys
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -29,10 +28,6 @@ from fgslam.cli.sweeping import sweep
 from fgslam.core.errors import FgslamError, one_line
 from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import experiment_names, find_experiment
-
-if TYPE_CHECKING:
-    from fgslam.runs.baseline import Baseline, Results
-
 
 EXIT_USER = 2
 # Typer exports only the child; its parent's home differs from one Typer to the next.
@@ -165,8 +160,6 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     jobs: options.Jobs = 1,
     trials: options.TrialCount = None,
     seed: options.FirstSeed = None,
-    write_baseline: options.WriteBaseline = None,
-    check_baseline: options.CheckBaseline = None,
 ) -> None:
     """Replay runs' measurements through estimators and set them side by side.
 
@@ -178,13 +171,11 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     """
     from fgslam.cli.console import show_parts
     from fgslam.core.errors import ConfigError
-    from fgslam.runs.baseline import read_baseline
-    from fgslam.runs.compare import Choice, ate_tables, compare_runs, metrics_of
+    from fgslam.runs.compare import Choice, ate_tables, compare_runs
     from fgslam.runs.trials import Seeds, run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), existing_folder(overwrite, resume)
-    expected = None if check_baseline is None else read_baseline(check_baseline)
     if trials is None and seed is not None:
         raise ConfigError("--seed means nothing without --trials; give both or none")
     if trials is not None and len(runs) != 1:
@@ -198,25 +189,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
             results = [tried]
     show_all(results, same_with_resume())
     show_parts((), ate_tables(results))
-    regression = _baselines(metrics_of(results), write_baseline, expected)
     exit_as(results)
-    if regression:
-        raise typer.Exit(EXIT_FAULT)
-
-
-def _baselines(results: Results, written: Path | None, expected: Baseline | None) -> bool:
-    """Writes and checks baselines where that is asked for; whether something became worse."""
-    from fgslam.cli.console import show_parts
-    from fgslam.runs.baseline import check_baseline, deviation_lines, write_baseline
-
-    if written is not None:
-        write_baseline(written, results, shlex.join(["fgslam", *sys.argv[1:]]))
-        show_parts((), (), [("baseline", str(written))])
-    if expected is None:
-        return False
-    deviations = check_baseline(expected, results)
-    show_parts((), (), deviation_lines(deviations))
-    return any(deviation.regression for deviation in deviations)
 
 
 app.command()(sweep)

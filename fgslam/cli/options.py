@@ -373,10 +373,3 @@ SweepFolder = Annotated[
 ResumeSweep = Annotated[
     bool, typer.Option("--resume", help="do what has no result yet; axes may have become longer")
 ]
-WriteBaseline = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="write the results as a baseline")
-]
-CheckBaseline = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="compare with a baseline; exit with 1 where one got worse"),
-]

@@ -253,12 +253,6 @@ def compare_runs(
     return results
 
 
-def metrics_of(results: Sequence[RunResult]) -> dict[str, dict[str, Any]]:
-    """Numbers of estimators, as metrics.json has them, by the run's name and their title."""
-    names = _told_apart([one.config.name for one in results], results)
-    return {name: one.metrics["estimators"] for name, one in zip(names, results, strict=True)}
-
-
 def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:
     """Final ATE of each estimator on each run, where there are several runs of SLAM."""
     slam = [one for one in results if isinstance(one.config, ExperimentConfig)]

@@ -1,4 +1,4 @@
-"""`fgslam run` with comparisons and on measurements, `fgslam compare`, trials and baselines."""
+"""`fgslam run` with comparisons and on measurements, `fgslam compare`, trials."""
 
 from __future__ import annotations
 
@@ -174,9 +174,9 @@ def test_a_run_replays_its_own_log_to_the_bit(recording: Path, tmp_path: Path) -
 def test_compare_gives_the_runs_own_bytes_and_a_table(
     measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    out, baseline = tmp_path / "out", tmp_path / "baseline.json"
+    out = tmp_path / "out"
     arguments = ("compare", measured, "--out", out, "--estimators", f"{KIND},world")
-    own = ("--set", "estimators.world.update=half", "--write-baseline", baseline)
+    own = ("--set", "estimators.world.update=half")
     assert main(monkeypatch, *arguments, *own) == 0
     shown = capsys.readouterr().out
     assert f"SE3 aligned, {FRAMES} matched poses" in shown
@@ -194,12 +194,6 @@ def test_compare_gives_the_runs_own_bytes_and_a_table(
     # The estimators of the configuration are the default; the second one differs from `half`.
     assert main(monkeypatch, "compare", measured, "--out", out) == 2
     assert "holds results already" in capsys.readouterr().err
-    check = ("--overwrite", "--check-baseline", baseline)
-    with units_in_this_process():
-        assert main(monkeypatch, "compare", measured, "--out", out, *check) == 1
-    shown = capsys.readouterr().out
-    assert "short_drive, world: ate_final_m: " in shown
-    assert f"short_drive, {KIND}: " not in shown
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -277,7 +271,6 @@ def test_the_command_that_an_interrupted_comparison_shows_goes_on_with_it(
         (("--estimators", "isam3"), "no estimator 'isam3'"),
         (("--out", "RUN", "--overwrite"), "holds the run itself; choose another folder"),
         (("--seed", 3), "--seed means nothing without --trials"),
-        (("--check-baseline", "RUN/config.yaml"), "cannot be read as a baseline"),
     ],
 )
 def test_mistakes_are_reported_in_a_line(

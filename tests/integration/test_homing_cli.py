@@ -154,24 +154,6 @@ def test_trials_repeat_simulated_homings_with_other_noise(
     assert load_homing(out / RUN_MARKER).seed == 7
 
 
-@pytest.mark.usefixtures("in_this_process")
-def test_a_baseline_of_homing_runs_is_checked(
-    trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
-) -> None:
-    baseline, out = tmp_path / "baseline.json", ("--estimators", "homing_ekf", "--overwrite")
-    compared = ("compare", trials, *out, "--out", tmp_path / "compared")
-    assert main(monkeypatch, *compared, "--write-baseline", baseline) == 0
-    expected = json.loads(baseline.read_text(encoding="utf-8"))
-    numbers = expected["runs"]["few_trials"]["homing_ekf"]
-    assert {"direction_median_deg", "nees_home_per_dof"} <= numbers.keys()
-    assert main(monkeypatch, *compared, "--check-baseline", baseline) == 0
-    numbers["direction_median_deg"] *= 0.5
-    baseline.write_text(json.dumps(expected), encoding="utf-8")
-    capfd.readouterr()
-    assert main(monkeypatch, *compared, "--check-baseline", baseline) == 1
-    assert "REGRESSION" in capfd.readouterr().out
-
-
 def test_a_run_is_neither_resumed_nor_overwritten_unasked(
     trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

@@ -1,4 +1,4 @@
-"""Choosing estimators, tables, files and baselines of a comparison."""
+"""Choosing estimators, tables, and files of a comparison."""
 
 from __future__ import annotations
 
@@ -35,7 +35,6 @@ from fgslam.report.tables import (
     write_comparison_csv,
     write_landmark_truth,
 )
-from fgslam.runs.baseline import check_baseline, read_baseline, write_baseline
 from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.estimator_files import points_from_log
@@ -516,61 +515,6 @@ def test_a_failed_trial_does_not_count() -> None:
     pooled = summary.pooled["smooth"]["pose"]
     assert pooled is not None
     assert pooled.independent == 2
-
-
-# --------------------------------------------------------------------------------------------
-# Baselines
-
-
-SOUND = EstimatorMetrics(ate_rmse_m=0.01, nees_pose_per_dof=1.5, more={"kind": "isam2"})
-
-
-def checked(path: Path, **changes: Any) -> list[tuple[bool, str]]:
-    results = {"run": {"isam2": dataclasses.replace(SOUND, **changes).as_json()}}
-    return [(d.regression, d.text) for d in check_baseline(read_baseline(path), results)]
-
-
-def test_a_baseline_without_a_number_is_not_written(tmp_path: Path) -> None:
-    path = tmp_path / "baseline.json"
-    with pytest.raises(ConfigError, match=r"not written: .* home has none .*leave out"):
-        write_baseline(path, {"home": {"homing_ekf": {"kind": "homing_ekf"}}}, "fgslam compare")
-    assert not path.exists()
-
-
-def test_a_baseline_tells_worse_from_better(tmp_path: Path) -> None:
-    path = tmp_path / "baseline.json"
-    write_baseline(path, {"run": {"isam2": SOUND.as_json()}}, "fgslam compare")
-    assert checked(path) == []
-    assert checked(path, ate_rmse_m=0.0104, nees_pose_per_dof=1.6) == []
-    ((worse, text),) = checked(path, ate_rmse_m=0.011)
-    assert worse
-    assert text == (
-        "run, isam2: ate_final_m: 0.01 in the baseline, 0.011 now (+10.0 %), tolerance 5 %: worse"
-    )
-    assert [w for w, _ in checked(path, ate_rmse_m=0.005)] == [False]
-    assert [w for w, _ in checked(path, nees_pose_per_dof=1.0)] == [False]
-    assert [w for w, _ in checked(path, nees_pose_per_dof=0.5)] == [True]
-    assert checked(path, ate_rmse_m=None)[0][0]
-    missing = check_baseline(read_baseline(path), {"run": {}})
-    assert [(d.regression, d.text) for d in missing] == [
-        (True, "run, isam2: not among the results")
-    ]
-
-
-@pytest.mark.parametrize("spoil", ["format", "version", "relative_tolerances", "runs"])
-def test_what_is_no_baseline_is_refused(spoil: str, tmp_path: Path) -> None:
-    path = tmp_path / "baseline.json"
-    write_baseline(path, {"run": {"isam2": SOUND.as_json()}}, "fgslam compare")
-    document = json.loads(path.read_text(encoding="utf-8"))
-    document[spoil] = {}
-    path.write_text(json.dumps(document), encoding="utf-8")
-    with pytest.raises(ConfigError, match="--write-baseline"):
-        checked(path)
-    path.write_text("{", encoding="utf-8")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        checked(path)
-    with pytest.raises(ConfigError, match="cannot be read"):
-        checked(tmp_path / "absent.json")
 
 
 @pytest.mark.parametrize(("kind", "predicted"), [("isam2", 2), ("odometry", 0)])

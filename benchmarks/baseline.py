@@ -1,0 +1,83 @@
+"""Compares a finished comparison with numbers that are committed: `make baseline`.
+
+`python -m benchmarks.baseline check FOLDER FILE` exits with 1 where a number got worse by more than
+its tolerance; `write` in the place of `check` writes the numbers of the folder into the file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from fgslam.evaluation.metrics import value_at
+from fgslam.report.tables import RESULT_COLUMNS
+
+_FLOOR = 1e-6  # metres, degrees: less is rounding, whatever the ratio
+_ONE_IS_BEST = ("nees_", "nis_")
+_WHERE = dict(RESULT_COLUMNS)
+
+
+def deviations(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> Iterator[tuple[bool, str]]:
+    """Values outside their tolerances: whether each got worse, and a line about it.
+
+    Args:
+        baseline: the document of a file.
+        found: numbers of the estimators by title, as in metrics.json.
+    """
+    (expected,) = baseline["runs"].values()
+    for title, numbers in expected.items():
+        for name, value in numbers.items():
+            now = value_at(found.get(title, {}), _WHERE.get(name, name))
+            if now is None:
+                yield True, f"{title}: {name}: {value:.6g} in the baseline, not known now"
+            elif abs(now - value) > max(_tolerance(baseline, name) * abs(value), _FLOOR):
+                worse = _badness(name, now) > _badness(name, value)
+                yield worse, f"{title}: {name}: {value:.6g} in the baseline, {now:.6g} now"
+
+
+def with_numbers(baseline: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+    """The document with the numbers of a comparison in the place of its own."""
+    numbers = {
+        title: {n: value_at(one, _WHERE.get(n, n)) for n in baseline["relative_tolerances"]}
+        for title, one in found.items()
+    }
+    known = {t: {n: v for n, v in one.items() if v is not None} for t, one in numbers.items()}
+    return {**baseline, "runs": dict.fromkeys(baseline["runs"], known)}
+
+
+def _tolerance(baseline: Mapping[str, Any], name: str) -> float:
+    return float(baseline["relative_tolerances"][name])
+
+
+def _badness(name: str, value: float) -> float:
+    if not name.startswith(_ONE_IS_BEST):
+        return value
+    return abs(math.log(value)) if value > 0.0 else math.inf
+
+
+def main() -> int:
+    """Checks or writes one baseline; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("task", choices=("check", "write"))
+    parser.add_argument("folder", type=Path, help="of the comparison")
+    parser.add_argument("file", type=Path, help="the baseline")
+    given = parser.parse_args()
+    found = json.loads((given.folder / "metrics.json").read_text(encoding="utf-8"))["estimators"]
+    baseline = json.loads(given.file.read_text(encoding="utf-8"))
+    if given.task == "write":
+        text = json.dumps(with_numbers(baseline, found), indent=2, allow_nan=False)
+        given.file.write_text(text + "\n", encoding="utf-8")
+        return 0
+    lines = list(deviations(baseline, found))
+    for worse, line in lines:
+        print("REGRESSION" if worse else "deviation", line)
+    print(f"{given.file}: {len(lines)} values are outside their tolerances")
+    return int(any(worse for worse, _ in lines))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
