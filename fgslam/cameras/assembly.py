@@ -11,12 +11,9 @@ import numpy as np
 from fgslam.cameras.corrected import correction_values
 from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView, checked_camera
 from fgslam.cameras.rectification import (
-    WIDEST_CYLINDER_DEG,
     Rectifier,
     View,
-    chosen_cylinder,
     chosen_view,
-    common_reach,
     orientation,
     rectifier,
 )
@@ -24,7 +21,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import RigView
 
 _LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
 # Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.
@@ -35,8 +31,6 @@ _LEAST_COMMON_VIEW = 0.707
 _LEAST_STATED = 0.5
 _SAME_PX = 1e-3  # cameras that differ by less are rectified already
 _TOLD_SHARE = 0.8  # of the angle of view; less is said to be cut off
-_TOLD_SHARE_OF_CYLINDER = 0.97  # the same of a cylinder, which is chosen not to lose any
-_WIDE_DEG = 120.0  # what both cameras see, from which on a cylinder is proposed
 _TOLD_SKEW_DEG = 0.5  # from a right angle between the baselines, of three cameras
 
 
@@ -57,43 +51,22 @@ class Assembly:
     remarks: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class ViewAsked:
-    """Which rectified view is wanted.
-
-    Attributes:
-        fov_deg: horizontal angle; None: as much as all cameras fill.
-        kind: perspective, or of two cameras cylindrical.
-    """
-
-    fov_deg: float | None = None
-    kind: RigView = "perspective"
-
-    @property
-    def is_default(self) -> bool:
-        """Whether nothing is asked for, so that what is rectified already may stay."""
-        return self.fov_deg is None and self.kind == "perspective"
-
-
-ANY_VIEW = ViewAsked()
-
-
-def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly:
+def assembled(calibration: Calibration, fov_deg: float | None = None) -> Assembly:
     """The rig of a calibration.
 
     Args:
         calibration: of two or three cameras.
-        asked: the rectified view.
+        fov_deg: horizontal angle of the rectified view; None: as much as all cameras fill.
 
     Raises:
         CalibrationError: it is of one camera only or of more than three, their images differ in
-            size, they are no stereo pair, or are three and a cylinder is asked for.
+            size, or they are no stereo pair.
     """
     cameras = _usable(calibration)
     sources, turn, told = _pair(cameras) if len(cameras) == 2 else _three(cameras)
     chosen = tuple(cameras[k] for k in sources)
     _require_side_by_side(chosen, turn)
-    rotations, view, also = _view(calibration, chosen, sources, turn, asked)
+    rotations, view, also = _view(calibration, chosen, sources, turn, fov_deg)
     found = rectifier(chosen, rotations, view, _corrected(calibration))
     found = replace(found, calibration=_with_view(calibration, sources, rotations, view))
     remarks = (*calibration.notes, *told, *also)
@@ -102,7 +75,7 @@ def assembled(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> Assembly
         if sources == (0, 1) and not told:
             remarks = (*remarks, _swapped(chosen, found.rig))
     remarks = (*remarks, *implausible(calibration.source, found.rig))
-    straight = found.order[:2] == (0, 1) and asked.is_default and _is_rectified(chosen, turn)
+    straight = found.order[:2] == (0, 1) and fov_deg is None and _is_rectified(chosen, turn)
     kept = None if straight and found.correction is None else found
     return Assembly(found.rig, kept, sources, remarks)
 
@@ -128,7 +101,7 @@ def _with_view(
     turns = [np.eye(3)] * len(calibration.cameras)
     for source, rotation in zip(sources, rotations, strict=True):
         turns[source] = rotation
-    stated = StatedView(tuple(turns), view.matrix, view.size, view.kind)
+    stated = StatedView(tuple(turns), view.matrix, view.size)
     return replace(calibration, view=stated, corrections=None)
 
 
@@ -289,29 +262,22 @@ def _view(
     chosen: Sequence[RawCamera],
     sources: tuple[int, ...],
     turn: FloatArray,
-    asked: ViewAsked,
+    fov_deg: float | None,
 ) -> tuple[tuple[FloatArray, ...], View, tuple[str, ...]]:
     """Rotation of each camera into the view, the view, and what to tell."""
-    if asked.kind == "cylindrical" and len(chosen) > 2:
-        raise CalibrationError(
-            f"{calibration.source}: a cylindrical view is of two cameras, not of three; give a "
-            "calibration of two (cameras=(0, 1) of load_rig, --cameras 0,1 of fgslam camera), or "
-            "leave the view perspective"
-        )
     stated = calibration.view
-    own = stated is not None and asked in (ANY_VIEW, ViewAsked(None, stated.kind))
-    if stated is not None and own and calibration.corrections is not None:
+    if stated is not None and fov_deg is None and calibration.corrections is not None:
         rotations = tuple(stated.rotations[k] for k in sources)
-        return rotations, View(stated.matrix, stated.size, stated.kind), ()
-    calibration.require_uncorrected("another view (fov_deg, view) is asked for")
-    if asked.is_default and _is_rectified(chosen, turn):
+        return rotations, View(stated.matrix, stated.size), ()
+    calibration.require_uncorrected("another view (fov_deg) is asked for")
+    if fov_deg is None and _is_rectified(chosen, turn):
         return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
     told: tuple[str, ...] = ()
     natural = float(np.mean([camera.focal_px for camera in chosen]))
-    if stated is not None and asked.is_default:
+    if stated is not None and fov_deg is None:
         if stated.matrix[0, 0] > _LEAST_STATED * natural:
             rotations = tuple(stated.rotations[k] for k in sources)
-            return rotations, View(stated.matrix, stated.size, stated.kind), ()
+            return rotations, View(stated.matrix, stated.size), ()
         told = (
             f"the rectified focal length that the file states, {stated.matrix[0, 0]:.0f} px, would "
             f"shrink the images ({natural:.0f} px); another view is chosen",
@@ -321,42 +287,20 @@ def _view(
     axes = np.array([camera.bTc[:3, 2] for camera in chosen])
     body_to_view = orientation([camera.bTc[:3, 3] for camera in chosen], axes)
     rotations = tuple(body_to_view @ camera.bTc[:3, :3] for camera in chosen)
-    if asked.kind == "cylindrical":
-        view = chosen_cylinder(chosen, rotations, asked.fov_deg)
-    else:
-        view = chosen_view(chosen, rotations, size, asked.fov_deg)
+    view = chosen_view(chosen, rotations, size, fov_deg)
     seen = np.degrees(chosen[0].field_of_view()[:2])
     seen = seen if size == chosen[0].size else seen[::-1]
-    return rotations, view, (*told, *_cut_off(seen, view), *_wider(chosen, rotations, view))
+    return rotations, view, (*told, *_cut_off(seen, view))
 
 
 def _cut_off(seen: FloatArray, view: View) -> tuple[str, ...]:
     """What the view does not show of the angles (2,) across and down that a camera sees."""
     kept = np.degrees(view.angles)
-    cylinder = view.kind == "cylindrical"
-    if kept[0] > (_TOLD_SHARE_OF_CYLINDER if cylinder else _TOLD_SHARE) * seen[0]:
+    if kept[0] > _TOLD_SHARE * seen[0]:
         return ()
-    more = "dataset.fov_deg chooses another angle"
-    if cylinder and kept[0] > _TOLD_SHARE_OF_CYLINDER * WIDEST_CYLINDER_DEG:
-        more = "no cylindrical view shows more"
     return (
         f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-        f"{kept[1]:.0f}; what lies beyond is cut off ({more})",
-    )
-
-
-def _wider(
-    chosen: Sequence[RawCamera], rotations: Sequence[FloatArray], view: View
-) -> tuple[str, ...]:
-    """That a cylinder shows more, where two cameras see more in common than a plane shows well."""
-    if view.kind == "cylindrical" or len(chosen) > 2:
-        return ()
-    low, high = np.degrees(common_reach(chosen, rotations))
-    if high[0] - low[0] <= _WIDE_DEG:
-        return ()
-    return (
-        f"a cylindrical view would show {high[0] - low[0]:.0f} degrees, which both cameras see "
-        "(--view cylindrical, dataset.view)",
+        f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
     )
 
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, is_rigid, pose, so3_exp
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import RigView
 
 # 'baseline' is close to 'baseline_m' (0.89); 'fy' to 'fx' (0.5) and 'baseline_m' to
 # 'vertical_baseline_m' (0.69), which are keys of their own, are not.
@@ -35,6 +34,11 @@ def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
             f"{path} says that the images are not rectified; rectify them first (rows of the left "
             "and right image must agree), or give the raw cameras' calibration by --camera FILE"
         )
+    if values.get("view", "perspective") != "perspective":
+        raise CalibrationError(
+            f"{path}: view is {values['view']!r}, but rectified images are perspective ones; "
+            "rectify the raw images anew"
+        )
     return CameraRig(
         width=pixels(path, values, "width"),
         height=pixels(path, values, "height"),
@@ -45,18 +49,7 @@ def read_calibration(path: Path, three_cameras: bool) -> CameraRig:
         baseline=positive(path, values, "baseline_m"),
         vertical_baseline=positive(path, values, "vertical_baseline_m") if three_cameras else None,
         bTc=_body_from_camera(path, values),
-        view=_view(path, values, three_cameras),
     )
-
-
-def _view(path: Path, values: Mapping[str, Any], three_cameras: bool) -> RigView:
-    view: RigView = values.get("view", "perspective")
-    if view not in get_args(RigView) or (view == "cylindrical" and three_cameras):
-        raise CalibrationError(
-            f"{path}: view is {view!r}; it is perspective, or of two cameras cylindrical; correct "
-            "or remove it"
-        )
-    return view
 
 
 def read_json_object(path: Path) -> Mapping[str, Any]:

@@ -64,8 +64,6 @@ def _rectified_values(rig: CameraRig) -> dict[str, Any]:
     if rig.vertical_baseline is not None:
         values["vertical_baseline_m"] = rig.vertical_baseline
     values["bTc"] = rig.bTc.tolist()
-    if rig.cylindrical:
-        values["view"] = rig.view
     return values
 
 

@@ -11,7 +11,6 @@ from fgslam.cameras.lenses import LENSES, Lens
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse, is_rigid
-from fgslam.core.settings import RigView
 
 _ZERO = 1e-6
 _MOST_OBLONG = 10.0  # a pixel's sides; interlaced and anamorphic images have two
@@ -248,15 +247,13 @@ class StatedView(Brief):
 
     Attributes:
         rotations: (3, 3) each, from raw to rectified axes, in the order of the file's cameras.
-        matrix: (3, 3) intrinsics of all rectified images, pixels; of a cylinder a radian.
+        matrix: (3, 3) intrinsics of all rectified images, pixels.
         size: width and height of the rectified images, pixels.
-        kind: perspective or cylindrical.
     """
 
     rotations: tuple[FloatArray, ...]
     matrix: FloatArray
     size: tuple[int, int]
-    kind: RigView = "perspective"
 
 
 @dataclass(frozen=True, eq=False, repr=False)

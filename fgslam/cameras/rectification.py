@@ -1,8 +1,7 @@
 """Rectification: one orientation and one view for all cameras, so that rows agree.
 
-The view is perspective, or of two cameras cylindrical (:mod:`fgslam.core.cylindrical`). Its x axis
-lies along the baseline, its z axis as near to the mean of the optical axes as that allows; of three
-cameras in an L the image plane holds both baselines.
+The view is perspective. Its x axis lies along the baseline, its z axis as near to the mean of the
+optical axes as that allows; of three cameras in an L the image plane holds both baselines.
 """
 
 from __future__ import annotations
@@ -18,24 +17,18 @@ import numpy.typing as npt
 
 from fgslam.cameras.raw_cameras import Calibration, RawCamera
 from fgslam.core.arrays import Brief, FloatArray, Image
-from fgslam.core.cylindrical import view_rays
 from fgslam.core.geometry import pose
 from fgslam.core.rig_correction import camera_displacements
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import RigView
 
 MapArray: TypeAlias = npt.NDArray[np.float32]
 
 _OUTSIDE = -1e4  # coordinate that is outside of any image, so that it stays black
 # A perspective view stretches its rim by 1 / cos^2: at 60 degrees off the axis by 4.
 _WIDEST_DEG = 120.0
-WIDEST_CYLINDER_DEG = 160.0
-"""Both ways. Beyond 80 degrees from the axis an ideal perspective camera, which graphs are built
-of, sees a pixel as thirty; along the baseline there is no disparity."""
 # The middle of the view keeps at least this share of the raw image's resolution.
 _LEAST_RESOLUTION = 0.9
 _BORDER_STEPS = 200
-_REACH_STEPS = 1601  # directions over the widest cylinder: every tenth of a degree
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,25 +114,22 @@ class Rectifier(Brief):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """An image plane, or a cylinder: (3, 3) intrinsics in pixels, width and height, and which."""
+    """An image plane: (3, 3) intrinsics in pixels, width and height."""
 
     matrix: FloatArray
     size: tuple[int, int]
-    kind: RigView = "perspective"
 
     @property
     def angles(self) -> FloatArray:
         """Horizontal and vertical angle of view (2,) in radians."""
         ends = np.array([[-0.5, -0.5], [self.size[0] - 0.5, self.size[1] - 0.5]])
         low, high = (ends - self.matrix[:2, 2]) / np.diag(self.matrix)[:2]
-        if self.kind != "cylindrical":
-            low, high = np.arctan(low), np.arctan(high)
-        return np.asarray(high - low)
+        return np.asarray(np.arctan(high) - np.arctan(low))
 
     def rays(self, pixels: FloatArray) -> FloatArray:
         """Rays (n, 3), of any length, along which pixels (n, 2) look."""
-        plane = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(self.matrix).T
-        return view_rays(plane[:, 0], plane[:, 1]) if self.kind == "cylindrical" else plane
+        homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+        return np.asarray(homogeneous @ np.linalg.inv(self.matrix).T)
 
 
 def orientation(positions: Sequence[FloatArray], axes: FloatArray) -> FloatArray:
@@ -189,51 +179,6 @@ def chosen_view(
     middle = 0.5 * (low + high)
     column, row = (0.5 * (np.array(size) - 1.0) - focal * middle).tolist()
     return View(np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]]), size)
-
-
-def chosen_cylinder(
-    cameras: Sequence[RawCamera],
-    rotations: Sequence[FloatArray],
-    fov_deg: float | None = None,
-) -> View:
-    """The cylindrical view of all that both cameras see along its axes, at most 160 degrees.
-
-    The whole has as many pixels as the raw images, all equally large. Corners that a fisheye does
-    not see are black. Arguments as for :func:`chosen_view`.
-    """
-    low, high = common_reach(cameras, rotations)
-    focal = float(np.sqrt(cameras[0].width * cameras[0].height / np.prod(high - low)))
-    if fov_deg is not None:
-        half = np.radians(0.5 * fov_deg)
-        low[0], high[0] = max(low[0], -half), min(high[0], half)
-    width, height = np.rint(focal * (high - low)).astype(int).tolist()
-    column, row = (-0.5 - focal * low).tolist()
-    matrix = np.array([[focal, 0.0, column], [0.0, focal, row], [0.0, 0.0, 1.0]])
-    return View(matrix, (width, height), "cylindrical")
-
-
-def common_reach(
-    cameras: Sequence[RawCamera], rotations: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest angle, across and down (2,), that all see along the view's axes, radians.
-
-    At most 80 degrees from the middle.
-    """
-    half = np.radians(0.5 * WIDEST_CYLINDER_DEG)
-    angles, zero = np.linspace(-half, half, _REACH_STEPS), np.zeros(_REACH_STEPS)
-    low, high = np.empty(2), np.empty(2)
-    for axis, rays in enumerate((view_rays(angles, zero), view_rays(zero, angles))):
-        seen = np.ones(_REACH_STEPS, np.bool_)
-        for camera, rotation in zip(cameras, rotations, strict=True):
-            pixels = camera.project(rays @ rotation)
-            seen &= ((pixels >= -0.5) & (pixels <= np.array(camera.size) - 0.5)).all(axis=1)
-        middle = _REACH_STEPS // 2
-        black = np.concatenate([[-1], np.flatnonzero(~seen), [_REACH_STEPS]])
-        after = int(np.searchsorted(black, middle, side="right"))
-        low[axis] = angles[min(black[after - 1] + 1, middle)]
-        high[axis] = angles[max(black[after] - 1, middle)]
-    step = angles[1] - angles[0]  # a camera that does not see the middle leaves no less
-    return low - 0.5 * step, high + 0.5 * step
 
 
 def _inner(camera: RawCamera, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -311,7 +256,6 @@ def rectifier(
         baseline=float(away[0][0]),
         vertical_baseline=float(away[1][1]) if len(away) > 1 else None,
         bTc=pose(axes, right.bTc[:3, 3]),
-        view=view.kind,
     )
     correction = None if corrected is None else corrected(rig)
     maps = tuple(

@@ -6,15 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import get_args
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.assembly import (
-    ANY_VIEW,
-    ViewAsked,
     assembled,
     at_size,
     implausible,
@@ -25,7 +22,7 @@ from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.corrected import read_own_format
 from fgslam.cameras.formats.own import calibration_of, is_rectified
 from fgslam.cameras.raw_cameras import Calibration
-from fgslam.cameras.rectification import WIDEST_CYLINDER_DEG, Rectifier
+from fgslam.cameras.rectification import Rectifier
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
@@ -33,7 +30,6 @@ from fgslam.core.files import as_path
 from fgslam.core.geometry import pose
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
-from fgslam.core.settings import RigView
 
 
 def _identity() -> FloatArray:
@@ -59,7 +55,6 @@ class StereoRig(CameraRig):
         exact: the calibration has no error, as that of a rendered rig; else covariances contain
             what one leaves.
         rectifier: how raw images become rectified ones; None where they are rectified already.
-        view: ``perspective``, or of a pair ``cylindrical``: fx and fy are pixels a radian.
         sources: which of a calibration file's cameras are right, left[, top].
         remarks: what the calibration gives rise to say, a line each.
 
@@ -130,7 +125,6 @@ def load_rig(
     scale: bool = False,
     unit_m: float = 1.0,
     fov_deg: float | None = None,
-    view: RigView = "perspective",
     cameras: Sequence[int] | None = None,
 ) -> StereoRig:
     """The rig of calibration files; the format is recognised by the content.
@@ -150,32 +144,29 @@ def load_rig(
         unit_m: metres of one unit of length of the file: 0.001 for millimetres, the side of a
             square for a calibration in squares.
         fov_deg: wanted horizontal angle of the rectified view in degrees, below 170; None: as much
-            as all cameras fill, at most 120; of a cylindrical view at most 160.
-        view: ``perspective``, or of two cameras ``cylindrical``: angles instead of tangents, for
-            lenses that see more than 120 degrees.
+            as all cameras fill, at most 120.
         cameras: which of the file's cameras form the rig, two or three; None: all.
 
     Raises:
         CalibrationError: the format or a camera model is not known, a value is missing or
             impossible, the size is another one, or the cameras are no stereo rig.
     """
-    asked = asked_view(fov_deg, view)
-    require_options(size, unit_m)
+    require_options(size, unit_m, fov_deg)
     _require_cameras(cameras)
     file = as_path(path, CalibrationError)
     file2 = None if path2 is None else as_path(path2, CalibrationError, "path2")
     own = _own_rectified(file, cameras, unit_m) if file2 is None else None
     same_size = own is not None and size in (None, (own.width, own.height))
-    if own is not None and same_size and asked in (ANY_VIEW, ViewAsked(None, own.view)):
+    if own is not None and same_size and fov_deg is None:
         return with_masks(own, file)
     found = read_calibration_file(file, file2, size)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
-    return with_masks(rig_of(found, asked), file)
+    return with_masks(rig_of(found, fov_deg), file)
 
 
-def rig_of(calibration: Calibration, asked: ViewAsked = ANY_VIEW) -> StereoRig:
+def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     """The rig of a calibration that is read; see :func:`load_rig`."""
-    made = assembled(calibration, asked)
+    made = assembled(calibration, fov_deg)
     return _stereo_rig(made.rig, made.rectifier, made.sources, made.remarks)
 
 
@@ -241,9 +232,7 @@ def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> 
     rig = _rig_in_metres(found.rig if isinstance(found, Rectifier) else found, unit_m)
     raw = replace(found, rig=rig) if isinstance(found, Rectifier) else None
     if unit_m != 1.0:
-        assembled(
-            calibration_of(replace(rig, view="perspective"), path)
-        )  # refuses a unit that makes one camera of two
+        assembled(calibration_of(rig, path))  # refuses a unit that makes one camera of two
     return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
 
 
@@ -284,7 +273,7 @@ def _require_cameras(cameras: object) -> None:
         )
 
 
-def require_options(size: object, unit_m: object) -> None:
+def require_options(size: object, unit_m: object, fov_deg: object) -> None:
     """Raises CalibrationError where what is said beside a file cannot be meant."""
     pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
     whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
@@ -292,23 +281,11 @@ def require_options(size: object, unit_m: object) -> None:
         raise CalibrationError(f"size is {size!r}; give (width, height) of the images in pixels")
     if not is_finite_number(unit_m) or not float(unit_m) > 0.0:  # type: ignore[arg-type]
         raise CalibrationError(f"unit_m is {unit_m!r}; give metres, 0.001 for millimetres")
-
-
-def asked_view(fov_deg: object, kind: object) -> ViewAsked:
-    """The view that is asked for. Raises CalibrationError where there is none of that kind."""
-    if not isinstance(kind, str) or kind not in get_args(RigView):
-        given = repr(kind) if isinstance(kind, str) else f"a {type(kind).__name__}"
-        raise CalibrationError(f"view is {given}; give {' or '.join(get_args(RigView))}")
-    if fov_deg is None:
-        return ViewAsked(None, kind)  # type: ignore[arg-type]
-    cylinder = kind == "cylindrical"
-    most = WIDEST_CYLINDER_DEG if cylinder else _WIDEST_PLANE_DEG
-    value = float(fov_deg) if is_finite_number(fov_deg) else math.nan  # type: ignore[arg-type]
-    if not (0.0 < value < most or (cylinder and value == most)):
+    within = is_finite_number(fov_deg) and 0.0 < float(fov_deg) < _WIDEST_DEG  # type: ignore[arg-type]
+    if fov_deg is not None and not within:
         raise CalibrationError(
-            f"fov_deg is {fov_deg!r}; a {kind} view takes 0 to {most:.0f} degrees"
+            f"fov_deg is {fov_deg!r}; a perspective view takes 0 to {_WIDEST_DEG:.0f} degrees"
         )
-    return ViewAsked(value, kind)  # type: ignore[arg-type]
 
 
-_WIDEST_PLANE_DEG = 170.0  # not included
+_WIDEST_DEG = 170.0  # not included

@@ -27,20 +27,13 @@ Unit = Annotated[
 Fov = Annotated[
     float | None, typer.Option(metavar="DEGREES", help="horizontal angle of the rectified view")
 ]
-View = Annotated[
-    str,
-    typer.Option(
-        metavar="KIND",
-        help="rectified view: perspective, or of two cameras cylindrical, up to 160 degrees",
-    ),
-]
 Cameras = Annotated[
     str | None, typer.Option(metavar="N,N", help="which of the file's cameras, as 0,1")
 ]
 
 
 @app.command()
-def show(  # noqa: PLR0913 - each option is a parameter
+def show(
     file: File,
     second: Second = None,
     size: Size = None,
@@ -48,7 +41,6 @@ def show(  # noqa: PLR0913 - each option is a parameter
     unit: Unit = 1.0,
     fov: Fov = None,
     cameras: Cameras = None,
-    view: View = "perspective",
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="the picture; default none")
     ] = None,
@@ -56,7 +48,7 @@ def show(  # noqa: PLR0913 - each option is a parameter
     """Say what a calibration file says: cameras, fields of view, baselines, rectified view."""
     from fgslam.runs.camera_files import Asked, show_calibration
 
-    asked = Asked(file, second, size, scale, unit, fov, cameras, view)
+    asked = Asked(file, second, size, scale, unit, fov, cameras)
     for line in show_calibration(asked, out):
         typer.echo(line)
 

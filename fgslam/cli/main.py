@@ -62,7 +62,6 @@ def run(  # noqa: PLR0913 - each option is a parameter
     fps: options.Fps = None,
     scale: options.Scale = None,
     unit: options.Unit = None,
-    view: options.View = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -87,7 +86,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     existing = existing_folder(overwrite, resume)
     chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
     )
     steered = {"estimator.kind": estimator, "map.load": map_in, "map.save": map_out}
     chosen += options.as_overrides(steered)
@@ -121,7 +120,6 @@ def init(  # noqa: PLR0913 - each option is a parameter
     fps: options.Fps = None,
     scale: options.Scale = None,
     unit: options.Unit = None,
-    view: options.View = None,
     topics: options.Topics = None,
     estimator: options.Estimator = None,
     overrides: options.Overrides = None,
@@ -130,7 +128,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.bare_recording import short_config
 
     chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
     )
     chosen += options.as_overrides({"estimator.kind": estimator})
     typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
@@ -210,7 +208,6 @@ def localize(  # noqa: PLR0913 - each option is a parameter
     fps: options.Fps = None,
     scale: options.Scale = None,
     unit: options.Unit = None,
-    view: options.View = None,
     topics: options.Topics = None,
     frame: Annotated[
         int | None,
@@ -234,7 +231,7 @@ def localize(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.tasks.localisation import localize as locate
 
     chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
     )
     wanted = Wanted(
         map_file, recording, (*(overrides or ()), *chosen), frame, frames, out,
@@ -333,7 +330,6 @@ def inspect(  # noqa: PLR0913 - each option is a parameter
     fps: options.Fps = None,
     scale: options.Scale = None,
     unit: options.Unit = None,
-    view: options.View = None,
     topics: options.Topics = None,
     overrides: options.Overrides = None,
     frames: Annotated[
@@ -348,7 +344,7 @@ def inspect(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs.inspection import inspect_recording
 
     chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit, view=view
+        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
     )
     given = [*(overrides or ()), *chosen]
     with stop_flag() as stopped, progress_bar() as progress:

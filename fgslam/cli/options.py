@@ -180,14 +180,6 @@ Unit = Annotated[
         help="one unit of the calibration's lengths, 0.001: millimetres; sets dataset.unit_m",
     ),
 ]
-View = Annotated[
-    str | None,
-    typer.Option(
-        metavar="KIND",
-        help="rectified view: perspective, or of two cameras cylindrical, which shows up to 160 "
-        "degrees; sets dataset.view",
-    ),
-]
 Topics = Annotated[
     str | None,
     typer.Option(

@@ -44,8 +44,6 @@ class StereoFeatures(Rows):
         pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top camera.
         complete: (n,) found in every image of the rig, complete ones first; None if all are. The
             others may be a landmark known already; they start none.
-        distance: (n,) by which sizes shrink in a cylindrical view
-            (:func:`fgslam.core.cylindrical.size_distances`); None: the depth.
     """
 
     measurement: FloatArray
@@ -57,12 +55,6 @@ class StereoFeatures(Rows):
     position_covariance: FloatArray
     pixels: FloatArray
     complete: BoolArray | None = None
-    distance: FloatArray | None = None
-
-    @property
-    def distances(self) -> FloatArray:
-        """(n,) physical size over scale."""
-        return self.position[:, 2] if self.distance is None else self.distance
 
     @property
     def whole(self) -> StereoFeatures:

@@ -12,7 +12,6 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from fgslam.core import cylindrical
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.measurements import Odometry
 from fgslam.core.planar import wrap
@@ -309,8 +308,6 @@ def project(sensor: Sensor, points: FloatArray) -> FloatArray:
     """
     if not isinstance(sensor, CameraRig):
         return project_range_bearing(points)
-    if sensor.cylindrical:
-        return cylindrical.project(sensor, points)
     inverse_depth = 1.0 / points[:, 2]
     out = np.empty_like(points)
     out[:, 0] = sensor.cx + sensor.fx * points[:, 0] * inverse_depth
@@ -331,8 +328,6 @@ def projection_jacobian(sensor: Sensor, points: FloatArray) -> FloatArray:
     """d(measurement)/d(point) (n, 3, 3) at points (n, 3) in the sensor's frame."""
     if not isinstance(sensor, CameraRig):
         return range_bearing_jacobian(points)
-    if sensor.cylindrical:
-        return cylindrical.projection_jacobian(sensor, points)
     inverse_depth = 1.0 / points[:, 2]
     inverse_depth2 = inverse_depth * inverse_depth
     out = np.zeros((len(points), 3, 3))
@@ -358,8 +353,6 @@ def triangulate(sensor: Sensor, measurement: FloatArray) -> FloatArray:
     """
     if not isinstance(sensor, CameraRig):
         return triangulate_range_bearing(measurement)
-    if sensor.cylindrical:
-        return cylindrical.triangulate(sensor, measurement)
     depth = sensor.fx * sensor.baseline / measurement[:, 2]
     out = np.empty(measurement.shape)
     out[:, 0] = (measurement[:, 0] - sensor.cx) * depth / sensor.fx
@@ -382,8 +375,6 @@ def triangulation_covariance(
     """
     if not isinstance(sensor, CameraRig):
         return congruence(range_bearing_point_jacobian(measurement), covariance)
-    if sensor.cylindrical:
-        return congruence(cylindrical.point_jacobian(sensor, measurement), covariance)
     d, fx, fy, baseline = measurement[:, 2], sensor.fx, sensor.fy, sensor.baseline
     jacobian = np.zeros((len(d), 3, 3))
     jacobian[:, 0, 0] = baseline / d

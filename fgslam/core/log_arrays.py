@@ -58,7 +58,7 @@ _UPPER = np.triu_indices(3)
 _UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
 _SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
-_DEFAULTS: dict[str, Any] = {"exact": False, "view": "perspective", "places": "all"}
+_DEFAULTS: dict[str, Any] = {"exact": False, "places": "all"}
 """Of a rig: written where it is otherwise."""
 
 

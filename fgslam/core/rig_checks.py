@@ -9,7 +9,7 @@ import numpy as np
 from fgslam.core.checks import is_finite_number
 from fgslam.core.geometry import is_rigid
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import RigPlaces, RigView
+from fgslam.core.settings import RigPlaces
 
 _FOCAL_RANGE = 1000.0
 """Of focal length and image size: at one end a telescope, at the other no picture."""
@@ -45,9 +45,6 @@ def rig_fault(rig: CameraRig) -> str:
 def _mounting_fault(rig: CameraRig) -> str:
     if not isinstance(rig.exact, bool | np.bool_):
         return f"exact is {rig.exact!r}; give True for a rig known without error, as a rendered one"
-    views = get_args(RigView)
-    if rig.view not in views or (rig.cylindrical and rig.cameras > 2):
-        return f"view is {rig.view!r}; give {views[0]}, or of two cameras {views[1]}"
     if rig.places not in get_args(RigPlaces):
         return f"places is {rig.places!r}; give {' or '.join(get_args(RigPlaces))}"
     if not is_rigid(np.asarray(rig.bTc, np.float64)):

@@ -16,7 +16,6 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, Brief, FloatArray
-from fgslam.core.cylindrical import on_fisheye, turns_of_cylinder
 from fgslam.core.features import Features
 from fgslam.core.sensors import CameraRig
 
@@ -106,11 +105,8 @@ def _fill(out: FloatArray, rig: CameraRig, camera: int, pixels: FloatArray) -> N
     rays = _rays(rig, pixels)
     if camera:
         own = slice(len(TERMS) * (camera - 1), len(TERMS) * camera)
-        _scale(out[:, own], rig, _terms(rig, *rays))
+        _scale(out[:, own], rig, _terms(*rays))
         out[:, -len(COMMON) :] = out[:, own][:, _COMMON]
-    elif rig.cylindrical:
-        terms = _terms(rig, *rays)
-        _scale(out[:, -len(COMMON) :], rig, [terms[term] for term in _COMMON])
     else:
         _scale(out[:, -len(COMMON) :], rig, [_radial(*rays)])
 
@@ -127,33 +123,13 @@ def _scale(out: FloatArray, rig: CameraRig, terms: Iterable[_Shift]) -> None:
         np.multiply(rig.fy, row, out=out[1, at])
 
 
-def _terms(rig: CameraRig, x: FloatArray, y: FloatArray) -> list[_Shift]:
-    """Displacements in column and row of normalised image points (k,), in the order of TERMS.
-
-    In a cylindrical view the points are angles, and the lens an equidistant fisheye, whose own
-    image the terms other than turns displace.
-    """
-    if not rig.cylindrical:
-        return _of_plane(x, y)
-    rays = np.column_stack([x, y])
-    on_lens, slopes = on_fisheye(rays)
-    (by_column, across), (along, by_row) = slopes.transpose(1, 2, 0)
-    out: list[_Shift] = [
-        (by_column * column + across * row, along * column + by_row * row)
-        for column, row in _of_plane(*on_lens.T)
-    ]
-    turns = turns_of_cylinder(rays).transpose(2, 1, 0)
-    out[2:5] = [(column, row) for column, row in turns]
-    return out
-
-
 def _radial(x: FloatArray, y: FloatArray) -> _Shift:
     r2 = x * x + y * y
     return x * r2, y * r2
 
 
-def _of_plane(x: FloatArray, y: FloatArray) -> list[_Shift]:
-    """The same of a perspective view."""
+def _terms(x: FloatArray, y: FloatArray) -> list[_Shift]:
+    """Displacements in column and row of normalised image points (k,), in the order of TERMS."""
     xx, xy, yy = x * x, x * y, y * y
     r2, across = xx + yy, 2.0 * xy
     along_x, along_y, outer = r2 + 2.0 * xx, r2 + 2.0 * yy, across * r2
@@ -199,7 +175,7 @@ def shared_displacements(rig: CameraRig, pixels: FloatArray) -> FloatArray:
 
     Arguments as for :func:`displacements`. A longer baseline is one with larger disparities.
     """
-    terms = _terms(rig, *_rays(rig, pixels.reshape(-1, 2)))
+    terms = _terms(*_rays(rig, pixels.reshape(-1, 2)))
     of_lens = np.zeros((2, len(SHARED), rig.cameras * len(pixels)))
     _scale(of_lens, rig, [terms[TERMS.index(name)] for name in SHARED[:-1]])
     out = np.ascontiguousarray(of_lens.transpose(2, 0, 1))

@@ -39,7 +39,6 @@ _PATCH, _PATCH_DISTANCE = "landmark_patch", "landmark_patch_distance"
 _UPPER = np.triu_indices(3)
 _LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the zip format's first moment: equal maps give equal bytes
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
-_VIEW = "view"  # written where it is cylindrical
 _SAME_RIG = 1e-6  # relative: the same calibration, perhaps read from another text
 
 # Arrays by what their first axis counts, with type and the shape of an item.
@@ -150,11 +149,6 @@ def require_rig(saved: SavedMap, rig: CameraRig, where: str) -> None:
     Raises:
         MapError: what differs first; ``where`` names the map.
     """
-    if saved.rig.view != rig.view:
-        raise MapError(
-            f"{where}: made with a {saved.rig.view} view, not with a {rig.view} one; sizes in them "
-            f"differ, choose the same view: dataset.view {saved.rig.view}"
-        )
     for name in _RIG:
         theirs, ours = getattr(saved.rig, name), getattr(rig, name)
         if (theirs is None) != (ours is None) or (
@@ -377,13 +371,12 @@ def _has_patches(header: dict[str, Any], arrays: StateArrays) -> bool:
 
 
 def _rig_values(rig: CameraRig) -> dict[str, Any]:
-    values = {name: getattr(rig, name) for name in _RIG}
-    return values | {_VIEW: rig.view} if rig.cylindrical else values
+    return {name: getattr(rig, name) for name in _RIG}
 
 
 def _rig(header: dict[str, Any], bTc: FloatArray, where: str) -> CameraRig:
     values = header["rig"]
-    if set(values) - {_VIEW} != set(_RIG):
+    if set(values) != set(_RIG):
         raise MapError(f"{where}: the map's header names no rig; make the map again")
     rig = CameraRig(**values, bTc=bTc)
     if fault := rig_fault(rig):

@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import Brief, FloatArray
-from fgslam.core.settings import RigPlaces, RigView
+from fgslam.core.settings import RigPlaces
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -34,8 +34,6 @@ class CameraRig(Brief):
         bTc: (4, 4) pose of the reference camera in the robot's body frame (the lever arm).
         exact: the calibration has no error, as that of a rendered rig; else covariances contain
             what one leaves (:data:`fgslam.core.rig_correction.SHARED`).
-        view: ``perspective``, or of a pair ``cylindrical`` (:mod:`fgslam.core.cylindrical`):
-            column and row are angles, focal lengths pixels a radian.
         places: ``all`` images tell the measured column and row, by least squares; or the
             ``reference`` alone, where the others are measured by shifts from it.
     """
@@ -50,19 +48,13 @@ class CameraRig(Brief):
     vertical_baseline: float | None
     bTc: FloatArray
     exact: bool = False
-    view: RigView = "perspective"
     places: RigPlaces = field(default="all", repr=False)
-
-    @property
-    def cylindrical(self) -> bool:
-        """Whether the view is cylindrical."""
-        return self.view == "cylindrical"
 
     @property
     def angles_deg(self) -> tuple[float, float]:
         """Horizontal and vertical angle of view around the middle of the image, degrees."""
         half = 0.5 * np.array([self.width / self.fx, self.height / self.fy])
-        across, down = np.degrees(2.0 * (half if self.cylindrical else np.arctan(half))).tolist()
+        across, down = np.degrees(2.0 * np.arctan(half)).tolist()
         return across, down
 
     @property

@@ -24,9 +24,6 @@ Degrees: TypeAlias = Annotated[float, Field(gt=0.0, le=180.0)]
 Count: TypeAlias = Annotated[int, Field(ge=1)]
 Index: TypeAlias = Annotated[int, Field(ge=0)]
 
-RigView: TypeAlias = Literal["perspective", "cylindrical"]
-"""How images are laid out when they are rectified."""
-
 RigPlaces: TypeAlias = Literal["all", "reference"]
 """The images that a measured column and row are of."""
 

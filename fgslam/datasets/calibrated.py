@@ -11,7 +11,7 @@ from fgslam.cameras.assembly import at_size, in_metres
 from fgslam.cameras.calibration import level_mounting
 from fgslam.cameras.raw_cameras import Calibration
 from fgslam.cameras.rectification import Rectifier
-from fgslam.cameras.rig import StereoRig, asked_view, load_rig, rig_of
+from fgslam.cameras.rig import StereoRig, load_rig, rig_of
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
 from fgslam.core.sensors import CameraRig, body_is_camera
@@ -79,7 +79,6 @@ def _loaded(
         scale=settings.resized,
         unit_m=settings.unit_m,
         fov_deg=settings.fov_deg,
-        view=settings.view,
         cameras=cameras,
     )
 
@@ -101,8 +100,7 @@ def read_rig(
 ) -> StereoRig:
     """The same of a calibration that is read."""
     found = in_metres(calibration, settings.unit_m)
-    asked = asked_view(settings.fov_deg, settings.view)
-    return rig_of(at_size(found, size, settings.resized), asked)
+    return rig_of(at_size(found, size, settings.resized), settings.fov_deg)
 
 
 def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:

@@ -50,7 +50,6 @@ def require_one_camera(settings: CalibratedSettings) -> None:
     """Raises DatasetError where something is asked for that two cameras alone have."""
     for name, asked in (
         ("fov_deg", settings.fov_deg),
-        ("view", settings.view != "perspective"),
         ("unit_m", settings.unit_m != 1.0),
     ):
         if asked:

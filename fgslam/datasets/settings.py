@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, Count, FrameSelection, Index, Positive, RigView
+from fgslam.core.settings import STRICT, Count, FrameSelection, Index, Positive
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings as ConstantVelocitySettings
 from fgslam.datasets.odometry_settings import OdometrySettings as OdometrySettings
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings as RecordedOdometrySettings
@@ -61,7 +61,6 @@ class CalibratedSettings(RecordingSettings):
         lt=170.0,
         description="horizontal angle of the rectified view; null: as wide as cameras fill",
     )
-    view: RigView = Field(default="perspective", description="`cylindrical` for two fisheyes")
     unit_m: Positive = Field(
         default=1.0,
         description="metres of one unit of the calibration's lengths: 0.001 for millimetres, "

@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.cylindrical import as_perspective
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.noise import Whitening
 
@@ -25,8 +24,6 @@ _UNIT_CAMERA = gtsam.Cal3_S2Stereo(1.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class StereoFactors:
     """Makes C++ stereo factors of one rig, of observations (column, row, disparity).
 
-    What a cylindrical view measures becomes what a perspective one does, to first order.
-
     The paper's reference is the right camera, GTSAM's stereo camera the left one. The pose variable
     stays the right camera's; the left one sits ``baseline`` along its -x axis and is given to the
     factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which is linear
@@ -38,7 +35,7 @@ class StereoFactors:
 
     def __init__(self, rig: CameraRig, whitening: Whitening) -> None:
         """The rig and the noise models, robust or not."""
-        self._rig, self._whitening = rig, whitening
+        self._whitening = whitening
         self._calibration = gtsam.Cal3_S2Stereo(rig.fx, rig.fy, 0.0, rig.cx, rig.cy, rig.baseline)
         self._rTl = gtsam.Pose3(gtsam.Rot3(), np.array([-rig.baseline, 0.0, 0.0]))
 
@@ -53,23 +50,11 @@ class StereoFactors:
             measurement: (3,) column, row, disparity, pixels.
             covariance: (3, 3) of it, pixels squared.
         """
-        if not self._rig.cylindrical:
-            model = self._whitening.model(covariance, FROM_MEASUREMENT)
-            return self.with_model(pose, landmark, measurement, model)
-        # Equal noise in the cylinder is another in the plane at each place.
-        planes, slopes = self.in_perspective(measurement[None])
-        model = self._whitening.model(slopes[0] @ covariance @ slopes[0].T)
-        return self.with_model(pose, landmark, planes[0], model)
-
-    def in_perspective(self, measurement: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As a perspective view measures (k, 3), and slopes (k, 3, 3) of (u_left, u_right, v)."""
-        if not self._rig.cylindrical:
-            return measurement, np.broadcast_to(FROM_MEASUREMENT, (len(measurement), 3, 3))
-        planes, slopes = as_perspective(self._rig, measurement)
-        return planes, FROM_MEASUREMENT @ slopes
+        model = self._whitening.model(covariance, FROM_MEASUREMENT)
+        return self.with_model(pose, landmark, measurement, model)
 
     def with_model(self, pose: int, landmark: int, measurement: FloatArray, model: Any) -> Any:
-        """The same of a perspective view, with a noise model of (u_left, u_right, v)."""
+        """The same with a noise model of (u_left, u_right, v)."""
         column, row, disparity = measurement.tolist()
         measured = gtsam.StereoPoint2(column + disparity, column, row)
         return gtsam.GenericStereoFactor3D(

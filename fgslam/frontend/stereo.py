@@ -12,7 +12,6 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.cylindrical import size_distances
 from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.rig_correction import RigCorrection
@@ -204,7 +203,6 @@ class StereoMatcher:
             position=position,
             position_covariance=triangulation_covariance(self._rig, measurement, covariance),
             pixels=pixels,
-            distance=size_distances(self._rig, position) if self._rig.cylindrical else None,
         )
 
     def _linear(self, seen: list[int], cameras: int) -> Linear:

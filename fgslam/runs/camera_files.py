@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.assembly import ViewAsked, assembled, at_size, in_metres
+from fgslam.cameras.assembly import assembled, at_size, in_metres
 from fgslam.cameras.calibration_files import read_calibration_file
 from fgslam.cameras.formats.writing import write_calibration
 from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
 from fgslam.cameras.rig import (
     StereoRig,
-    asked_view,
     chosen_cameras,
     require_options,
     rig_of,
@@ -37,12 +36,6 @@ class Asked:
     unit_m: float = 1.0
     fov_deg: float | None = None
     cameras: str | None = None
-    view: str = "perspective"
-
-    @property
-    def rectified(self) -> ViewAsked:
-        """The rectified view. Raises CalibrationError where there is none of that kind."""
-        return asked_view(self.fov_deg, self.view)
 
     def read(self) -> Calibration:
         """The calibration. Raises CalibrationError, or ConfigError for an option that is none."""
@@ -51,8 +44,7 @@ class Asked:
         if self.cameras is not None:
             chosen = _whole_numbers(self.cameras, ",", "--cameras", "0,1")
         pair = None if size is None else (size[0], size[1]) if len(size) == 2 else size
-        require_options(pair, self.unit_m)
-        _ = self.rectified  # refused before a file is read
+        require_options(pair, self.unit_m, self.fov_deg)
         found = read_calibration_file(self.path, self.second, pair)  # type: ignore[arg-type]
         found = in_metres(chosen_cameras(found, chosen), self.unit_m)
         return at_size(found, pair, self.scale)  # type: ignore[arg-type]
@@ -83,16 +75,16 @@ def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> lis
             f"{found.source} does not state the images' size; give it: --size 640x480"
         )
     for_ros = form == "ros" or (form is None and not out.suffix)
-    view = _view(found, asked.rectified) if for_ros and len(found.cameras) == 2 else None
+    view = _view(found, asked.fov_deg) if for_ros and len(found.cameras) == 2 else None
     words = write_calibration(found, out, view, form)
     return [f"{out}: {words}, {len(found.cameras)} cameras of {found.source}", *found.notes]
 
 
-def _view(found: Calibration, asked: ViewAsked) -> StatedView:
+def _view(found: Calibration, fov_deg: float | None) -> StatedView:
     """The rectification of a pair, left camera first."""
-    if found.view is not None and asked.is_default:
+    if found.view is not None and fov_deg is None:
         return found.view
-    made = assembled(found, asked)
+    made = assembled(found, fov_deg)
     if made.sources != (1, 0):
         raise CalibrationError(
             f"{found.source}: its first camera is the right one, and ROS wants the left one first; "
@@ -121,7 +113,7 @@ def show_calibration(asked: Asked, picture: Path | None) -> list[str]:
     lines = [f"{found.source}: {found.format}, {many}", *_table(found)]
     rig = None
     if len(found.cameras) > 1:
-        rig = rig_of(found, asked.rectified)
+        rig = rig_of(found, asked.fov_deg)
         lines += _about(rig, found)
     if picture is not None:
         _draw(found, rig, picture)
@@ -159,8 +151,8 @@ def _about(rig: StereoRig, found: Calibration) -> list[str]:
     lines = [f"rig: {', '.join(parts)}; baseline {1e3 * rig.baseline:.2f} mm"]
     if rig.vertical_baseline is not None:
         lines[0] += f", vertical baseline {1e3 * rig.vertical_baseline:.2f} mm"
-    view, form = rig.angles_deg, "cylindrical" if rig.cylindrical else "rectified"
-    what = "rectified already" if rig.rectifier is None else f"{form} view"
+    view = rig.angles_deg
+    what = "rectified already" if rig.rectifier is None else "rectified view"
     lines.append(
         f"{what}: {rig.width}x{rig.height}, focal length {rig.fx:.1f} px, {view[0]:.0f} x "
         f"{view[1]:.0f} degrees, {100.0 * _overlap(rig):.1f} % of it seen by all cameras; 1 px of "

@@ -52,11 +52,6 @@ def export_images(
     Raises:
         FgslamError: the run has no images, its recording is gone, or a file cannot be written.
     """
-    if folder is not None and isinstance(log.rig, CameraRig) and log.rig.cylindrical:
-        raise DatasetError(
-            f"{folder}: the run's images are cylindrical, and COLMAP and nerfstudio know "
-            "perspective ones; run the raw recording in the perspective view (dataset.view)"
-        )
     rows, pictures = frames_of(config, trajectory)
     model = build_model(log, trajectory, points)
     tints = Tints(len(model.ids))

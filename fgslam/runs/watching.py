@@ -146,9 +146,8 @@ class Watcher:
         stream.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         level = rerun.Transform3D(mat3x3=level_axes(vertical_of(rig.bTc)))
         stream.log("world/first_camera", level, static=True)
-        if not rig.cylindrical:  # which rerun has no model of
-            lens = rerun.Pinhole(focal_length=[rig.fx, rig.fy], width=rig.width, height=rig.height)
-            stream.log("world/first_camera/camera", lens, static=True)
+        lens = rerun.Pinhole(focal_length=[rig.fx, rig.fy], width=rig.width, height=rig.height)
+        stream.log("world/first_camera/camera", lens, static=True)
         for name, colour in (("matched", _KEPT), ("landmarks", _ESTIMATE), ("sigma_m", _REJECTED)):
             style = rerun.SeriesLines(colors=[colour], names=[name])
             stream.log(f"numbers/{name}", style, static=True)

@@ -110,7 +110,7 @@ def _functions(folder: Path) -> list[Call]:
         (_compared, {"answers": {"a": replayed}, "truth": path, "landmark_truth": None,
                      "full": False}),
         (fg.load_rig, {"path": calib, "path2": None, "size": None, "scale": False, "unit_m": 1.0,
-                       "fov_deg": None, "view": "perspective", "cameras": None}),
+                       "fov_deg": None, "cameras": None}),
         (fg.load_camera, {"source": "equirectangular", "size": (256, 128)}),
         (fg.Map.load, {"path": calib}),
         (fg.MeasurementLog.load, {"path": folder / "log.npz"}),

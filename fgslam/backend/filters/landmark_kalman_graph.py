@@ -33,7 +33,7 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Increment, MeasurementType, Observations
 from fgslam.core.sensors import CameraRig, Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
-from fgslam.factors.landmark import StereoFactors
+from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
 from fgslam.factors.noise import Whitening
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import MAX_ITERATIONS
@@ -92,9 +92,8 @@ class FixedMapPose:
     ) -> Any:
         graph = gtsam.NonlinearFactorGraph()
         roots = self._roots(weighted_at, landmarks, observed)
-        planes, slopes = self._factors.in_perspective(observed.measurement)
-        roots = roots @ np.linalg.inv(slopes)
-        for i, (measured, root) in enumerate(zip(planes, roots, strict=True)):
+        roots = roots @ np.linalg.inv(FROM_MEASUREMENT)
+        for i, (measured, root) in enumerate(zip(observed.measurement, roots, strict=True)):
             model = gtsam.noiseModel.Gaussian.SqrtInformation(root)
             graph.add(self._factors.with_model(_POSE, landmark_key(i), measured, model))
         if self._settings.prior:

@@ -22,7 +22,6 @@ from fgslam.backend.smoothers.border import Bordered
 from fgslam.backend.smoothers.marginals import reduced
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray
-from fgslam.core.cylindrical import as_perspective, from_perspective
 from fgslam.core.rig_correction import (
     RigCorrection,
     displacements,
@@ -70,13 +69,10 @@ def doubted(graph: WholeGraph, state: State, rig: RigCorrection) -> Bordered:
 def shifts(rig: CameraRig, measured: FloatArray, field: bool = False) -> FloatArray:
     """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED.
 
-    Then, with ``field``, by its modes. All as graphs have them: of a perspective view.
+    Then, with ``field``, by its modes.
     """
-    if rig.cylindrical:
-        measured = from_perspective(rig, measured)
     pixels = pixels_of(rig, measured)
     of_pixels = [displacements(rig, pixels), shared_displacements(rig, pixels)]
     if field:
         of_pixels.append(field_displacements(rig, pixels))
-    moved = fused(rig, np.concatenate(of_pixels, axis=2))
-    return as_perspective(rig, measured)[1] @ moved if rig.cylindrical else moved
+    return fused(rig, np.concatenate(of_pixels, axis=2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import is_rigid, pose
 from fgslam.core.sensors import CameraRig
-from fgslam.core.settings import RigView
 
 FORMAT = "calib.json of fgslam"
 CORRECTIONS = "corrections"
@@ -85,8 +84,8 @@ def _stated_view(part: Values, cameras: int) -> StatedView | None:
     if not part.tree:
         return None
     kind = part.text("kind", "perspective")
-    if kind not in get_args(RigView):
-        raise part.refuse(f"kind is {kind!r}; it is {' or '.join(get_args(RigView))}")
+    if kind != "perspective":
+        raise part.refuse(f"kind is {kind!r}, but a view is perspective; rectify anew")
     rotations = part.numbers("rotations", 9 * cameras).reshape(cameras, 3, 3)
     if not all(is_rigid(pose(rotation, np.zeros(3))) for rotation in rotations):
         raise part.refuse("rotations has one that is no rotation; correct the file")
@@ -94,7 +93,7 @@ def _stated_view(part: Values, cameras: int) -> StatedView | None:
     if min(size) <= 0:
         raise part.refuse(f"width and height are {size[0]} and {size[1]}; correct the file")
     matrix = part.matrix("matrix", 3, 3)
-    view = StatedView(tuple(rotations), matrix, size, cast(RigView, kind))
+    view = StatedView(tuple(rotations), matrix, size)
     return checked_view(view, str(part.path))
 
 
@@ -132,7 +131,6 @@ def raw_values(calibration: Calibration) -> Mapping[str, Any]:
     view = calibration.view
     if view is not None:
         values["rectified_view"] = {
-            "kind": view.kind,
             "width": view.size[0],
             "height": view.size[1],
             "matrix": view.matrix.tolist(),
@@ -146,17 +144,7 @@ def raw_values(calibration: Calibration) -> Mapping[str, Any]:
 def calibration_of(
     rig: CameraRig, path: Path, corrections: Mapping[str, float] | None = None
 ) -> Calibration:
-    """Rectified cameras as calibrated ones without distortion: left, right[, top].
-
-    Raises:
-        CalibrationError: their view is cylindrical, and no lens is like that.
-    """
-    if rig.cylindrical:
-        raise CalibrationError(
-            f"{path}: is of cylindrical images of {rig.width}x{rig.height} pixels, which no camera "
-            "model makes; give images of that size and ask for no other view, or give the "
-            "calibration of the raw cameras"
-        )
+    """Rectified cameras as calibrated ones without distortion: left, right[, top]."""
     offsets: list[tuple[str, FloatArray]] = [
         ("left", np.array([-rig.baseline, 0.0, 0.0])),
         ("right", np.zeros(3)),

@@ -11,11 +11,9 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.cylindrical import as_perspective
 from fgslam.core.errors import FrameError, OdometryError
 from fgslam.core.geometry import so3_log, triangulate
 from fgslam.core.measurements import Odometry
-from fgslam.core.sensors import CameraRig
 from fgslam.datasets.recording import OdometrySource, Recording
 
 _STEPS = 60  # those in which the turn changes most: a steady one says nothing of the clock
@@ -251,9 +249,8 @@ class _Looks:
         level = np.abs(left[0][partners, 1] - right[0][rows, 1]) < _INLIER_PX
         good = level & (disparity > 1.0)
         measured = np.column_stack([right[0][rows], disparity])[good]
-        rig = self._recording.rig
-        points[rows[good]] = triangulate(rig, measured)
-        return _Look(_perspective_pixels(rig, right[0]), right[1], points)
+        points[rows[good]] = triangulate(self._recording.rig, measured)
+        return _Look(right[0], right[1], points)
 
     def _found(self, image: Image) -> tuple[FloatArray, Image]:
         points, descriptors = self._detector.detectAndCompute(image, None)
@@ -263,22 +260,11 @@ class _Looks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Look:
-    """Pixels (n, 2), descriptors (n, 32), and points (n, 3) by stereo, NaN where there is none.
-
-    Pixels are of the perspective view with the rig's numbers, whatever its view is.
-    """
+    """Pixels (n, 2), descriptors (n, 32), and points (n, 3) by stereo, NaN where there is none."""
 
     pixels: FloatArray
     descriptors: Image
     points: FloatArray
-
-
-def _perspective_pixels(rig: CameraRig, pixels: FloatArray) -> FloatArray:
-    """(n, 2) where the perspective view of the same numbers sees what these pixels show."""
-    if not rig.cylindrical:
-        return pixels
-    alone = np.column_stack([pixels, np.zeros(len(pixels))])
-    return as_perspective(rig, alone)[0][:, :2]
 
 
 def _matches(first: Image, second: Image) -> tuple[IntArray, IntArray]:

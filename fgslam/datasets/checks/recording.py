@@ -20,7 +20,7 @@ from fgslam.core.recordings import Frame, Sequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 
 _LISTED = 5
-_WIDEST_DEG = {"perspective": 140.0, "cylindrical": 165.0}  # of usual fields of view
+_WIDEST_DEG = 140.0  # of usual fields of view
 
 
 class Level(str, Enum):
@@ -206,7 +206,7 @@ def check_calibration(rig: CameraRig) -> tuple[Finding, ...]:
             "stretched after they were calibrated?"
         )
     view = rig.angles_deg[0]
-    if not 15.0 < view < _WIDEST_DEG[rig.view]:
+    if not 15.0 < view < _WIDEST_DEG:
         found.append(
             f"the field of view of {view:.0f} degrees is unusual; is fx in pixels of these images?"
         )

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows, StateArrays
-from fgslam.core.cylindrical import size_distances
 from fgslam.core.features import (
     CUT_PIXELS,
     PATCH_PX,
@@ -26,7 +25,6 @@ from fgslam.core.features import (
     LandmarkPatches,
     StereoFeatures,
 )
-from fgslam.core.geometry import triangulate
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.fine_image import FineImage, Float32
@@ -207,7 +205,7 @@ class LandmarkCarrier:
             return None
         rows = np.searchsorted(expected.ids, self._points.ids)
         predicted = expected.measurement[rows]
-        depths = self._distances(predicted)
+        depths = self._rig.fx * self._rig.baseline / predicted[:, 2]
         # What comes nearer grows.
         maps = patches.maps * (self._points.depths / depths)[:, None, None]
         patches = dataclasses.replace(patches, maps=maps)
@@ -308,12 +306,6 @@ class LandmarkCarrier:
         good = (status[:, 0] == 1) & (correlation >= _MIN_CORRELATION)
         good &= np.linalg.norm(places - at, axis=1) < _FARTHEST_PX
         return patches, places, np.asarray(good & self._inside(places, _MARGIN_PX))
-
-    def _distances(self, predicted: FloatArray) -> FloatArray:
-        """(n,) by which sizes shrink, of predicted measurements (n, 3)."""
-        if self._rig.cylindrical:
-            return size_distances(self._rig, triangulate(self._rig, predicted))
-        return np.asarray(self._rig.fx * self._rig.baseline / predicted[:, 2])
 
     def _inside(self, places: FloatArray, margin: float) -> BoolArray:
         return _inside(places, margin, (self._rig.width, self._rig.height))

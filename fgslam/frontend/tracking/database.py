@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from fgslam.core.cylindrical import size_distances
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
 from fgslam.core.sensors import CameraRig
@@ -91,7 +90,7 @@ class LandmarkDatabase(LandmarkTable):
             ids=landmarks.ids[found.rows],
             rows=found.rows,
             measurement=found.measurement,
-            scale=views.size / size_distances(self._rig, found.points),
+            scale=views.size / found.points[:, 2],
             orientation=views.orientation + lean(self._rig, wTc, found.points),
             descriptors=views.descriptors,
             certain=found.certain & known,

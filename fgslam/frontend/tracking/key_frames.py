@@ -139,7 +139,7 @@ class KeyFrameTracker:
         self._count = int(good.sum())
         self._cells = len(_cells(observed.pixels[good, 0], image))
         fresh = good & ~np.isin(observed.ids, self._carrier.ids)
-        distances = features.distances[association.features[fresh]]
+        distances = features.position[association.features[fresh], 2]
         points = Points(observed.ids[fresh], observed.pixels[fresh, 0], distances)
         self._carrier.begin(image, self._with_patches(image, points, observed.is_new[fresh]))
 

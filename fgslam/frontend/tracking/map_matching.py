@@ -9,7 +9,6 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.cylindrical import are_beyond, size_distances
 from fgslam.core.estimates import Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import (
@@ -106,7 +105,7 @@ class FieldOfView:
         points = transform_to_camera(wTc, positions)
         rows = self._roughly(points)
         if wanted is not None:
-            rows = rows[wanted(rows, size_distances(self._rig, points[rows]))]
+            rows = rows[wanted(rows, points[rows, 2])]
         points = points[rows]
         measurement = project(self._rig, points)
         if self._cone:
@@ -122,9 +121,9 @@ class FieldOfView:
 
         The reference image with its border, widened by a hair, as planes through the camera.
         """
-        rows = np.flatnonzero(are_beyond(self._rig, points, _NEAREST_M))
+        rows = np.flatnonzero(points[:, 2] > _NEAREST_M)
         rig, reach = self._rig, self._border + _SLACK_PX
-        if self._cone or rig.cylindrical:
+        if self._cone:
             return rows
         for axis, (focal, centre, size) in enumerate(
             ((rig.fx, rig.cx, rig.width), (rig.fy, rig.cy, rig.height))
@@ -186,9 +185,6 @@ def lean(rig: CameraRig, wTc: FloatArray, points: FloatArray) -> FloatArray:
     """
     x, y, z = points.T
     down = wTc[1, :3]
-    if rig.cylindrical:
-        right, below, _ = (projection_jacobian(rig, points) @ down).T
-        return np.asarray(np.arctan2(-right, below))
     right, below = rig.fx * (down[0] * z - x * down[2]), rig.fy * (down[1] * z - y * down[2])
     return np.asarray(np.arctan2(-right, below))
 

@@ -54,7 +54,7 @@ class Views(Rows):
         if directions is None:
             directions = np.full((len(which), 3), np.nan)
         return Views(
-            size=features.scale[which] * features.distances[which],
+            size=features.scale[which] * features.position[which, 2],
             orientation=features.orientation[which],
             descriptors=features.descriptors[which],
             direction=directions.astype(np.float32),

@@ -13,7 +13,6 @@ import numpy as np
 
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.cylindrical import size_distances
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.estimates import LandmarkMap, Relocalisation
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
@@ -302,17 +301,15 @@ def _as_features(pipeline: SlamPipeline, rig: CameraRig, wTc: FloatArray) -> Ste
     measurement, noise = _measured(rig, points, covariances)
     pixels = np.full((len(points), 3, 2), np.nan)
     pixels[:, 0] = measurement[:, :2]
-    distance = size_distances(rig, points)
     return StereoFeatures(
         measurement=measurement,
         measurement_covariance=noise,
-        scale=looks.size / np.abs(distance),
+        scale=looks.size / np.abs(points[:, 2]),
         orientation=looks.orientation,
         descriptors=looks.descriptors,
         position=points,
         position_covariance=covariances,
         pixels=pixels,
-        distance=distance,
     )
 
 

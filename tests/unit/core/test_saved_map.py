@@ -376,19 +376,6 @@ def test_saving_into_a_missing_folder_is_refused(saved: SavedMap, tmp_path: Path
         save_map(saved, tmp_path / "none" / "m.fgmap")
 
 
-def test_a_map_of_another_view_is_refused(saved: SavedMap, tmp_path: Path) -> None:
-    """Sizes of its landmarks are other ones."""
-    pair = replace(RIG, vertical_baseline=None)
-    rolled = replace(pair, view="cylindrical", width=400, fx=0.8 * RIG.fx)
-    save_map(replace(saved, rig=rolled), tmp_path / "rolled.npz")
-    loaded = load_map(tmp_path / "rolled.npz")
-    require_rig(loaded, rolled, "m")
-    with pytest.raises(
-        MapError, match=r"made with a cylindrical view, .* dataset\.view cylindrical"
-    ):
-        require_rig(loaded, pair, "m")
-
-
 def test_only_the_same_rig_is_accepted(saved: SavedMap) -> None:
     require_rig(saved, replace(RIG, fx=RIG.fx * (1.0 + 1e-9)), "m")
     for other, reported in (

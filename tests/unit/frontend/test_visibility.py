@@ -11,18 +11,12 @@ from test_database import database_of, landmark_map
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.features import Features
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.settings import DatabaseSettings, StereoSettings
-from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.carrying import LandmarkCarrier
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.settings import DatabaseSettings
 from fgslam.frontend.tracking.map_matching import _CONE_DEG, FieldOfView, directions_to
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
-CYLINDER = dataclasses.replace(TWO_CAMERAS, fx=180.0, fy=180.0, view="cylindrical")
 LOOKS = 90 * np.eye(3, 128, dtype=np.uint8)
 SETTINGS = {
     "image": DatabaseSettings(border_px=8.0),
@@ -37,7 +31,7 @@ def full_scan(
     """Points (n, 3) of the camera's frame that may be and that are in view, one by one."""
     possible, certain = np.zeros(len(points), np.bool_), np.zeros(len(points), np.bool_)
     for k, point in enumerate(points):
-        if point[2] <= 0.0 or (np.linalg.norm(point) if rig.cylindrical else point[2]) <= 0.1:
+        if point[2] <= 0.1:
             continue
         column, row, disparity = g.project(rig, point[None])[0]
         top = disparity if rig.vertical_baseline is not None else 0.0
@@ -57,9 +51,7 @@ def full_scan(
     return possible, certain
 
 
-@pytest.mark.parametrize(
-    "rig", [RIG, TWO_CAMERAS, CYLINDER], ids=["three cameras", "two", "cylindrical"]
-)
+@pytest.mark.parametrize("rig", [RIG, TWO_CAMERAS], ids=["three cameras", "two"])
 @pytest.mark.parametrize("how", SETTINGS)
 def test_the_selection_is_that_of_a_full_scan(how: str, rig: CameraRig) -> None:
     rng = np.random.default_rng(4)
@@ -107,32 +99,6 @@ def test_what_is_too_small_to_be_found_is_not_expected() -> None:
         found = database.expected(landmark_map(points), wTc)
         assert found.ids.tolist() == np.flatnonzero(scale >= 1.0).tolist()
         np.testing.assert_allclose(found.scale, scale[found.ids])
-
-
-def test_sizes_in_a_cylindrical_view_shrink_by_the_mean_of_both_distances() -> None:
-    """From the matcher's features to what is expected from elsewhere, up to its rim."""
-    seen = np.array([[40.0, 60.0, 8.0], [150.0, 40.0, 20.0], [300.0, 200.0, 15.0]])
-    points = g.triangulate(CYLINDER, seen)
-    left = seen[:, :2] + np.column_stack([seen[:, 2], np.zeros(3)])
-    images = [Features(at, np.full(3, 3.0), np.ones(3), LOOKS) for at in (seen[:, :2], left)]
-    stereo = StereoMatcher(CYLINDER, StereoSettings(), AppearanceSettings())
-    features = stereo.match(images)
-    database = LandmarkDatabase(CYLINDER, DatabaseSettings(least_scale_px=1.62), MAX_DISPARITY)
-    database.add(features, np.arange(3), np.zeros(3, np.uint8))
-    back = g.pose(np.eye(3), np.array([0.1, 0.2, -0.7]))
-    found = database.expected(landmark_map(points), back)
-    scale = 3.0 * shrinking(points) / shrinking(g.transform_to_camera(back, points))
-    assert found.ids.tolist() == np.flatnonzero(scale >= 1.62).tolist()
-    assert 0 < len(found.ids) < 3
-    np.testing.assert_allclose(found.scale, scale[found.ids])
-    carried = LandmarkCarrier(CYLINDER, stereo)._distances(seen)
-    np.testing.assert_allclose(carried, shrinking(points))
-
-
-def shrinking(points: FloatArray) -> FloatArray:
-    """(n,) geometric mean of the distances to the camera and to its baseline."""
-    away = np.linalg.norm(points[:, 1:], axis=1)
-    return np.asarray(np.sqrt(away * np.linalg.norm(points, axis=1)))
 
 
 def test_directions_are_unit_vectors_in_the_world() -> None:

@@ -300,10 +300,10 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
             "cameras is a int; give a list",
             lambda p: fg.load_rig(p / "calib.json", cameras=as_any(0)),
         ),
-        "no view": (
+        "no angle": (
             CalibrationError,
-            "view is a ndarray; give perspective or cylindrical",
-            lambda p: fg.load_rig(p / "calib.json", view=as_any(np.zeros((0, 0)))),
+            "fov_deg is array.*; a perspective view takes 0 to 170",
+            lambda p: fg.load_rig(p / "calib.json", fov_deg=as_any(np.zeros((0, 0)))),
         ),
         "long name": (
             CalibrationError,

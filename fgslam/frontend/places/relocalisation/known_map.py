@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.cylindrical import are_beyond, size_distances
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
@@ -95,13 +94,12 @@ class KnownMap:
     ) -> tuple[IntArray, FloatArray]:
         """Rows (m,) of landmarks in all images from ``wTc``, and their points in the camera.
 
-        Only those whose sizes shrink by no more than ``farthest`` (metres, the depth in a
-        perspective view; one for all, or one for each).
+        Only those at a depth of at most ``farthest`` (metres; one for all, or one for each).
         """
         rows = self._roughly_in_view(rig, wTc, farthest)
         points = transform_to_camera(wTc, self.landmarks.positions[rows])
         limit = farthest if isinstance(farthest, float) else farthest[rows]
-        near = are_beyond(rig, points, _NEAREST_M) & (size_distances(rig, points) <= limit)
+        near = (points[:, 2] > _NEAREST_M) & (points[:, 2] <= limit)
         rows, points = rows[near], points[near]
         column, row, disparity = project(rig, points).T
         vertical = 0.0
@@ -122,8 +120,6 @@ class KnownMap:
         depth = forward @ self.axes - forward @ wTc[:3, 3]
         across = right @ self.axes - right @ wTc[:3, 3]
         near = depth <= farthest + _ROUNDING_M
-        if rig.cylindrical:  # its columns are no planes through the camera
-            return np.flatnonzero(near & (depth > -_ROUNDING_M))
         near &= depth > _NEAREST_M - _ROUNDING_M
         near &= across >= -rig.cx / rig.fx * depth - _ROUNDING_M
         near &= across <= (rig.width - 1.0 - rig.cx) / rig.fx * depth + _ROUNDING_M
@@ -139,7 +135,7 @@ class KnownMap:
         """
         rows, _ = self.in_view(rig, wTc, self.largest / scales[0] + _ROUNDING_M)
         sight = self.landmarks.positions[rows] - wTc[:3, 3]
-        distance = np.maximum(size_distances(rig, sight @ wTc[:3, :3]), _NEAREST_M)
+        distance = np.maximum((sight @ wTc[:3, :3])[:, 2], _NEAREST_M)
         sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
         views, at = self.views_of(rows)
         cosine = np.einsum("vi,vi->v", self.views.direction[views], sight[at])
@@ -212,7 +208,7 @@ def gated(
     (i, v), (views, owners) = pairs, looks
     depth = np.abs(features.position[i, 2])
     sigma = np.sqrt(features.position_covariance[i, 2, 2]) / np.maximum(depth, 1e-6)
-    sizes = features.scale[i] * np.abs(features.distances[i])
+    sizes = features.scale[i] * np.abs(features.position[i, 2])
     ratio = np.abs(np.log(sizes / np.maximum(views.size[v], 1e-9)))
     keep = ratio <= np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     if floor.rigid_dof != 3:
@@ -282,7 +278,7 @@ def unspecific(
     views, owners = looks
     depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
     sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
-    size = np.log(np.maximum(features.scale * np.abs(features.distances), 1e-9))
+    size = np.log(np.maximum(features.scale * np.abs(features.position[:, 2]), 1e-9))
     reach = np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
     i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
     keep = gated(features, (i, v), landmarks, looks, floor)

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
-from fgslam.core.cylindrical import are_beyond
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
 from fgslam.core.floor import Floor
@@ -58,7 +57,7 @@ class SeenPoints(Rows):
         column, row, disparity = features.measurement.T
         inside = (column >= -0.5) & (column <= rig.width - 0.5)
         inside &= (row >= -0.5) & (row <= rig.height - 0.5)
-        inside &= (disparity > 0.0) & are_beyond(rig, features.position, _NEAREST_M)
+        inside &= (disparity > 0.0) & (features.position[:, 2] > _NEAREST_M)
         pick = inside[:, None, None]
         return SeenPoints(
             in_image=inside,
@@ -129,7 +128,7 @@ def residuals(
     offset = pairs.points - wTc[..., :3, 3]
     points = np.einsum("kji,kj->ki", wRc, offset)
     seen = pairs.seen
-    ahead = are_beyond(rig, points, _NEAREST_M)
+    ahead = points[:, 2] > _NEAREST_M
     valid = ahead | ~seen.in_image
     safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
     pick = seen.in_image[:, None]

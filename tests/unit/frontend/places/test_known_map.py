@@ -9,12 +9,10 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances
 from fgslam.core.geometry import project, transform_to_camera
-from fgslam.core.sensors import CameraRig
 from fgslam.frontend.places.relocalisation.known_map import KnownMap
 from tests.known_places import RIG, looks, planar
 
 SIGMA_M = 0.02
-CYLINDER = CameraRig(400, 300, 120.0, 120.0, 199.5, 149.5, 0.1, None, np.eye(4), view="cylindrical")
 
 
 def _landmarks(ids: IntArray, positions: FloatArray) -> LandmarkMap:
@@ -72,48 +70,29 @@ def test_views_of_landmarks_are_reported_landmark_by_landmark(
     assert np.array_equal(known.owners[views], rows[at])
 
 
-both_views = pytest.mark.parametrize("rig", [RIG, CYLINDER], ids=["perspective", "cylindrical"])
-
-
-def distances(rig: CameraRig, points: FloatArray) -> FloatArray:
-    """By which sizes shrink: the depth, or the geometric mean of width's and height's."""
-    if not rig.cylindrical:
-        return points[:, 2]
-    away = np.linalg.norm(points[:, 1:], axis=1)
-    return np.asarray(np.sqrt(away * np.linalg.norm(points, axis=1)))
-
-
-@both_views
 @pytest.mark.parametrize("farthest", [np.inf, 4.0])
-def test_what_is_in_view_is_what_projects_into_all_images(
-    known: KnownMap, rig: CameraRig, farthest: float
-) -> None:
+def test_what_is_in_view_is_what_projects_into_all_images(known: KnownMap, farthest: float) -> None:
     for yaw in (0.0, 1.0, 3.0, -2.0):
         wTc = planar(1.0, -2.0, yaw)
         points = transform_to_camera(wTc, known.landmarks.positions)
-        nearest = np.linalg.norm(points, axis=1) if rig.cylindrical else points[:, 2]
-        front = (points[:, 2] > 0.0) & (nearest > 0.3) & (distances(rig, points) <= farthest)
-        column, row, disparity = project(rig, np.where(front[:, None], points, 1.0)).T
-        baselines = (rig.vertical_baseline or 0.0) / rig.baseline
-        up = disparity * rig.fy * baselines / rig.fx
-        inside = front & (column >= 0) & (column + disparity <= rig.width - 1)
-        inside &= (row >= 0) & (row + up <= rig.height - 1)
-        assert not rig.cylindrical or (inside & (points[:, 2] < 0.3)).sum() > 1  # at its rim
-        rows, local = known.in_view(rig, wTc, farthest)
+        front = (points[:, 2] > 0.3) & (points[:, 2] <= farthest)
+        column, row, disparity = project(RIG, np.where(front[:, None], points, 1.0)).T
+        baselines = (RIG.vertical_baseline or 0.0) / RIG.baseline
+        up = disparity * RIG.fy * baselines / RIG.fx
+        inside = front & (column >= 0) & (column + disparity <= RIG.width - 1)
+        inside &= (row >= 0) & (row + up <= RIG.height - 1)
+        rows, local = known.in_view(RIG, wTc, farthest)
         assert len(rows) > 15
         assert np.array_equal(rows, np.flatnonzero(inside))
         np.testing.assert_allclose(local, points[rows], atol=1e-12)
 
 
-@both_views
-def test_recognisable_is_what_has_a_view_of_like_direction_and_scale(
-    known: KnownMap, rig: CameraRig
-) -> None:
+def test_recognisable_is_what_has_a_view_of_like_direction_and_scale(known: KnownMap) -> None:
     scales, angle = (1.5, 6.0), 0.8
     wTc = planar(-1.0, 2.0, 0.5)
-    rows, points = known.in_view(rig, wTc)
+    rows, points = known.in_view(RIG, wTc)
     wanted = []
-    for row, distance in zip(rows.tolist(), distances(rig, points), strict=True):
+    for row, distance in zip(rows.tolist(), points[:, 2], strict=True):
         sight = known.landmarks.positions[row] - wTc[:3, 3]
         for view in np.flatnonzero(known.owners == row):
             cosine = sight @ known.views.direction[view] / np.linalg.norm(sight)
@@ -121,6 +100,6 @@ def test_recognisable_is_what_has_a_view_of_like_direction_and_scale(
             if alike and scales[0] <= known.views.size[view] / distance <= scales[1]:
                 wanted.append(row)
                 break
-    found = known.recognisable(rig, wTc, angle, scales)
+    found = known.recognisable(RIG, wTc, angle, scales)
     assert 0 < len(wanted) < len(rows)
     assert found.tolist() == wanted
