@@ -198,13 +198,6 @@ class EgoMotionSettings:
 class RelocalisationSettings:
     """Global localisation from one frame, or from a short submap of frames."""
 
-    method: Literal["ransac", "hough"] = Field(
-        default="ransac", description="poses by minimal samples, or by votes"
-    )
-    descriptors: bool = Field(
-        default=True,
-        description="match by descriptor; false: by size, height and orientation alone",
-    )
     map_sigma_m: NonNegative = Field(
         default=0.01, description="added to landmarks': drift of the map"
     )

@@ -29,16 +29,13 @@ def _exact_features(monkeypatch: pytest.MonkeyPatch) -> None:
     x=st.floats(-3.0, 3.0),
     z=st.floats(-3.0, 3.0),
     yaw=st.floats(-3.14, 3.14),
-    hough=st.booleans(),
 )
 def test_never_confident_and_wrong(
-    seed: int, count: int, clutter: int, x: float, z: float, yaw: float, hough: bool
+    seed: int, count: int, clutter: int, x: float, z: float, yaw: float
 ) -> None:
     rng = np.random.default_rng(seed)
     place, truth = room(rng, count), planar(x, z, yaw)
-    method = "hough" if hough else "ransac"
-    chosen = RelocalisationSettings(map_sigma_m=0.001, method=method)
-    made = Relocaliser(RIG, floor(3), chosen)
+    made = Relocaliser(RIG, floor(3), RelocalisationSettings(map_sigma_m=0.001))
     made.learn(*place.map())
     view = seen(place, truth, rng, clutter)
     found = made.locate(view, rng)

@@ -14,7 +14,6 @@ from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.planar import wrap
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.descriptor_index import AppearanceIndex, Neighbours
-from fgslam.frontend.features.matching import pairs_within
 
 _NEAREST_M = 0.3
 _ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare
@@ -263,28 +262,6 @@ def specific(
         distances.append(far[first])
         places.append(np.full(len(first), count))
     return _joined(features, rows, distances, places)
-
-
-def unspecific(
-    features: StereoFeatures,
-    landmarks: LandmarkMap,
-    looks: tuple[LandmarkAppearances, IntArray],
-    floor: Floor,
-) -> Tentative:
-    """Every landmark that agrees in size (on a level floor in height and orientation, too).
-
-    What features without descriptors can say; each is shared by all that it may be.
-    """
-    views, owners = looks
-    depth = np.maximum(np.abs(features.position[:, 2]), 1e-6)
-    sigma = np.sqrt(features.position_covariance[:, 2, 2]) / depth
-    size = np.log(np.maximum(features.scale * np.abs(features.position[:, 2]), 1e-9))
-    reach = np.log(_SIZE_RATIO) + _GATE_SIGMAS * sigma
-    i, v = pairs_within(size, reach, np.log(np.maximum(views.size, 1e-9)))
-    keep = gated(features, (i, v), landmarks, looks, floor)
-    pairs = np.unique(np.column_stack([i[keep], owners[v[keep]]]), axis=0)
-    counts = np.bincount(pairs[:, 0], minlength=len(features))
-    return Tentative(pairs[:, 0], pairs[:, 1], np.zeros(len(pairs)), counts[pairs[:, 0]])
 
 
 def _places(positions: FloatArray, radius: float) -> IntArray:

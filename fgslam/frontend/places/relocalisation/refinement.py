@@ -153,7 +153,6 @@ class Refiner:
         pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
         squared = squared_distances(residuals(self.rig, search.wTc, pairs), search.covariance)
         near = squared <= _GATE_SIGMAS**2
-        cost = cost if self.settings.descriptors else squared
         return _one_to_one(i[near], j[near], cost[near])
 
     def _proposed(self) -> Candidates:
@@ -166,10 +165,7 @@ class Refiner:
         farthest = _BEYOND * float(np.abs(self.features.position[:, 2]).max())
         rows, _ = self.known.in_view(self.rig, wTc, farthest)
         views, _ = self.known.views_of(rows)
-        if self.settings.descriptors:
-            distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
-        else:
-            distance = np.zeros((len(self.features), len(views)))
+        distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
         i, column = np.nonzero(distance <= MAX_DISTANCE)
         cost, v = distance[i, column], views[column]
         looks = (self.known.views, self.known.owners)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, RelocalisationStatus
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.floor import Floor
@@ -14,7 +13,6 @@ from fgslam.frontend.places.relocalisation.known_map import (
     Tentative,
     gated,
     specific,
-    unspecific,
 )
 from fgslam.frontend.places.relocalisation.proposals import (
     Evidence,
@@ -22,7 +20,6 @@ from fgslam.frontend.places.relocalisation.proposals import (
     apart,
     distinct,
     propose_by_samples,
-    propose_by_votes,
 )
 from fgslam.frontend.places.relocalisation.refinement import PIECE_M, Refined, Refiner
 from fgslam.frontend.places.relocalisation.residuals import Pairs, SeenPoints, log_uniform
@@ -41,11 +38,6 @@ class Relocaliser:
 
     def __init__(self, rig: CameraRig, floor: Floor, settings: RelocalisationSettings) -> None:
         """Knows no map yet; ``floor`` says which camera motions the map's robot makes."""
-        if settings.method == "hough" and floor.rigid_dof != 3:
-            raise ConfigError(
-                "frontend.relocalisation.method hough votes on a level floor alone; choose ransac, "
-                "or set frontend.ego_motion.dof to 3"
-            )
         self._rig = rig
         self._floor = floor
         self._settings = settings
@@ -83,10 +75,7 @@ class Relocaliser:
         tentative = self.tentative(features)
         seen = SeenPoints.of(features, self._rig, _VIEW_SIGMA_PX)
         evidence = self._evidence(seen, tentative)
-        if self._settings.method == "hough":
-            proposals = propose_by_votes(evidence, self._floor)
-        else:
-            proposals = propose_by_samples(evidence, self._floor, rng)
+        proposals = propose_by_samples(evidence, self._floor, rng)
         refined = self._refine(features, seen, evidence, proposals)
         return accept(tentative, refined, self._known.landmarks, self._settings)
 
@@ -94,8 +83,6 @@ class Relocaliser:
         """Matches of the features with landmarks anywhere in the map."""
         known = self._known
         looks = (known.views, known.owners)
-        if not self._settings.descriptors:
-            return unspecific(features, known.landmarks, looks, self._floor)
         found = known.index.query(features.descriptors, _NEIGHBOURS)
         i, k = np.nonzero(found.rows >= 0)
         pairs = (i, found.rows[i, k])

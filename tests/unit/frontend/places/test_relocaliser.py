@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Relocalisation, RelocalisationStatus
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
@@ -19,7 +18,6 @@ from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
 
 DEFAULTS = RelocalisationSettings(map_sigma_m=0.001)
-HOUGH = replace(DEFAULTS, method="hough")
 
 
 @pytest.fixture(autouse=True)
@@ -42,13 +40,10 @@ def _same(a: Relocalisation, b: Relocalisation) -> bool:
     return equal and a.why == b.why and a.status == b.status
 
 
-@pytest.mark.parametrize("settings", [DEFAULTS, HOUGH])
-def test_pose_on_the_floor_is_found_without_a_prior(
-    rng: np.random.Generator, settings: RelocalisationSettings
-) -> None:
+def test_pose_on_the_floor_is_found_without_a_prior(rng: np.random.Generator) -> None:
     place, truth = room(rng), planar(1.2, -0.7, 2.1)
     view = seen(place, truth, rng, clutter=60)
-    found = _relocaliser(place, settings=settings).locate(view, rng)
+    found = _relocaliser(place).locate(view, rng)
     assert found.found, found.why
     metres, degrees = error(found.wTc, truth)
     assert metres < 0.05
@@ -146,14 +141,10 @@ def test_alike_places_stay_ambiguous_where_one_is_better_mapped(
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 @pytest.mark.parametrize("dof", [3, 6])
-@pytest.mark.parametrize("descriptors", [True, False])
-def test_few_features_are_too_few(
-    rng: np.random.Generator, count: int, dof: int, descriptors: bool
-) -> None:
+def test_few_features_are_too_few(rng: np.random.Generator, count: int, dof: int) -> None:
     place = room(rng)
     view = seen(place, planar(0.0, 0.0, 0.0), rng)
-    settings = replace(DEFAULTS, descriptors=descriptors)
-    found = _relocaliser(place, dof, settings).locate(_first(view, count), rng)
+    found = _relocaliser(place, dof).locate(_first(view, count), rng)
     assert found.status in (
         RelocalisationStatus.TOO_FEW_MATCHES,
         RelocalisationStatus.TOO_FEW_INLIERS,
@@ -187,15 +178,6 @@ def test_one_plane_is_enough(rng: np.random.Generator) -> None:
         assert error(found.wTc, truth)[0] < 0.05
 
 
-def test_pose_is_found_without_descriptors_by_votes(rng: np.random.Generator) -> None:
-    """Without descriptors, by votes over size, height and orientation alone."""
-    place, truth = room(rng, 300), planar(0.5, -1.0, 1.0)
-    settings = replace(HOUGH, descriptors=False)
-    found = _relocaliser(place, settings=settings).locate(seen(place, truth, rng), rng)
-    assert found.found, found.why
-    assert error(found.wTc, truth)[0] < 0.05
-
-
 def test_a_submap_counts_what_lies_outside_the_image(rng: np.random.Generator) -> None:
     """Features of earlier frames, in the last camera's frame, some behind it."""
     place, last = room(rng), planar(0.0, 0.0, 0.0)
@@ -208,11 +190,6 @@ def test_a_submap_counts_what_lies_outside_the_image(rng: np.random.Generator) -
     assert found.found, found.why
     assert error(found.wTc, last)[0] < 0.05
     assert (submap.position[found.features, 2] < 0.0).any()
-
-
-def test_hough_needs_a_level_floor() -> None:
-    with pytest.raises(ConfigError, match="choose ransac"):
-        Relocaliser(RIG, floor(6), HOUGH)
 
 
 def test_nothing_handed_in_is_changed(rng: np.random.Generator) -> None:
