@@ -11,7 +11,6 @@ from fgslam.cameras.formats import (
     kalibr,
     kitti,
     makers,
-    middlebury,
     opencv,
     own,
     published,
@@ -31,8 +30,7 @@ Reader: TypeAlias = Callable[[Path, Tree, Size | None], Calibration]
 KNOWN = (
     "known: calib.json of fgslam, Kalibr's camchain, OpenCV's stereo files (M1, D1, M2, D2, R, T), "
     "left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, EuRoC's sensor.yaml, settings "
-    "of ORB-SLAM, stella_vslam, VINS, OKVIS and SVO, Middlebury's calib.txt, files of Basalt, OAK, "
-    "ZED, RealSense, MRPT, DSO and OCamCalib"
+    "of ORB-SLAM, stella_vslam and VINS, files of Basalt, OAK, ZED, RealSense and OCamCalib"
 )
 
 
@@ -65,10 +63,6 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (slam_settings.is_orb_slam, slam_settings.read_orb_slam),
     (slam_settings.is_stella, _without_size(slam_settings.read_stella)),
     (slam_settings.is_multicol, _without_size(slam_settings.read_multicol)),
-    (slam_settings.is_okvis, _without_size(slam_settings.read_okvis)),
-    (slam_settings.is_svo, _without_size(slam_settings.read_svo)),
-    (published.is_cityscapes, published.read_cityscapes),
-    (published.is_openloris, _without_size(published.read_openloris)),
     (published.is_rgbd, _without_size(published.read_rgbd)),
     (published.is_nerfstudio, _without_size(published.read_nerfstudio)),
     (opencv.is_opencv_pair, opencv.read_opencv_pair),
@@ -80,13 +74,9 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
 _TEXTS: tuple[tuple[Callable[[str], bool], Callable[[Path, str, Size | None], Calibration]], ...]
 _TEXTS = (
     (kitti.is_kitti, lambda path, _, size: kitti.read_kitti(path, size)),
-    (middlebury.is_middlebury, lambda path, *_: middlebury.read_middlebury(path)),
     (makers.is_zed, makers.read_zed),
-    (published.is_mrpt, lambda path, text, _: published.read_mrpt(path, text)),
     (published.is_colmap, lambda path, text, _: published.read_colmap(path, text)),
-    (published.is_dso, lambda path, *_: published.read_dso(path)),
     (makers.is_ocamcalib, lambda path, *_: makers.read_ocam(path)),
-    (published.is_numbers, published.read_numbers),
 )
 """The same of files that are no keys and values."""
 

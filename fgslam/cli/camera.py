@@ -60,8 +60,8 @@ def convert(  # noqa: PLR0913 - each option is a parameter
         Path,
         typer.Argument(
             metavar="OUT",
-            help=".json is fgslam's, .yml or .xml OpenCV's, .yaml Kalibr's, .txt KITTI's, no "
-            "ending a folder with left.yaml and right.yaml of ROS",
+            help=".json is fgslam's, .yml or .xml OpenCV's, .yaml Kalibr's, no ending a folder "
+            "with left.yaml and right.yaml of ROS",
         ),
     ],
     form: Annotated[
@@ -69,8 +69,7 @@ def convert(  # noqa: PLR0913 - each option is a parameter
         typer.Option(
             "--format",
             metavar="NAME",
-            help="the format, if not that of OUT's ending: fgslam, opencv, kalibr, ros, kitti, "
-            "euroc (a folder with cam0/sensor.yaml, ...), orb_slam3",
+            help="the format, if not that of OUT's ending: fgslam, opencv, kalibr, ros",
         ),
     ] = None,
     second: Second = None,

@@ -287,16 +287,10 @@ def _camera(
     return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
 
 
-_TEXTS = (
-    *("calibration.txt", "intrinsics.txt", "camera-intrinsics.txt", "cam_K.txt"),
-    "camera_info.txt",
-)
-
-
 def _own_files(root: Path) -> list[Path]:
     """The folder's files that may be a camera; of several those that are one."""
     suffixes = (".json", ".yaml", ".yml", ".xml")
-    found = [p for p in shown_in(root) if p.suffix in suffixes or p.name in _TEXTS]
+    found = [p for p in shown_in(root) if p.suffix in suffixes or p.name == "camera_info.txt"]
     return found if len(found) < 2 else [path for path in found if _is_camera(path)]
 
 

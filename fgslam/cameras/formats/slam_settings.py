@@ -1,9 +1,8 @@
-"""Settings files of other SLAM programs: ORB-SLAM, stella_vslam, VINS, camodocal, OKVIS, SVO."""
+"""Settings files of other SLAM programs: ORB-SLAM, stella_vslam, VINS, camodocal."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -218,108 +217,6 @@ def read_vins(path: Path, tree: Tree) -> Calibration:
             raise part.refuse(f"cam{k}_calib names {beside}, which is no camera of camodocal")
         cameras.append(_camodocal(beside, own, part.motion(f"body_T_cam{k}")))
     return Calibration(str(path), "VINS-Fusion configuration", tuple(cameras))
-
-
-# --------------------------------------------------------------------------------------------
-# OKVIS
-
-
-_OKVIS = {
-    "radialtangential": "radtan",
-    "radialtangential8": "radtan",
-    "equidistant": "equidistant",
-    "none": "radtan",
-}
-
-
-def is_okvis(tree: Tree) -> bool:
-    """Whether it is a configuration of OKVIS."""
-    cameras = tree.get("cameras")
-    return isinstance(cameras, list) and bool(cameras) and "T_SC" in _as_tree(cameras[0])
-
-
-def _as_tree(value: Any) -> Tree:
-    return value if isinstance(value, dict) else {}
-
-
-def read_okvis(path: Path, tree: Tree) -> Calibration:
-    """Its cameras; the body is the IMU, ``T_SC`` a camera's pose in it.
-
-    Raises:
-        CalibrationError: a value is missing or impossible, or the distortion is not known.
-    """
-    parts = [Values(path, _as_tree(c), f"cameras[{k}].") for k, c in enumerate(tree["cameras"])]
-    return Calibration(str(path), "OKVIS configuration", tuple(map(_okvis_camera, parts)))
-
-
-def _okvis_camera(part: Values) -> RawCamera:
-    model = part.text("distortion_type", "none")
-    if model not in _OKVIS:
-        raise part.refuse(f"distortion_type {model} is not known; known: {', '.join(_OKVIS)}")
-    parameters = np.zeros(4) if model == "none" else part.numbers("distortion_coefficients")
-    matrix = intrinsic_matrix(*part.numbers("focal_length", 2), *part.numbers("principal_point", 2))
-    size = part.size("image_dimension", "image_dimension")
-    name = f"{part.path.name}: {part.where[:-1]}"
-    return checked_camera(
-        RawCamera(*size, matrix, parameters, part.motion("T_SC"), name, _OKVIS[model])
-    )
-
-
-# --------------------------------------------------------------------------------------------
-# SVO
-
-
-_SVO = {
-    "none": "radtan",
-    "radial-tangential": "radtan",
-    "equidistant": "equidistant",
-    "fisheye": "fov",
-    "atan": "fov",
-}
-
-
-def is_svo(tree: Tree) -> bool:
-    """Whether it is a camera rig, or one camera, of SVO."""
-    cameras = tree.get("cameras")
-    first = cameras[0] if isinstance(cameras, list) and cameras else None
-    rig = isinstance(first, dict) and "camera" in first
-    return rig or ("distortion" in tree and "intrinsics" in tree)
-
-
-def read_svo(path: Path, tree: Tree) -> Calibration:
-    """The cameras; the body is the IMU.
-
-    Raises:
-        CalibrationError: a value is missing or impossible, or a model is not known.
-    """
-    blocks = tree.get("cameras") or [{"camera": tree, "T_B_C": tree.get("T_B_C")}]
-    cameras = []
-    for block in blocks:
-        part = Values(path, block)
-        bTc = part.motion("T_B_C") if "T_B_C" in part else np.eye(4)
-        cameras.append(_svo_camera(part.inside("camera"), bTc))
-    return Calibration(str(path), "SVO camera rig", tuple(cameras))
-
-
-def _svo_camera(part: Values, bTc: FloatArray) -> RawCamera:
-    kind, distortion = part.text("type"), part.inside("distortion")
-    size = part.size("image_width", "image_height")
-    name = f"{part.path.name}: {part.text('label', 'camera')}"
-    if kind == "omni":
-        values = part.numbers("intrinsics")
-        if len(values) < 10:
-            raise part.refuse("intrinsics of an omni camera are five coefficients, centre, affine")
-        matrix = ocam_matrix(tuple(values[7:10]), (values[5], values[6]))
-        return checked_camera(RawCamera(*size, matrix, values[:5], bTc, name, "ocam"))
-    model = distortion.text("type", "none")
-    if kind != "pinhole" or model not in _SVO:
-        raise part.refuse(
-            f"type {kind} with distortion {model} is not known; known: pinhole with "
-            f"{', '.join(_SVO)}, and omni"
-        )
-    parameters = np.zeros(4) if model == "none" else distortion.numbers("parameters")
-    matrix = intrinsic_matrix(*part.numbers("intrinsics", 4))
-    return checked_camera(RawCamera(*size, matrix, parameters, bTc, name, _SVO[model]))
 
 
 # --------------------------------------------------------------------------------------------

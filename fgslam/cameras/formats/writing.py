@@ -1,4 +1,4 @@
-"""Calibrations written in the formats of fgslam, OpenCV, Kalibr, ROS and of SLAM data sets."""
+"""Calibrations written in the formats of fgslam, OpenCV, Kalibr and ROS."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from fgslam.cameras.formats.writing_parts import (
     two,
     two_of_one_size,
 )
-from fgslam.cameras.formats.writing_slam import euroc_files, kitti_text, orb_slam_text
 from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
@@ -38,8 +37,8 @@ def write_calibration(
 ) -> str:
     """Writes a calibration; the name says the format, unless it is given.
 
-    ``.json`` is fgslam's own, ``.yml`` and ``.xml`` OpenCV's, ``.yaml`` Kalibr's, ``.txt`` KITTI's,
-    and a name without an ending a folder with ``left.yaml`` and ``right.yaml`` of ROS.
+    ``.json`` is fgslam's own, ``.yml`` and ``.xml`` OpenCV's, ``.yaml`` Kalibr's, and a name
+    without an ending a folder with ``left.yaml`` and ``right.yaml`` of ROS.
 
     Args:
         calibration: what is written.
@@ -189,26 +188,6 @@ def _block(key: str, matrix: FloatArray) -> Mapping[str, Any]:
     return {key: {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}}
 
 
-# --------------------------------------------------------------------------------------------
-# KITTI, EuRoC, ORB-SLAM3
-
-
-def _kitti(calibration: Calibration, path: Path, _: StatedView | None) -> None:
-    write_text(path, kitti_text(calibration))
-
-
-def _orb_slam(calibration: Calibration, path: Path, _: StatedView | None) -> None:
-    write_text(path, orb_slam_text(calibration))
-
-
-def _euroc(calibration: Calibration, path: Path, _: StatedView | None) -> None:
-    files = euroc_files(calibration)
-    for name, text in files.items():
-        with clear_output_errors(path):
-            (path / name).parent.mkdir(parents=True, exist_ok=True)
-        write_text(path / name, text)
-
-
 FORMATS: dict[
     str, tuple[str, tuple[str, ...], Callable[[Calibration, Path, StatedView | None], None]]
 ] = {
@@ -216,9 +195,6 @@ FORMATS: dict[
     "opencv": ("OpenCV", (".yml", ".yaml", ".xml", ".json"), _opencv),
     "kalibr": ("Kalibr", (".yaml", ".yml"), _kalibr),
     "ros": ("ROS camera_info, a folder", ("",), _ros),
-    "kitti": ("KITTI's calib.txt", (".txt",), _kitti),
-    "euroc": ("EuRoC's sensor.yaml, a folder", ("",), _euroc),
-    "orb_slam3": ("ORB-SLAM3 settings", (".yaml", ".yml"), _orb_slam),
 }
 """Formats that are written: in words, the endings of their names, and how."""
 _ENDINGS = {
@@ -226,6 +202,5 @@ _ENDINGS = {
     ".yml": "opencv",
     ".xml": "opencv",
     ".yaml": "kalibr",
-    ".txt": "kitti",
     "": "ros",
 }

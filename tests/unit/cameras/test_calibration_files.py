@@ -71,7 +71,6 @@ BASELINES = {
     "calibrations/stella_vslam/TUM_VI_stereo.yaml": 0.10109,
     "calibrations/stella_vslam/KITTI_stereo_00-02.yaml": 0.53717,
     "calibrations/basalt/euroc_ds_calib.json": 0.11023,
-    "calibrations/svo_pro/euroc_stereo.yaml": EUROC,
     "calibrations/vins_fusion/euroc/euroc_stereo_imu_config.yaml": EUROC,
     "calibrations/kimera_vio/Euroc": EUROC,
     "calibrations/kitti/calib_cam_to_cam.txt": 0.53715,

@@ -1,4 +1,4 @@
-"""Calibrations are written in seven formats, and read back as they were."""
+"""Calibrations are written in four formats, and read back as they were."""
 
 from __future__ import annotations
 
@@ -78,11 +78,6 @@ def test_a_pair_for_ros_is_read_back(model: str, count: int, tmp_path: Path) -> 
         ("a.json", "opencv", "radtan", 5),
         ("a.json", "opencv", "equidistant", 4),
         ("a.json", "opencv", "omni", 5),
-        ("mav0", "euroc", "radtan", 4),
-        ("mav0", "euroc", "equidistant", 4),
-        ("orb.yaml", "orb_slam3", "radtan", 4),
-        ("orb.yaml", "orb_slam3", "radtan", 5),
-        ("orb.yaml", "orb_slam3", "equidistant", 4),
     ],
 )
 def test_a_format_that_is_named_is_read_back(
@@ -91,37 +86,19 @@ def test_a_format_that_is_named_is_read_back(
     expected = calibration(model, [*PARAMETERS[model], 0.01][:count])
     write_calibration(expected, tmp_path / "before.json")
     convert_calibration(Asked(tmp_path / "before.json"), tmp_path / name, form)
-    tolerance = np.finfo(np.float32).eps if form == "orb_slam3" else 1e-15
     found = read_calibration_file(tmp_path / name)
     assert len(found.cameras) == 2
     for a, b in zip(found.cameras, expected.cameras, strict=True):
         assert (a.model, a.size) == (b.model, b.size)
         np.testing.assert_array_equal(a.matrix, b.matrix)
         np.testing.assert_array_equal(a.distortion, b.distortion)
-    np.testing.assert_allclose(found.offset(1, 0), STEP, rtol=0.0, atol=tolerance)
-
-
-def test_orb_slam3_is_given_floats_of_32_bits_and_the_columns_in_common(tmp_path: Path) -> None:
-    """It reads Stereo.T_c1_c2 by at<float>, and asks fisheyes for overlappingBegin and End."""
-    write_calibration(calibration("equidistant"), tmp_path / "orb.yaml", form="orb_slam3")
-    lines = [line.strip() for line in (tmp_path / "orb.yaml").read_text("utf-8").splitlines()]
-    at = lines.index("Stereo.T_c1_c2: !!opencv-matrix")
-    assert lines[at + 1 : at + 4] == ["rows: 4", "cols: 4", "dt: f"]
-    numbers = lines[at + 4].removeprefix("data: [").removesuffix("]").split(", ")
-    assert numbers == [str(number) for number in STEP.astype(np.float32).ravel()]
-    for k in (1, 2):
-        assert f"Camera{k}.overlappingBegin: 0" in lines
-        assert f"Camera{k}.overlappingEnd: 63" in lines
-    write_calibration(calibration("radtan"), tmp_path / "plain.yaml", form="orb_slam3")
-    assert "overlapping" not in (tmp_path / "plain.yaml").read_text("utf-8")
+    np.testing.assert_allclose(found.offset(1, 0), STEP, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize(
     ("name", "form", "words"),
     [
         ("a.yml", None, "OpenCV's file has one size"),
-        ("a.yaml", "orb_slam3", "ORB-SLAM3 has one size"),
-        ("a.txt", None, "KITTI's calib.txt has one size"),
     ],
 )
 def test_images_of_two_sizes_have_no_place_in_a_file_of_one(
@@ -135,18 +112,6 @@ def test_images_of_two_sizes_have_no_place_in_a_file_of_one(
     write_calibration(given, tmp_path / "a.json")
     found = read_calibration_file(tmp_path / "a.json")
     assert [camera.size for camera in found.cameras] == [(64, 48), (80, 48)]
-
-
-def test_a_rectified_pair_for_kitti_is_read_back(tmp_path: Path) -> None:
-    first = calibration().cameras[0]
-    plain = replace(first, distortion=np.zeros(4))
-    beside = replace(plain, bTc=pose(np.eye(3), np.array([0.5371, 0.0, 0.0])))
-    write_calibration(Calibration("made", "made", (plain, beside)), tmp_path / "calib.txt")
-    found = read_calibration_file(tmp_path / "calib.txt", size=SIZE)
-    assert found.format == "KITTI"
-    for camera in found.cameras:
-        np.testing.assert_array_equal(camera.matrix, plain.matrix)
-    np.testing.assert_allclose(found.offset(1, 0), beside.bTc, rtol=0.0, atol=1e-12)
 
 
 def test_five_formats_one_after_another(tmp_path: Path) -> None:
@@ -167,7 +132,7 @@ def test_five_formats_one_after_another(tmp_path: Path) -> None:
         (calibration("ocam"), "a.yaml", "Kalibr has no model ocam"),
         (calibration(parameters=[0.1] * 5), "a.yaml", "no radial-tangential model of 5"),
         (calibration(), "a.csv", "no format ends like that; known: .json"),
-        (calibration(), "a.txt", "of images that are not rectified"),
+        (calibration(), "a.txt", "no format ends like that"),
         (calibration("fov"), "a", "is no stereo rig"),
     ],
 )
@@ -182,17 +147,9 @@ def test_what_a_format_cannot_hold_is_refused(
 @pytest.mark.parametrize(
     ("given", "name", "form", "words"),
     [
-        (calibration("ds"), "a", "euroc", "EuRoC has no model ds"),
-        (calibration("omni"), "a.yaml", "orb_slam3", "ORB-SLAM3 has no model omni"),
-        (calibration(), "a.txt", "orb_slam3", "is written as .yaml or .yml"),
-        (calibration(), "a.yaml", "euroc", "is written as no ending, a folder"),
+        (calibration(), "a.txt", "kalibr", "is written as .yaml or .yml"),
+        (calibration(), "a.yaml", "ros", "is written as no ending, a folder"),
         (calibration(), "a.yaml", "okvis", "format 'okvis' is not known; use fgslam, opencv"),
-        (
-            Calibration("made", "made", calibration().cameras[::-1]),
-            "a.yaml",
-            "orb_slam3",
-            "ORB-SLAM3 wants the left one first",
-        ),
     ],
 )
 def test_what_a_named_format_cannot_hold_is_refused(

@@ -100,9 +100,10 @@ def test_first_and_second_camera_of_eth3d(tmp_path: Path, side: float) -> None:
     stamps = [f"{5096.154125 + 0.037 * k:.6f}.png" for k in range(3)]
     root = loose(tmp_path / "walk", lambda k: (f"rgb2/{stamps[k]}", f"rgb/{stamps[k]}"))
     (root / "calib.json").unlink()
-    for name in ("calibration.txt", "calibration2.txt"):
-        (root / name).write_text("30 30 15.5 11.5\n")
-    (root / "extrinsics_1_2.txt").write_text(f"1 0 0 {0.2 * side}\n0 1 0 0\n0 0 1 0\n")
+    camera = {"camera_model": "pinhole", "intrinsics": [30, 30, 15.5, 11.5], "resolution": [32, 24]}
+    step = [[1, 0, 0, -0.2 * side], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    chain = {"cam0": camera, "cam1": camera | {"T_cn_cnm1": step}}
+    (root / "camchain.yaml").write_text(json.dumps(chain))
     recording = opened_loose(root)
     assert recording.rig.baseline == pytest.approx(0.2)
     assert codes(recording)[1] == ((11, 61) if side < 0.0 else (61, 11))
