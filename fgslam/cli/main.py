@@ -247,7 +247,7 @@ def localize(  # noqa: PLR0913 - each option is a parameter
 def export(
     run_folder: options.RunOrMap,
     map_file: Annotated[
-        Path | None, typer.Option("--map", help="landmarks as .ply, .pcd or .off (Geomview)")
+        Path | None, typer.Option("--map", help="landmarks as .ply or .pcd")
     ] = None,
     trajectory: Annotated[
         Path | None,
@@ -259,7 +259,7 @@ def export(
     ] = None,
     images: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="images, poses and points, for COLMAP and nerfstudio"),
+        typer.Option(metavar="DIR", help="images, poses and points, for COLMAP"),
     ] = None,
     estimator: Annotated[
         str | None, typer.Option(help="which estimator's; default the one that steered")

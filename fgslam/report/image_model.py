@@ -1,13 +1,10 @@
-"""Images of known pose and the points they show, for other tools: COLMAP and nerfstudio.
+"""Images of known pose and the points they show, for COLMAP (https://colmap.github.io/format.html).
 
-COLMAP (https://colmap.github.io/format.html) has our camera axes and world-to-camera poses, but
-pixel centres at one half; nerfstudio (https://docs.nerf.studio/quickstart/data_conventions.html)
-has camera-to-world poses of cameras with y up that look along -z.
+It has our camera axes and world-to-camera poses, but pixel centres at one half.
 """
 
 from __future__ import annotations
 
-import json
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +21,6 @@ from fgslam.core.trajectories import pose_rows
 _PINHOLE = 1  # COLMAP's number of that camera model
 _CAMERA = 1  # all images are of one camera: rectified rigs have equal intrinsics
 _PIXEL_CENTRE = 0.5
-_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # a camera with y up that looks along -z
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,40 +86,6 @@ def write_colmap(folder: Path, model: ImageModel) -> None:
         ("points3D.txt", _point_text(model, table)),
     ):
         write_text(folder / name, text)
-
-
-def write_nerfstudio(path: Path, model: ImageModel, images: str, points: str) -> None:
-    """Writes `transforms.json`: intrinsics, and the camera-to-world pose of each image.
-
-    The world stays ours (y down); nerfstudio levels it itself.
-
-    Args:
-        path: the file.
-        model: what to write; its points are in another file.
-        images: folder of the images, as seen from the file.
-        points: the file with the points, as seen from the file.
-
-    Raises:
-        OutputError: a pose or point is not finite, or writing failed.
-    """
-    _require_finite(path, model)
-    rig = model.rig
-    frames = [
-        {"file_path": f"{images}/{name}", "transform_matrix": (wTi @ _OPENGL + 0.0).tolist()}
-        for name, wTi in zip(model.names, model.poses, strict=True)
-    ]
-    content = {
-        "camera_model": "PINHOLE",
-        "w": rig.width,
-        "h": rig.height,
-        "fl_x": rig.fx,
-        "fl_y": rig.fy,
-        "cx": rig.cx + _PIXEL_CENTRE,
-        "cy": rig.cy + _PIXEL_CENTRE,
-        "ply_file_path": points,
-        "frames": frames,
-    }
-    write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 # --------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Landmark maps as point clouds: .ply (everything), .pcd (everything, single precision), .off.
+"""Landmark maps as point clouds: .ply (everything), .pcd (single precision).
 
 Written with NumPy alone, so that no viewer's library is needed; the same map gives the same
 bytes. Coordinates are those of the world frame: the reference camera's first frame, x right,
@@ -7,7 +7,6 @@ y DOWN, z forward, metres. The .ply is also how a map is read back (:func:`read_
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -111,7 +110,7 @@ class MapPoints(Rows):
 
 
 def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
-    """Write a map in the format that the suffix names: `.ply`, `.pcd` or `.off`.
+    """Write a map in the format that the suffix names: `.ply` or `.pcd`.
 
     Args:
         path: the file to write, atomically.
@@ -121,11 +120,11 @@ def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
     Raises:
         OutputError: the suffix is another one, a landmark is not finite, or writing failed.
     """
-    writers = {".ply": write_ply, ".pcd": write_pcd, ".off": write_off}
+    writers = {".ply": write_ply, ".pcd": write_pcd}
     writer = writers.get(path.suffix.lower())
     if writer is None:
         raise OutputError(
-            f"cannot write {path}: unknown map format '{path.suffix}'; use .ply, .pcd or .off"
+            f"cannot write {path}: unknown map format '{path.suffix}'; use .ply or .pcd"
         )
     writer(path, points, remark)
 
@@ -241,7 +240,7 @@ def _normals_in(records: Records) -> FloatArray | None:
 
 
 # --------------------------------------------------------------------------------------------
-# PCD and OFF
+# PCD
 
 
 def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
@@ -279,30 +278,6 @@ def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
         "DATA binary\n",
     ]
     write_bytes(path, "\n".join(header).encode("ascii") + records.tobytes())
-
-
-def write_off(path: Path, points: MapPoints, remark: str = "") -> None:
-    """Write an ASCII Geomview .off: every landmark a vertex and a coloured face of one corner.
-
-    Geomview, which the paper used, draws faces only, and one of a single corner as a dot; Open3D
-    refuses a file without faces. Colours are therefore those of the faces.
-
-    Args:
-        path: the file to write, atomically.
-        points: the landmarks.
-        remark: ASCII, put into a comment line.
-
-    Raises:
-        OutputError: as :func:`write_ply`.
-    """
-    _require_writable(path, points)
-    n = len(points)
-    buffer = io.StringIO()
-    buffer.write("OFF\n" + (f"# {remark}\n" if remark else "") + f"{n} {n} 0\n")
-    np.savetxt(buffer, np.round(points.positions, 9) + 0.0, fmt="%.9f")
-    faces = np.column_stack([np.ones(n, np.int64), np.arange(n), points.colours])
-    np.savetxt(buffer, faces, fmt="%d")
-    write_bytes(path, buffer.getvalue().encode("ascii"))
 
 
 def _with_normals(dtype: np.dtype[Any], points: MapPoints, suffix: str) -> np.dtype[Any]:

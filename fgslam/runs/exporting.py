@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -36,10 +35,10 @@ class Wanted:
     """What to export: files and folders to write, None where not asked for.
 
     Attributes:
-        map: landmarks, `.ply`, `.pcd` or `.off`.
+        map: landmarks, `.ply` or `.pcd`.
         trajectory: poses, `.tum`, `.kitti`, `.csv` (EuRoC) or `.mcap` (ROS 2).
         graph: measurements, poses and landmarks, `.g2o`.
-        images: folder for images with poses and points, for COLMAP and nerfstudio.
+        images: folder for images with poses and points, for COLMAP.
         estimator: whose; None for the one that steered.
         valid_only: only landmarks that were seen often enough to be trusted.
         colour: the map in the images' colours, with normals.
@@ -255,17 +254,15 @@ _HEADER = (
     "information: g2o's error (translation, vector part of the quaternion), metres and half angles",
     "left out: observations that the run rejected, constraints of a floor, closures of loops, "
     "odometry to frames located anew",
-    "vertices: the optimum of these measurements as GTSAM's readG2o weighs them, first pose held; "
-    "an estimator that weighs and rejects otherwise differs",
+    "vertices: the estimator's final answer, first pose held",
 )
 
 
 def export_graph(
     path: Path, log: MeasurementLog, trajectory: Trajectory, points: MapPoints, remark: str = ""
 ) -> str:
-    """Writes a log's measurements and the poses and map that fit them best, as .g2o.
+    """Writes a log's measurements around an estimator's final answer, as .g2o.
 
-    The optimum is the file's own, as GTSAM reads it, found from an estimator's final answer.
     Stereo and range-bearing observations become points with their first-order covariance.
 
     Args:
@@ -281,21 +278,13 @@ def export_graph(
     Raises:
         OutputError: another ending, or it cannot be written.
     """
-    from fgslam.backend.g2o_optimum import g2o_optimum  # not before: it loads GTSAM
-
     graph = build_graph(log, trajectory, points.ids, points.positions)
-    header = [*([remark] if remark else []), *_HEADER]
-    write_g2o(path, graph, header)
-    settled = g2o_optimum(path, len(graph.poses))
-    if settled is not None:
-        poses, landmarks = settled
-        write_g2o(path, dataclasses.replace(graph, poses=poses, landmarks=landmarks), header)
-    where = "their optimum" if settled is not None else "the estimate: they have no single optimum"
+    write_g2o(path, graph, [*([remark] if remark else []), *_HEADER])
     left_out = sum(len(increment.observations) for increment in log) - len(graph.points)
     return (
         f"{path}: {len(graph.poses)} poses, {len(graph.landmarks)} landmarks, "
         f"{len(graph.motions)} odometry edges, {len(graph.points)} observations "
-        f"({left_out} rejected ones left out); starts at {where}"
+        f"({left_out} rejected ones left out)"
     )
 
 

@@ -1,4 +1,4 @@
-"""Hands a run's images with their poses to photogrammetry: COLMAP, nerfstudio; colours of a map."""
+"""Hands a run's images with their poses to photogrammetry (COLMAP); colours of a map."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from fgslam.core.sensors import CAMERA_NAMES, CameraRig, pixel_model, vertical_t
 from fgslam.datasets.images import encoded_png
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
-from fgslam.report.image_model import ImageModel, write_colmap, write_nerfstudio
-from fgslam.report.point_cloud import MapPoints, write_map
+from fgslam.report.image_model import ImageModel, write_colmap
+from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
 
@@ -40,7 +40,7 @@ def export_images(
     trajectory: Trajectory,
     points: MapPoints,
 ) -> tuple[MapPoints, str]:
-    """Writes rectified images, `sparse/0` for COLMAP and `transforms.json` for nerfstudio.
+    """Writes rectified images, `sparse/0` for COLMAP.
 
     The recording's images are read again, once. A frame whose images cannot be read stays in the
     model, without files.
@@ -63,8 +63,6 @@ def export_images(
         return points, ""
     model = replace(model, colours=points.colours[np.searchsorted(points.ids, model.ids)])
     write_colmap(_made(folder / "sparse" / "0"), model)
-    write_map(folder / "points.ply", points)
-    write_nerfstudio(folder / "transforms.json", model, "images", "points.ply")
     return points, _about(folder, model, missing)
 
 

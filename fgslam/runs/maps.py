@@ -67,7 +67,7 @@ class Map:
     def save(self, path: str | Path) -> None:
         """Writes the map in the format that the suffix names.
 
-        `.fgmap` holds all of it, for :meth:`load`; `.ply`, `.pcd` and `.off` are point clouds for
+        `.fgmap` holds all of it, for :meth:`load`; `.ply` and `.pcd` are point clouds for
         other tools, in the world: x right, y down, z forward, metres. The same map gives the same
         bytes; a file is written whole or not at all.
 
@@ -77,12 +77,11 @@ class Map:
         path = Path(path)
         if path.suffix.lower() == _SUFFIX:
             save_map(self.saved, path)
-        elif path.suffix.lower() in (".ply", ".pcd", ".off"):
+        elif path.suffix.lower() in (".ply", ".pcd"):
             write_map(path, self.points, self.remark)
         else:
             raise OutputError(
-                f"cannot write {path}: unknown map format '{path.suffix}'; use .fgmap, .ply, .pcd "
-                "or .off"
+                f"cannot write {path}: unknown map format '{path.suffix}'; use .fgmap, .ply or .pcd"
             )
 
     def locate(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shlex
@@ -61,7 +60,6 @@ def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
                 "--map",
                 ".ply",
                 ".pcd",
-                ".off",
                 "--trajectory",
                 ".tum",
                 ".kitti",
@@ -189,7 +187,7 @@ def test_synthetic_odometry_is_marked_everywhere(
     assert "SYNTHETIC" in capfd.readouterr().out
     for name in ("metrics.json", f"{KIND}/final.tum", f"{KIND}/covariance.csv", f"{KIND}/map.ply"):
         assert b"SYNTHETIC" in (folder / name).read_bytes(), name
-    for suffix in (".ply", ".pcd", ".off", ".tum", ".kitti"):
+    for suffix in (".ply", ".pcd", ".tum", ".kitti"):
         file = tmp_path / f"exported{suffix}"
         option = "--trajectory" if suffix in (".tum", ".kitti") else "--map"
         assert main(monkeypatch, "export", folder, option, file) == 0
@@ -238,7 +236,7 @@ def test_the_resolved_configuration_repeats_the_run(finished: Finished, tmp_path
 # export
 
 
-@pytest.mark.parametrize("suffix", ["ply", "pcd", "off", "PLY"])
+@pytest.mark.parametrize("suffix", ["ply", "pcd", "PLY"])
 def test_export_of_the_map(
     suffix: str, finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
@@ -250,7 +248,6 @@ def test_export_of_the_map(
     expected = {
         "ply": f"element vertex {count}\n",
         "pcd": f"POINTS {count}\n",
-        "off": f"OFF\n{count} ",
     }
     assert expected[suffix.lower()].encode() in head
 
@@ -306,8 +303,6 @@ def test_export_of_images_for_photogrammetry_and_of_a_coloured_map(
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
     assert "images/left/000011.png" in names
     assert "sparse/0/images.bin" in names
-    frames = json.loads((folder / "transforms.json").read_text())["frames"]
-    assert all((folder / frame["file_path"]).is_file() for frame in frames)
     points = read_ply(file)
     assert points.normals is not None
     np.testing.assert_allclose(np.linalg.norm(points.normals, axis=1), 1.0, rtol=0, atol=1e-6)
@@ -384,7 +379,7 @@ def test_mistakes_of_export(
     assert "use .tum, .kitti or .csv" in reported(run, "--trajectory", tmp_path / "t.txt")
     assert "use .g2o" in reported(run, "--graph", tmp_path / "t.graph")
     line = reported(run, "--map", tmp_path / "map.xyz")
-    assert all(suffix in line for suffix in (".ply", ".pcd", ".off", "xyz"))
+    assert all(suffix in line for suffix in (".ply", ".pcd", "xyz"))
     absent = tmp_path / "absent"
     assert f"{absent}: no such folder" in reported(absent, "--map", tmp_path / "m.ply")
     line = reported(run, "--map", tmp_path / "m.ply", "--estimator", "isam2")

@@ -22,8 +22,7 @@ from fgslam.report.graph_file import (
     information_of,
     write_g2o,
 )
-from fgslam.report.point_cloud import MapPoints
-from fgslam.runs.exporting import build_graph, export_graph
+from fgslam.runs.exporting import build_graph
 
 Lines = dict[str, list[list[float]]]
 
@@ -130,43 +129,6 @@ def test_gtsam_reads_poses_and_motions(tmp_path: Path, rng: np.random.Generator)
         which = gtsam.Symbol(landmark).index() - len(graph.poses)
         seen = graph.points[(graph.seen_from == at) & (graph.seen == which)][0]
         assert factors.at(row).measured().range() == pytest.approx(np.linalg.norm(seen), rel=1e-9)
-
-
-def test_gtsam_reads_a_graph_that_starts_at_its_optimum(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
-    graph, log, _ = exact_graph(rng, noise=1.0)
-    held = np.unique(np.concatenate([increment.observations.ids for increment in log]))
-    stamps = np.array([increment.timestamp for increment in log])
-    points = MapPoints(
-        ids=held,
-        positions=graph.landmarks,
-        covariances=np.tile(np.eye(3), (len(held), 1, 1)),
-        colours=np.zeros((len(held), 3), np.uint8),
-        hits=np.ones(len(held), np.int64),
-        misses=np.zeros(len(held), np.int64),
-        valid=np.ones(len(held), np.bool_),
-        permanent=np.zeros(len(held), np.bool_),
-    )
-    said = export_graph(tmp_path / "graph.g2o", log, Trajectory(stamps, graph.poses), points)
-    assert "starts at their optimum" in said
-    start, optimum = costs(tmp_path / "graph.g2o")
-    assert start == pytest.approx(optimum, rel=1e-6, abs=0.0)
-    write_g2o(tmp_path / "estimate.g2o", graph)
-    off, same = costs(tmp_path / "estimate.g2o")
-    assert off > 1.1 * start
-    assert same == pytest.approx(optimum, rel=1e-6, abs=0.0)
-
-
-def costs(path: Path) -> tuple[float, float]:
-    """Of a file's own vertices, and of the best ones, as GTSAM reads it; the first pose is held."""
-    factors, values = gtsam.readG2o(str(path), True)
-    held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-    factors.add(gtsam.PriorFactorPose3(0, values.atPose3(0), held))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setRelativeErrorTol(1e-12)
-    best = gtsam.LevenbergMarquardtOptimizer(factors, values, parameters).optimize()
-    return factors.error(values), factors.error(best)
 
 
 def test_landmarks_start_on_the_map_or_where_first_seen(rng: np.random.Generator) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OutputError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.report.image_model import ImageModel, write_colmap, write_nerfstudio
+from fgslam.report.image_model import ImageModel, write_colmap
 from fgslam.report.point_cloud import MapPoints
 from fgslam.runs.exporting_images import Tints, build_model, with_normals
 
@@ -73,23 +72,6 @@ def test_the_left_camera_is_a_baseline_away_from_the_right_one(model: ImageModel
     np.testing.assert_allclose(
         np.linalg.inv(right) @ left[:, 3], [-model.rig.baseline, 0, 0, 1], rtol=0, atol=1e-12
     )
-
-
-def test_nerfstudio_cameras_look_along_minus_z_at_the_points(
-    model: ImageModel, tmp_path: Path
-) -> None:
-    write_nerfstudio(tmp_path / "transforms.json", model, "images", "points.ply")
-    content = json.loads((tmp_path / "transforms.json").read_text())
-    assert content["frames"][1]["file_path"] == "images/left/000000.png"
-    row, point = int(model.image[0]), int(model.point[0])
-    c2w = np.array(content["frames"][row]["transform_matrix"])
-    x, y, z, _ = np.linalg.inv(c2w) @ [*model.positions[point], 1.0]
-    assert z < 0.0  # OpenGL: y up, the camera looks along -z; pixels from the image's corner
-    pixel = (
-        content["cx"] + content["fl_x"] * x / -z - 0.5,
-        content["cy"] - content["fl_y"] * y / -z - 0.5,
-    )
-    np.testing.assert_allclose(pixel, model.pixels[0], rtol=0, atol=2.0)
 
 
 def test_normals_are_those_of_the_surface_and_face_the_camera(model: ImageModel) -> None:

@@ -13,7 +13,6 @@ from fgslam.report.point_cloud import (
     MapPoints,
     read_ply,
     write_map,
-    write_off,
     write_pcd,
     write_ply,
 )
@@ -74,7 +73,7 @@ def test_ply_header_names_every_property(tmp_path: Path) -> None:
     assert "metres" in header
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".off"])
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 @pytest.mark.parametrize("n", [0, 1, 50])
 def test_same_map_same_bytes(tmp_path: Path, suffix: str, n: int) -> None:
     for name in ("a", "b"):
@@ -106,23 +105,6 @@ def test_open3d_reads_the_pcd(tmp_path: Path, open3d) -> None:
     np.testing.assert_allclose(np.asarray(cloud.colors), points.colours / 255.0)
 
 
-def test_open3d_reads_the_off(tmp_path: Path, open3d) -> None:
-    points = a_map()
-    write_off(tmp_path / "map.off", points)
-    mesh = open3d.io.read_triangle_mesh(str(tmp_path / "map.off"))
-    np.testing.assert_allclose(np.asarray(mesh.vertices), points.positions, atol=1e-9)
-
-
-def test_off_file_lists_positions_and_colours(tmp_path: Path) -> None:
-    points = a_map(2)
-    write_off(tmp_path / "map.off", points)
-    lines = (tmp_path / "map.off").read_text().splitlines()
-    assert lines[:2] == ["OFF", "2 2 0"]
-    np.testing.assert_allclose(np.array(lines[3].split(), float), points.positions[1], atol=1e-9)
-    assert lines[5].split() == ["1", "1", *map(str, points.colours[1])]
-    assert len(lines) == 6
-
-
 def test_selection_keeps_rows_together() -> None:
     points = a_map()
     valid = points.select(points.valid)
@@ -133,7 +115,7 @@ def test_selection_keeps_rows_together() -> None:
 
 
 def test_unknown_format_and_landmarks_that_cannot_be_written(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"use \.ply, \.pcd or \.off"):
+    with pytest.raises(OutputError, match=r"use \.ply or \.pcd"):
         write_map(tmp_path / "map.xyz", a_map(1))
     broken = a_map(5)
     broken.positions[3, 1] = np.nan
