@@ -19,7 +19,20 @@ help: ## list the targets
 .venv/.dev-stamp: .venv/.runtime-stamp
 	@bash scripts/setup.sh dev
 
-setup: .venv/.dev-stamp ## make .venv with the package and the development tools
+# Recordings of experiments, once in our own layouts, where the published ones lie.
+DATA := ../shared/data
+STARRY_NIGHT := $(DATA)/landmarks/utias_starry_night_dataset3.mat
+CHESS := $(DATA)/stanford_chess_grid
+CONVERTED := $(if $(wildcard $(STARRY_NIGHT)),build/recordings/starry_night) \
+  $(if $(wildcard $(CHESS)),build/recordings/chess_trinocular)
+
+setup: .venv/.dev-stamp $(CONVERTED) ## make .venv with package and tools; convert what ../shared/data has
+
+build/recordings/starry_night: | .venv/.runtime-stamp
+	.venv/bin/python -m scripts.convert.starry_night $(STARRY_NIGHT) $@
+
+build/recordings/chess_trinocular: | .venv/.runtime-stamp
+	.venv/bin/python -m scripts.convert.light_field $(CHESS) $@
 
 demo: .venv/.runtime-stamp ## render the lab, run the paper's drive through it, write runs/demo
 	.venv/bin/fgslam demo --out $(DEMO_OUT)

@@ -28,6 +28,7 @@ from fgslam.slam.factory import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
+from scripts.convert import light_field
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -43,8 +44,9 @@ _FOLDERS = {
     "euroc_v101": "euroc_v101_kf100",
     "kitti_raw_0926": "kitti_raw_0926_5hz",
     "kitti06": "kitti06",
-    "chess_trinocular": "stanford_chess_grid",
 }
+CHESS = "stanford_chess_grid"
+_CONVERTED = EXPERIMENTS.parent / "build" / "recordings" / "chess_trinocular"
 # Evidence needs neither pictures nor checkpoints.
 _QUIET = ("output.pictures=false", "output.checkpoint_seconds=3600")
 
@@ -54,8 +56,13 @@ def experiment(name: str, overrides: Iterable[str] = (), data: Path = DATA) -> E
 
     Raises:
         ConfigError: there is no such experiment or key.
+        DatasetError: its recording cannot be converted.
     """
     where = [f"dataset.path={data / _FOLDERS[name]}"] if name in _FOLDERS else []
+    if name == "chess_trinocular":
+        if not _CONVERTED.is_dir():
+            light_field.convert(data / CHESS, _CONVERTED)
+        where = [f"dataset.path={_CONVERTED}"]
     return load_config(EXPERIMENTS / f"{name}.yaml", [*where, *_QUIET, *overrides])
 
 

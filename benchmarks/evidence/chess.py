@@ -8,17 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.runs import DATA, experiment, find_features, say
+from benchmarks.runs import CHESS, DATA, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.opening import open_recording
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.datasets.settings import LightFieldSettings
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.feature_stream import FeatureFrame
+from scripts.convert.light_field import METRES_PER_UNIT, ROW, SHIFT_PX, SPACING, read_grid
 
 LEAST_LANDMARKS = 400
 CORRECT_PX = 1.0
@@ -51,7 +50,8 @@ def tables(data: Path = DATA) -> list[Table]:
     config = experiment("chess_trinocular", data=data)
     found = find_features(config)
     say("judging matches by the light field's other views")
-    real = {m: judge_chess(config, found.sequence, found.frames, m) for m in MODES}
+    row = open_row(data / CHESS)
+    real = {m: judge_chess(config, found.sequence, found.frames, row, m) for m in MODES}
     lab = {m: judge_lab(m) for m in MODES}
     return [
         landmarks_table(config, found.sequence, found.frames),
@@ -84,27 +84,30 @@ def landmarks_table(
 
 
 def judge_chess(
-    config: ExperimentConfig, sequence: Sequence, frames: list[FeatureFrame], mode: Appearance
+    config: ExperimentConfig,
+    sequence: Sequence,
+    frames: list[FeatureFrame],
+    row: Row,
+    mode: Appearance,
 ) -> Judged:
     """Right-left matches of all frames, judged by the views of their row that they did not use."""
-    settings, truth = config.dataset, sequence.ground_truth
-    if not isinstance(settings, LightFieldSettings) or truth is None:
-        raise ValueError("chess_trinocular is a light field")
-    row, spacing = open_row(settings), settings.spacing
+    truth = sequence.ground_truth
+    if truth is None:
+        raise ValueError("chess_trinocular has ground truth")
     matcher = _matcher(sequence, config, mode)
-    per_metre = settings.shift_px_per_step * spacing / sequence.rig.baseline
+    per_metre = SHIFT_PX * SPACING / sequence.rig.baseline
     parts = []
     for frame in frames:
-        # The row starts at column 1, the frames at column `spacing`.
-        reference = spacing - 1 + frame.i
-        left = reference - spacing
+        # The row starts at column 1, the frames at column SPACING.
+        reference = SPACING - 1 + frame.i
+        left = reference - SPACING
         if left < 0:
             continue  # its left view is column 0, whose true position the row does not give
         i, j, confirmed = _pairs(matcher, frame)
         right = frame.features[0].xy[i]
         raw = right + per_metre * truth.poses[frame.i, :2, 3]
         shifted = frame.features[1].xy[j, 0] - right[:, 0]
-        disparity = shifted - settings.shift_px_per_step * spacing
+        disparity = shifted - SHIFT_PX * SPACING
         parts.append(_judged(row, (reference, left), raw, disparity, confirmed))
     return _joined(parts)
 
@@ -213,15 +216,13 @@ class Row:
     places: FloatArray
 
 
-def open_row(settings: LightFieldSettings) -> Row:
-    """All views of ``settings.row`` but the first, which has no left neighbour."""
-    single = replace(settings, spacing=1, use_top=False, shift_px_per_step=0.0, start=0, stop=None)
-    recording = open_recording(single)
-    truth = recording.ground_truth
-    if truth is None:
-        raise ValueError("a light field has ground truth")
-    images = [recording.frame(i).images[0] for i in range(len(recording))]
-    return Row(np.array(images, np.float64), truth.poses[:, :2, 3])
+def open_row(root: Path) -> Row:
+    """All views of the grid's row in which the cameras walk, but for the first."""
+    grid = read_grid(root)
+    views = sorted(view for view in grid.files if view[0] == ROW)[1:]
+    places = np.array([grid.positions[view] for view in views])
+    images = np.array([grid.image(view) for view in views], np.float64)
+    return Row(images, (places - places[0]) * METRES_PER_UNIT)
 
 
 @dataclass(frozen=True, eq=False)

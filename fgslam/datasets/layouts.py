@@ -406,11 +406,6 @@ LAYOUTS = {
     "rgbd": Layout(
         "colour and depth", _lacking_of_rgbd, lambda folder: (folder / "depth.txt").is_file()
     ),
-    "light_field": Layout(
-        "light field",
-        lambda folder: _absent(folder, ("positions.csv", "calib.json")),
-        lambda folder: (folder / "positions.csv").is_file(),
-    ),
     "loose_images": Layout(
         "folder of images",
         _lacking_of_loose_images,

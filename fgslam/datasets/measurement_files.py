@@ -1,31 +1,43 @@
-"""What all recordings of measurements share: landmark identities and the motion model of logs."""
+"""Measurements as recordings: a folder with a log, and what all of them share.
+
+Landmark identities and the motion model of logs. docs/datasets/measurements.md.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations, Odometry
+from fgslam.core.recordings import (
+    LANDMARK_TRUTH_FILE,
+    MeasurementRecording,
+    read_landmark_truth,
+)
 from fgslam.core.sensors import Sensor
+from fgslam.core.trajectories import Trajectory
+from fgslam.datasets.images import require_folder
+from fgslam.datasets.recording import select_of
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
+    MeasurementFilesSettings,
     OdometrySettings,
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
 
+LOG_FILE, GROUND_TRUTH_FILE = "measurements.npz", "ground_truth.tum"
+_STAMP_STEP_S = 1e-9  # of a trajectory's file
 _NONE: IntArray = np.empty(0, np.int64)
 
 
@@ -50,6 +62,45 @@ class MeasuredFrame:
     measurement: FloatArray
     covariance: FloatArray
     pixels: FloatArray
+
+
+def open_measurement_files(
+    settings: MeasurementFilesSettings, odometry: OdometrySettings
+) -> MeasurementRecording:
+    """Opens a folder with a log: a run folder, or what `scripts/convert` wrote.
+
+    Raises:
+        DatasetError: the folder is missing, or a file of it is damaged.
+        MeasurementLogError: the log is.
+        ConfigError: synthetic odometry is asked for, or other frames than the first ones.
+    """
+    if settings.start or settings.stride != 1:
+        raise ConfigError(
+            "measurements build upon those of earlier frames: set dataset.stop alone, without "
+            "dataset.start and dataset.stride"
+        )
+    root = Path(settings.path)
+    require_folder(root, "the recording")
+    path, truth, landmarks = (
+        root / name for name in (LOG_FILE, GROUND_TRUTH_FILE, LANDMARK_TRUTH_FILE)
+    )
+    log = MeasurementLog.load(path)
+    count = len(select_of(len(log), settings, str(path)))
+    log = make_log(log.rig, list(log)[:count], odometry)
+    poses = Trajectory.load(truth) if truth.is_file() else None
+    if poses is not None:
+        within = poses.timestamps < log.timestamps[-1] + _STAMP_STEP_S
+        poses = Trajectory(poses.timestamps[within], poses.poses[within])
+    return MeasurementRecording(
+        name=root.resolve().name,
+        identity=files_identity(
+            [one for one in (path, truth, landmarks) if one.is_file()], asdict(settings)
+        ),
+        log=log,
+        ground_truth=poses,
+        landmark_truth=read_landmark_truth(landmarks)[0] if landmarks.is_file() else None,
+        notes=(),
+    )
 
 
 def make_increments(frames: Iterable[MeasuredFrame]) -> list[Increment]:
@@ -78,19 +129,6 @@ def make_increments(frames: Iterable[MeasuredFrame]) -> list[Increment]:
             )
         )
     return out
-
-
-def camera_odometry(
-    step: Callable[[int], Odometry], chosen: IntArray, bTc: FloatArray
-) -> Iterator[Odometry | None]:
-    """Motions of the camera (mounted at ``bTc``) into each of the chosen frames; first is None.
-
-    ``step`` gives the body's motion from a frame to the next; those between are composed.
-    """
-    yield None
-    for before, after in pairwise(chosen.tolist()):
-        steps = (step(i) for i in range(before, after))
-        yield g.odometry_of_camera(g.compose_odometry(steps), bTc)
 
 
 def files_identity(files: Iterable[Path], settings: Mapping[str, Any]) -> str:

@@ -16,17 +16,14 @@ from fgslam.datasets.settings import (
     FileRecordingSettings,
     ImageFolderSettings,
     KittiRawSettings,
-    KittiSettings,
-    LightFieldSettings,
     LooseImagesSettings,
     MeasurementDatasetSettings,
+    MeasurementFilesSettings,
     OdometrySettings,
     RecordedOdometrySettings,
     RgbdSettings,
     SimulatedMeasurementsSettings,
     StereoTracksSettings,
-    UtiasRangeBearingSettings,
-    UtiasStereoSettings,
     VideoSettings,
 )
 
@@ -70,15 +67,9 @@ def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings)
         return _open_with_odometry(settings, odometry)
     if isinstance(settings, _FilmOrDepth):
         return _open_film_or_depth(settings, odometry)
-    match settings:
-        case KittiSettings():
-            from fgslam.datasets.kitti import open_kitti
+    from fgslam.datasets.kitti import open_kitti
 
-            return open_kitti(settings)
-        case LightFieldSettings():
-            from fgslam.datasets.light_field import open_light_field
-
-            return open_light_field(settings)
+    return open_kitti(settings)
 
 
 _FilmOrDepth: TypeAlias = VideoSettings | RgbdSettings
@@ -148,14 +139,10 @@ def open_measurements(
             from fgslam.datasets.stereo_tracks import open_stereo_tracks
 
             return open_stereo_tracks(settings, odometry)
-        case UtiasStereoSettings():
-            from fgslam.datasets.utias import open_starry_night
+        case MeasurementFilesSettings():
+            from fgslam.datasets.measurement_files import open_measurement_files
 
-            return open_starry_night(settings, odometry)
-        case UtiasRangeBearingSettings():
-            from fgslam.datasets.utias import open_lost_in_the_woods
-
-            return open_lost_in_the_woods(settings, odometry)
+            return open_measurement_files(settings, odometry)
 
 
 def open_omni(settings: OmniDatasetSettings) -> OmniRecording:

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, Count, FrameSelection, Index, Positive
+from fgslam.core.settings import STRICT, FrameSelection, Positive
 from fgslam.datasets.odometry_settings import ConstantVelocitySettings as ConstantVelocitySettings
 from fgslam.datasets.odometry_settings import OdometrySettings as OdometrySettings
 from fgslam.datasets.odometry_settings import RecordedOdometrySettings as RecordedOdometrySettings
@@ -18,7 +18,6 @@ from fgslam.datasets.odometry_settings import (
     SyntheticOdometrySettings as SyntheticOdometrySettings,
 )
 from fgslam.worlds.lab_settings import RenderedLabSettings as RenderedLabSettings
-from fgslam.worlds.simulated.settings import Correlation
 from fgslam.worlds.simulated.settings import (
     SimulatedMeasurementsSettings as SimulatedMeasurementsSettings,
 )
@@ -196,23 +195,6 @@ class EurocSettings(CalibratedSettings):
     )
 
 
-@dataclass(frozen=True, config=STRICT)
-class LightFieldSettings(RecordingSettings):
-    """A gantry's grid of views read as a trinocular walk (docs/datasets/light_field.md)."""
-
-    kind: Literal["light_field"] = "light_field"
-    row: Index = Field(default=8, description="grid row along which the reference walks")
-    spacing: Count = Field(default=4, description="grid steps to the left and the top view")
-    use_top: bool = Field(default=True, description="use the vertical neighbour as third camera")
-    focal_length_px: Positive = Field(
-        default=800.0, description="nominal focal length; scales depth, not the trajectory"
-    )
-    shift_px_per_step: float = Field(
-        default=1.0,
-        description="shift of each view per grid step, so that disparities are positive",
-    )
-
-
 # --------------------------------------------------------------------------------------------
 # Measurements without images
 
@@ -238,25 +220,14 @@ class StereoTracksSettings(FrameSelection):
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class UtiasStereoSettings(RecordingSettings):
-    """UTIAS "Starry Night": stereo pixels, body rates, truth (docs/datasets/utias.md)."""
+class MeasurementFilesSettings(FrameSelection):
+    """The measurements of a run folder, or of a converted recording: docs/datasets/measurements.md.
 
-    path: str = Field(min_length=1, description="the .mat file of dataset 3")
-    kind: Literal["utias_stereo"] = "utias_stereo"
-    left_right_correlation: tuple[Correlation, Correlation] = Field(
-        default=(0.86, 0.99), description="correlation of both images' noise, columns and rows"
-    )
+    Frames build upon those before them: the first ones (``stop``) are used, or all.
+    """
 
-
-@dataclass(frozen=True, config=STRICT, kw_only=True)
-class UtiasRangeBearingSettings(RecordingSettings):
-    """UTIAS "Lost in the Woods": laser ranges, wheel odometry, truth (docs/datasets/utias.md)."""
-
-    path: str = Field(min_length=1, description="the .mat file of dataset 2")
-    kind: Literal["utias_range_bearing"] = "utias_range_bearing"
-    max_range_m: Positive = Field(
-        default=5.0, description="readings farther than this are left out, metres"
-    )
+    path: str = Field(min_length=1, description="folder with measurements.npz")
+    kind: Literal["measurements"] = "measurements"
 
 
 # --------------------------------------------------------------------------------------------
@@ -272,13 +243,9 @@ FileRecordingSettings: TypeAlias = (
     | KittiSettings
     | KittiRawSettings
     | EurocSettings
-    | LightFieldSettings
 )
 MeasurementDatasetSettings: TypeAlias = (
-    StereoTracksSettings
-    | UtiasStereoSettings
-    | UtiasRangeBearingSettings
-    | SimulatedMeasurementsSettings
+    StereoTracksSettings | MeasurementFilesSettings | SimulatedMeasurementsSettings
 )
 DatasetSettings: TypeAlias = Annotated[
     RenderedLabSettings | FileRecordingSettings | MeasurementDatasetSettings,

@@ -114,7 +114,7 @@ def open_recording(path: str | Path, overrides: Overrides = ()) -> RecordedFrame
     """Opens a recording: a folder of any known layout, or that of an experiment.
 
     Args:
-        path: folder of an image folder, KITTI, EuRoC or light-field recording; or the name or file
+        path: folder of an image folder, KITTI or EuRoC recording; or the name or file
             of an experiment, whose selection of frames and odometry then hold.
         overrides: settings that differ, by dotted key: ``{"dataset.stop": 100}``.
 

@@ -15,18 +15,13 @@ import numpy as np
 from fgslam.backend.settings import DeadReckoningSettings, EstimatorSettings
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.recordings import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.core.trajectories import Trajectory
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.point_cloud import MapPoints, read_ply
-from fgslam.report.tables import (
-    LANDMARK_TRUTH_FILE,
-    read_landmark_truth,
-    read_metrics,
-    write_comparison_csv,
-    write_metrics,
-)
+from fgslam.report.tables import read_metrics, write_comparison_csv, write_metrics
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, RunResult, Status, Task
 from fgslam.runs.estimator_files import write_replay

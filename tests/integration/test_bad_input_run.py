@@ -371,7 +371,6 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
         "kitti06",
         "chess_trinocular",
         "starry_night",
-        "lost_in_the_woods",
     ],
 )
 def test_experiments_say_clearly_that_their_data_is_absent(

@@ -15,7 +15,6 @@ from fgslam.datasets.checks.matches import check_epipolar
 from fgslam.datasets.checks.recording import Level
 from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.kitti import open_kitti
-from fgslam.datasets.light_field import open_light_field
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -24,7 +23,6 @@ from fgslam.datasets.settings import (
     EurocSettings,
     ImageFolderSettings,
     KittiSettings,
-    LightFieldSettings,
     LooseImagesSettings,
     RecordedOdometrySettings,
     RgbdSettings,
@@ -34,6 +32,7 @@ from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.inspection import check_sequence
 from fgslam.slam.factory import make_extractor
+from scripts.convert.light_field import convert
 
 pytestmark = pytest.mark.data
 
@@ -191,12 +190,13 @@ def test_matches_tell_sound_swapped_and_shifted_cameras(shared_data: Path, name:
     assert any("rows disagree" in f.text for f in shifted)
 
 
-def test_light_field_is_a_trinocular_rig(shared_data: Path) -> None:
+def test_light_field_is_a_trinocular_rig(shared_data: Path, tmp_path: Path) -> None:
     """Measured at spacing 4: 430 to 490 features agree in three views, all disparities positive."""
     path = shared_data / "stanford_chess_grid"
     if not path.is_dir():
         pytest.skip(f"no light field in {shared_data}: this test needs it")
-    recording = open_light_field(LightFieldSettings(path=str(path)))
+    convert(path, tmp_path)
+    recording = open_image_folder(ImageFolderSettings(path=str(tmp_path)))
     assert len(recording) == 13
     assert recording.rig.baseline == pytest.approx(0.0208, abs=2e-4)
     right, left, top = recording.frame(6).images

@@ -12,6 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks.evidence import chess, drives, honesty, noise, paper_views, person, variants
 from benchmarks.runs import (
+    CHESS,
     Run,
     experiment,
     find_features,
@@ -235,8 +236,9 @@ def test_three_real_cameras(shared_data: Path) -> None:
     least = counts.column("three views: least")[0]
     assert isinstance(least, int)
     assert least >= chess.LEAST_LANDMARKS
+    row = chess.open_row(shared_data / CHESS)
     for mode in chess.MODES:
-        judged = chess.judge_chess(config, found.sequence, found.frames, mode)
+        judged = chess.judge_chess(config, found.sequence, found.frames, row, mode)
         assert judged.decided.mean() > 0.8
         dropped = judged.precision(~judged.confirmed)
         assert judged.precision(judged.confirmed) >= 0.98

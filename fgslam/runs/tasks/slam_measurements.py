@@ -9,7 +9,11 @@ import numpy as np
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, LandmarkMap
-from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.recordings import (
+    LANDMARK_TRUTH_FILE,
+    MeasurementRecording,
+    write_landmark_truth,
+)
 from fgslam.core.sensors import vertical_of
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
@@ -17,7 +21,7 @@ from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.judging import predicted_poses
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.report.point_cloud import read_ply
-from fgslam.report.tables import LANDMARK_TRUTH_FILE, StageTime, write_landmark_truth, write_timing
+from fgslam.report.tables import StageTime, write_timing
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames

@@ -14,7 +14,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.files import make_subfolder
 from fgslam.core.measurements import moved_pixels
-from fgslam.core.recordings import Sequence
+from fgslam.core.recordings import LANDMARK_TRUTH_FILE, Sequence, write_landmark_truth
 from fgslam.core.sensors import vertical_of
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
@@ -22,13 +22,7 @@ from fgslam.report.content import Column, TextTable
 from fgslam.report.figures.over_time import error_by_axis, matches_over_time
 from fgslam.report.figures.trajectory import ON_PAPER, drive_from_above, map_to_turn
 from fgslam.report.run_results import ReportData, judged_report, truth_in_their_world
-from fgslam.report.tables import (
-    LANDMARK_TRUTH_FILE,
-    StageTime,
-    write_landmark_truth,
-    write_metrics,
-    write_timing,
-)
+from fgslam.report.tables import StageTime, write_metrics, write_timing
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
 from fgslam.runs.folder import LOG_FILE

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Literal
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, Count, FrameSelection, Index, NonNegative, Positive
 from fgslam.worlds.lab_settings import DriveLimits, LabRigSettings, WheelOdometrySettings
-
-Correlation: TypeAlias = Annotated[float, Field(gt=-1.0, lt=1.0)]
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -49,12 +49,6 @@ def test_euroc_is_recognised_from_both_folders(tmp_path: Path) -> None:
         assert recognise_layout(folder) == {"kind": "euroc", "path": str(folder)}
 
 
-def test_light_field_is_recognised(tmp_path: Path) -> None:
-    (tmp_path / "positions.csv").write_text("", encoding="utf-8")
-    (tmp_path / "calib.json").write_text("{}", encoding="utf-8")
-    assert recognise_layout(tmp_path)["kind"] == "light_field"
-
-
 def test_kitti_is_recognised_from_its_root_and_from_a_drive(tmp_path: Path) -> None:
     root, _ = kitti(tmp_path, 3, "06")
     (root / "sequences" / "11").mkdir()
@@ -125,7 +119,6 @@ def test_unknown_layout_lists_what_is_missing(tmp_path: Path) -> None:
         recognise_layout(tmp_path)
     text = str(caught.value)
     assert "image folder (lacks left, right, times.txt)" in text
-    assert "light field (lacks positions.csv)" in text
     assert "KITTI odometry (lacks sequences/NN, or of one drive image_0, image_1" in text
     assert "EuRoC native (lacks mav0/cam0, mav0/cam1)" in text
     assert "\n" not in text

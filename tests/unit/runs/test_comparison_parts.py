@@ -22,7 +22,7 @@ from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
-from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.recordings import LandmarkTruth, read_landmark_truth, write_landmark_truth
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import Answer, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
@@ -31,9 +31,7 @@ from fgslam.report.point_cloud import MapPoints
 from fgslam.report.tables import (
     RESULT_COLUMNS,
     TIME_COLUMNS,
-    read_landmark_truth,
     write_comparison_csv,
-    write_landmark_truth,
 )
 from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, make_config

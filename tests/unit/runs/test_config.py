@@ -104,7 +104,7 @@ def test_missing_keys_and_bad_kinds(values: dict[str, Any], expected: str, tmp_p
 
 def test_kinds_are_listed(tmp_path: Path) -> None:
     message = message_of(nested(MINIMAL, "dataset.kind", "tape"), tmp_path)
-    for kind in ("rendered_lab", "image_folder", "bag", "kitti", "euroc", "light_field"):
+    for kind in ("rendered_lab", "image_folder", "bag", "kitti", "euroc", "measurements"):
         assert kind in message
 
 

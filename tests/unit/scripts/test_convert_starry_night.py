@@ -1,4 +1,4 @@
-"""UTIAS recordings: a small world written as their files, then the files themselves."""
+"""UTIAS Starry Night: a small world written as its file and converted, then the file itself."""
 
 from __future__ import annotations
 
@@ -12,27 +12,23 @@ from scipy.io import savemat
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
-from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Prediction, Trajectory
-from fgslam.core.planar import wrap
 from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.sensors import CameraRig, RangeBearingSensor
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
-    UtiasRangeBearingSettings,
-    UtiasStereoSettings,
+    MeasurementFilesSettings,
 )
 from fgslam.evaluation.trajectory import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
+from scripts.convert.starry_night import LEFT_RIGHT_CORRELATION, convert
 
 N = 12
-STEREO_FILE = "utias_starry_night_dataset3.mat"
-WOODS_FILE = "utias_lost_in_the_woods_dataset2.mat"
+STARRY_NIGHT = "landmarks/utias_starry_night_dataset3.mat"
 
 
 def starry(rng: np.random.Generator) -> dict[str, Any]:
@@ -77,47 +73,15 @@ def starry(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def woods(rng: np.random.Generator) -> dict[str, Any]:
-    """The same for the plane."""
-    t = 0.1 * np.arange(N)
-    v, om = rng.uniform(0.1, 0.5, N), rng.normal(0.0, 0.8, N)
-    pose = g.pose(g.so3_exp(np.array([0.0, 0.0, 3.0])), np.array([1.0, -2.0, 0.0]))
-    landmarks = rng.uniform(-4.0, 4.0, (5, 2))
-    true, ranges, bearings = np.empty((N, 3)), np.zeros((N, 5)), np.zeros((N, 5))
-    ahead = 0.22
-    for k in range(N):
-        heading = np.arctan2(pose[1, 0], pose[0, 0])
-        true[k] = pose[0, 3], pose[1, 3], heading
-        laser = pose[:2, 3] + ahead * np.array([np.cos(heading), np.sin(heading)])
-        away = landmarks - laser
-        ranges[k] = np.hypot(*away.T)
-        bearings[k] = wrap(np.arctan2(away[:, 1], away[:, 0]) - heading)
-        pose = pose @ g.se3_exp(0.1 * np.array([0, 0, om[k], v[k], 0, 0]))
-    ranges[3, 2] = bearings[3, 2] = 0.0
-    valid = np.ones((N, 1), np.uint8)
-    valid[5] = 0
-    numbers = {"d": ahead, "r_var": 0.0009, "b_var": 0.0004, "v_var": 0.004, "om_var": 0.01}
-    return {
-        "t": t[:, None],
-        "v": v[:, None],
-        "om": om[:, None],
-        "r": ranges,
-        "b": bearings,
-        "l": landmarks,
-        "x_true": true[:, :1],
-        "y_true": true[:, 1:2],
-        "th_true": true[:, 2:],
-        "true_valid": valid,
-        **{name: np.array([[value]]) for name, value in numbers.items()},
-    }
+def converted(tmp_path: Path, values: dict[str, Any], **settings: Any) -> MeasurementRecording:
+    """The values written as a file, converted, and opened."""
+    savemat(tmp_path / "values.mat", values)
+    return opened(tmp_path / "values.mat", tmp_path / "converted", **settings)
 
 
-def opened(tmp_path: Path, values: dict[str, Any], **settings: Any) -> MeasurementRecording:
-    """The values written as a file and opened by the reader that fits."""
-    path = tmp_path / "values.mat"
-    savemat(path, values)
-    kind = UtiasStereoSettings if "y_k_j" in values else UtiasRangeBearingSettings
-    return open_measurements(kind(path=str(path), **settings), 0)
+def opened(file: Path, folder: Path, **settings: Any) -> MeasurementRecording:
+    convert(file, folder)
+    return open_measurements(MeasurementFilesSettings(path=str(folder), **settings), 0)
 
 
 def require_exact(recording: MeasurementRecording) -> int:
@@ -134,7 +98,7 @@ def require_exact(recording: MeasurementRecording) -> int:
             local = g.transform_to_camera(at[increment.timestamp], points)
             expected = g.project(recording.log.rig, local)
             error = g.measurement_difference(recording.log.rig, seen.measurement, expected)
-            np.testing.assert_allclose(error, 0.0, atol=1e-8)
+            np.testing.assert_allclose(error, 0.0, atol=1e-5)  # landmarks are written to 1 nm
             count += len(seen)
     return count
 
@@ -157,32 +121,18 @@ def require_exact_motion(recording: MeasurementRecording) -> None:
 # Exact worlds
 
 
-@pytest.mark.parametrize("stride", [1, 3])
 def test_starry_night_is_read_as_its_equations_say(
-    tmp_path: Path, rng: np.random.Generator, stride: int
+    tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    recording = opened(tmp_path, starry(rng), stride=stride)
+    recording = converted(tmp_path, starry(rng))
     assert require_exact(recording) >= 4
     require_exact_motion(recording)
-    assert isinstance(recording.log.rig, CameraRig)
-    assert [i.index for i in recording.log] == list(range(0, N, stride))
-
-
-@pytest.mark.parametrize("stride", [1, 3])
-def test_lost_in_the_woods_is_read_as_its_equations_say(
-    tmp_path: Path, rng: np.random.Generator, stride: int
-) -> None:
-    recording = opened(tmp_path, woods(rng), stride=stride, max_range_m=100.0)
-    assert require_exact(recording) >= 10
-    require_exact_motion(recording)
-    sensor = recording.log.rig
-    assert isinstance(sensor, RangeBearingSensor)
-    np.testing.assert_allclose(sensor.bTc[:3, 3], [0.22, 0.0, 0.0])
+    assert [i.index for i in recording.log] == list(range(N))
 
 
 def test_pixels_left_and_right_keep_their_places(tmp_path: Path, rng: np.random.Generator) -> None:
     values = starry(rng)
-    for increment in opened(tmp_path, values).log:
+    for increment in converted(tmp_path, values).log:
         seen = increment.observations
         written = values["y_k_j"][:, increment.index, seen.ids].T
         np.testing.assert_array_equal(seen.pixels[:, 1], written[:, :2])
@@ -194,15 +144,12 @@ def test_pixels_left_and_right_keep_their_places(tmp_path: Path, rng: np.random.
 def test_pixel_covariance_follows_from_the_file_s_variances(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    def first(**settings: Any) -> FloatArray:
-        log = opened(tmp_path, starry(rng), **settings).log
-        return next(i.observations.covariance[0] for i in log if len(i.observations))
-
-    independent = first(left_right_correlation=(0.0, 0.0))
-    np.testing.assert_allclose(independent, [[16, 0, -16], [0, 8.5, 0], [-16, 0, 20]])
-    tied = first(left_right_correlation=(0.5, 0.9))
+    log = converted(tmp_path, starry(rng)).log
+    stated = next(i.observations.covariance[0] for i in log if len(i.observations))
+    columns, rows = LEFT_RIGHT_CORRELATION
+    both = 2.0 * 4.0 * columns
     np.testing.assert_allclose(
-        tied, np.array([[16, 0, 4 - 16], [0, 8.5 + 0.5 * 0.9 * 15, 0], [4 - 16, 0, 20 - 8]])
+        stated, [[16, 0, both - 16], [0, 8.5 + 0.5 * rows * 15, 0], [both - 16, 0, 20 - 2 * both]]
     )
 
 
@@ -211,9 +158,9 @@ def test_odometry_covariance_is_that_of_noisy_rates(
 ) -> None:
     """Monte Carlo over the rates of one step of Starry Night, in the reference camera."""
     values = starry(rng)
-    stated = opened(tmp_path, values).log.increments[1].odometry
+    stated = converted(tmp_path, values).log.increments[1].odometry
     assert stated is not None
-    rig = opened(tmp_path, values).log.rig
+    rig = converted(tmp_path, values).log.rig
     dt = values["t"][0, 1] - values["t"][0, 0]
     w, v = values["w_vk_vk_i"][:, 0], values["v_vk_vk_i"][:, 0]
     drawn = []
@@ -230,34 +177,6 @@ def test_odometry_covariance_is_that_of_noisy_rates(
     )
 
 
-def test_wheel_odometry_is_uncertain_sideways(tmp_path: Path, rng: np.random.Generator) -> None:
-    """The covariance back in the body: forward x, left y, up z."""
-    recording = opened(tmp_path, woods(rng))
-    odometry = recording.log.increments[1].odometry
-    assert odometry is not None
-    body = g.change_tangent_frame(recording.log.rig.bTc, odometry.covariance)
-    sigma = np.sqrt(np.diagonal(body)) / 0.1
-    assert sigma[2] == pytest.approx(np.sqrt(0.01))
-    assert sigma[3] == pytest.approx(np.sqrt(0.004))
-    assert sigma[4] == pytest.approx(0.03)
-
-
-def test_far_readings_and_frames_without_truth_are_noted(
-    tmp_path: Path, rng: np.random.Generator
-) -> None:
-    values = woods(rng)
-    near = opened(tmp_path, values, max_range_m=3.0)
-    ranges = np.concatenate([i.observations.measurement[:, 2] for i in near.log])
-    wanted = values["r"][(values["r"] > 0.0) & (values["r"] <= 3.0)]
-    np.testing.assert_array_equal(np.sort(ranges), np.sort(wanted))
-    far = int((values["r"] > 3.0).sum())
-    assert f"{far} readings beyond 3 m left out" in near.notes
-    assert f"1 of {N} frames have no ground truth" in near.notes
-    assert near.ground_truth is not None
-    assert len(near.ground_truth) == N - 1
-    assert len(near.log) == N
-
-
 # --------------------------------------------------------------------------------------------
 # Bad files
 
@@ -268,33 +187,26 @@ def wrong(values: dict[str, Any], name: str, value: object) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("make", "name", "value", "message"),
+    ("name", "value", "message"),
     [
-        (starry, "t", None, "no variable t of numbers"),
-        (starry, "y_var", np.full((4, 1), "x"), "no variable y_var of numbers"),
-        (starry, "C_c_v", np.eye(2), "variable C_c_v is 2 x 2, expected 3 x 3"),
-        (starry, "C_c_v", 2.0 * np.eye(3), "C_c_v is not a rotation"),
-        (starry, "w_var", np.zeros((3, 1)), "variable w_var must be positive"),
-        (starry, "fu", np.array([[np.nan]]), "variable fu is not finite"),
-        (starry, "t", np.zeros((1, N)), "times t do not increase"),
-        (starry, "y_k_j", -np.ones((4, N, 6)), "y_k_j never sees a landmark"),
-        (starry, "y_k_j", np.ones((4, N, 5)), f"is 4 x {N} x 5, expected 4 x {N} x 6"),
-        (woods, "d", None, "no variable d of numbers"),
-        (woods, "r", np.ones((N, 4)), f"variable r is {N} x 4, expected {N} x 5"),
-        (woods, "om_var", np.array([[-1.0]]), "variable om_var must be positive"),
-        (woods, "b", np.full((N, 5), np.inf), "variable b is not finite"),
+        ("t", None, "no variable t of numbers"),
+        ("y_var", np.full((4, 1), "x"), "no variable y_var of numbers"),
+        ("C_c_v", np.eye(2), "variable C_c_v is 2 x 2, expected 3 x 3"),
+        ("C_c_v", 2.0 * np.eye(3), "C_c_v is not a rotation"),
+        ("w_var", np.zeros((3, 1)), "variable w_var must be positive"),
+        ("fu", np.array([[np.nan]]), "variable fu is not finite"),
+        ("t", np.zeros((1, N)), "times t do not increase"),
+        ("y_k_j", -np.ones((4, N, 6)), "y_k_j never sees a landmark"),
+        ("y_k_j", np.ones((4, N, 5)), f"is 4 x {N} x 5, expected 4 x {N} x 6"),
     ],
 )
 def test_a_wrong_variable_is_named(
-    tmp_path: Path, rng: np.random.Generator, make: Any, name: str, value: object, message: str
+    tmp_path: Path, rng: np.random.Generator, name: str, value: object, message: str
 ) -> None:
-    values = make(rng)
-    path = tmp_path / "values.mat"
-    savemat(path, wrong(values, name, value))
-    kind = UtiasStereoSettings if make is starry else UtiasRangeBearingSettings
     with pytest.raises(DatasetError, match=message) as caught:
-        open_measurements(kind(path=str(path)), 0)
-    assert str(path) in str(caught.value)
+        converted(tmp_path, wrong(starry(rng), name, value))
+    assert str(tmp_path / "values.mat") in str(caught.value)
+    assert not (tmp_path / "converted").exists()
     assert "\n" not in str(caught.value)
 
 
@@ -302,27 +214,22 @@ def test_a_negative_pixel_is_no_measurement(tmp_path: Path, rng: np.random.Gener
     values = starry(rng)
     values["y_k_j"][1, 0, 0] = -3.0
     with pytest.raises(DatasetError, match="a negative pixel that is not marked unseen"):
-        opened(tmp_path, values)
+        converted(tmp_path, values)
 
 
 def test_missing_and_damaged_files_give_one_line_errors(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     path = tmp_path / "a.mat"
-    with pytest.raises(DatasetError, match=r"does not exist; check dataset\.path"):
-        open_measurements(UtiasStereoSettings(path=str(path)), 0)
+    with pytest.raises(DatasetError, match=r"does not exist; give the \.mat file"):
+        convert(path, tmp_path / "converted")
     savemat(path, starry(rng), do_compression=True)
     whole = path.read_bytes()
     for damaged in (b"", b"not MATLAB", whole[:60], whole[: len(whole) // 2], whole[:-3]):
         path.write_bytes(damaged)
         with pytest.raises(DatasetError, match="it may be truncated, restore it") as caught:
-            open_measurements(UtiasStereoSettings(path=str(path)), 0)
+            convert(path, tmp_path / "converted")
         assert "\n" not in str(caught.value)
-    path.write_bytes(whole)
-    with pytest.raises(DatasetError, match="choose a smaller start"):
-        open_measurements(UtiasStereoSettings(path=str(path), start=N), 0)
-    with pytest.raises(DatasetError, match="variable t is 1 x 12, expected n x 1"):
-        open_measurements(UtiasRangeBearingSettings(path=str(path)), 0)
 
 
 # --------------------------------------------------------------------------------------------
@@ -356,9 +263,8 @@ def ate(trajectory: Trajectory, recording: MeasurementRecording) -> float:
 
 
 @pytest.mark.data
-def test_starry_night(shared_data: Path) -> None:
-    path = shared_data / "landmarks" / STEREO_FILE
-    recording = open_measurements(UtiasStereoSettings(path=str(path), stop=600), 0)
+def test_starry_night(shared_data: Path, tmp_path: Path) -> None:
+    recording = opened(shared_data / STARRY_NIGHT, tmp_path, stop=600)
     assert len(recording.log) == 600
     loose = EgoMotionSettings(min_matches=1, outlier_px=60.0, max_correction_deg=30.0)
     found, alone = (
@@ -370,10 +276,9 @@ def test_starry_night(shared_data: Path) -> None:
 
 
 @pytest.mark.data
-def test_the_residuals_of_starry_night_are_those_stated(shared_data: Path) -> None:
+def test_the_residuals_of_starry_night_are_those_stated(shared_data: Path, tmp_path: Path) -> None:
     """True landmarks from true poses: the file's variances, and the correlation of the images."""
-    path = shared_data / "landmarks" / STEREO_FILE
-    recording = open_measurements(UtiasStereoSettings(path=str(path)), 0)
+    recording = opened(shared_data / STARRY_NIGHT, tmp_path)
     truth, landmarks = recording.ground_truth, recording.landmark_truth
     assert truth is not None
     assert landmarks is not None
@@ -387,14 +292,3 @@ def test_the_residuals_of_starry_night_are_those_stated(shared_data: Path) -> No
     stated = first.covariance[0]
     assert np.diagonal(sample) == pytest.approx(np.diagonal(stated), rel=0.06)
     assert sample[0, 2] == pytest.approx(stated[0, 2], abs=1.5)
-
-
-@pytest.mark.data
-def test_lost_in_the_woods(shared_data: Path) -> None:
-    path = shared_data / "landmarks" / WOODS_FILE
-    settings = UtiasRangeBearingSettings(path=str(path), stop=2000, stride=5)
-    recording = open_measurements(settings, 0)
-    assert len(recording.log) == 400
-    planar = EgoMotionSettings(dof=3, min_matches=1)
-    assert ate(dead_reckoning(recording), recording) > 0.3
-    assert ate(filtered(recording, planar), recording) < 0.06
