@@ -59,15 +59,6 @@ def height_key(variable: int) -> int:
     return int(gtsam.symbol(_HEIGHT, variable))
 
 
-def without_gaps(graph: Any) -> Any:
-    """A nonlinear graph without its empty slots."""
-    kept = gtsam.NonlinearFactorGraph()
-    for row in range(graph.size()):
-        if graph.exists(row):
-            kept.add(graph.at(row))
-    return kept
-
-
 def landmarks_in(values: Any) -> tuple[IntArray, FloatArray]:
     """Numbers (n,) of the landmark variables in GTSAM values, ascending, and positions (n, 3).
 

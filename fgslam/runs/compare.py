@@ -57,7 +57,6 @@ HOMING_VARIANTS = {
     settings.title: settings
     for settings in (
         HomingGraphSettings(),
-        HomingGraphSettings(label="graph_fixed_lag", solver="fixed_lag"),
         HomingGraphSettings(label="graph_batch", solver="batch"),
         HomingEkfSettings(),
         PAPER,

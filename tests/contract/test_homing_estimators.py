@@ -28,13 +28,12 @@ EVERY: list[HomingEstimatorSettings] = [
     PAPER,
     HomingEkfSettings(),
     HomingGraphSettings(),
-    HomingGraphSettings(solver="fixed_lag", label="fixed_lag"),
     HomingGraphSettings(solver="batch", label="batch"),
     HomingGraphSettings(elevations="all", label="elevations"),
     AverageLandmarkVectorSettings(),
     SnapshotSettings(),
 ]
-MAPPING = EVERY[:6]
+MAPPING = EVERY[:5]
 SETTINGS = SimulatedBearingsSettings(
     images_per_s=4.0, part=0.6, lost_per_s=0.1, tracked_elevations=True
 )

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fgslam.backend.homing.estimator import TrackedFeatures
-from fgslam.backend.homing.graph_gtsam import BatchSolver, FixedLagSolver, Isam2Solver
+from fgslam.backend.homing.graph_gtsam import BatchSolver, Isam2Solver
 from fgslam.backend.homing.graph_parts import TARGET, Beginning, NewPart, Pair, Sight, Solver
 from fgslam.backend.homing.schur_solver import SchurSolver
 from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
@@ -351,7 +351,7 @@ class HomingGraph:
         self._solver = make_solver(settings)
         self._image = 0
         self._covariance: FloatArray | None = None
-        self._solver.add(self._problem.first(), start.time)
+        self._solver.add(self._problem.first())
 
     def update(self, tracked: TrackedBearings) -> None:
         """Takes in one image; see the protocol."""
@@ -361,10 +361,10 @@ class HomingGraph:
         new = self._problem.image(tracked, taken, before, points)
         self._covariance = None
         self._image += 1
-        self._solver.add(new, tracked.time)
+        self._solver.add(new)
         collapsed = self._problem.collapsed(self._solver.points(self._entered()))
         if collapsed:
-            self._solver.move(collapsed, tracked.time)
+            self._solver.move(collapsed)
 
     def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """The present state; see the protocol."""
@@ -421,7 +421,5 @@ def make_solver(settings: HomingGraphSettings) -> Solver:
             return SchurSolver(settings)
         case "isam2":
             return Isam2Solver(settings)
-        case "fixed_lag":
-            return FixedLagSolver(settings)
         case "batch":
             return BatchSolver(settings)

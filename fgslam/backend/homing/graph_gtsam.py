@@ -1,4 +1,4 @@
-"""The homing graph in GTSAM's factors, and its solvers by GTSAM: incremental, fixed lag, batch.
+"""The homing graph in GTSAM's factors, and its solvers by GTSAM: incremental and batch.
 
 All keep the values of every variable that they still have, and answer joint covariances.
 """
@@ -40,11 +40,9 @@ from fgslam.factors.graphs import (
     pose_key,
     target_key,
     velocity_key,
-    without_gaps,
 )
 
 _TRUST_RADIUS = 1.0  # legs, radians: the first of Powell's dog leg
-_LAG_S = 1.0  # of `fixed_lag`: ten images; older poses hardly change
 _MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes three to ten
 _RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
 
@@ -120,25 +118,23 @@ class GtsamSolver:
         self._graph = gtsam.NonlinearFactorGraph()
         self.values = gtsam.Values()
 
-    def add(self, new: NewPart, time: float) -> None:
+    def add(self, new: NewPart) -> None:
         """See :class:`Solver`."""
         self._image = new.image
         graph, values, keys = self._parts.of(new)
-        before = self._factors()
         try:
-            self._update(graph, values, (keys, time))
+            self._update(graph, values, keys)
         except RuntimeError:
             self.values.insert(values)
-            whole = without_gaps(before)
-            whole.push_back(graph)
-            self.values = minimised(whole, self.values)
-            self._restart(whole, time)
+            self._graph.push_back(graph)
+            self.values = minimised(self._graph, self.values)
+            self._restart()
 
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
+    def move(self, points: dict[int, FloatArray]) -> None:
         """See :class:`Solver`."""
         for row, point in points.items():
             self.values.update(landmark_key(row), point)
-        self._restart(without_gaps(self._factors()), time)
+        self._restart()
 
     def pose(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
@@ -166,20 +162,15 @@ class GtsamSolver:
         turn[3:6, 3:6] = tangent_to_pose(self.target())
         return turn @ covariance @ turn.T
 
-    def _factors(self) -> Any:
-        """The graph so far, in which slots may be empty."""
-        return self._graph
+    def _update(self, graph: Any, values: Any, touched: set[int]) -> None:
+        """Brings an image in, by its factors, first guesses and the keys that it touches.
 
-    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
-        """Brings an image in, by its factors and first guesses.
-
-        ``touched`` holds the keys that it touches, and its time. Raises RuntimeError, as GTSAM.
+        Raises RuntimeError, as GTSAM.
         """
         raise NotImplementedError
 
-    def _restart(self, graph: Any, time: float) -> None:
-        """Begins anew with a graph, at the values as they are."""
-        self._graph = graph
+    def _restart(self) -> None:
+        """Begins anew with the graph, at the values as they are."""
 
     def _joint(self, keys: list[int]) -> FloatArray:
         """Joint covariance of variables in the order given, in GTSAM's tangent spaces."""
@@ -194,15 +185,15 @@ class Isam2Solver(GtsamSolver):
         super().__init__(settings)
         self._isam = gtsam.ISAM2(_parameters())
 
-    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
-        self._isam.update(graph, values, [], _last(touched[0]))
+    def _update(self, graph: Any, values: Any, touched: set[int]) -> None:
+        self._isam.update(graph, values, [], _last(touched))
         self.values = self._isam.calculateEstimate()
         self._graph.push_back(graph)
 
-    def _restart(self, graph: Any, time: float) -> None:
-        self._graph, self._isam = graph, gtsam.ISAM2(_parameters())
+    def _restart(self) -> None:
+        self._isam = gtsam.ISAM2(_parameters())
         try:
-            self._isam.update(graph, self.values)
+            self._isam.update(self._graph, self.values)
             self.values = self._isam.calculateEstimate()
         except RuntimeError as error:
             raise _failed(error) from None
@@ -211,49 +202,10 @@ class Isam2Solver(GtsamSolver):
         return joint_of(self._isam, keys)
 
 
-class FixedLagSolver(GtsamSolver):
-    """iSAM2 over the last seconds: older poses are marginalised, start, target and map stay."""
-
-    def __init__(self, settings: HomingGraphSettings) -> None:
-        """Empty."""
-        super().__init__(settings)
-        self._stamps: dict[int, float] = {}
-        self._smoother = self._new()
-
-    def _new(self) -> Any:
-        params = _parameters()
-        params.findUnusedFactorSlots = True  # without it the smoother grows
-        return gtsam.IncrementalFixedLagSmoother(_LAG_S, params)
-
-    def _factors(self) -> Any:
-        return self._smoother.getFactors()
-
-    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
-        time = touched[1]
-        stamps = self._stamps | dict.fromkeys(list(values.keys()), time)
-        stamps |= {key: time for key in stamps if not is_passing(key)}
-        oldest = time - _LAG_S
-        self._stamps = {key: stamp for key, stamp in stamps.items() if stamp >= oldest}
-        self._smoother.update(graph, values, stamps)  # those before the oldest leave with it
-        self.values = self._smoother.calculateEstimate()
-
-    def _restart(self, graph: Any, time: float) -> None:
-        self._smoother = self._new()
-        try:
-            stamps = {key: self._stamps.get(key, time) for key in list(self.values.keys())}
-            self._smoother.update(graph, self.values, stamps)
-            self.values = self._smoother.calculateEstimate()
-        except RuntimeError as error:
-            raise _failed(error) from None
-
-    def _joint(self, keys: list[int]) -> FloatArray:
-        return joint_of(self._smoother.getISAM2(), keys)
-
-
 class BatchSolver(GtsamSolver):
     """Levenberg-Marquardt over the whole graph with every image, from the last solution."""
 
-    def _update(self, graph: Any, values: Any, touched: tuple[set[int], float]) -> None:
+    def _update(self, graph: Any, values: Any, touched: set[int]) -> None:
         self._graph.push_back(graph)
         self.values.insert(values)
         self.values = minimised(self._graph, self.values)
@@ -293,12 +245,6 @@ def _last(keys: set[int]) -> Any:
     for key in keys | {target_key()}:
         groups.insert2(key, 1)
     return groups
-
-
-def is_passing(key: int) -> bool:
-    """Whether a variable belongs to an image on the way, a pose or a velocity."""
-    symbol = gtsam.Symbol(key)
-    return symbol.index() > 0 and (is_pose(key) or symbol.chr() == ord("v"))
 
 
 def joint_of(source: Any, keys: list[int]) -> FloatArray:

@@ -92,11 +92,11 @@ def first_speeds(motion: GraphMotionSettings) -> FloatArray:
 class Solver(Protocol):
     """Takes the graph in, part by part. Poses are (x, y, psi) in the start frame."""
 
-    def add(self, new: NewPart, time: float) -> None:
+    def add(self, new: NewPart) -> None:
         """Brings an image in. Raises EstimatorError where the graph cannot be solved."""
         ...
 
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
+    def move(self, points: dict[int, FloatArray]) -> None:
         """Puts landmarks, by row, back to places (2,) and goes on from there."""
         ...
 

@@ -123,7 +123,7 @@ class SchurSolver:
         self._state = State(np.empty((0, 6)), np.zeros(3), np.empty((0, numbers)))
         self._factored: Factored | None = None
 
-    def add(self, new: NewPart, time: float) -> None:
+    def add(self, new: NewPart) -> None:
         """See :class:`Solver`."""
         self._state = self._model.take(new, self._state)
         look = self._go_on(_FIRST_STEPS if new.image == 0 else _STEPS)
@@ -134,7 +134,7 @@ class SchurSolver:
         if new.image % _EVERY == 0:
             self._doubt(look)
 
-    def move(self, points: dict[int, FloatArray], time: float) -> None:
+    def move(self, points: dict[int, FloatArray]) -> None:
         """See :class:`Solver`."""
         places = self._state.points.copy()
         for row, point in points.items():

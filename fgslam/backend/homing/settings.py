@@ -96,9 +96,9 @@ class HomingGraphSettings(NamedSettings):
     """The same problem as one graph of bearings (design H)."""
 
     kind: Literal["homing_graph"] = "homing_graph"
-    solver: Literal["schur", "isam2", "fixed_lag", "batch"] = Field(
+    solver: Literal["schur", "isam2", "batch"] = Field(
         default="schur",
-        description="`schur` exact, all images; `isam2`, `fixed_lag`, `batch` by GTSAM",
+        description="`schur` exact, all images; `isam2`, `batch` by GTSAM",
     )
     kernel: KernelSettings = KernelSettings("cauchy", 2.0)
     elevations: Literal["none", "two_views", "all"] = Field(
