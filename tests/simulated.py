@@ -83,7 +83,7 @@ def simulate(
     for step in steps:
         poses.append(g.reorthonormalise(poses[-1] @ step))
     points = points_in_views(drive, poses, rng)
-    book = _Identities(drive, points)
+    book = Identities(drive, points)
     to = [np.eye(4), *steps]
     increments = [book.increment(k, wTc, to[k], rng) for k, wTc in enumerate(poses)]
     return Simulation(drive, np.array(poses), points[book.book.point_of_id], increments)
@@ -109,7 +109,7 @@ def points_in_view(
     )
 
 
-class _Identities:
+class Identities:
     """Measures the points and keeps the book of their identities, frame after frame."""
 
     def __init__(self, drive: Drive, points: FloatArray) -> None:

@@ -107,8 +107,8 @@ def problem(drive: MeasuredDrive) -> tuple[Any, Any]:
     """Batch's factors and initial values of a whole drive."""
     estimator = play(drive, LEAST_SQUARES).estimator
     assert isinstance(estimator, Smoother)
-    assert isinstance(estimator._solver, BatchSolver)
-    return estimator._builder.kept_factors(), estimator._solver._values
+    assert isinstance(estimator.solver, BatchSolver)
+    return estimator.builder.kept_factors(), estimator.solver.values
 
 
 def minimum(graph: Any, values: Any) -> Any:

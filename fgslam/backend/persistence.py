@@ -221,7 +221,7 @@ def _fits(tracking: EgoMotion) -> BoolArray:
     return np.asarray(off_px <= _FITS * np.median(off_px))
 
 
-def _inverses(normal: FloatArray) -> FloatArray:
+def inverses_of_blocks(normal: FloatArray) -> FloatArray:
     """(m, 3, 3); of one that is singular the pseudo-inverse, which takes six times as long."""
     with np.errstate(all="ignore"):
         found = inverse_spd3(normal)
@@ -300,7 +300,7 @@ class _Sightings:
         start = self.tracks.start
         normal = np.add.reduceat(np.swapaxes(weighed, 1, 2) @ jacobian, start)
         gradient = np.add.reduceat(np.einsum("nci,nc->ni", weighed, residual), start)
-        return np.asarray(np.einsum("mij,mj->mi", _inverses(normal), gradient))
+        return np.asarray(np.einsum("mij,mj->mi", inverses_of_blocks(normal), gradient))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,7 +332,7 @@ class Fitted:
         kept = tracks.select(good)
         residual, jacobian = residual[rows], jacobian[rows]
         turned = np.swapaxes(jacobian, 1, 2)
-        normal = _inverses(np.add.reduceat(turned @ jacobian, kept.start))
+        normal = inverses_of_blocks(np.add.reduceat(turned @ jacobian, kept.start))
         gradient = np.add.reduceat(np.einsum("nci,nc->ni", jacobian, residual), kept.start)
         step = np.einsum("mij,mj->mi", normal, gradient)
         residual = residual - np.einsum("nci,ni->nc", jacobian, step[kept.track])

@@ -31,7 +31,7 @@ _LABEL_WIDTH = 12
 _WIDTH_OF_FILES = 120
 
 
-class _Bars:
+class Bars:
     """A bar for each stage of the work, with the time left."""
 
     def __init__(self, console: Console, begin: Callable[[], None] | None = None) -> None:
@@ -48,6 +48,7 @@ class _Bars:
         self._begin = begin or self.drawn.start
 
     def tell(self, what: str, done: int, total: int) -> None:
+        """Shows how much of a stage is done; the first call of it draws its bar."""
         if not self.tasks:
             self._begin()
         if what not in self.tasks:
@@ -58,7 +59,7 @@ class _Bars:
 @contextmanager
 def progress_bar() -> Iterator[Tell]:
     """A bar on standard error for each stage of the work."""
-    bars = _Bars(Console(stderr=True))
+    bars = Bars(Console(stderr=True))
     try:
         yield bars.tell
     finally:
@@ -71,7 +72,7 @@ def progress_with_table() -> Iterator[tuple[Tell, Callable[[TextTable], None]]]:
     """Bars on standard error, and below them a table that changes while there is more to come."""
     console = Console(stderr=True)
     live = Live(console=console)
-    bars = _Bars(console, live.start)
+    bars = Bars(console, live.start)
     live.update(bars.drawn)
     try:
         yield bars.tell, lambda table: live.update(Group(bars.drawn, rich_table(table)))

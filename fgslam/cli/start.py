@@ -38,7 +38,7 @@ def main() -> None:
     try:
         with signals.OtherErrors():
             signals.watch()
-            _require_memory()
+            require_memory()
             _require_current_folder()
             from fgslam.cli.main import main as command
 
@@ -81,7 +81,7 @@ def _leave() -> None:
         os._exit(_ended_with[0])
 
 
-def _require_memory() -> None:
+def require_memory() -> None:
     """Ends with a line where the system's limit is below what the libraries take by themselves."""
     limit = limit_bytes()
     if limit is None:

@@ -68,7 +68,7 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(partial, path)
         finally:
             # Still there only when something failed: that error must not be hidden by another.
-            _remove_quietly(partial)
+            remove_quietly(partial)
 
 
 def _beside(path: Path) -> Path:
@@ -86,7 +86,7 @@ def remove_unfinished_files(folder: Path) -> None:
     """Removes what processes that were killed while writing left in a folder and below."""
     for path in folder.rglob(".*.partial*"):
         if is_unfinished_file(path) and not _is_being_written(path):
-            _remove_quietly(path)
+            remove_quietly(path)
 
 
 def remove_left_behind(path: Path) -> None:
@@ -98,7 +98,7 @@ def remove_left_behind(path: Path) -> None:
     for other in path.parent.glob(f".{escape(path.name[:_KEPT])}.*.partial*"):
         mine = other.name.startswith(own)
         if not mine and is_unfinished_file(other) and not _is_being_written(other):
-            _remove_quietly(other)
+            remove_quietly(other)
 
 
 def _is_being_written(path: Path) -> bool:
@@ -133,10 +133,11 @@ def require_writable(folder: Path) -> None:
         try:
             probe.write_bytes(b"\0")
         finally:
-            _remove_quietly(probe)
+            remove_quietly(probe)
 
 
-def _remove_quietly(path: Path) -> None:
+def remove_quietly(path: Path) -> None:
+    """Removes a file where that is possible."""
     with suppress(OSError):
         path.unlink(missing_ok=True)
 

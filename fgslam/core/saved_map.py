@@ -116,7 +116,7 @@ def save_map(saved: SavedMap, path: Path) -> int:
     _require_consistent(header, arrays, str(path))
     arrays, header["triangles"] = _without_mirrors(arrays)
     arrays, header["same_as"] = _without_repeats(arrays)
-    header["sha256"] = _digest(header, arrays)
+    header["sha256"] = digest(header, arrays)
     members = FILE.header(**header) | arrays
     with replacing(path) as partial, partial.open("wb") as file:
         with zipfile.ZipFile(file, "w", compresslevel=1) as archive:
@@ -133,7 +133,7 @@ def load_map(path: Path) -> SavedMap:
     """
     arrays = FILE.load(path)
     header = _read_header(arrays, str(path))
-    if header.pop("sha256", None) != _digest(header, arrays):
+    if header.pop("sha256", None) != digest(header, arrays):
         raise MapError(
             f"{path}: damaged: its contents do not have the checksum that they were saved with; "
             "restore the file or make the map again"
@@ -318,7 +318,7 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     return header
 
 
-def _digest(header: dict[str, Any], arrays: StateArrays) -> str:
+def digest(header: dict[str, Any], arrays: StateArrays) -> str:
     """SHA-256 over the header and all arrays: names, types, shapes and bytes."""
     whole = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):

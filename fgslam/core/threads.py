@@ -24,7 +24,7 @@ class _Limit(Protocol):
         """Undoes it."""
 
 
-class _Limits:
+class BlasLimits:
     """Limits of the process, taken back in the reverse order in which they were set.
 
     A limit belongs to the whole process. Of several threads at work the first to leave must not
@@ -39,6 +39,7 @@ class _Limits:
         self._modules = 0  # imported when the libraries were last looked for
 
     def enter(self) -> _Limit:
+        """Sets a limit of one thread."""
         with self._lock:
             limits: _Limit = self._libraries().limit(limits=1, user_api="blas")
             self._set.append(limits)
@@ -52,6 +53,7 @@ class _Limits:
         return self._loaded
 
     def leave(self, limits: _Limit) -> None:
+        """Undoes a limit, and those before it that have left already."""
         with self._lock:
             self._left.add(id(limits))
             while self._set and id(self._set[-1]) in self._left:
@@ -60,7 +62,7 @@ class _Limits:
                 last.restore_original_limits()
 
 
-_LIMITS = _Limits()
+_LIMITS = BlasLimits()
 
 
 @contextmanager

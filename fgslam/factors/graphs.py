@@ -74,7 +74,7 @@ def poses_of_frame(values: Any, frame: int) -> FloatArray:
     return np.asarray(values.atPose3(pose_key(frame)).matrix())
 
 
-_RELINEARISED = 0.01
+RELINEARISED = 0.01
 """Radians, and metres or legs: a variable that moves by more is linearised anew. 0.1, GTSAM's own,
 leaves a drive of 50 m twice as far off."""
 
@@ -89,7 +89,7 @@ def isam2_parameters(method: Any, factorization: str = "CHOLESKY") -> Any:
     params = gtsam.ISAM2Params()
     params.setOptimizationParams(method)
     params.setFactorization(factorization)
-    params.setRelinearizeThreshold(_RELINEARISED)
+    params.setRelinearizeThreshold(RELINEARISED)
     params.relinearizeSkip = 1
     return params
 

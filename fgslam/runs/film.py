@@ -63,13 +63,13 @@ def film_of_run(
 
 def _film_of_following(run: Path, followed: Followed, out: Path, progress: Progress) -> str:
     total = len(followed.rows)
-    fps = _rate(followed.times, "images", run)
+    fps = frame_rate(followed.times, "images", run)
     count = write_film(out, followed.frames(lambda done: progress("film", done, total)), fps)
     progress("film", total, total)
     return f"{out}: {count} frames"
 
 
-def _rate(times: FloatArray, what: str, where: Path) -> float:
+def frame_rate(times: FloatArray, what: str, where: Path) -> float:
     """Frames a second of a film of these times.
 
     Raises:
@@ -94,7 +94,7 @@ def _film_of_slam(run: Path, out: Path, estimator: str | None, progress: Progres
     log = MeasurementLog.read_from(log_of(run))
     if not isinstance(log.rig, CameraRig):
         raise DatasetError(f"{run}: its sensor has no images, so that there is nothing to film")
-    fps = _rate(trajectory.timestamps, "poses", run)
+    fps = frame_rate(trajectory.timestamps, "poses", run)
     rows, pictures = frames_of(load_config(run / RUN_MARKER), trajectory)
     moments = _moments(log, rows_of_frames(log, trajectory), points, rows, pictures)
     data = load_report(run)

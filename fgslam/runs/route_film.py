@@ -71,7 +71,7 @@ class Followed:
             FgslamError: a file is gone, no table, or the route is another one since.
         """
         path = PathMemory.load(config.route)
-        rows = _rows(run / FOLLOW_FILE)
+        rows = follow_rows(run / FOLLOW_FILE)
         _require_same_route(rows, path, config.route)
         recording = recording_along(config, path)
         driven = None if taught is None else _taught_recording(taught, path)
@@ -101,7 +101,7 @@ class Followed:
         return PathPicture(name, (camera.width, camera.height), pixels, image)
 
 
-def _rows(table: Path) -> tuple[Row, ...]:
+def follow_rows(table: Path) -> tuple[Row, ...]:
     """Raises DatasetError where it is gone, damaged, or none that `fgslam follow` wrote."""
     try:
         with table.open(encoding="utf-8", newline="") as file:
@@ -177,7 +177,7 @@ def _moment(row: Row, image: Image | None, camera: OmniCamera) -> RouteMoment:
         sigma=float(np.deg2rad(_number(row, "sigma_direction_deg"))),
         beam=_beam(camera, float(direction)),
         ahead=_beam(camera, 0.0),
-        command=_command(row),
+        command=command_text(row),
         refused=bool(row["refusal"]) and row["state"] != "arrived",
     )
 
@@ -187,7 +187,7 @@ def _beam(camera: OmniCamera, bearing: float) -> FloatArray:
     return camera.pixels(unit_rays(np.full(len(_BEAM), bearing), _BEAM))
 
 
-def _command(row: Row) -> str:
+def command_text(row: Row) -> str:
     """Lines: speed, turn and metres; or why there is no homing vector."""
     if row["refusal"]:
         return row["refusal"]

@@ -89,7 +89,7 @@ class OdometryMotion:
         self._bTc = bTc
         self._kind = kind
         self._stand_in = stand_in
-        self._gyroscope = GyroscopeError()
+        self.gyroscope = GyroscopeError()
 
     @property
     def acceleration_variance(self) -> FloatArray:
@@ -99,7 +99,7 @@ class OdometryMotion:
     @property
     def gyroscope_factor(self) -> float:
         """By how much the deviation of turns exceeds what a gyroscope's noise states."""
-        return float(np.sqrt(self._gyroscope.noise_factor))
+        return float(np.sqrt(self.gyroscope.noise_factor))
 
     def between(self, timestamp: float, body: Odometry | None) -> Odometry | None:
         """Camera motion by the odometry, or by the stand-in."""
@@ -107,23 +107,23 @@ class OdometryMotion:
             return self._stand_in.between(timestamp)
         if not body.turned:
             return odometry_of_camera(body, self._bTc)
-        turn = self._gyroscope.corrected(turn_of_camera(body, self._bTc))
-        return self._gyroscope.handed(self._stand_in.between(timestamp, turn))
+        turn = self.gyroscope.corrected(turn_of_camera(body, self._bTc))
+        return self.gyroscope.handed(self._stand_in.between(timestamp, turn))
 
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
         """Updates the velocity of the stand-in, how far it is to be trusted, and the bias."""
         self._stand_in.observe(timestamp, pose, measured)
-        self._gyroscope.observe(pose)
+        self.gyroscope.observe(pose)
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """The stand-in goes on from there."""
         self._stand_in.displaced(timestamp, wTc, carried)
-        self._gyroscope.displaced()
+        self.gyroscope.displaced()
 
     def regained(self, timestamp: float, wTc: FloatArray) -> None:
         """The stand-in goes on from there."""
         self._stand_in.regained(timestamp, wTc)
-        self._gyroscope.displaced()
+        self.gyroscope.displaced()
 
     def description(self) -> dict[str, Any]:
         """The kind of odometry and what bridges its gaps."""
@@ -131,12 +131,12 @@ class OdometryMotion:
 
     def state(self) -> StateArrays:
         """State of the stand-in and of the gyroscope's bias."""
-        return self._stand_in.state() | self._gyroscope.state()
+        return self._stand_in.state() | self.gyroscope.state()
 
     def restore(self, state: StateArrays) -> None:
         """State of the stand-in and of the gyroscope's bias."""
         self._stand_in.restore(state)
-        self._gyroscope.restore(state)
+        self.gyroscope.restore(state)
 
 
 class ConstantVelocityMotion:

@@ -130,7 +130,7 @@ class Session:
         self._movable = beginning is None and own
         if isinstance(beginning, MapStart):
             beginning = self._begun(beginning, chosen, seed)
-        self._describer = make_describer(rig, frontend, checked_extractor(features))
+        self.describer = make_describer(rig, frontend, checked_extractor(features))
         self.pipeline = self._made(beginning)
         sensor = as_measured(rig, frontend)
         self.recorder = RunRecorder(MeasurementLog(sensor, description_of(self.pipeline.motion)))
@@ -144,8 +144,8 @@ class Session:
 
     def _made(self, beginning: Arrival | None) -> SlamPipeline:
         pipeline = self._make(beginning)
-        pipeline.describe = self._describer.complete
-        pipeline.describe_reference = self._describer.of_reference
+        pipeline.describe = self.describer.complete
+        pipeline.describe_reference = self.describer.of_reference
         self._near(pipeline)
         return pipeline
 
@@ -261,14 +261,14 @@ class Session:
         with one_blas_thread():
             bare = undescribed(i, frame)
             every = self.frontend.tracking == "sift"
-            found = self._describer.complete(bare) if every or self._start is not None else bare
+            found = self.describer.complete(bare) if every or self._start is not None else bare
             if images is not None:
                 self._seen.add(found, any_uint16(images))
             if self._start is None:
                 now = found
                 if self.begins_anew(found, body):
                     # An extractor that fails does so before anything has changed.
-                    now, body = self._describer.of_reference(replace(found, i=0)), None
+                    now, body = self.describer.of_reference(replace(found, i=0)), None
                     self._begin_anew(timestamp)
                 report = self.advance(now, timestamp, body)
                 if images is not None and not found.features:
@@ -396,7 +396,7 @@ class Session:
     def close(self) -> None:
         """Ends the session and its threads; results can still be asked for."""
         self._ended = self._ended or "it is closed"
-        self._describer.close()
+        self.describer.close()
 
     def __enter__(self) -> Self:
         return self

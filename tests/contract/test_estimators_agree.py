@@ -206,15 +206,15 @@ def test_the_marginals_of_a_long_lag_are_batch_s_on_any_floor(
 
 def own_values(solver: Isam2Solver) -> Refined:
     """The tree's own values as they are, without the last word that the estimate has."""
-    values = gtsam.Values(solver._values)
-    values.insert(solver._new_values)
-    return Refined(*WholeGraph.of(solver._builder.kept_factors(), values, solver._builder.kernel))
+    values = gtsam.Values(solver.values)
+    values.insert(solver.new_values)
+    return Refined(*WholeGraph.of(solver.builder.kept_factors(), values, solver.builder.kernel))
 
 
 def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """By itself: one step a frame, and nothing stays unlinearised."""
     relinearise_beyond(monkeypatch, 1e-9)
-    monkeypatch.setattr(Isam2Solver, "_refine", own_values)
+    monkeypatch.setattr(Isam2Solver, "solve_whole", own_values)
     for seed in range(10, 14):
         reference = answer(BATCH, last_blind(seed))
         settings = Isam2Settings(update_every=1, **LEAST_SQUARES)
@@ -223,7 +223,7 @@ def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_isam2_by_default_is_near_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its own estimate leaves what moves by less than the threshold; the last word is batch's."""
-    monkeypatch.setattr(Isam2Solver, "_refine", own_values)
+    monkeypatch.setattr(Isam2Solver, "solve_whole", own_values)
     own = Isam2Settings(**LEAST_SQUARES)
     for seed in range(10, 14):
         assert_same(answer(own, last_blind(seed)), answer(BATCH, last_blind(seed)), 0.1, 0.05)

@@ -28,10 +28,10 @@ from fgslam.runs.trials import Seeds, run_trials
 REFUSED = 2
 _STEPS = {
     "fgslam.core.log_blocks.BLOCK": 3,
-    "fgslam.runs.tasks.homing_views._VIEWS_A_BLOCK": 2,
-    "fgslam.runs.tasks.homing_trials._BLOCK": 1,
-    "fgslam.runs.tasks.homing_video._SAVE_EVERY_S": 0.0,
-    "fgslam.runs.tasks.localisation_queries._SAVE_EVERY_S": 0.0,
+    "fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK": 2,
+    "fgslam.runs.tasks.homing_trials.TRIALS_A_BLOCK": 1,
+    "fgslam.runs.tasks.homing_video.SAVE_EVERY_S": 0.0,
+    "fgslam.runs.tasks.localisation_queries.SAVE_EVERY_S": 0.0,
     "fgslam.report.pictures.style.DPI": 50,
 }
 
@@ -87,14 +87,14 @@ class Server:
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(request | {"said": str(self._said)}) + "\n")
         self._process.stdin.flush()
-        return int(self._line())
+        return int(self.line())
 
     def ended(self) -> tuple[int, str]:
         """Status of the process, once it has ended, and what it refused by."""
-        status = int(self._line())
+        status = int(self.line())
         return status, self._said.read_text() if self._said.is_file() else ""
 
-    def _line(self) -> str:
+    def line(self) -> str:
         assert self._process.stdout is not None
         return self._process.stdout.readline().strip()
 
@@ -111,7 +111,7 @@ def server(experiments: list[dict[str, Any]], scratch: Path) -> Iterator[Server]
         env=os.environ | {"PYTHONPATH": paths},
     ) as process:
         found = Server(process, scratch / "said")
-        assert found._line() == "ready"
+        assert found.line() == "ready"
         yield found
         process.kill()
 

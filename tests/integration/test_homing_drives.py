@@ -33,7 +33,7 @@ from fgslam.runs.tasks.homing_drives import (
     DrivenSeed,
     DriveWatcher,
     Unwrapping,
-    _displaced,
+    displaced_start,
     draw_leg_views,
     finish_drives,
 )
@@ -201,7 +201,7 @@ def test_displaced_starts_stay_near_and_free() -> None:
 
     world = SimpleNamespace(true_pose=np.zeros(3), clearance=clearance)
     places = np.array(
-        [_displaced(cast(Any, world), 1.0, np.random.default_rng(k)) for k in range(50)]
+        [displaced_start(cast(Any, world), 1.0, np.random.default_rng(k)) for k in range(50)]
     )
     assert (np.hypot(*places[:, :2].T) <= 1.0).all()
     assert (places[:, 0] <= 0.3).all()

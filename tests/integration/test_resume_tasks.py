@@ -84,8 +84,8 @@ HOUSE: dict[str, Any] = {
 IN_SMALL_BLOCKS = """
 from fgslam.cli.main import main
 from fgslam.runs.tasks import homing_trials, homing_views
-homing_trials._BLOCK = 1
-homing_views._VIEWS_A_BLOCK = 2
+homing_trials.TRIALS_A_BLOCK = 1
+homing_views.VIEWS_A_BLOCK = 2
 main()
 """
 _TIMED_FILES = ("timing.csv", "trials_timing.csv", "report.html")
@@ -237,10 +237,10 @@ def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None
     """Units in this process, few in a block, and every state saved."""
     monkeypatch.setattr("fgslam.core.log_blocks.BLOCK", 3)
     monkeypatch.setattr("fgslam.backend.smoothers.recorded_inputs.BLOCK", 1)
-    monkeypatch.setattr("fgslam.runs.tasks.homing_views._VIEWS_A_BLOCK", 2)
-    monkeypatch.setattr("fgslam.runs.tasks.homing_trials._BLOCK", 1)
-    monkeypatch.setattr("fgslam.runs.tasks.homing_video._SAVE_EVERY_S", 0.0)
-    monkeypatch.setattr("fgslam.runs.tasks.localisation_queries._SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK", 2)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_trials.TRIALS_A_BLOCK", 1)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_video.SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr("fgslam.runs.tasks.localisation_queries.SAVE_EVERY_S", 0.0)
 
 
 def run(
@@ -272,9 +272,9 @@ def renames(monkeypatch: pytest.MonkeyPatch, most: float, *, after: bool) -> lis
         elif path.is_file():
             os.truncate(path, path.stat().st_size // 2)
 
-    real_remove = files._remove_quietly
+    real_remove = files.remove_quietly
     monkeypatch.setattr(files, "os", SimpleNamespace(**vars(os) | {"replace": replace}))
-    monkeypatch.setattr("fgslam.core.files._remove_quietly", remove_quietly)
+    monkeypatch.setattr("fgslam.core.files.remove_quietly", remove_quietly)
     return seen
 
 

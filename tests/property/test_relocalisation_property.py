@@ -18,7 +18,7 @@ SETTINGS = RelocalisationSettings(map_sigma_m=0.001)
 @pytest.fixture(autouse=True)
 def _exact_features(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulated features are where their landmarks are, from wherever they are seen."""
-    monkeypatch.setattr(relocaliser, "_VIEW_SIGMA_PX", 0.0)
+    monkeypatch.setattr(relocaliser, "VIEW_SIGMA_PX", 0.0)
 
 
 @settings(max_examples=12, deadline=None)

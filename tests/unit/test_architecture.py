@@ -8,7 +8,14 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from architecture_rules import ROOMS, Module, check_modules, check_package, load_package
+from architecture_rules import (
+    ROOMS,
+    Module,
+    check_modules,
+    check_package,
+    load_package,
+    private_name_violations,
+)
 
 PACKAGE = Path(__file__).parents[2] / "fgslam"
 
@@ -38,6 +45,11 @@ def findings(folder: Path, files: dict[str, str]) -> list[str]:
 
 def test_fgslam_keeps_the_house_rules() -> None:
     violations = check_modules(whole_package())
+    assert not violations, "\n" + "\n".join(map(str, violations))
+
+
+def test_tests_reach_no_private_name_of_the_package() -> None:
+    violations = private_name_violations(PACKAGE.parent / "tests", whole_package())
     assert not violations, "\n" + "\n".join(map(str, violations))
 
 
@@ -238,3 +250,36 @@ def test_light_modules_load_no_heavy_library(module: str) -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+PRIVATE_CASES = {
+    "attribute": "made = object()\nmade._kept()\n",
+    "import": "\nfrom fgslam.core.a import _kept\n",
+    "attribute set by name": "\nmonkeypatch.setattr(module, '_kept', 1)\n",
+    "path": "\nmonkeypatch.setattr('fgslam.core.a._kept', 1)\n",
+    "path handed on": "x = 1\nSMALL = {'fgslam.core.a._kept': 1}\n",
+}
+
+
+@pytest.mark.parametrize("case", PRIVATE_CASES)
+def test_a_private_name_that_a_test_reaches_is_found(tmp_path: Path, case: str) -> None:
+    modules = load_package(write_package(tmp_path, {"core/a.py": "def _kept(): pass\n"}))
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_a.py").write_text(PRIVATE_CASES[case])
+    found = private_name_violations(tmp_path / "tests", modules)
+    assert [str(each) for each in found] == ["tests/test_a.py:2: reaches the private _kept"]
+
+
+def test_private_names_of_the_test_itself_and_of_libraries_are_its_own(tmp_path: Path) -> None:
+    modules = load_package(write_package(tmp_path, {"core/a.py": "_mine = _kept = 1\n"}))
+    (tmp_path / "tests").mkdir()
+    source = "import os\n_mine = 1\nsame = os._mine, os._exit\nself._kept = 1\n"
+    (tmp_path / "tests" / "test_a.py").write_text(source)
+    assert private_name_violations(tmp_path / "tests", modules) == []
+
+
+def test_a_clean_file_leaves_the_list_of_those_that_reach_private_names(tmp_path: Path) -> None:
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "test_a.py").write_text("x = 1\n")
+    (found,) = private_name_violations(tmp_path / "tests", [], frozenset({"tests/test_a.py"}))
+    assert str(found).endswith("strike it from the list")

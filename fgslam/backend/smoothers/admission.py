@@ -78,7 +78,7 @@ class LandmarkAdmission:
         self._saved: dict[int, tuple[FloatArray, FloatArray]] = {}
         self._first_frame = 0
         self.tracks: dict[int, Track] = {}
-        self._recent: dict[int, Track] = {}
+        self.by_last_sighting: dict[int, Track] = {}
         self.remarks: list[str] = []
 
     # -- what a frame's observations say of their landmarks --------------------------------------
@@ -159,8 +159,8 @@ class LandmarkAdmission:
         track = self.tracks.get(identity)
         if track is None:
             track = self.tracks[identity] = Track(LEAST_PARALLAX, sighting)
-        self._recent.pop(identity, None)  # the order is that of the last sightings
-        self._recent[identity] = track
+        self.by_last_sighting.pop(identity, None)  # the order is that of the last sightings
+        self.by_last_sighting[identity] = track
         track.last = sighting
         track.sightings += 1
         return track
@@ -182,14 +182,14 @@ class LandmarkAdmission:
         """Drops landmarks as the front-end did: what they said stays in the graph, they do not."""
         for identity in identities.tolist():
             self.tracks.pop(identity, None)
-            self._recent.pop(identity, None)
+            self.by_last_sighting.pop(identity, None)
             self._saved.pop(identity, None)
 
     def start_anew(self, identities: Iterable[int], why: str) -> None:
         """Closes the variables of landmarks; their next sighting begins new ones."""
         for identity in identities:
             self._saved.pop(identity, None)
-            self._recent.pop(identity, None)
+            self.by_last_sighting.pop(identity, None)
             track = self.tracks.pop(identity, None)
             if track is not None and why:
                 self.remarks.append(
@@ -213,9 +213,11 @@ class LandmarkAdmission:
             Identity and track of each; it keeps its variable until the caller closes it.
         """
         self._first_frame = frame
-        left = [(i, track) for i, track in self._recent.items() if track.last.frame < frame]
+        left = [
+            (i, track) for i, track in self.by_last_sighting.items() if track.last.frame < frame
+        ]
         for identity, _ in left:
-            del self._recent[identity]
+            del self.by_last_sighting[identity]
         return [(i, track) for i, track in left if track.variable >= 0]
 
     def recent(self, since: int) -> tuple[IntArray, IntArray, IntArray]:
@@ -224,7 +226,7 @@ class LandmarkAdmission:
         Returns:
             Their identities, variables (-1: it waits outside) and the frames that saw them last.
         """
-        latest = reversed(self._recent.items())
+        latest = reversed(self.by_last_sighting.items())
         seen = list(itertools.takewhile(lambda each: each[1].last.frame >= since, latest))
         variables = [track.variable for _, track in seen]
         frames = [track.last.frame for _, track in seen]
@@ -237,7 +239,7 @@ class LandmarkAdmission:
 
     def in_graph(self) -> list[tuple[int, Track]]:
         """Landmarks that are in the graph, the one seen last first."""
-        latest = reversed(self._recent.items())
+        latest = reversed(self.by_last_sighting.items())
         return [(i, track) for i, track in latest if track.variable >= 0]
 
     def describe(self, identity: int, variable: int) -> str:

@@ -54,7 +54,7 @@ class BatchSolver(WholeGraphSolver):
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Takes in a frame's initial values; the builder keeps its factors."""
-        self._values.insert(new.values)
+        self.values.insert(new.values)
         self._answer = None
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
@@ -63,8 +63,8 @@ class BatchSolver(WholeGraphSolver):
         if not every or (frame + 1) % every:
             return None
         answer = self.solution()
-        self._values.update(self._refined().values)
-        return Smoothed(self._values, Prediction(answer.poses[-1], answer.pose_covariances[-1]))
+        self.values.update(self.refined().values)
+        return Smoothed(self.values, Prediction(answer.poses[-1], answer.pose_covariances[-1]))
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
@@ -73,8 +73,8 @@ class BatchSolver(WholeGraphSolver):
             return None
         if found.values is None:
             return ClosedLoop()
-        self._values = found.values
-        graph, state = self._builder.whole_graph(self._values)
+        self.values = found.values
+        graph, state = self.builder.whole_graph(self.values)
         covariance = reduced(graph.linear(state)).poses()[-1]
         here = reorthonormalise(state.poses[-1])
         return self._after_loop(allowed_parts(self._floor, here[None], covariance[None])[0])
@@ -82,7 +82,7 @@ class BatchSolver(WholeGraphSolver):
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
         if self._settings.method == "gnc":
-            return graduated(graph, state, MINIMUM, self._builder.noise_factor)
+            return graduated(graph, state, MINIMUM, self.builder.noise_factor)
         if self._settings.trim:
-            return trimmed(graph, state, MINIMUM, self._builder.noise_factor)
+            return trimmed(graph, state, MINIMUM, self.builder.noise_factor)
         return graph.minimum(state, MINIMUM.iterations, MINIMUM.tolerance), graph

@@ -71,13 +71,13 @@ class FixedLagSolver:
 
     def __init__(self, problem: GraphProblem, settings: FixedLagSettings) -> None:
         """An empty window."""
-        self._builder, self._floor = problem.builder, problem.floor
+        self.builder, self._floor = problem.builder, problem.floor
         self._in_seconds = settings.lag_frames is None
         self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
-        self._window = Window(problem.sensor, problem.builder.kernel)
+        self.window = Window(problem.sensor, problem.builder.kernel)
         self._solved: Solved | None = None
         self._oldest = 0
-        self._poses: list[FloatArray] = []
+        self.poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
         self._clock: list[float] = []
         self.remarks: list[str] = []
@@ -89,12 +89,12 @@ class FixedLagSolver:
 
     def pose(self, frame: int) -> Prediction:
         """A frame's pose; final before the lag."""
-        return Prediction(self._poses[frame], self._covariances[frame])
+        return Prediction(self.poses[frame], self._covariances[frame])
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Takes in a frame, and lets go what is older than the lag."""
         self._clock.append(timestamp)
-        self._poses.append(np.eye(4))
+        self.poses.append(np.eye(4))
         self._covariances.append(np.full((6, 6), np.nan))
         self._take(new)
         self._solve()
@@ -102,7 +102,7 @@ class FixedLagSolver:
 
     def recalibrate(self, change: RigChange) -> None:
         """Corrects the window's observations anew; what has left it is what it was."""
-        self._window.remeasure(change.measured)
+        self.window.remeasure(change.measured)
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """The window's solution, in every frame."""
@@ -110,12 +110,10 @@ class FixedLagSolver:
 
     def _smoothed(self, frames: set[int]) -> Smoothed:
         """Keeps the covariances of some frames of the window."""
-        last = len(self._poses) - 1
+        last = len(self.poses) - 1
         for frame in frames:
             self._covariances[frame] = self._covariance(frame)
-        return Smoothed(
-            self._window.values(), Prediction(self._poses[last], self._covariances[last])
-        )
+        return Smoothed(self.window.values(), Prediction(self.poses[last], self._covariances[last]))
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
@@ -126,7 +124,7 @@ class FixedLagSolver:
         if inside:
             self._covariances[loop.before] = self._covariance(loop.before)
         earlier, last = (
-            Prediction(self._poses[frame], self._covariances[frame])
+            Prediction(self.poses[frame], self._covariances[frame])
             for frame in (loop.before, loop.after)
         )
         found = drift_undone(self._floor, earlier, last, loop, what)
@@ -134,7 +132,7 @@ class FixedLagSolver:
             self.remarks.append(found.remark)
             return None
         if inside:
-            self._window.factors.add(constraint_factor(loop))
+            self.window.factors.add(constraint_factor(loop))
             self._solve()
             self.remarks.append(f"{found.remark}; within the lag, it is a factor more")
         else:
@@ -145,24 +143,24 @@ class FixedLagSolver:
     def _move_all(self, last: Prediction) -> None:
         """Takes the window along with its last pose, as it is, and starts from there."""
         oldest = self._oldest
-        moved = last.wTc @ inverse(self._poses[-1])
-        to_oldest = adjoint(inverse(self._poses[oldest]) @ last.wTc)
+        moved = last.wTc @ inverse(self.poses[-1])
+        to_oldest = adjoint(inverse(self.poses[oldest]) @ last.wTc)
         self._covariances[oldest] = congruence(to_oldest, last.covariance)
-        there = Prediction(moved @ self._poses[oldest], self._covariances[oldest])
-        self._window.carried_along(moved, pose_prior(pose_key(oldest), there))
+        there = Prediction(moved @ self.poses[oldest], self._covariances[oldest])
+        self.window.carried_along(moved, pose_prior(pose_key(oldest), there))
         self._solve()
 
     def solution(self) -> Solution:
         """Poses as they left the window, and those inside with their marginals."""
         covariances = np.array(self._covariances)  # our own stay as the updates left them
-        for frame in range(self._oldest, len(self._poses)):
+        for frame in range(self._oldest, len(self.poses)):
             covariances[frame] = self._covariance(frame)
-        solved, landmarks = self._at_last(), self._window.landmarks
-        inside = [track.variable for _, track in self._builder.admission.in_graph()]
+        solved, landmarks = self._at_last(), self.window.landmarks
+        inside = [track.variable for _, track in self.builder.admission.in_graph()]
         places = landmarks.points[np.searchsorted(landmarks.variables, inside)]
         found = solved.eliminated.landmarks()[solved.rows(inside)]
         return Solution(
-            np.array(self._poses),
+            np.array(self.poses),
             covariances,
             dict(zip(inside, places, strict=True)),
             dict(zip(inside, found, strict=True)),
@@ -172,7 +170,7 @@ class FixedLagSolver:
         """Joint covariance of the last pose and landmark variables of the window."""
         solved = self._at_last()
         joint = solved.eliminated.joint(len(solved.frames) - 1, solved.rows(variables))
-        return allowed_joint(self._floor, self._poses[-1], joint)
+        return allowed_joint(self._floor, self.poses[-1], joint)
 
     # ----------------------------------------------------------------------------------------
 
@@ -182,48 +180,48 @@ class FixedLagSolver:
     def _take(self, new: NewFactors) -> None:
         """A frame's pose, landmarks and observations into the window."""
         pose = new.values.atPose3(pose_key(new.frame)).matrix()
-        self._window.add_pose(new.frame, pose, new.graph)
-        self._window.kernel = self._builder.kernel
-        known = self._window.landmarks.variables
+        self.window.add_pose(new.frame, pose, new.graph)
+        self.window.kernel = self.builder.kernel
+        known = self.window.landmarks.variables
         before = int(known[-1]) if len(known) else -1
         entered = sorted({v for v, _ in new.sightings if v > before})
         if entered:
-            self._window.add_landmarks(_landmarks(new, entered))
+            self.window.add_landmarks(_landmarks(new, entered))
         if new.sightings:
-            self._window.observe(
+            self.window.observe(
                 np.array([s.frame for _, s in new.sightings], np.int64),
                 np.array([v for v, _ in new.sightings], np.int64),
                 np.array([s.measurement for _, s in new.sightings]),
-                self._builder.noise.power * np.array([s.covariance for _, s in new.sightings]),
+                self.builder.noise.power * np.array([s.covariance for _, s in new.sightings]),
             )
 
     def _solve(self) -> None:
         """Solves the window, without landmarks on which it fails."""
-        self._solved = self._window.repaired(self._take_out, self._failed)
-        for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
-            self._poses[frame] = pose.copy()  # a view would keep the whole window's array
+        self._solved = self.window.repaired(self._take_out, self._failed)
+        for frame, pose in zip(self.window.frames, self.window.poses, strict=True):
+            self.poses[frame] = pose.copy()  # a view would keep the whole window's array
 
     def _failed(self, error: Exception) -> Exception:
-        return solver_failed(self.kind, error, self._builder.frames[-1])
+        return solver_failed(self.kind, error, self.builder.frames[-1])
 
     def _take_out(self, variable: int) -> None:
-        self._window.take_out(variable)
+        self.window.take_out(variable)
         self.remarks.append(
-            f"{self._builder.take_out(variable)} left the system indeterminate at frame "
-            f"{self._builder.frames[-1]}: taken out"
+            f"{self.builder.take_out(variable)} left the system indeterminate at frame "
+            f"{self.builder.frames[-1]}: taken out"
         )
 
     def _move_window(self, known: LandmarkMap) -> None:
         """Notes which poses and landmarks have left; landmarks keep their last place."""
-        last = len(self._poses) - 1
+        last = len(self.poses) - 1
         while self._time(self._oldest) < self._time(last) - self._lag:
             self._oldest += 1
         try:
-            self._window.let_go_before(self._oldest)
+            self.window.let_go_before(self._oldest)
         except (UndeterminedError, np.linalg.LinAlgError) as error:
             raise self._failed(error) from None
         last_seen: dict[int, list[tuple[int, Track]]] = {}
-        for identity, track in self._builder.forget_before(self._oldest):
+        for identity, track in self.builder.forget_before(self._oldest):
             last_seen.setdefault(track.last.frame, []).append((identity, track))
         for frame, left in last_seen.items():
             rows = known.rows(np.array([identity for identity, _ in left], np.int64))
@@ -234,7 +232,7 @@ class FixedLagSolver:
 
     def _with_pose(self, frame: int, places: FloatArray, given_poses: FloatArray) -> FloatArray:
         """Covariances (k, 3, 3) of landmarks that left: given the poses, and of the last pose."""
-        wTc = self._poses[frame]
+        wTc = self.poses[frame]
         jacobians = point_pose_jacobian(transform_to_camera(wTc, places))
         by_pose = congruence(jacobians, self._covariances[frame])
         return np.asarray(given_poses + congruence(wTc[:3, :3], by_pose))
@@ -248,7 +246,7 @@ class FixedLagSolver:
     def _covariance(self, frame: int) -> FloatArray:
         solved = self._at_last()
         covariance = solved.eliminated.pose(solved.frames.index(frame))
-        kept = allowed_parts(self._floor, self._poses[frame][None], covariance[None])
+        kept = allowed_parts(self._floor, self.poses[frame][None], covariance[None])
         return np.asarray(kept[0])
 
 

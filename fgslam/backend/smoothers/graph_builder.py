@@ -110,7 +110,7 @@ class GraphBuilder:
         self._turned: dict[int, TurnedStep] = {}
         self._weigh()
         self._rows: dict[int, list[int]] = {}
-        self._id_of = array("q")  # eight bytes a variable, which is all a bounded lag keeps of it
+        self.identities = array("q")  # of variables: all that a bounded lag keeps of one
         self.observed = GrowingColumns(
             frame=np.empty(0, np.int64),
             variable=np.empty(0, np.int64),
@@ -151,7 +151,7 @@ class GraphBuilder:
     @property
     def variables(self) -> int:
         """Number of landmark variables made so far."""
-        return len(self._id_of)
+        return len(self.identities)
 
     def add(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> NewFactors:
         """Adds a frame's pose and observations.
@@ -184,12 +184,12 @@ class GraphBuilder:
             self.graph.remove(row)
         self.observed["gone"][self.observed["variable"] == variable] = True
         words = self.describe(variable)
-        self.admission.taken_out(self._id_of[variable], variable)
+        self.admission.taken_out(self.identities[variable], variable)
         return words
 
     def describe(self, variable: int) -> str:
         """A landmark variable's identity and sightings, in words."""
-        return self.admission.describe(self._id_of[variable], variable)
+        return self.admission.describe(self.identities[variable], variable)
 
     def forget_before(self, frame: int) -> list[tuple[int, Track]]:
         """For a bounded lag: earlier frames, and landmarks last seen in them, have left the graph.
@@ -216,7 +216,7 @@ class GraphBuilder:
 
     def of_saved_map(self, variable: int) -> bool:
         """Whether a landmark variable is on the prior of a saved map's landmark."""
-        return self.admission.saved(self._id_of[variable]) is not None
+        return self.admission.saved(self.identities[variable]) is not None
 
     def in_graph(self, variable: int) -> bool:
         """Whether a landmark variable still has its factors."""
@@ -389,8 +389,8 @@ class GraphBuilder:
     ) -> None:
         """A landmark's variable, its prior if it needs one, and all its sightings so far."""
         track = self.admission.tracks[identity]
-        track.variable = len(self._id_of)
-        self._id_of.append(identity)
+        track.variable = len(self.identities)
+        self.identities.append(identity)
         self._rows[track.variable] = []
         key = landmark_key(track.variable)
         new.values.insert(key, position)

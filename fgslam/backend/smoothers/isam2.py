@@ -69,26 +69,26 @@ class Isam2Solver(WholeGraphSolver):
         super().__init__(problem.builder, problem.floor)
         self._settings = settings
         self._with_qr = False
-        self._isam = self._new_solver()
+        self.tree = self.new_tree()
         self._graph = gtsam.NonlinearFactorGraph()
-        self._new_values = gtsam.Values()
+        self.new_values = gtsam.Values()
         self._updated = 0
 
     def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
         """Keeps a frame's factors for the next update."""
         self._graph.push_back(new.graph)
-        self._graph.push_back(self._builder.observation_factors(new.sightings))
-        self._new_values.insert(new.values)
+        self._graph.push_back(self.builder.observation_factors(new.sightings))
+        self.new_values.insert(new.values)
         self._answer = None
 
     def recalibrate(self, change: RigChange) -> None:
         """Builds the tree anew, of the new measurements."""
         super().recalibrate(change)
-        together = gtsam.Values(self._values)
-        together.insert(self._new_values)
+        together = gtsam.Values(self.values)
+        together.insert(self.new_values)
         if together.empty():
             return
-        self._graph, self._new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._graph, self.new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         try:
             self._rebuild(together)
         except RuntimeError as error:
@@ -100,35 +100,36 @@ class Isam2Solver(WholeGraphSolver):
             return None
         self._updated = frame
         self._flush()
-        last = self._builder.frames[-1]
+        last = self.builder.frames[-1]
         return Smoothed(
-            self._values, Prediction(poses_of_frame(self._values, last), self._covariance(last))
+            self.values, Prediction(poses_of_frame(self.values, last), self._covariance(last))
         )
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Updates the tree with the loop, or builds it anew where the loop moves the map."""
-        self._updated = self._builder.frames[-1]
+        self._updated = self.builder.frames[-1]
         self._flush()
         found = self._accepted(loop, drive, what, _without_loop)
         if found is None:
             return None
         self._join(found.values)
-        return self._after_loop(self._covariance(self._builder.frames[-1]))
+        return self._after_loop(self._covariance(self.builder.frames[-1]))
 
-    def _refine(self) -> Refined:
-        values = gtsam.Values(self._values)
-        values.insert(self._new_values)
-        return refine(self._builder, values, self._minimise)
+    def solve_whole(self) -> Refined:
+        """The minimum from the tree's values, with those of frames that wait."""
+        values = gtsam.Values(self.values)
+        values.insert(self.new_values)
+        return refine(self.builder, values, self._minimise)
 
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
-        return trimmed(graph, state, MINIMUM, self._builder.noise_factor)
+        return trimmed(graph, state, MINIMUM, self.builder.noise_factor)
 
     def _join(self, found: Any | None) -> None:
         """Goes on with the graph that has the loop; from these values where they are given."""
         if found is None:
             graph = gtsam.NonlinearFactorGraph()
-            graph.add(self._loops.last_factor())
+            graph.add(self.loops.last_factor())
             self._update(graph, gtsam.Values())
             return
         try:
@@ -138,7 +139,8 @@ class Isam2Solver(WholeGraphSolver):
 
     # ----------------------------------------------------------------------------------------
 
-    def _new_solver(self) -> Any:
+    def new_tree(self) -> Any:
+        """An empty Bayes tree."""
         method, factorization = (
             gtsam.ISAM2GaussNewtonParams(),
             "QR" if self._with_qr else "CHOLESKY",
@@ -149,16 +151,16 @@ class Isam2Solver(WholeGraphSolver):
         """Brings the frames since the last update in."""
         if self._graph.size() == 0:
             return
-        graph, values = self._graph, self._new_values
-        self._graph, self._new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        graph, values = self._graph, self.new_values
+        self._graph, self.new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._update(graph, values)
 
     def _update(self, graph: Any, values: Any) -> None:
         try:
-            self._isam.update(graph, values, [], self._groups())
-            self._values = self._isam.calculateEstimate()
+            self.tree.update(graph, values, [], self._groups())
+            self.values = self.tree.calculateEstimate()
         except RuntimeError as error:
-            together = gtsam.Values(self._values)
+            together = gtsam.Values(self.values)
             together.insert(values)
             self._repair(together, error)
 
@@ -168,7 +170,7 @@ class Isam2Solver(WholeGraphSolver):
         if window == 0:
             return None
         groups = gtsam.KeyGroupMap()
-        for frame in self._builder.frames[-window:]:
+        for frame in self.builder.frames[-window:]:
             groups.insert2(pose_key(frame), 1)
         return groups
 
@@ -211,10 +213,10 @@ class Isam2Solver(WholeGraphSolver):
             what = f"pose of frame {number(key)}" if is_pose(key) else "the map beyond a gap"
             self.remarks.append(
                 f"{what} known too unevenly for Cholesky at frame "
-                f"{self._builder.frames[-1]}: iSAM2 built anew, with QR from here on"
+                f"{self.builder.frames[-1]}: iSAM2 built anew, with QR from here on"
             )
             return True
-        if is_pose(key) or not self._builder.in_graph(number(key)):
+        if is_pose(key) or not self.builder.in_graph(number(key)):
             return False
         self._take_out(number(key), values, "left the system indeterminate")
         return True
@@ -224,47 +226,47 @@ class Isam2Solver(WholeGraphSolver):
 
         Behind a camera nothing holds them: each alone would leave the system indeterminate.
         """
-        poses = np.full((self._builder.frames[-1] + 1, 4, 4), np.nan)
-        for frame in self._builder.frames:
+        poses = np.full((self.builder.frames[-1] + 1, 4, 4), np.nan)
+        for frame in self.builder.frames:
             poses[frame] = poses_of_frame(values, frame)
-        places = self._builder.seen_last(poses)
+        places = self.builder.seen_last(poses)
         points = {v: values.atPoint3(landmark_key(v)) for v in places}
-        behind = self._builder.behind(poses, points)
+        behind = self.builder.behind(poses, points)
         for variable in behind:
             values.update(landmark_key(variable), places[variable])
         if behind:
             self.remarks.append(
                 f"{len(behind)} landmarks came out behind a camera at frame "
-                f"{self._builder.frames[-1]}: put where they were seen last, iSAM2 built anew"
+                f"{self.builder.frames[-1]}: put where they were seen last, iSAM2 built anew"
             )
         return len(behind)
 
     def _take_out(self, variable: int, values: Any, why: str) -> None:
-        what = self._builder.take_out(variable)
+        what = self.builder.take_out(variable)
         values.erase(landmark_key(variable))
         self.remarks.append(
-            f"{what} {why} at frame {self._builder.frames[-1]}: taken out of the graph, iSAM2 "
+            f"{what} {why} at frame {self.builder.frames[-1]}: taken out of the graph, iSAM2 "
             "built anew from the last estimate"
         )
 
     def _rebuild(self, values: Any) -> None:
-        self._isam = self._new_solver()
-        self._isam.update(self._builder.kept_factors(), values, [], self._groups())
-        self._values = self._isam.calculateEstimate()
+        self.tree = self.new_tree()
+        self.tree.update(self.builder.kept_factors(), values, [], self._groups())
+        self.values = self.tree.calculateEstimate()
 
     def _covariance(self, frame: int) -> FloatArray:
         """Marginal of a pose; where the tree cannot tell it, it is built anew first."""
         try:
-            covariance = np.asarray(self._isam.marginalCovariance(pose_key(frame)))
+            covariance = np.asarray(self.tree.marginalCovariance(pose_key(frame)))
         except RuntimeError as error:
-            self._repair(self._values, error)
+            self._repair(self.values, error)
             covariance = self._marginal_again(frame)
-        pose = poses_of_frame(self._values, frame)
+        pose = poses_of_frame(self.values, frame)
         return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
 
     def _marginal_again(self, frame: int) -> FloatArray:
         try:
-            return np.asarray(self._isam.marginalCovariance(pose_key(frame)))
+            return np.asarray(self.tree.marginalCovariance(pose_key(frame)))
         except RuntimeError as error:
             raise self._failed(error) from None
 

@@ -54,7 +54,7 @@ class LagSmoother(Smoother):
     @property
     def homes(self) -> IntArray:
         """(n,) frame that first saw each landmark of the map."""
-        return self._tracker.homes
+        return self.tracker.homes
 
     def poses_of(self, frames: IntArray) -> FloatArray:
         """Poses (k, 4, 4) of earlier frames as known now."""
@@ -62,8 +62,8 @@ class LagSmoother(Smoother):
 
     def settled(self, ids: IntArray) -> BoolArray:
         """(k,) which landmarks have left the lag: what it sees does not change them any more."""
-        tracks, oldest = self._builder.admission.tracks, self._lag.oldest
-        seen_within = self._tracker.held_aside(ids).lasts >= oldest
+        tracks, oldest = self.builder.admission.tracks, self._lag.oldest
+        seen_within = self.tracker.held_aside(ids).lasts >= oldest
         within = [
             track is not None and (track.variable >= 0 or track.last.frame >= oldest)
             for track in map(tracks.get, ids.tolist())
@@ -72,9 +72,9 @@ class LagSmoother(Smoother):
 
     def held_aside(self, ids: IntArray) -> SetAside:
         """Copies of landmarks, with what it takes to give them back; nothing changes."""
-        aside = self._tracker.held_aside(ids)
+        aside = self.tracker.held_aside(ids)
         gain, information = self._doubt.held_aside(ids)
-        tracks = arrays_of(self._builder.admission, ids)
+        tracks = arrays_of(self.builder.admission, ids)
         return dataclasses.replace(
             aside,
             poses=self.poses_of(aside.frames),
@@ -85,9 +85,9 @@ class LagSmoother(Smoother):
 
     def give_up(self, ids: IntArray) -> None:
         """Forgets landmarks that somebody else holds now; they are settled."""
-        self._tracker.give_up(ids)
+        self.tracker.give_up(ids)
         self._doubt.forget(ids)
-        self._builder.admission.start_anew(ids.tolist(), "")
+        self.builder.admission.start_anew(ids.tolist(), "")
         self._away = np.union1d(self._away, ids)
 
     def take_back(self, aside: SetAside) -> None:
@@ -95,12 +95,12 @@ class LagSmoother(Smoother):
         ids = aside.landmarks.ids
         where_tracked = dataclasses.replace(
             aside,
-            poses=self._tracker.poses_of(aside.frames),
+            poses=self.tracker.poses_of(aside.frames),
             doubt_information=np.zeros_like(aside.doubt_information),  # the tracker's has none
         )
-        self._tracker.take_back(where_tracked)
+        self.tracker.take_back(where_tracked)
         self._doubt.take_back(ids, aside.doubt_gain, aside.doubt_information)
-        self._builder.admission.tracks.update(tracks_of(aside.tracks, ids))
+        self.builder.admission.tracks.update(tracks_of(aside.tracks, ids))
         self._away = np.setdiff1d(self._away, ids)
 
     def reported(self, aside: SetAside) -> LandmarkMap:
@@ -141,7 +141,7 @@ class LagSmoother(Smoother):
 
     def _within(self, ids: IntArray) -> int:
         """How many of them are variables of the lag: those hold a frame by their factors."""
-        tracks = self._builder.admission.tracks
+        tracks = self.builder.admission.tracks
         return sum(i in tracks and tracks[i].variable >= 0 for i in ids.tolist())
 
     def _located(self, matched: IntArray, tracking: EgoMotion) -> FloatArray:
@@ -149,8 +149,8 @@ class LagSmoother(Smoother):
 
         Its landmarks are as uncertain as the pose of the frame that began them, in the middle.
         """
-        known = self._tracker.landmarks()
-        homes = self._tracker.homes[known.rows(matched[np.isin(matched, known.ids)])]
+        known = self.tracker.landmarks()
+        homes = self.tracker.homes[known.rows(matched[np.isin(matched, known.ids)])]
         if not len(homes):
             return tracking.covariance
         home = self._lag.pose(int(np.sort(homes)[len(homes) // 2]))

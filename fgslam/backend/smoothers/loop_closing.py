@@ -37,7 +37,7 @@ from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 _AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
 _OBSERVED = float(chi_square_quantile(0.999, 3))  # of an observation that fits
-_LONG_UNSEEN = 60  # frames, as the front-end's LoopSettings.forgotten_after
+LONG_UNSEEN = 60  # frames, as the front-end's LoopSettings.forgotten_after
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small
@@ -66,7 +66,7 @@ class GraphLoops:
 
     def __init__(self, builder: GraphBuilder, kernel: KernelSettings | None = None) -> None:
         """No loop yet; the kernel is that of the observations where the graph is solved."""
-        self._builder, self._kernel = builder, kernel
+        self.builder, self._kernel = builder, kernel
         self.accepted: list[Constraint] = []
 
     def judge(
@@ -93,10 +93,10 @@ class GraphLoops:
         if misfit(constraint_factor(known), values) <= _AGREES:
             self.accept(known)
             return Acceptance(True, None, f"{what}: as expected, nothing moved")
-        graph, state = self._builder.whole_graph(values, self._kernel)
+        graph, state = self.builder.whole_graph(values, self._kernel)
         state = minimum(graph, state)
         loops = [*self.accepted, known]
-        guess = first_guess(self._builder, graph.values(state), drive.chain, loops)
+        guess = first_guess(self.builder, graph.values(state), drive.chain, loops)
         closed = graph.plus(constraint_factor(known))
         solution = solved(closed, dataclasses.replace(State.of(guess), bias=state.bias))
         refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
@@ -122,14 +122,14 @@ class GraphLoops:
         camera expected it. That is a loop closure, too, of a few matches, and false where the
         drift is large; so the larger number of matches says which of both is believed.
         """
-        gate = _OBSERVED / self._builder.noise_factor**2
-        frames, variables, *_ = self._builder.kept_observed()
+        gate = _OBSERVED / self.builder.noise_factor**2
+        frames, variables, *_ = self.builder.kept_observed()
         return found_again(frames, variables) & (squared > gate)
 
     def accept(self, known: Constraint) -> None:
         """Believed now, it is doubted when later ones contradict it."""
         known = dataclasses.replace(known, doubted=True)
-        self._builder.add_factor(constraint_factor(known))
+        self.builder.add_factor(constraint_factor(known))
         self.accepted.append(known)
 
     def last_factor(self) -> Any:
@@ -141,7 +141,7 @@ def found_again(frames: IntArray, variables: IntArray) -> BoolArray:
     """(k,) which observations, by frame and landmark, are of landmarks that were long unseen."""
     order = np.lexsort((frames, variables))
     same = np.diff(variables[order], prepend=-1) == 0
-    returns = np.cumsum(same & (np.diff(frames[order], prepend=0) >= _LONG_UNSEEN))
+    returns = np.cumsum(same & (np.diff(frames[order], prepend=0) >= LONG_UNSEEN))
     starts = np.flatnonzero(~same)
     before = np.repeat(returns[starts], np.diff(np.append(starts, len(returns))))
     out = np.zeros(len(frames), np.bool_)

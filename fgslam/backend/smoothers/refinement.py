@@ -245,7 +245,7 @@ def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)
         found = Refined(kept, state, tuple(remarks), builder.doubted)
-        lost = _lost(builder, found)
+        lost = lost_landmarks(builder, found)
         if not lost:
             return found
         remarks += [f"{builder.describe(v)} {why}: left out" for v, why in lost.items()]
@@ -267,9 +267,9 @@ class WholeGraphSolver:
         self, builder: GraphBuilder, floor: Floor, kernel: KernelSettings | None = None
     ) -> None:
         """Nothing to solve yet; loops are judged with the builder's kernel or with another."""
-        self._builder, self._floor = builder, floor
-        self._loops = GraphLoops(builder, kernel)
-        self._values = gtsam.Values()
+        self.builder, self._floor = builder, floor
+        self.loops = GraphLoops(builder, kernel)
+        self.values = gtsam.Values()
         self._answer: Refined | None = None
         self.remarks: list[str] = []
 
@@ -280,7 +280,7 @@ class WholeGraphSolver:
     @one_blas_thread()
     def solution(self) -> Solution:
         """All poses and landmarks at the minimum over all that was measured, with marginals."""
-        return solution(self._refined(), self._builder.frames, self._floor)
+        return solution(self.refined(), self.builder.frames, self._floor)
 
     @one_blas_thread()
     def joint(self, variables: list[int]) -> FloatArray:
@@ -289,25 +289,26 @@ class WholeGraphSolver:
         Raises:
             EstimatorError: a landmark was left out of the last solution.
         """
-        refined = self._refined()
+        refined = self.refined()
         lost = set(variables) - set(refined.variables)
         if lost:
-            raise EstimatorError(f"{self._builder.describe(min(lost))} was left out of the graph")
+            raise EstimatorError(f"{self.builder.describe(min(lost))} was left out of the graph")
         rows = np.searchsorted(refined.variables, variables).astype(np.int64)
         joint = refined.marginals.joint(len(refined.state.poses) - 1, rows)
         return allowed_joint(self._floor, refined.state.poses[-1], joint)
 
-    def _refined(self) -> Refined:
+    def refined(self) -> Refined:
         """The graph's last solution."""
         if self._answer is None:
             try:
-                self._answer = self._refine()
+                self._answer = self.solve_whole()
             except RuntimeError as error:
                 raise self._failed(error, "after") from None
         return self._answer
 
-    def _refine(self) -> Refined:
-        return refine(self._builder, self._values, self._minimise)
+    def solve_whole(self) -> Refined:
+        """The minimum of the whole graph from the values of now."""
+        return refine(self.builder, self.values, self._minimise)
 
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
@@ -318,7 +319,7 @@ class WholeGraphSolver:
         self, loop: Constraint, drive: Drive, what: str, minimum: Minimum
     ) -> Acceptance | None:
         """The loop in the graph; None, and a remark, if it is refused. See GraphLoops.judge."""
-        found = self._loops.judge(loop, drive, self._values, minimum, what)
+        found = self.loops.judge(loop, drive, self.values, minimum, what)
         self.remarks.append(found.remark)
         if not found.closed:
             return None
@@ -327,11 +328,11 @@ class WholeGraphSolver:
 
     def _after_loop(self, covariance: FloatArray) -> ClosedLoop:
         """The values that a loop has moved, and the covariance (6, 6) of their last pose."""
-        here = reorthonormalise(poses_of_frame(self._values, self._builder.frames[-1]))
-        return ClosedLoop(Smoothed(self._values, Prediction(here, covariance), by_loop=True))
+        here = reorthonormalise(poses_of_frame(self.values, self.builder.frames[-1]))
+        return ClosedLoop(Smoothed(self.values, Prediction(here, covariance), by_loop=True))
 
     def _failed(self, error: Exception, when: str = "at") -> Exception:
-        return solver_failed(self.kind, error, self._builder.frames[-1], when)
+        return solver_failed(self.kind, error, self.builder.frames[-1], when)
 
 
 def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
@@ -352,7 +353,8 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     return Solution(poses, kept, points, covariances, remarks, True, ratio, bias)
 
 
-def _lost(builder: GraphBuilder, found: Refined) -> dict[int, str]:
+def lost_landmarks(builder: GraphBuilder, found: Refined) -> dict[int, str]:
+    """Landmark variables behind a camera or without an observation that counts, and why."""
     behind = dict.fromkeys(builder.behind(found.poses(), found.points()), _BEHIND)
     variables = found.variables
     return behind | {variables[row]: _UNSEEN for row in found.graph.unseen().tolist()}

@@ -71,15 +71,15 @@ class SlidingWindowSolver(WholeGraphSolver):
         """An empty window."""
         super().__init__(problem.builder, problem.floor)
         self._settings, self._sensor = settings, problem.sensor
-        self._window = Window(problem.sensor, problem.builder.kernel)
-        self._held = HeldLandmarks()
+        self.window = Window(problem.sensor, problem.builder.kernel)
+        self.held = HeldLandmarks()
         self._new: list[NewFactors] = []
         self._solved_at = 0
         self._leaving: Solved | None = None  # the solution, until what is too old has left
         self._taken = 0  # observations of the builder's that were looked at
         self._waiting = np.empty(0, np.int64)  # of them, those of landmarks that may be back
-        self._poses: list[FloatArray] = []
-        self._drift: list[FloatArray] = []  # (6, 6) covariances, as motions of the world
+        self.poses: list[FloatArray] = []
+        self.drift: list[FloatArray] = []  # (6, 6) covariances, as motions of the world
         self._sizes: list[float] = []  # m^2, variance of each place
 
     # -- a frame -----------------------------------------------------------------------------
@@ -88,11 +88,11 @@ class SlidingWindowSolver(WholeGraphSolver):
         """Keeps a frame for the window's next solution."""
         self._answer = None
         self._new.append(new)
-        self._poses.append(new.values.atPose3(pose_key(new.frame)).matrix())
-        self._drift.append(self._drift[-1] if self._drift else np.zeros((6, 6)))
+        self.poses.append(new.values.atPose3(pose_key(new.frame)).matrix())
+        self.drift.append(self.drift[-1] if self.drift else np.zeros((6, 6)))
         self._sizes.append(np.inf)
-        for variable in range(len(self._held), self._builder.variables):
-            self._held.enter(new.values.atPoint3(landmark_key(variable)))
+        for variable in range(len(self.held), self.builder.variables):
+            self.held.enter(new.values.atPoint3(landmark_key(variable)))
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Solves the window where the last solution lies `update_every` frames back.
@@ -109,27 +109,27 @@ class SlidingWindowSolver(WholeGraphSolver):
         if not frame:
             self._solved_at = min(_SECOND - self._settings.update_every, 0)
         last = self._measured(solved, len(solved.frames) - 1)
-        return Smoothed(self._window.values(), last, self._window.frames[0])
+        return Smoothed(self.window.values(), last, self.window.frames[0])
 
     def recalibrate(self, change: RigChange) -> None:
         """Looks again at the window; what has left it moves with where it was seen last."""
         super().recalibrate(change)
         self._let_go()
-        self._window.remeasure(change.measured)
+        self.window.remeasure(change.measured)
         self._take_in()  # the builder has measured these anew already
-        frames, variables, *_ = self._builder.kept_observed()
+        frames, variables, *_ = self.builder.kept_observed()
         if len(frames):
-            last = np.zeros(len(self._held), np.int64)
+            last = np.zeros(len(self.held), np.int64)
             np.maximum.at(last, variables, frames)
-            own, poses = ~self._held.saved, np.array(self._poses)[last]
-            self._held.points[own] = change.moved(poses[own], self._held.points[own])[0]
+            own, poses = ~self.held.saved, np.array(self.poses)[last]
+            self.held.points[own] = change.moved(poses[own], self.held.points[own])[0]
 
     # -- into the window and out of it -------------------------------------------------------
 
     def _take_in(self) -> None:
         """The frames since the last solution, and what they saw."""
-        window, new, self._new = self._window, self._new, []
-        window.kernel = self._builder.kernel
+        window, new, self._new = self.window, self._new, []
+        window.kernel = self.builder.kernel
         for frame in new:
             factors = gtsam.NonlinearFactorGraph()
             for row in range(frame.graph.size()):
@@ -140,33 +140,33 @@ class SlidingWindowSolver(WholeGraphSolver):
                 else:
                     known = factor.prior(), factor.noiseModel().covariance()
                     variable = key - landmark_key(0)
-                    saved = self._builder.of_saved_map(variable)
-                    self._held.know(variable, *known, saved)
-            window.add_pose(frame.frame, self._poses[frame.frame], factors)
+                    saved = self.builder.of_saved_map(variable)
+                    self.held.know(variable, *known, saved)
+            window.add_pose(frame.frame, self.poses[frame.frame], factors)
         self._observe()
 
     def _observe(self) -> None:
-        seen, new = self._builder.observed, np.arange(self._taken, len(self._builder.observed))
+        seen, new = self.builder.observed, np.arange(self._taken, len(self.builder.observed))
         self._taken = len(seen)
         self._give_up_waiting()
         rows = self._inside(np.concatenate([self._waiting, new]))
-        outside = ~np.isin(seen["variable"][rows], self._window.landmarks.variables)
+        outside = ~np.isin(seen["variable"][rows], self.window.landmarks.variables)
         self._bring(self._newest(rows[outside]))
-        waiting = ~np.isin(seen["variable"][rows], self._window.landmarks.variables)
+        waiting = ~np.isin(seen["variable"][rows], self.window.landmarks.variables)
         self._waiting, rows = rows[waiting], rows[~waiting]
-        covariance = self._builder.noise.power * seen["covariance"][rows]
+        covariance = self.builder.noise.power * seen["covariance"][rows]
         variables, measured = seen["variable"][rows], seen["measurement"][rows]
-        self._window.observe(seen["frame"][rows], variables, measured, covariance)
+        self.window.observe(seen["frame"][rows], variables, measured, covariance)
 
     def _inside(self, rows: IntArray) -> IntArray:
         """Of observations those from the window's frames that were not taken out."""
-        seen = self._builder.observed
-        inside = seen["frame"][rows] >= self._window.frames[0]
+        seen = self.builder.observed
+        inside = seen["frame"][rows] >= self.window.frames[0]
         return np.asarray(rows[inside & ~seen["gone"][rows]])
 
     def _newest(self, rows: IntArray) -> IntArray:
         """Of observations in their order the last one of each landmark, by ascending variable."""
-        variables = self._builder.observed["variable"][rows]
+        variables = self.builder.observed["variable"][rows]
         last = np.unique(variables[::-1], return_index=True)[1]
         return np.asarray(rows[::-1][last])
 
@@ -175,49 +175,49 @@ class SlidingWindowSolver(WholeGraphSolver):
 
         What was known of them when they left it comes along.
         """
-        variables = self._builder.observed["variable"][rows]
-        places = self._held.homes[variables] // _PLACE
+        variables = self.builder.observed["variable"][rows]
+        places = self.held.homes[variables] // _PLACE
         for place in np.unique(places[places >= 0]).tolist():
             back, tie = variables[places == place], None
-            if place not in self._window.places:
-                back, tie = self._back(rows[places == place], place), self._tie(place)
+            if place not in self.window.places:
+                back, tie = self._back(rows[places == place], place), self.tie_of(place)
             if len(back):
-                self._window.bring_back(self._held.of(back), place, tie)
-        self._window.add_landmarks(self._held.of(variables[self._held.homes[variables] < 0]))
+                self.window.bring_back(self.held.of(back), place, tie)
+        self.window.add_landmarks(self.held.of(variables[self.held.homes[variables] < 0]))
 
     def _back(self, rows: IntArray, place: int) -> IntArray:
         """Variables of landmarks of a place that are surely back; where many are, no other is."""
         seen = self._placed(rows)
-        known = self._held.of(seen.variables)
-        there = seen.returned(known, self._window.poses[0], self._apart(place))
+        known = self.held.of(seen.variables)
+        there = seen.returned(known, self.window.poses[0], self._apart(place))
         if there.sum() >= LEAST:
             self._begin_elsewhere(seen.select(~there))
         return np.asarray(seen.variables[there])
 
     def _placed(self, rows: IntArray) -> SeenAgain:
         """Landmarks where observations (k,) of one each have them."""
-        seen, power = self._builder.observed, self._builder.noise.power
-        poses = np.array([self._poses[frame] for frame in seen["frame"][rows].tolist()])
+        seen, power = self.builder.observed, self.builder.noise.power
+        poses = np.array([self.poses[frame] for frame in seen["frame"][rows].tolist()])
         measured = seen["measurement"][rows], power * seen["covariance"][rows]
-        return SeenAgain.of(self._sensor, self._held.of(seen["variable"][rows]), poses, *measured)
+        return SeenAgain.of(self._sensor, self.held.of(seen["variable"][rows]), poses, *measured)
 
     def _give_up_waiting(self) -> None:
         """Landmarks that the window does not show to be back begin where they are seen now."""
-        seen, rows = self._builder.observed, self._waiting
-        late = seen["frame"][rows] < self._window.frames[0]
+        seen, rows = self.builder.observed, self._waiting
+        late = seen["frame"][rows] < self.window.frames[0]
         of_late = np.isin(seen["variable"][rows], seen["variable"][rows[late]])
         self._begin_elsewhere(self._placed(self._newest(self._inside(rows[of_late]))))
 
     def _begin_elsewhere(self, seen: SeenAgain) -> None:
         """What was known of landmarks was of others; those too far to be placed wait on."""
-        self._held.begin(seen.variables[seen.near], seen.points[seen.near])
+        self.held.begin(seen.variables[seen.near], seen.points[seen.near])
 
-    def _tie(self, place: int) -> Tie:
+    def tie_of(self, place: int) -> Tie:
         """How a place is off, given the one next to it, or the window's first pose."""
-        own, frame, follows = self._frame_of(place), self._window.frames[0], None
-        for other in self._window.places:
-            if abs(self._frame_of(other) - own) < abs(frame - own):
-                frame, follows = self._frame_of(other), other
+        own, frame, follows = self.frame_of(place), self.window.frames[0], None
+        for other in self.window.places:
+            if abs(self.frame_of(other) - own) < abs(frame - own):
+                frame, follows = self.frame_of(other), other
         shared, drift, of_other = self._drifts(own, frame)
         gain = np.linalg.solve(of_other, shared).T
         rest = nearest_positive(drift - gain @ shared) + _STIFF**2 * np.eye(6)
@@ -225,7 +225,7 @@ class SlidingWindowSolver(WholeGraphSolver):
 
     def _apart(self, place: int) -> FloatArray:
         """(6, 6) covariance of the motion between a place and the window's first pose."""
-        shared, drift, here = self._drifts(self._frame_of(place), self._window.frames[0])
+        shared, drift, here = self._drifts(self.frame_of(place), self.window.frames[0])
         return nearest_positive(drift + here - 2.0 * shared) + _STIFF**2 * np.eye(6)
 
     def _drifts(self, own: int, other: int) -> list[FloatArray]:
@@ -233,65 +233,65 @@ class SlidingWindowSolver(WholeGraphSolver):
 
         Drift adds up: they share that of the best known frame between them.
         """
-        here = inverse(self._window.poses[0])
+        here = inverse(self.window.poses[0])
         begin, end = min(own, other), max(own, other)
         least = begin + int(np.argmin(self._sizes[begin : end + 1]))
         return [
-            congruence(adjoint(here), self._drift[frame]) + _STIFF**2 * np.eye(6)
+            congruence(adjoint(here), self.drift[frame]) + _STIFF**2 * np.eye(6)
             for frame in (least, own, other)
         ]
 
-    def _frame_of(self, place: int) -> int:
+    def frame_of(self, place: int) -> int:
         """The frame whose drift is a place's."""
-        return min(place * _PLACE + _PLACE // 2, self._window.frames[0])
+        return min(place * _PLACE + _PLACE // 2, self.window.frames[0])
 
     def _solve(self) -> Solved:
         self._let_go()
         self._take_in()
-        self._solved_at = self._window.frames[-1]
+        self._solved_at = self.window.frames[-1]
         try:
-            solved = self._window.repaired(self._window.take_out, self._failed)
+            solved = self.window.repaired(self.window.take_out, self._failed)
         except EstimatorError:
             self._begin_anew()
-            solved = self._window.repaired(self._window.take_out, self._failed)
-        for frame, pose in zip(self._window.frames, self._window.poses, strict=True):
-            self._poses[frame] = pose.copy()  # a view would keep the whole window's array
-        self._held.points[self._window.landmarks.variables] = self._window.landmarks.points
-        if self._window.places:  # the tracker's map is in doubt: some of it may have moved
-            self._builder.noise.smoothed(self._window.frames, self._window.poses)
+            solved = self.window.repaired(self.window.take_out, self._failed)
+        for frame, pose in zip(self.window.frames, self.window.poses, strict=True):
+            self.poses[frame] = pose.copy()  # a view would keep the whole window's array
+        self.held.points[self.window.landmarks.variables] = self.window.landmarks.points
+        if self.window.places:  # the tracker's map is in doubt: some of it may have moved
+            self.builder.noise.smoothed(self.window.frames, self.window.poses)
         return solved
 
     def _let_go(self) -> None:
         """Lets the window begin so many frames back, in the frame after its solution."""
         solved, self._leaving = self._leaving, None
-        leaving = len(self._window.frames) - self._settings.window
+        leaving = len(self.window.frames) - self._settings.window
         if solved is not None and leaving > 0:
-            first, home = self._window.frames[leaving], self._window.frames[leaving - 1]
+            first, home = self.window.frames[leaving], self.window.frames[leaving - 1]
             for row in (leaving - 1, leaving):
                 self._measured(solved, row)
             try:
-                self._held.left(self._window.let_go_before(first), home)
+                self.held.left(self.window.let_go_before(first), home)
             except (UndeterminedError, np.linalg.LinAlgError):
                 self._begin_anew()
 
     def _begin_anew(self) -> None:
         """What has left, known too unevenly to be solved, gives way to the first pose's place."""
-        first = self._window.frames[0]
-        self._window.carried_along(np.eye(4), pose_prior(pose_key(first), self._at(first)))
+        first = self.window.frames[0]
+        self.window.carried_along(np.eye(4), pose_prior(pose_key(first), self._at(first)))
         self.remarks.append(
-            f"known too unevenly at frame {self._builder.frames[-1]}: the window begun anew"
+            f"known too unevenly at frame {self.builder.frames[-1]}: the window begun anew"
         )
 
     def _measured(self, solved: Solved, row: int) -> Prediction:
         """A pose of the window's solution, and its covariance, which is noted as its drift."""
-        frame, pose = self._window.frames[row], self._window.poses[row]
+        frame, pose = self.window.frames[row], self.window.poses[row]
         covariance = solved.eliminated.pose(row)
         found = Prediction(pose, allowed_parts(self._floor, pose[None], covariance[None])[0])
         self._note(frame, found)
         return found
 
     def _note(self, frame: int, found: Prediction) -> None:
-        self._drift[frame] = congruence(adjoint(found.wTc), found.covariance)
+        self.drift[frame] = congruence(adjoint(found.wTc), found.covariance)
         self._sizes[frame] = float(np.trace(found.covariance[3:, 3:]))
 
     # -- loops -------------------------------------------------------------------------------
@@ -302,7 +302,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         A loop within the window is a factor more.
         """
         self._measured(solved := self._solve(), len(solved.frames) - 1)
-        inside = loop.before >= self._window.frames[0]
+        inside = loop.before >= self.window.frames[0]
         if inside:
             self._measured(solved, solved.frames.index(loop.before))
         before, last = self._at(loop.before), self._at(loop.after)
@@ -310,36 +310,36 @@ class SlidingWindowSolver(WholeGraphSolver):
         self.remarks.append(found.remark + ("" if found.last is None else ", the drive with it"))
         if found.last is None:
             return None
-        self._loops.accept(loop)
+        self.loops.accept(loop)
         self._answer = None
         if inside:
             return self._closed_inside(loop)
-        self._move(found.last, loop, drive)
-        every = range(len(self._held))
+        self.move_by_loop(found.last, loop, drive)
+        every = range(len(self.held))
         values = WindowValues(
-            dict(zip(map(pose_key, range(len(self._poses))), self._poses, strict=True)),
-            dict(zip(map(landmark_key, every), self._held.points, strict=True)),
+            dict(zip(map(pose_key, range(len(self.poses))), self.poses, strict=True)),
+            dict(zip(map(landmark_key, every), self.held.points, strict=True)),
         )
         return ClosedLoop(Smoothed(values, found.last, by_loop=True))
 
     def _closed_inside(self, loop: Constraint) -> ClosedLoop:
-        self._window.factors.add(constraint_factor(loop))
+        self.window.factors.add(constraint_factor(loop))
         self._leaving = solved = self._solve()
         last = self._measured(solved, len(solved.frames) - 1)
-        return ClosedLoop(Smoothed(self._window.values(), last, self._window.frames[0]))
+        return ClosedLoop(Smoothed(self.window.values(), last, self.window.frames[0]))
 
     def _at(self, frame: int) -> Prediction:
         """A pose as it is now, as uncertain as when it left."""
-        pose = self._poses[frame]
-        return Prediction(pose, congruence(adjoint(inverse(pose)), self._drift[frame]))
+        pose = self.poses[frame]
+        return Prediction(pose, congruence(adjoint(inverse(pose)), self.drift[frame]))
 
-    def _move(self, last: Prediction, loop: Constraint, drive: Drive) -> None:
+    def move_by_loop(self, last: Prediction, loop: Constraint, drive: Drive) -> None:
         """Spreads the last pose's change over the drive, and takes all landmarks along."""
-        window, poses = self._window, np.array(self._poses)
-        moved = closed_chain(poses, drive.chain, self._loops.accepted, last.wTc)
+        window, poses = self.window, np.array(self.poses)
+        moved = closed_chain(poses, drive.chain, self.loops.accepted, last.wTc)
         by = changes(poses, moved)
-        self._poses = list(moved)
-        held = self._held
+        self.poses = list(moved)
+        held = self.held
         held.carried_along(by)
         oldest = window.frames[0]
         whole = last.wTc @ inverse(window.poses[-1])
@@ -349,28 +349,29 @@ class SlidingWindowSolver(WholeGraphSolver):
         window.carried_along(whole, prior, np.flatnonzero(held.saved))
         held.points[window.landmarks.variables] = window.landmarks.points
         for frame, pose in zip(window.frames, window.poses, strict=True):
-            self._poses[frame] = pose.copy()
+            self.poses[frame] = pose.copy()
         self._note(oldest, there)
         for frame in window.frames[1:]:
-            self._drift[frame], self._sizes[frame] = self._drift[oldest], np.inf
+            self.drift[frame], self._sizes[frame] = self.drift[oldest], np.inf
         self._note(window.frames[-1], last)
 
     # -- all of it ---------------------------------------------------------------------------
 
-    def _refine(self) -> Any:
-        self._values = self._everything()
-        return super()._refine()
+    def solve_whole(self) -> Any:
+        """The minimum from the poses and landmarks of the window and before it."""
+        self.values = self._everything()
+        return super().solve_whole()
 
     def _everything(self) -> Any:
         """GTSAM values of all poses and landmarks."""
         values = gtsam.Values()
-        for frame, pose in enumerate(self._poses):
+        for frame, pose in enumerate(self.poses):
             values.insert(pose_key(frame), gtsam.Pose3(reorthonormalise(pose)))
-        for variable, point in enumerate(self._held.points):
-            if self._builder.in_graph(variable):
+        for variable, point in enumerate(self.held.points):
+            if self.builder.in_graph(variable):
                 values.insert(landmark_key(variable), point)
         return values
 
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
-        return trimmed(graph, state, MINIMUM, self._builder.noise_factor)
+        return trimmed(graph, state, MINIMUM, self.builder.noise_factor)

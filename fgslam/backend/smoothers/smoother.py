@@ -108,8 +108,8 @@ class Smoother:
             segments: chooses the keyframes; None: every frame is a variable.
         """
         self._sensor, self._floor = problem.sensor, problem.floor
-        self._tracker, self._builder = problem.tracker, problem.builder
-        self._solver, self._segments = solver, segments
+        self.tracker, self.builder = problem.tracker, problem.builder
+        self.solver, self._segments = solver, segments
         self._map = TrackerMap(problem.sensor, problem.tracker, problem.builder.admission)
         self._inputs = RecordedInputs(problem.sensor)
         self._smoothed = problem.prior
@@ -124,21 +124,21 @@ class Smoother:
     @property
     def kind(self) -> str:
         """The solver's."""
-        return self._solver.kind
+        return self.solver.kind
 
     @property
     def noise_factors(self) -> tuple[float, float]:
         """Factors on stated deviations: of a single measurement, and as the graph weighs them."""
-        noise = self._builder.noise
+        noise = self.builder.noise
         return float(np.sqrt(noise.spread)), float(np.sqrt(noise.power))
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
-        return self._tracker.predict(odometry)
+        return self.tracker.predict(odometry)
 
     def landmarks(self) -> LandmarkMap:
         """Smoothed landmarks with what is known of them given the poses."""
-        return self._tracker.landmarks()
+        return self.tracker.landmarks()
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Tracks the frame, adds it to the graph, solves the graph if it is time to.
@@ -153,12 +153,12 @@ class Smoother:
             increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
         recalibrated(self, increment.rig_correction)
-        before = self._tracker.predict(None).wTc
+        before = self.tracker.predict(None).wTc
         # The tracker's covariances are given the graph's, and so are not in doubt themselves.
         plain = dataclasses.replace(increment, loops=(), rig_correction=None)
-        stats = self._tracker.update(plain, tracking)
+        stats = self.tracker.update(plain, tracking)
         self._record(increment, tracking)
-        learn_from(self._builder.noise, len(self._inputs) - 1, increment, tracking, before)
+        learn_from(self.builder.noise, len(self._inputs) - 1, increment, tracking, before)
         tracked = self._admitted(increment, tracking)
         entering = self._entering(tracked, at_once=bool(increment.loops))
         for frame in entering:
@@ -174,19 +174,19 @@ class Smoother:
 
     def recalibrate(self, correction: FloatArray) -> None:
         """Where the tracker's map moves, corrects all that was measured so far anew."""
-        change = self._tracker.recalibrate(correction)
+        change = self.tracker.recalibrate(correction)
         if change is None:
             return
         self._answer = None
-        self._builder.recalibrate(change)
+        self.builder.recalibrate(change)
         if self._segments is not None:
             self._segments.recalibrate(change)
-        self._solver.recalibrate(change)
+        self.solver.recalibrate(change)
 
     def estimate(self) -> Estimate:
         """All poses and landmarks as the graph has them now, with their marginals."""
         if not len(self._inputs):
-            return self._tracker.estimate()
+            return self.tracker.estimate()
         answer = self._solved()
         covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
         if self._doubt.present and not answer.considers_rig:
@@ -196,21 +196,21 @@ class Smoother:
             Trajectory(self._inputs.timestamps(), answer.poses),
             covariances,
             landmarks,
-            (*self._solver.remarks, *self._builder.admission.remarks, *answer.remarks),
-            noise_factor=float(np.sqrt(self._builder.noise.power * answer.noise_ratio)),
+            (*self.solver.remarks, *self.builder.admission.remarks, *answer.remarks),
+            noise_factor=float(np.sqrt(self.builder.noise.power * answer.noise_ratio)),
             gyroscope=answer.gyroscope,
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Marginal covariances (k, 3, 3) of the named landmarks."""
-        self._tracker.landmarks().rows(ids)
+        self.tracker.landmarks().rows(ids)
         found = self.estimate().landmarks
         return found.covariances[found.rows(ids)]
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
         """Joint covariance of the last pose and the named landmarks."""
-        self._tracker.landmarks().rows(ids)
-        tracks = [self._builder.admission.tracks.get(i) for i in ids.tolist()]
+        self.tracker.landmarks().rows(ids)
+        tracks = [self.builder.admission.tracks.get(i) for i in ids.tolist()]
         variables = [-1 if track is None else track.variable for track in tracks]
         outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
         if outside:
@@ -218,7 +218,7 @@ class Smoother:
                 f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
                 "its marginal instead"
             )
-        joint = self._at_last_frame(self._solver.joint(variables))
+        joint = self._at_last_frame(self.solver.joint(variables))
         if self._doubt.present and not self._solved().considers_rig:
             joint = self._doubt.joint(ids, joint)
         return joint
@@ -241,7 +241,7 @@ class Smoother:
 
         But a gyroscope has felt even how the camera was carried.
         """
-        before, turn = self._tracker.predict(None).wTc, increment.odometry
+        before, turn = self.tracker.predict(None).wTc, increment.odometry
         motion, covariance = inverse(before) @ tracking.wTc, FREE
         if turn is None or not turn.turned:
             return Odometry(motion, covariance, measured=False)
@@ -252,13 +252,13 @@ class Smoother:
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
         self._inputs.append(increment, tracking)
         frame = len(self._inputs) - 1
-        self._builder.corrections.note(frame, increment)
+        self.builder.corrections.note(frame, increment)
         self._eras.append(self._takeovers)
         self._answer = None
 
     def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
         """The frame with those observations that fit; landmarks that moved have started anew."""
-        admission, observed = self._builder.admission, increment.observations
+        admission, observed = self.builder.admission, increment.observations
         matched = observed.select(~observed.is_new)
         used, astray = admission.judge(tracking)
         admission.pruned(increment.pruned_ids)
@@ -272,14 +272,14 @@ class Smoother:
 
     def _held(self, observed: Observations) -> Observations:
         """Those of landmarks that are in the map, pruned ones no longer."""
-        return observed.select(np.isin(observed.ids, self._tracker.landmarks().ids))
+        return observed.select(np.isin(observed.ids, self.tracker.landmarks().ids))
 
     def _restart(self, moved: Observations) -> None:
         """Landmarks that were contradicted too often begin anew where they are seen now."""
         ids = moved.ids.tolist()
         why = "was seen elsewhere in frame after frame: moved, started anew"
-        self._builder.admission.start_anew(ids, why)
-        self._tracker.restart(moved)
+        self.builder.admission.start_anew(ids, why)
+        self.tracker.restart(moved)
         self._doubt.forget(moved.ids)
         if self._segments is not None:
             self._segments.forget(ids)
@@ -288,16 +288,16 @@ class Smoother:
         """What now enters the graph: this frame, or a segment that it completes, or nothing."""
         if self._segments is None:
             return [tracked]
-        return self._segments.take(tracked, self._tracker.landmarks(), at_once)
+        return self._segments.take(tracked, self.tracker.landmarks(), at_once)
 
     def _add(self, frame: TrackedFrame) -> None:
-        landmarks = self._tracker.landmarks()
+        landmarks = self.tracker.landmarks()
         self._map.entered(frame.frame, frame.wTc)
         timestamp = self._inputs.timestamp(frame.frame)
-        self._solver.add(self._builder.add(frame, landmarks), landmarks, timestamp)
+        self.solver.add(self.builder.add(frame, landmarks), landmarks, timestamp)
 
     def _solve(self, entered: TrackedFrame, tracked: TrackedFrame, closes_loop: bool) -> None:
-        smoothed = self._solver.solve_if_due(tracked.frame, closes_loop)
+        smoothed = self.solver.solve_if_due(tracked.frame, closes_loop)
         if smoothed is not None:
             last = smoothed.last
             if self._segments is not None:
@@ -312,9 +312,9 @@ class Smoother:
     def _close(self, loop: LoopClosure, index: int) -> bool:
         """Closes a loop of the frame just taken in, or refuses it."""
         known = self._between(loop)
-        drive = Drive(self._tracker.chain, self._tracker.predict(None).wTc)
+        drive = Drive(self.tracker.chain, self.tracker.predict(None).wTc)
         what = f"frame {index}: loop closure to frame {loop.frame} of the log"
-        closed = self._solver.close(known, drive, what)
+        closed = self.solver.close(known, drive, what)
         if closed is not None and closed.smoothed is not None:
             self._take_over(closed.smoothed, closed.smoothed.last)
         return closed is not None
@@ -331,7 +331,7 @@ class Smoother:
                 f"{self.kind}: a loop closure of frame {last} of the log leads to frame "
                 f"{loop.frame}, which does not come before it; correct the log"
             )
-        era, frames = self._eras[loop.frame], self._builder.frames
+        era, frames = self._eras[loop.frame], self.builder.frames
         fellows = [frame for frame in frames if self._eras[frame] == era] or frames
         near = min(fellows, key=lambda frame: abs(frame - loop.frame))
         covariance = CLOSURE_FACTOR**2 * loop.covariance
@@ -340,23 +340,23 @@ class Smoother:
 
     def _current(self, tracking: EgoMotion) -> Prediction:
         """The last pose: the tracker's, whose map is as uncertain as the pose last smoothed."""
-        now = self._tracker.predict(None)
+        now = self.tracker.predict(None)
         if now.wTc is self._smoothed.wTc:
             return self._smoothed
         moved = adjoint(inverse(now.wTc) @ self._smoothed.wTc)
         drift = congruence(moved, self._smoothed.covariance)
-        weighed = self._builder.noise.power / tracking.noise  # as the graph weighs it
+        weighed = self.builder.noise.power / tracking.noise  # as the graph weighs it
         since = weighed * tracking.covariance
         return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + since))
 
     def _solved(self) -> Solution:
         """The graph's answer, with the poses of frames between keyframes."""
         if self._answer is None:
-            self._answer = self._solver.solution()
+            self._answer = self.solver.solution()
             if self._segments is not None:
-                tracks = self._builder.admission.tracks
+                tracks = self.builder.admission.tracks
                 variable_of = {i: track.variable for i, track in tracks.items()}
-                between = self._segments.settled(self._builder.corrections)
+                between = self._segments.settled(self.builder.corrections)
                 motions = self._inputs.motions()
                 self._answer = fill_between(
                     self._sensor, self._floor, self._answer, between, motions, variable_of
@@ -365,7 +365,7 @@ class Smoother:
 
     def _at_last_frame(self, joint: FloatArray) -> FloatArray:
         """A joint covariance with the graph's last pose, carried on to the last frame's."""
-        entered, last = self._builder.frames[-1], len(self._inputs) - 1
+        entered, last = self.builder.frames[-1], len(self._inputs) - 1
         if entered == last:
             return joint
         answer = self._solved()
@@ -394,8 +394,8 @@ class MapSmoother(Smoother):
 
     def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
         """Takes a saved map over: a prior factor for each landmark that is seen again."""
-        self._tracker.begin_in(landmarks, hits, fixed=False)
-        self._builder.admission.know(landmarks)
+        self.tracker.begin_in(landmarks, hits, fixed=False)
+        self.builder.admission.know(landmarks)
         self._begun_in = {
             "map/ids": landmarks.ids,
             "map/positions": landmarks.positions,
@@ -420,8 +420,8 @@ class MapSmoother(Smoother):
     def _start_at(self, prior: Prediction) -> None:
         """Another prior pose: who goes on with a run in a map does not know where that began."""
         self._prior = self._smoothed = prior
-        self._builder.start_at(prior)
-        self._tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
+        self.builder.start_at(prior)
+        self.tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:

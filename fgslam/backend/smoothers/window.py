@@ -131,7 +131,7 @@ class Window:
             UndeterminedError: a pose is not.
         """
         for _ in range(_STEPS):
-            eliminated = self._eliminated(self._equations())
+            eliminated = self._eliminated(self.equations())
             self._move(eliminated)
             if np.abs(eliminated.corner[eliminated.hidden :]).max() < _SHORT:
                 break
@@ -196,7 +196,7 @@ class Window:
         """(p,) rows of the landmarks that the prior speaks of."""
         return np.searchsorted(self.landmarks.variables, self.prior.variables).astype(np.int64)
 
-    def _look(self, observed: Observed) -> Look:
+    def linearise(self, observed: Observed) -> Look:
         """Some of the window's observations; a kernel weighs each where it is linearised."""
         (pose, point), o, kernel = self._rows(observed), observed, self.kernel
         at, places = self._where_linearised()
@@ -216,8 +216,9 @@ class Window:
         points[self._tied()] = self.prior.points
         return poses, points
 
-    def _equations(self) -> Equations:
-        look = self._look(self.observed)
+    def equations(self) -> Equations:
+        """Normal equations of all that the window holds, where it is linearised."""
+        look = self.linearise(self.observed)
         pose, point, rows = look.pose, look.point, look.rows
         n, m, p = len(self.frames), len(self.landmarks.variables), self.prior
         tied, r, weak = self._tied(), p.hidden, self.landmarks
@@ -288,7 +289,7 @@ class Window:
             factor = self.factors.at(row)
             earliest = min(number(key) for key in list(factor.keys()))
             (touched if earliest < first else untouched).add(factor)
-        self._into_prior(self._look(self.observed.select(gone)), touched, leaving)
+        self._into_prior(self.linearise(self.observed.select(gone)), touched, leaving)
         self.factors = untouched
         self.observed = self.observed.select(~gone)
         self._drop_poses(leaving)

@@ -21,8 +21,8 @@ from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_moments import PatchColours
 from fgslam.frontend.features.settings import ColourMomentSettings, UprightSiftSettings
 
-_SIGMA_PX = 1.2  # of a feature's position, pixels of its view (docs/derivations/omni_features.md)
-_SIGMA_SCALES = 0.27  # scales of a feature, added in quadrature to its position's sigma
+SIGMA_PX = 1.2  # of a feature's position, pixels of its view (docs/derivations/omni_features.md)
+SIGMA_SCALES = 0.27  # scales of a feature, added in quadrature to its position's sigma
 _BASE_SIGMA_PX = 1.6  # Gaussian of the first level, doubled image
 _EDGE_THRESHOLD = 10.0  # ratio of principal curvatures above which edges go
 _OCTAVE_LAYERS = 3  # levels an octave; 3 in Lowe
@@ -203,7 +203,7 @@ class UprightSift:
         descriptors: ByteArray,
         colour: FloatArray,
     ) -> UprightFeatures:
-        sigma = np.hypot(_SIGMA_PX, _SIGMA_SCALES * scale_px)
+        sigma = np.hypot(SIGMA_PX, SIGMA_SCALES * scale_px)
         bearing, elevation, covariance = measure(self._camera, pixels, 1.0)
         return UprightFeatures(
             pixels=pixels,

@@ -23,7 +23,7 @@ from fgslam.core.features import Words
 
 VOCABULARY_FILE = Path(__file__).with_name("vocabulary.npz")
 
-_CHUNK = 4096  # descriptors compared at a time; their distances stay in the cache
+CHUNK = 4096  # descriptors compared at a time; their distances stay in the cache
 
 
 @lru_cache(maxsize=1)
@@ -36,8 +36,8 @@ def vocabulary() -> ByteArray:
 def words_of(descriptors: ByteArray) -> Words:
     """The word (m,) of each descriptor (m, 128): the cell whose centre is nearest."""
     out = np.empty(len(descriptors), np.int16)
-    for start in range(0, len(descriptors), _CHUNK):
-        part = slice(start, start + _CHUNK)
+    for start in range(0, len(descriptors), CHUNK):
+        part = slice(start, start + CHUNK)
         out[part] = np.argmin(_to_centres(descriptors[part]), axis=1)
     return out
 
@@ -65,10 +65,10 @@ def _centres() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     return np.ascontiguousarray(2.0 * values.T), np.einsum("ij,ij->i", values, values)
 
 
-_EXACT = 6000  # contents up to here are compared in full, which costs no more
-_PROBES = 12  # cells searched for each query, of 256
-_AT_ONCE = 1024  # queries; more than a frame has, and their distances are tens of megabytes
-_LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
+EXACT = 6000  # contents up to here are compared in full, which costs no more
+PROBES = 12  # cells searched for each query, of 256
+AT_ONCE = 1024  # queries; more than a frame has, and their distances are tens of megabytes
+LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
 
 _Floats = npt.NDArray[np.float32]
 Cell = tuple[ByteArray, _Floats]
@@ -100,7 +100,7 @@ class AppearanceIndex:
         ``words`` (m,) are those of ``vocabulary.words_of``, where known.
         """
         self._descriptors = descriptors
-        self._small = len(descriptors) <= _EXACT
+        self._small = len(descriptors) <= EXACT
         if not self._small:
             words = words_of(descriptors) if words is None else words
             self._order = np.argsort(words, kind="stable")
@@ -119,8 +119,8 @@ class AppearanceIndex:
         does not search is not found. Distances are exact.
         """
         found = [
-            self._some(descriptors[start : start + _AT_ONCE], neighbours)
-            for start in range(0, max(len(descriptors), 1), _AT_ONCE)
+            self._some(descriptors[start : start + AT_ONCE], neighbours)
+            for start in range(0, max(len(descriptors), 1), AT_ONCE)
         ]
         return Neighbours(
             np.concatenate([one.rows for one in found]),
@@ -134,7 +134,7 @@ class AppearanceIndex:
             query, row, squared = self._in_full(asked, neighbours)
         else:
             query, row, squared = self._probed(
-                asked, nearest_words(descriptors, _PROBES), neighbours
+                asked, nearest_words(descriptors, PROBES), neighbours
             )
         order = np.lexsort((row, squared, query))
         query, row, squared = query[order], row[order], squared[order]
@@ -150,8 +150,8 @@ class AppearanceIndex:
 
     def _in_full(self, asked: _Floats, neighbours: int) -> Candidates:
         found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))]
-        for start in range(0, len(self), _CHUNK):
-            squared = _squared(asked, self._descriptors[start : start + _CHUNK])
+        for start in range(0, len(self), CHUNK):
+            squared = _squared(asked, self._descriptors[start : start + CHUNK])
             bound = _bound(squared, neighbours)
             query, column = np.nonzero(squared <= bound[:, None])
             found.append((query, start + column, squared[query, column]))
@@ -197,8 +197,8 @@ class AppearanceIndex:
     def _leading(self, squared: _Floats, place: IntArray, cells: IntArray) -> _Floats:
         """Distances (q, m) of each query to what its nearest cells hold, padded with infinity."""
         sizes = self._starts[cells + 1] - self._starts[cells]
-        ends = np.minimum(np.cumsum(sizes, axis=1), _LEADING)
-        out = np.full((len(cells), _LEADING), np.inf, np.float32)
+        ends = np.minimum(np.cumsum(sizes, axis=1), LEADING)
+        out = np.full((len(cells), LEADING), np.inf, np.float32)
         starts = ends - np.diff(ends, axis=1, prepend=0)
         for i, probe in zip(*np.nonzero(ends > starts), strict=True):
             start, end, here = starts[i, probe], ends[i, probe], place[i, probe]
@@ -227,7 +227,7 @@ def _bound(values: _Floats, count: int) -> _Floats:
     No larger than that many of the leading ones, where there are so many.
     """
     bound = np.full(len(values), np.finfo(np.float32).max)
-    leading = values[:, :_LEADING]
+    leading = values[:, :LEADING]
     if leading.shape[1] > count:
         bound = np.minimum(bound, np.partition(leading, count - 1, axis=1)[:, count - 1])
     return bound

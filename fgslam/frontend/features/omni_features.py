@@ -24,7 +24,7 @@ _MAX_TANGENT = 1.0  # of the elevation, up and down, that the cylinder has
 _MAX_CYLINDER_WIDTH = 2048  # of the cylinder, pixels; less for coarser cameras
 
 
-class _View:
+class View:
     """Another camera's picture of what one camera sees."""
 
     def __init__(self, source: OmniCamera, target: OmniCamera) -> None:
@@ -55,7 +55,7 @@ class OmniFeatureExtractor:
         width = min(_MAX_CYLINDER_WIDTH, round(2.0 * np.pi * resolution))
         height = round(2.0 * _MAX_TANGENT * width / (2.0 * np.pi)) + 1
         cylinder = Cylinder(width, height, -_MAX_TANGENT, _MAX_TANGENT)
-        self._cylinder = _View(camera, cylinder)
+        self._cylinder = View(camera, cylinder)
         self._columns = ColumnSegmentFinder(cylinder, settings.colour, self._cylinder.seen)
 
     def extract(self, image: Image) -> OmniFeatures:
@@ -82,14 +82,14 @@ class OmniFeatureExtractor:
             return empty_segments()
         return self._columns.extract(self._cylinder.of(image))
 
-    def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> _View | None:
+    def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> View | None:
         if wrapping_period(self._camera) is not None or settings.sift.view == "raw":
             return None
         width = min(_MAX_VIEW_WIDTH, round(2.0 * np.pi * resolution))
         limits = np.deg2rad([settings.sift.max_elevation_deg, settings.sift.min_elevation_deg])
         height = round((limits[0] - limits[1]) * width / (2.0 * np.pi)) + 1
         view = Equirectangular(width, height, float(limits[0]), float(limits[1]))
-        return _View(self._camera, view)
+        return View(self._camera, view)
 
     def _in_given_image(self, found: UprightFeatures) -> UprightFeatures:
         if not len(found):

@@ -44,7 +44,7 @@ _OVERLAP_SHARE = 0.15  # of the landmarks among the other map's, least share tha
 _COMPETING = 8  # hypotheses elsewhere that are refined: the best ones
 _LEAST_SPREAD_M = 0.3  # smaller triangles turn the map by more than least squares corrects
 _ROUNDS = 8  # of least squares and choosing anew
-_AT_ONCE = 8192  # pairs of views compared together; their bytes stay in the cache
+AT_ONCE = 8192  # pairs of views compared together; their bytes stay in the cache
 _AMONG_M = 0.5  # a landmark this near to one of the other map's lies among them
 
 
@@ -320,8 +320,8 @@ def _descriptor_distances(a: SavedMap, b: SavedMap, pairs: IntArray) -> FloatArr
     )
     own, other = mine[pair, 0] + own, yours[pair, 0] + other
     out = np.full(len(pairs), np.inf)
-    for start in range(0, len(pair), _AT_ONCE):
-        part = slice(start, start + _AT_ONCE)
+    for start in range(0, len(pair), AT_ONCE):
+        part = slice(start, start + AT_ONCE)
         difference = a.appearances.descriptors[own[part]].astype(np.int32)
         difference -= b.appearances.descriptors[other[part]]
         squared = np.einsum("ij,ij->i", difference, difference)

@@ -82,12 +82,12 @@ class PlaceRecognition:
         """Nothing is remembered yet; the tracker is the run's own, with the map it begins in."""
         self._parts = parts
         self._tracker = tracker
-        self._memory = SightingMemory(int(tracker.database.ids.max(initial=-1)))
+        self.memory = SightingMemory(int(tracker.database.ids.max(initial=-1)))
         self._confirmation = None if parts.loops is None else Confirmation(parts.loops)
         self._lost = 0
         self._offered = -1  # frame of the last closure, taken or not
-        self._merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
-        self._fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
+        self.merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
+        self.fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
         self._pose: FloatArray = np.eye(4)
         self._looks: _Looks = (-1, _NOBODY, None)
         self._find_words()
@@ -109,12 +109,12 @@ class PlaceRecognition:
     @property
     def taken(self) -> tuple[bool, ...]:
         """Whether the estimator took the closures so far, in the log's order."""
-        return tuple(self._memory.taken)
+        return tuple(self.memory.taken)
 
     @property
     def ending(self) -> IntArray:
         """(m,) landmarks that the last frame's closure showed to be older ones: they end next."""
-        return np.asarray(self._merging[:, 0])
+        return np.asarray(self.merging[:, 0])
 
     @property
     def wants_features(self) -> bool:
@@ -190,7 +190,7 @@ class PlaceRecognition:
         loops = self._parts.loops
         if loops is None or tracked.ego_motion.coherent:
             return tracked
-        old = self._memory.unseen_for(loops.forgotten_after, landmarks.ids)
+        old = self.memory.unseen_for(loops.forgotten_after, landmarks.ids)
         recent = self._tracker.track(prediction, landmarks.without(old), features)
         found = recent.ego_motion
         return recent if found.status.measured and found.coherent else tracked
@@ -213,7 +213,7 @@ class PlaceRecognition:
             features: the frame's.
             association: which landmarks they are taken for.
         """
-        joint = self._joined(landmarks, features, association)
+        joint = self.find_join(landmarks, features, association)
         if joint is not None:
             return (joint,)
         loops, confirmation = self._parts.loops, self._confirmation
@@ -230,7 +230,7 @@ class PlaceRecognition:
         closure = self._closure(landmarks, features, found, partners)
         if closure is None or not is_sharp(closure, loops):
             return ()
-        self._offered = len(self._memory)
+        self._offered = len(self.memory)
         return (closure,)
 
     def fuse(self, landmarks: LandmarkMap) -> IntArray:
@@ -242,13 +242,13 @@ class PlaceRecognition:
         Args:
             landmarks: the map as corrected.
         """
-        since = self._fuse_since
+        since = self.fuse_since
         if since < 0:
             return _NOBODY
-        ended = self._tracker.merge(self._merging)
-        self._merging, self._fuse_since = _NO_PAIRS, -1
+        ended = self._tracker.merge(self.merging)
+        self.merging, self.fuse_since = _NO_PAIRS, -1
         left = landmarks.ids[~np.isin(landmarks.ids, ended)]
-        new = self._memory.made_after(since, left)
+        new = self.memory.made_after(since, left)
         looks = self._tracker.database.appearances()
         sides = left[new], left[~new]
         pairs = duplicates(landmarks, looks, sides, self._parts.appearance)
@@ -266,41 +266,41 @@ class PlaceRecognition:
         """
         taken = [loop for loop, so in zip(increment.loops, stats.closed, strict=True) if so]
         if taken:
-            self._merging = np.concatenate([loop.merged for loop in taken])
-            since = [self._memory.last_seen(loop.observations.ids) for loop in taken]
-            self._fuse_since = min(since)
-        step = inverse(self._pose) @ tracked if len(self._memory) else np.eye(4)
-        self._memory.add(increment, step, stats.closed)
+            self.merging = np.concatenate([loop.merged for loop in taken])
+            since = [self.memory.last_seen(loop.observations.ids) for loop in taken]
+            self.fuse_since = min(since)
+        step = inverse(self._pose) @ tracked if len(self.memory) else np.eye(4)
+        self.memory.add(increment, step, stats.closed)
         self._pose = stats.wTc
-        if len(self._memory) % _WORDS_EVERY == 0:
+        if len(self.memory) % _WORDS_EVERY == 0:
             self._find_words()
 
     def read_from(self, log: MeasurementLog) -> None:
         """Measurements of earlier frames are read from the log of the run."""
-        self._memory.read_from(log)
+        self.memory.read_from(log)
 
     def state(self) -> StateArrays:
         """All but what the log tells."""
         confirmation = self._confirmation
-        return self._memory.state() | {
+        return self.memory.state() | {
             "counts": np.array(
                 [
                     self._lost,
                     self._offered,
-                    self._fuse_since,
+                    self.fuse_since,
                     0 if confirmation is None else confirmation.count,
                 ]
             ),
             **({} if confirmation is None else {"offset": confirmation.offset}),
-            "merging": self._merging,
+            "merging": self.merging,
             "pose": self._pose,
         }
 
     def restore(self, state: StateArrays, log: MeasurementLog) -> None:
         """Continues from :meth:`state` and the log of as many frames."""
-        self._memory.restore(state, log)
-        self._lost, self._offered, self._fuse_since, count = state["counts"].tolist()
-        self._merging, self._pose = state["merging"], state["pose"]
+        self.memory.restore(state, log)
+        self._lost, self._offered, self.fuse_since, count = state["counts"].tolist()
+        self.merging, self._pose = state["merging"], state["pose"]
         if self._confirmation is not None:
             self._confirmation.count, self._confirmation.offset = count, state["offset"]
         self._find_words()
@@ -315,7 +315,7 @@ class PlaceRecognition:
     def _apart(self) -> bool:
         return self._parts.joins and self._tracker.parts.several
 
-    def _joined(
+    def find_join(
         self,
         landmarks: LandmarkMap,
         features: StereoFeatures,
@@ -332,7 +332,7 @@ class PlaceRecognition:
         seen, parts = association.observations, self._tracker.parts
         own = parts.placed_by(seen.ids[~seen.is_new & ~association.rejected])
         moved = not len(parts) or own != parts.of_frame(len(parts) - 1)
-        if own < 0 or not (moved or len(self._memory) % _JOINT.every == 0):
+        if own < 0 or not (moved or len(self.memory) % _JOINT.every == 0):
             return None
         others = landmarks.ids[parts.of(landmarks.ids) != own]
         if len(others) < _JOINT.min_matches:
@@ -352,7 +352,7 @@ class PlaceRecognition:
         partners: IntArray,
     ) -> LoopClosure | None:
         resection = self._tracker.resection
-        return close_loop(self._memory, landmarks, features, found, partners, resection)
+        return close_loop(self.memory, landmarks, features, found, partners, resection)
 
     @property
     def _astray(self) -> bool:
@@ -365,7 +365,7 @@ class PlaceRecognition:
         return self._lost > 0 and not outside
 
     def _time_to_look(self, loops: LoopSettings, confirmation: Confirmation) -> bool:
-        frame = len(self._memory)
+        frame = len(self.memory)
         if self._astray or (self._offered >= 0 and frame - self._offered <= loops.rest):
             return False
         return confirmation.begun or frame % loops.every == 0
@@ -376,7 +376,7 @@ class PlaceRecognition:
         """The frame located by landmarks not seen for long, or never; None where it is not."""
         trusted = self._trusted()
         known = trusted[np.isin(trusted, landmarks.ids)]
-        old = self._memory.unseen_for(loops.forgotten_after, known)
+        old = self.memory.unseen_for(loops.forgotten_after, known)
         if not len(old) or not len(features):
             return None
         found = self._locate(landmarks, old, features)
@@ -390,15 +390,15 @@ class PlaceRecognition:
     def _plausible(
         self, found: Relocalisation, wTc: FloatArray, landmarks: LandmarkMap, loops: LoopSettings
     ) -> bool:
-        earlier = self._memory.best_view_of(found.ids, landmarks)
+        earlier = self.memory.best_view_of(found.ids, landmarks)
         if earlier < 0:
             return False
-        return drift_allows(found.wTc, wTc, self._memory.way_since(earlier), loops)
+        return drift_allows(found.wTc, wTc, self.memory.way_since(earlier), loops)
 
     def _locate(
         self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
     ) -> Relocalisation:
-        rng = np.random.default_rng([self._parts.seed, _STREAM, len(self._memory)])
+        rng = np.random.default_rng([self._parts.seed, _STREAM, len(self.memory)])
         self._learn(landmarks, among)
         return self._parts.relocaliser.locate(features, rng)
 

@@ -265,13 +265,13 @@ class LandmarkCarrier:
         """The patches of all points, those of the fresh ones found in the last image first."""
         fresh, self._fresh = self._fresh, Begun.none()
         if len(fresh.points):
-            new, begun = self._found_again(last, fresh)
+            new, begun = self.find_again(last, fresh)
             patches, points = self._patches.join(new), self._points.join(begun)
             order = np.argsort(points.ids)
             self._points, self._patches = points.select(order), patches.select(order)
         return self._patches
 
-    def _found_again(self, last: FineImage, fresh: Begun) -> tuple[ReferencePatches, Points]:
+    def find_again(self, last: FineImage, fresh: Begun) -> tuple[ReferencePatches, Points]:
         """Patches and places of landmarks begun in an image; what looks different by now is left.
 
         Those known from before are placed by their own patch, not by SIFT.

@@ -248,7 +248,7 @@ class LandmarkDatabase(LandmarkTable):
         return self.are_valid(hits) & reliable(hits, misses, permanence)
 
 
-_NEAR_PX = 40.0  # what is seen past a place is this near to it in the image
+NEAR_PX = 40.0  # what is seen past a place is this near to it in the image
 _APART_PX = 2.0
 """What lies before or behind a place has a disparity that differs by more."""
 
@@ -277,7 +277,7 @@ def seen_past(places: FloatArray, seen: FloatArray) -> BoolArray:
         places: (m, 3) predicted (column, row, disparity) of missed landmarks.
         seen: (f, 3) the frame's stereo features.
     """
-    reach = _NEAR_PX
+    reach = NEAR_PX
     i, j = pairs_within(places[:, 1], reach, seen[:, 1])
     near = np.hypot(*(seen[j, :2] - places[i, :2]).T) <= reach
     i, j = i[near], j[near]

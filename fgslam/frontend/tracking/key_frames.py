@@ -91,7 +91,7 @@ class KeyFrameTracker:
         every = np.arange(len(carried))
         matches = MapMatches(carried.rows, every, np.ones(len(carried), np.bool_))
         tracked = self._tracker.solved(prediction, landmarks, (expected, matches, carried.features))
-        return CarriedFrame(carried, tracked, self._lasting(carried, tracked, images[0]))
+        return CarriedFrame(carried, tracked, self.lasts(carried, tracked, images[0]))
 
     def book(self, frame: CarriedFrame) -> Association:
         """Records a frame between key frames; outliers are carried no further."""
@@ -164,7 +164,8 @@ class KeyFrameTracker:
         self._count, self._cells = state["key_frame"].tolist()
         self._carrier.restore(state)
 
-    def _lasting(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
+    def lasts(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
+        """Whether enough landmarks are left, over enough of the image, and few contradict."""
         agreeing = tracked.ego_motion.inliers
         enough = max(_LEAST_SHARE * self._count, (1.0 - _MOST_REJECTED) * len(carried))
         if agreeing.sum() < enough:

@@ -28,7 +28,7 @@ Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 """(k,) landmarks, features, and distances of their descriptors."""
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their distances by which sizes shrink: which to consider at all."""
-_CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
+CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
 _NEAREST_M = 0.1
 _SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
 
@@ -86,7 +86,7 @@ class FieldOfView:
         self._rig = rig
         self._border = settings.border_px
         self._cone = settings.field_of_view == "cone"
-        self._tangent = np.tan(np.deg2rad(_CONE_DEG))
+        self._tangent = np.tan(np.deg2rad(CONE_DEG))
         self._max_disparity = max_disparity_px
 
     def select(
@@ -192,12 +192,12 @@ def lean(rig: CameraRig, wTc: FloatArray, points: FloatArray) -> FloatArray:
 _SCALE_RATIO = 1.5
 """Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
 
-_WINDOW_PX = 5.0  # side of the search window in the image, as in Se et al. 3.1
-REFINE_SHIFT_PX = 0.25 * _WINDOW_PX
+WINDOW_PX = 5.0  # side of the search window in the image, as in Se et al. 3.1
+REFINE_SHIFT_PX = 0.25 * WINDOW_PX
 """Landmarks that a first pose shifts by more, in the median, are matched anew around it. Measured:
 on steps that the odometry foretells within it (roads) a second matching changes nothing."""
 _DISPARITY_PX = 2.0  # largest difference from the predicted disparity, likewise before widening
-_MAX_WINDOW_PX = 80.0
+MAX_WINDOW_PX = 80.0
 """Side that widening may not exceed, also of the disparity gate: a quarter of 320 px, beyond
 which most candidates are of other landmarks."""
 _ORIENTATION_DEG = 20.0  # largest difference to the predicted orientation, as between images
@@ -226,7 +226,7 @@ class MapMatcher:
         """Takes the gates and the use of descriptors."""
         self._settings = settings
         self._appearance = appearance
-        self._limit = 0.5 * _MAX_WINDOW_PX
+        self._limit = 0.5 * MAX_WINDOW_PX
 
     @property
     def widens(self) -> bool:
@@ -301,7 +301,7 @@ class MapMatcher:
 
     def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
         """Half widths (v, 3) of the gates in column, row and disparity."""
-        half = 0.5 * _WINDOW_PX
+        half = 0.5 * WINDOW_PX
         base = np.array([half, half, _DISPARITY_PX])
         if uncertainty is None:
             return np.tile(base, (count, 1))

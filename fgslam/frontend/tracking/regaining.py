@@ -26,7 +26,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.map_parts import MapParts
 from fgslam.frontend.tracking.resection import Resection, sample_size
 
-_LATELY = 10  # frames before the last sighting whose landmarks are looked for
+LATELY = 10  # frames before the last sighting whose landmarks are looked for
 _AT_LAST = 0  # likewise where that fails: among few landmarks few others look like the right one
 FALSE_POSES = 1e-6  # poses by chance that are allowed in a frame
 
@@ -46,7 +46,7 @@ class Regainer:
 
     def find(self, landmarks: LandmarkMap, features: StereoFeatures) -> Prediction | None:
         """Pose and covariance; None where none is to be believed. The same input, the same bits."""
-        for frames in (_LATELY, _AT_LAST):
+        for frames in (LATELY, _AT_LAST):
             found = self._found_by(frames, landmarks, features)
             if found is not None:
                 return Prediction(found.wTc, found.covariance)

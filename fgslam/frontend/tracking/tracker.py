@@ -114,9 +114,9 @@ class LandmarkTracker:
     ) -> Tracked:
         """Matches expected landmarks and solves for the pose; wider or anew around it if set so."""
         around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
-        tracked = self._attempt(prediction, around, landmarks, features)
+        tracked = self.match_and_solve(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
-            rescued = self._attempt(prediction, around, landmarks, features, anywhere=True)
+            rescued = self.match_and_solve(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
         if self._matcher.rescues and self._doubtful(tracked, features):
@@ -125,7 +125,7 @@ class LandmarkTracker:
                 return anew
         if self._matcher.refines and self._moved_far(tracked, landmarks):
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
-            refined = self._attempt(prediction, around, landmarks, features)
+            refined = self.match_and_solve(prediction, around, landmarks, features)
             tracked = refined if refined.ego_motion.status.measured else tracked
         return tracked
 
@@ -198,7 +198,7 @@ class LandmarkTracker:
         found = self._ego_motion.solve(prediction, nothing)
         return replace(found, status=status)
 
-    def _attempt(
+    def match_and_solve(
         self,
         prediction: Prediction,
         around: Prediction,

@@ -186,7 +186,9 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     opened = task.opener(config, task.seed)
     world, front_end, memory = opened.world, opened.front_end, opened.memory
     if config.start_offset_m > 0.0:
-        world.put(_displaced(world, config.start_offset_m, np.random.default_rng((task.seed, 7))))
+        world.put(
+            displaced_start(world, config.start_offset_m, np.random.default_rng((task.seed, 7)))
+        )
     follower = HomingChain(
         front_end,
         memory.images,
@@ -206,7 +208,7 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     return DrivenSeed(task.seed, record, memory, tuple(world.outlines), leg, views)
 
 
-def _displaced(world: PathWorld, radius: float, rng: np.random.Generator) -> FloatArray:
+def displaced_start(world: PathWorld, radius: float, rng: np.random.Generator) -> FloatArray:
     """The start, moved and turned at random to a place that is free; itself where none is found."""
     pose = np.array(world.true_pose, np.float64)
     room = float(world.clearance(pose[None, :2])[0])

@@ -85,7 +85,7 @@ def _run(config: HomingPairsConfig, views: OmniRecording, context: Context) -> R
         folder,
         "finished" if whole else "interrupted",
         _sentences(numbers, errors, asked),
-        _tables(errors),
+        error_tables(errors),
         (*views.notes, *failures),
         reached=f"after {len(answers)} of {len(answers) + left} pairs",
     )
@@ -183,7 +183,8 @@ _COLUMNS = (
 )
 
 
-def _tables(errors: PairErrors | None) -> tuple[TextTable, ...]:
+def error_tables(errors: PairErrors | None) -> tuple[TextTable, ...]:
+    """The errors of all pairs, of those in one room and of the others; empty without truth."""
     if errors is None:
         return ()
     numbers = error_numbers(errors)

@@ -44,7 +44,7 @@ from fgslam.runs.units import each_apart
 Unit: TypeAlias = tuple[HomingTrialsConfig, int, int]
 """Configuration, number of the share of outliers, and of the trial."""
 
-_BLOCK = 20  # trials a process: starting one takes as long as some trials
+TRIALS_A_BLOCK = 20  # trials a process: starting one takes as long as some trials
 _COLUMNS = (
     "outliers",
     "trial",
@@ -93,7 +93,7 @@ def _run(config: HomingTrialsConfig, context: Context) -> RunResult:
     """Runs all trials; stopped early, those finished count."""
     units = _units(config)
     done = context.perform(
-        each_apart(("trials", "trials"), perform_trial, units, HomingTrial, _BLOCK)
+        each_apart(("trials", "trials"), perform_trial, units, HomingTrial, TRIALS_A_BLOCK)
     )
     trials = sorted(done.results.values(), key=lambda trial: (trial.share, trial.trial))
     failures = sorted(_failure([units[k] for k in block], why) for block, why in done.ended)
@@ -137,9 +137,9 @@ def _units(config: HomingTrialsConfig) -> list[Unit]:
     """All trials; those of one block are of one share, and the shares take turns."""
     return [
         (config, share, trial)
-        for first in range(0, config.trials, _BLOCK)
+        for first in range(0, config.trials, TRIALS_A_BLOCK)
         for share in range(len(config.outliers))
-        for trial in range(first, min(first + _BLOCK, config.trials))
+        for trial in range(first, min(first + TRIALS_A_BLOCK, config.trials))
     ]
 
 

@@ -35,7 +35,7 @@ TRACKS_FILE = "tracks.csv"
 PICTURES = "pictures"
 _TRAIL = 15  # images
 _STATE = "state"
-_SAVE_EVERY_S = 2.0
+SAVE_EVERY_S = 2.0
 
 
 @dataclass(slots=True, eq=False)
@@ -122,7 +122,7 @@ def _track(config: OmniVideoConfig, recording: OmniRecording, context: Context) 
     last_saved = perf_counter()
     for i in range(len(tracks.frames), len(recording)):
         stopped = context.stopped()
-        if stopped or perf_counter() - last_saved >= _SAVE_EVERY_S:
+        if stopped or perf_counter() - last_saved >= SAVE_EVERY_S:
             context.store.add(_STATE, {0: _Progress(tracks, tracker.state())}, _Progress)
             last_saved = perf_counter()
         if stopped:

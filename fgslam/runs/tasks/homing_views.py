@@ -193,7 +193,7 @@ def _circle(image: Image, near: tuple[tuple[float, float], float] | None) -> Mir
         return None
 
 
-_VIEWS_A_BLOCK = 4
+VIEWS_A_BLOCK = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +234,7 @@ def extract_features(
         work=_extract,
         argument=lambda units: _Block(dataset, settings, units),
         kind=OmniFeatures,
-        blocks=in_blocks(_VIEWS_A_BLOCK),
+        blocks=in_blocks(VIEWS_A_BLOCK),
         small=True,
     )
     done = context.perform(stage)

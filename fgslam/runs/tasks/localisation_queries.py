@@ -43,7 +43,7 @@ from fgslam.slam.pipeline import SlamPipeline
 
 _STREAM = 13  # of random numbers, beside those of the recording
 _STAGE = "queries"
-_SAVE_EVERY_S = 2.0
+SAVE_EVERY_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,7 +226,7 @@ def _answered(
         fresh[k] = tuple(asker.ask(found[len(found) - n :], sighted) for n in frames)
         context.progress("localising", len(done) + len(fresh), queries)
         stopped = context.stopped()
-        if stopped or k == queries - 1 or time.perf_counter() - saved >= _SAVE_EVERY_S:
+        if stopped or k == queries - 1 or time.perf_counter() - saved >= SAVE_EVERY_S:
             done |= context.store.add(_STAGE, fresh, _ANSWERS)
             fresh, saved = {}, time.perf_counter()
         if stopped:

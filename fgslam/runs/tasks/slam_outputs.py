@@ -320,13 +320,13 @@ def _nees(metrics: EstimatorMetrics) -> str:
 
 
 FOLDER = "pictures"
-_SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
+SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
 """Frames shown, as parts of the run: those of the paper's Figure 4."""
 
 
 def frames_to_show(count: int) -> frozenset[int]:
     """Which of ``count`` frames are drawn; the second is among them for the first flow."""
-    return frozenset({round(part * count) for part in _SHOWN} | {1}) & frozenset(range(count))
+    return frozenset({round(part * count) for part in SHOWN} | {1}) & frozenset(range(count))
 
 
 def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:

@@ -78,7 +78,7 @@ def rendered_landmark_truth(
         ids.append(seen.ids[known])
         points.append(transform_to_world(truth.poses[k], local[known]))
         split.append(at_edges(depth, pixels[known]))
-    return _medians(np.concatenate(ids), np.concatenate(points), np.concatenate(split))
+    return medians_of(np.concatenate(ids), np.concatenate(points), np.concatenate(split))
 
 
 def points_under(
@@ -132,7 +132,7 @@ def _within(middle: IntArray, size: int) -> tuple[IntArray, IntArray]:
     return low, np.clip(middle + WHOLE_PX + 1, 0, size)
 
 
-def _medians(
+def medians_of(
     ids: IntArray, points: FloatArray, split: BoolArray
 ) -> tuple[LandmarkTruth, FloatArray]:
     """Median and its standard error of each landmark's points, those seen often enough.

@@ -48,7 +48,7 @@ class FeatureWorld:
         self._rng = rng
         if descriptors is None:
             descriptors = rng.integers(0, 120, (count, 128)).astype(np.uint8)
-        self._descriptors = descriptors
+        self.descriptors = descriptors
         self._orientation = rng.uniform(0.0, 2.0 * np.pi, count)
         self._size = rng.uniform(4.0, 12.0, count)
 
@@ -75,5 +75,5 @@ class FeatureWorld:
             xy=xy + sigma_px * self._rng.standard_normal(xy.shape),
             scale=self._size[which] / local[which, 2],
             orientation=self._orientation[which],
-            descriptors=self._descriptors[which],
+            descriptors=self.descriptors[which],
         )

@@ -60,8 +60,8 @@ def test_final_solution_is_the_minimum_over_what_fits() -> None:
     spoilt = wrong_matches(simulation.increments, 0.3, np.random.default_rng(5))
     estimator, _ = run(BatchSettings(), spoilt)
     assert isinstance(estimator, MapSmoother)
-    refined = estimator._solver._refined()
-    everything, values = estimator._builder.kept_factors(), refined.values
+    refined = estimator.solver.refined()
+    everything, values = estimator.builder.kept_factors(), refined.values
     graph, total = counting(everything, refined.graph), everything.size()
     assert 0.7 * total < graph.size() < 0.85 * total
     gradient = graph.linearize(values).gradientAtZero()
@@ -113,9 +113,13 @@ def test_landmark_without_any_fitting_observation_is_left_out_with_a_remark(
 ) -> None:
     simulation = drawn(7)
     estimator, _ = run(BatchSettings(), simulation.increments)
-    variable = estimator._builder.admission.tracks[3].variable
+    variable = estimator.builder.admission.tracks[3].variable
     reported = [{variable: "has no observation that fits the others"}]
-    monkeypatch.setattr(refinement, "_lost", lambda *given: reported.pop() if reported else {})
+
+    def lost(*given: object) -> dict[int, str]:
+        return reported.pop() if reported else {}
+
+    monkeypatch.setattr(refinement, "lost_landmarks", lost)
     found = estimator.estimate()
     assert_finite(found)
     assert len(found.remarks) == 1
@@ -134,7 +138,7 @@ def test_landmarks_lost_in_every_round_come_to_an_end(monkeypatch: pytest.Monkey
     def lost(builder: object, found: refinement.Refined) -> dict[int, str]:
         return {found.variables[0]: "is lost"}
 
-    monkeypatch.setattr(refinement, "_lost", lost)
+    monkeypatch.setattr(refinement, "lost_landmarks", lost)
     found = estimator.estimate()
     assert_finite(found)
     assert len(found.remarks) == 5

@@ -36,7 +36,7 @@ LAG = FixedLagSettings(lag_frames=5)
 
 def spoil(estimator: Any, error: Exception) -> None:
     """The window's next solution fails with this error, those after it are found."""
-    window = estimator._solver._window
+    window = estimator.solver.window
     solve, errors = window.solve, [error]
 
     def failing(*arguments: Any) -> Any:
@@ -99,15 +99,15 @@ def test_factors_and_variables_do_not_grow_with_the_run() -> None:
     counts = []
     for increment in simulation.increments:
         play(estimator, [increment], FREE)
-        window = estimator._solver._window
+        window = estimator.solver.window
         counts.append(
             (
                 len(window.observed.frame),
                 len(window.landmarks.variables),
                 window.prior.hidden,
                 len(window.frames),
-                estimator._builder.graph.size() + len(estimator._builder.observed),
-                len(estimator._builder.admission._recent),
+                estimator.builder.graph.size() + len(estimator.builder.observed),
+                len(estimator.builder.admission.by_last_sighting),
             )
         )
     seen = np.array([len(x.observations) for x in simulation.increments])
@@ -127,9 +127,9 @@ def test_a_frame_that_left_keeps_no_array_of_its_window() -> None:
     """A view of one row would keep the poses of the whole lag for each frame of the run."""
     estimator = smoother()
     play(estimator, drawn(1, frames=10).increments, FREE)
-    solver = estimator._solver
+    solver = estimator.solver
     assert isinstance(solver, FixedLagSolver)
-    assert max(_held_by(pose) for pose in solver._poses[:-1]) == 4 * 4 * 8
+    assert max(_held_by(pose) for pose in solver.poses[:-1]) == 4 * 4 * 8
 
 
 def _held_by(array: FloatArray) -> int:
@@ -148,7 +148,7 @@ def test_landmark_that_left_keeps_its_place_until_it_is_seen_again() -> None:
         row = found.rows(np.array([28]))[0]
         places.append((found.positions[row], found.covariances[row]))
         if k in (12, 15):
-            assert estimator._builder.admission.tracks[28].variable == -1
+            assert estimator.builder.admission.tracks[28].variable == -1
             with pytest.raises(EstimatorError, match="landmark 28 waits outside the graph"):
                 estimator.joint_covariance(np.array([28]))
     for k in range(11, 16):
@@ -177,10 +177,10 @@ def test_repeated_failures_at_landmarks_are_repaired() -> None:
     estimator = smoother()
     play(estimator, simulation.increments[:9], FREE)
     for k, identity in ((9, 28), (11, 5)):
-        variable = estimator._builder.admission.tracks[identity].variable
+        variable = estimator.builder.admission.tracks[identity].variable
         spoil(estimator, undetermined(variable))
         play(estimator, simulation.increments[k : k + 2], FREE)
-        assert not estimator._builder.in_graph(variable)
+        assert not estimator.builder.in_graph(variable)
     play(estimator, simulation.increments[13:], FREE)
     found = estimator.estimate()
     assert_finite(found)
@@ -197,7 +197,7 @@ def test_the_rebuilt_window_is_as_uncertain_as_the_one_that_failed() -> None:
     repaired, whole = smoother(), smoother()
     for estimator in (repaired, whole):
         play(estimator, simulation.increments[:12], FREE)
-    variable = repaired._builder.admission.tracks[28].variable
+    variable = repaired.builder.admission.tracks[28].variable
     spoil(repaired, undetermined(variable))
     for estimator in (repaired, whole):
         play(estimator, simulation.increments[12:13], FREE)
@@ -213,7 +213,7 @@ def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
     for estimator in (repaired, whole):
         play(estimator, simulation.increments[:3], FREE)
     assert isinstance(repaired, Smoother)
-    variable = repaired._builder.admission.tracks[28].variable
+    variable = repaired.builder.admission.tracks[28].variable
     spoil(repaired, undetermined(variable))
     for estimator in (repaired, whole):
         play(estimator, simulation.increments[3:4], FREE)
@@ -226,10 +226,10 @@ def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
 def test_rebuilt_poses_leave_when_their_lag_is_over() -> None:
     simulation, estimator = drawn(8, frames=24), smoother()
     play(estimator, simulation.increments[:12], FREE)
-    variable = estimator._builder.admission.tracks[28].variable
+    variable = estimator.builder.admission.tracks[28].variable
     spoil(estimator, undetermined(variable))
     play(estimator, simulation.increments[12:15], FREE)
-    assert estimator._solver._window.frames == list(range(9, 15))
+    assert estimator.solver.window.frames == list(range(9, 15))
 
 
 def test_asking_changes_nothing_where_several_frames_leave_at_once() -> None:
@@ -268,7 +268,7 @@ def test_restored_smoother_continues_to_the_bit(at: int) -> None:
     second.restore({name: np.array(array) for name, array in first.state().items()})
     play(second, increments[at:], FREE)
     assert_same_bits(second.estimate(), straight.estimate())
-    held = [i for i, track in second._builder.admission.tracks.items() if track.variable >= 0][:2]
+    held = [i for i, track in second.builder.admission.tracks.items() if track.variable >= 0][:2]
     ids = np.array(held)
     assert_same_bits(second.joint_covariance(ids), straight.joint_covariance(ids))
 

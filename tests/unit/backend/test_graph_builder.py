@@ -195,7 +195,7 @@ def test_points_without_parallax_wait_and_are_in_the_map(name: str) -> None:
     far = found.landmarks.ids[found.landmarks.ids >= SHIFT]
     assert len(far) > 20
     assert ate(found, near) < 0.02
-    waiting = [identity for identity in waiting_in(estimator._builder) if identity >= SHIFT]
+    waiting = [identity for identity in waiting_in(estimator.builder) if identity >= SHIFT]
     assert len(waiting) > 5
     asked = np.array(waiting[:1])
     assert np.linalg.eigvalsh(estimator.landmark_covariances(asked)[0])[0] > 0.0
@@ -253,7 +253,7 @@ def test_a_landmark_that_moved_starts_anew(name: str, drive: Simulation) -> None
     assert np.sqrt(np.trace(covariance)) < 0.03
     assert ate(found, drive) < 1.3 * ate(undisturbed(name), drive)
     # Its first observations stay with the variable that they were made of.
-    variables = estimator._builder._id_of
+    variables = estimator.builder.identities
     assert variables.count(OFTEN) == 2
 
 
@@ -328,7 +328,7 @@ def test_a_landmark_seen_again_after_a_gap_under_its_identity(name: str, drive: 
         assert offset @ np.linalg.solve(covariance, offset) < 16.3
         assert np.sqrt(np.trace(covariance)) < 0.05
         assert found.remarks == ()
-    variables = estimator._builder._id_of.count(OFTEN)
+    variables = estimator.builder.identities.count(OFTEN)
     assert variables == (2 if name == "fixed_lag" else 1)
 
 
@@ -341,7 +341,7 @@ def test_a_pruned_identity_that_comes_back_is_another_landmark(drive: Simulation
     for settings in SMOOTHERS.values():
         estimator, _ = run(settings, increments)
         found = estimator.estimate()
-        assert estimator._builder._id_of.count(OFTEN) == 2
+        assert estimator.builder.identities.count(OFTEN) == 2
         offset = found.landmarks.positions[row_of(found, OFTEN)] - drive.points_by_id[OFTEN]
         assert np.linalg.norm(offset) < 0.05
 
@@ -423,10 +423,10 @@ def test_landmarks_behind_a_camera_are_removed(
     name: str, drive: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     estimator, _ = run(SMOOTHERS[name], drive.increments)
-    variable = estimator._builder.admission.tracks[OFTEN].variable
+    variable = estimator.builder.admission.tracks[OFTEN].variable
     answers = [[variable]]
     monkeypatch.setattr(
-        estimator._builder, "behind", lambda poses, points: answers.pop() if answers else []
+        estimator.builder, "behind", lambda poses, points: answers.pop() if answers else []
     )
     found = estimator.estimate()
     assert_finite(found)

@@ -38,7 +38,7 @@ Thrown when a linear system is ill-posed.
 
 
 def spoil(estimator: MapSmoother, key: int) -> None:
-    estimator._solver._isam = Failing(estimator._solver._isam, FAILED.format(key=key))
+    estimator.solver.tree = Failing(estimator.solver.tree, FAILED.format(key=key))
 
 
 def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, MapSmoother]:
@@ -60,8 +60,8 @@ def played(frames: int, settings: Isam2Settings = EVERY_FRAME) -> tuple[Any, Map
 )
 def test_failure_at_a_landmark_is_repaired_with_a_remark(settings: Isam2Settings) -> None:
     simulation, estimator = played(13, settings)
-    variable = estimator._builder.admission.tracks[5].variable
-    sightings = estimator._builder.admission.tracks[5].sightings
+    variable = estimator.builder.admission.tracks[5].variable
+    sightings = estimator.builder.admission.tracks[5].sightings
     spoil(estimator, landmark_key(variable))
     play(estimator, simulation.increments[13:], FREE)
     found = estimator.estimate()
@@ -81,7 +81,7 @@ def test_after_the_repair_it_is_as_if_the_landmark_had_never_been_in(
     relinearise_beyond(monkeypatch, 1e-9)
     settings = Isam2Settings(update_every=1)
     simulation, estimator = played(15, settings)
-    spoil(estimator, landmark_key(estimator._builder.admission.tracks[5].variable))
+    spoil(estimator, landmark_key(estimator.builder.admission.tracks[5].variable))
     play(estimator, simulation.increments[15:16], FREE)
     without = answer(settings, unseen(simulation.increments[:16], 5, range(16)))
     found = estimator.estimate()
@@ -95,10 +95,10 @@ def test_after_the_repair_it_is_as_if_the_landmark_had_never_been_in(
 
 def test_a_removed_landmark_returns_at_twice_the_parallax() -> None:
     simulation, estimator = played(6)
-    before = estimator._builder.admission.tracks[5].variable
+    before = estimator.builder.admission.tracks[5].variable
     spoil(estimator, landmark_key(before))
     play(estimator, simulation.increments[6:7], FREE)
-    track = estimator._builder.admission.tracks[5]
+    track = estimator.builder.admission.tracks[5]
     assert track.least_parallax == 6.0
     play(estimator, simulation.increments[7:], FREE)
     assert track.variable > before
@@ -114,7 +114,7 @@ def test_a_removed_landmark_returns_at_twice_the_parallax() -> None:
 )
 def test_failure_beyond_repair_is_one_clear_line(message: str) -> None:
     simulation, estimator = played(10)
-    estimator._solver._isam = Failing(estimator._solver._isam, message)
+    estimator.solver.tree = Failing(estimator.solver.tree, message)
     with pytest.raises(
         EstimatorError, match=r"^isam2: the solver failed at frame 10 \("
     ) as reported:
@@ -126,7 +126,7 @@ def test_failure_beyond_repair_is_one_clear_line(message: str) -> None:
 def test_a_pose_that_defeats_cholesky_is_solved_by_qr() -> None:
     simulation, estimator = played(10)
     straight = played(11)[1].estimate()
-    estimator._solver._isam = Failing(estimator._solver._isam, FAILED.format(key=pose_key(3)))
+    estimator.solver.tree = Failing(estimator.solver.tree, FAILED.format(key=pose_key(3)))
     play(estimator, simulation.increments[10:11], FREE)
     found = estimator.estimate()
     assert [words for words in found.remarks if "with QR" in words]
@@ -136,23 +136,23 @@ def test_a_pose_that_defeats_cholesky_is_solved_by_qr() -> None:
 
 def test_a_pose_that_defeats_qr_too_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation, estimator = played(10)
-    failing = Failing(estimator._solver._isam, FAILED.format(key=pose_key(3)))
-    monkeypatch.setattr(estimator._solver, "_new_solver", lambda: failing)
-    estimator._solver._isam = failing
+    failing = Failing(estimator.solver.tree, FAILED.format(key=pose_key(3)))
+    monkeypatch.setattr(estimator.solver, "new_tree", lambda: failing)
+    estimator.solver.tree = failing
     with pytest.raises(EstimatorError, match="isam2: the solver failed at frame 10"):
         play(estimator, simulation.increments[10:11], FREE)
 
 
 def test_a_solver_that_fails_again_and_again_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     simulation, estimator = played(10)
-    solver = estimator._solver._isam
+    solver = estimator.solver.tree
     variables = iter(range(10_000))
 
     def failing() -> Failing:
         return Failing(solver, FAILED.format(key=landmark_key(next(variables))))
 
-    monkeypatch.setattr(estimator._solver, "_new_solver", failing)
-    estimator._solver._isam = failing()
+    monkeypatch.setattr(estimator.solver, "new_tree", failing)
+    estimator.solver.tree = failing()
     with pytest.raises(EstimatorError, match="isam2: the solver failed at frame 10"):
         play(estimator, simulation.increments[10:11], FREE)
     assert next(variables) <= 22
@@ -180,7 +180,7 @@ def test_tracker_answers_between_updates_of_the_graph() -> None:
     sizes = []
     for increment in simulation.increments[:12]:
         play(estimator, [increment], FREE)
-        sizes.append(estimator._solver._values.size())
+        sizes.append(estimator.solver.values.size())
     grown = np.flatnonzero(np.diff(sizes, prepend=0))
     assert grown.tolist() == [0, 5, 10]
     assert len(estimator.estimate().trajectory) == 12
@@ -238,7 +238,7 @@ def test_restored_between_updates_and_keyframes_it_continues_to_the_bit(
 def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -> None:
     _, estimator = played(frames, Isam2Settings(keyframe_every=4, update_every=4))
     found = estimator.estimate()
-    held = [i for i, track in estimator._builder.admission.tracks.items() if track.variable >= 0]
+    held = [i for i, track in estimator.builder.admission.tracks.items() if track.variable >= 0]
     ids = np.intersect1d(held, found.landmarks.ids)[:5]
     joint = estimator.joint_covariance(ids)
     np.testing.assert_allclose(joint[:6, :6], found.covariances[-1], rtol=1e-9, atol=1e-18)
@@ -251,7 +251,7 @@ def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -
 
 def test_joint_covariance_of_a_landmark_outside_the_graph_is_refused() -> None:
     _, estimator = played(14, Isam2Settings(keyframe_every=4))
-    outside = set(estimator.landmarks().ids.tolist()) - set(estimator._builder.admission.tracks)
+    outside = set(estimator.landmarks().ids.tolist()) - set(estimator.builder.admission.tracks)
     for identity in sorted(outside):
         with pytest.raises(EstimatorError, match=f"landmark {identity} waits outside"):
             estimator.joint_covariance(np.array([identity]))
@@ -261,11 +261,11 @@ def test_joint_covariance_of_a_landmark_outside_the_graph_is_refused() -> None:
 def test_landmarks_behind_a_camera_are_put_back_before_it() -> None:
     """Where a bad step has left them nothing holds them, and the solver fails on each in turn."""
     simulation, estimator = played(13)
-    solver, builder = estimator._solver, estimator._builder
+    solver, builder = estimator.solver, estimator.builder
     tracks = [track for _, track in builder.admission.in_graph()][:30]
     for track in tracks:
-        wTc = poses_of_frame(solver._values, track.last.frame)
-        solver._values.update(landmark_key(track.variable), wTc[:3, 3] - 2.0 * wTc[:3, 2])
+        wTc = poses_of_frame(solver.values, track.last.frame)
+        solver.values.update(landmark_key(track.variable), wTc[:3, 3] - 2.0 * wTc[:3, 2])
     spoil(estimator, landmark_key(tracks[0].variable))
     play(estimator, simulation.increments[13:], FREE)
     found = estimator.estimate()
@@ -287,7 +287,7 @@ class Mute(Failing):
 
 def test_a_covariance_that_the_tree_cannot_tell_is_asked_of_a_new_one() -> None:
     simulation, estimator = played(13)
-    estimator._solver._isam = Mute(estimator._solver._isam, "")
+    estimator.solver.tree = Mute(estimator.solver.tree, "")
     play(estimator, simulation.increments[13:], FREE)
     found = estimator.estimate()
     assert_finite(found)

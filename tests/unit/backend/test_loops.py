@@ -33,7 +33,7 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
-from fgslam.backend.smoothers.loop_closing import _LONG_UNSEEN, found_again
+from fgslam.backend.smoothers.loop_closing import LONG_UNSEEN, found_again
 from fgslam.backend.smoothers.sliding_window import SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core import geometry as g
@@ -106,9 +106,9 @@ def test_a_loop_within_the_sliding_window_is_a_factor_more() -> None:
     off = np.linalg.norm(online[-1].wTc[:3, 3] - drive.poses[CLOSED, :3, 3])
     assert off < 0.6 * before
     assert isinstance(estimator, MapSmoother)
-    solver = estimator._solver
+    solver = estimator.solver
     assert isinstance(solver, SlidingWindowSolver)
-    np.testing.assert_allclose(solver._poses[0], drive.poses[0], rtol=0, atol=1e-6)
+    np.testing.assert_allclose(solver.poses[0], drive.poses[0], rtol=0, atol=1e-6)
 
 
 def test_a_loop_within_a_lag_so_long_that_it_drifts_is_closed_and_a_wrong_one_refused() -> None:
@@ -261,12 +261,12 @@ def test_refused_loop_leaves_the_answer_of_its_frame_alone() -> None:
 
 def found_again_where_expected(estimator: Any, count: int) -> None:
     """Old landmarks, found again at the drifted pose where the drifted map has them: all wrong."""
-    builder, solver = estimator._builder, estimator._solver
+    builder, solver = estimator.builder, estimator.solver
     frame = builder.frames[-1]
-    pose = poses_of_frame(solver._values, frame)
+    pose = poses_of_frame(solver.values, frame)
     seen, when = builder.observed["variable"], builder.observed["frame"]
-    old = np.setdiff1d(seen, seen[when > frame - _LONG_UNSEEN])
-    points = {v: solver._values.atPoint3(landmark_key(v)) for v in old.tolist()}
+    old = np.setdiff1d(seen, seen[when > frame - LONG_UNSEEN])
+    points = {v: solver.values.atPoint3(landmark_key(v)) for v in old.tolist()}
     local = g.transform_to_camera(pose, np.array(list(points.values())))
     rows = np.flatnonzero(visible(RIG, local))[:count]
     assert len(rows) == count

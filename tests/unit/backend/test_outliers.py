@@ -70,7 +70,7 @@ def problem(kernel: KernelSettings, share: float) -> tuple[gtsam.NonlinearFactor
     )
     settings = dataclasses.replace(PLAIN, kernel=kernel)
     estimator, _ = run(settings, spoilt)
-    return estimator._builder.kept_factors(), estimator._solver._values, wrong
+    return estimator.builder.kept_factors(), estimator.solver.values, wrong
 
 
 def solved(
@@ -126,8 +126,8 @@ def test_graduated_non_convexity_finds_the_wrong_ones() -> None:
 
 def test_unseen_landmarks_are_those_of_which_no_observation_counts() -> None:
     estimator, _ = run(PLAIN, drawn(0).increments)
-    graph, _ = WholeGraph.of(estimator._builder.kept_factors(), estimator._solver._values)
+    graph, _ = WholeGraph.of(estimator.builder.kept_factors(), estimator.solver.values)
     assert graph.unseen().tolist() == []
     assert graph.weighed(np.zeros(len(graph.weights))).unseen().tolist() == list(
-        range(estimator._builder.variables)
+        range(estimator.builder.variables)
     )

@@ -9,7 +9,7 @@ import pytest
 from simulated import RIG
 from smoothing import answer, drawn
 
-from fgslam.backend.persistence import Persistence, StatedNoise, _inverses
+from fgslam.backend.persistence import Persistence, StatedNoise, inverses_of_blocks
 from fgslam.backend.settings import (
     BatchSettings,
     FixedLagSettings,
@@ -218,7 +218,7 @@ def test_what_no_sighting_determines_of_a_place_is_left_as_it_is(rng: np.random.
     root[3, :, 2] = 0.0
     root[7] = 0.0
     normal = np.swapaxes(root, 1, 2) @ root
-    found = _inverses(normal)
+    found = inverses_of_blocks(normal)
     expected = np.linalg.pinv(normal)
     np.testing.assert_array_equal(found[[3, 7]], expected[[3, 7]])
     size = np.sqrt(np.einsum("mii->mi", expected))

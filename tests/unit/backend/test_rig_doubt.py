@@ -71,7 +71,7 @@ def solved(seed: int = 3, shift: tuple[float, ...] = (0.0,) * len(ALL)) -> Refin
     settings = BatchSettings(kernel=KernelSettings("none"), trim=False, noise_factor=1.0)
     increments = [displaced(each, np.array(shift)) for each in drawn(seed, frames=12).increments]
     estimator: Any = run(settings, increments)[0]
-    found: Refined = estimator._solver._refined()
+    found: Refined = estimator.solver.refined()
     return found
 
 

@@ -40,8 +40,8 @@ CIRCLE = {
 
 def solver_of(estimator: Estimator) -> SlidingWindowSolver:
     assert isinstance(estimator, MapSmoother)
-    assert isinstance(estimator._solver, SlidingWindowSolver)
-    return estimator._solver
+    assert isinstance(estimator.solver, SlidingWindowSolver)
+    return estimator.solver
 
 
 def live(seed: int, settings: SlidingWindowSettings = SHORT) -> tuple[FloatArray, FloatArray]:
@@ -71,7 +71,7 @@ def test_window_stays_as_long_as_it_is_set_and_places_leave_it() -> None:
     drive, estimator, places = drawn(3, **CIRCLE), build(SHORT), set()
     for increment in drive.increments:
         play(estimator, [increment], FREE)
-        window = solver_of(estimator)._window
+        window = solver_of(estimator).window
         assert len(window.frames) <= SHORT.window + SHORT.update_every
         assert window.prior.kept == 6 * len(window.places)
         assert len(window.places) <= 3
@@ -90,7 +90,7 @@ def returned() -> SlidingWindowSolver:
 def test_a_place_that_is_like_any_pose_that_left_says_the_same(
     returned: SlidingWindowSolver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    window = returned._window
+    window = returned.window
     assert window.places
     expected = last_pose(window)
     for prior in (window.prior.without_place(0), window.prior.without_place(0).compressed()):
@@ -100,17 +100,17 @@ def test_a_place_that_is_like_any_pose_that_left_says_the_same(
 
 def last_pose(window: Window) -> FloatArray:
     """(6, 6) covariance, linearised where the window is."""
-    return Eliminated(window._equations()).pose(len(window.frames) - 1)
+    return Eliminated(window.equations()).pose(len(window.frames) - 1)
 
 
 def test_a_place_is_off_as_far_as_its_frame_had_drifted(returned: SlidingWindowSolver) -> None:
     """Given another that shares a part of it, and the rest."""
-    tie, here = returned._tie(0), g.inverse(returned._window.poses[0])
-    beside = returned._window.frames[0]
+    tie, here = returned.tie_of(0), g.inverse(returned.window.poses[0])
+    beside = returned.window.frames[0]
     if tie.follows is not None:
-        beside = returned._frame_of(tie.follows)
-    frames = beside, returned._frame_of(0)
-    other, own = (g.congruence(g.adjoint(here), returned._drift[frame]) for frame in frames)
+        beside = returned.frame_of(tie.follows)
+    frames = beside, returned.frame_of(0)
+    other, own = (g.congruence(g.adjoint(here), returned.drift[frame]) for frame in frames)
     whole = g.congruence(tie.gain, other) + np.linalg.inv(tie.information)
     found, expected = np.sqrt(np.diagonal(whole)), np.sqrt(np.diagonal(own))
     assert (found > 0.98 * expected).all()
@@ -160,13 +160,13 @@ def test_a_change_of_the_rig_is_taken_once_also_by_frames_that_wait() -> None:
     solver, turned = solver_of(estimator), np.zeros(len(term_names(RIG)))
     turned[term_names(RIG).index("left.yaw")] = 1e-2
     change = RigChange(RIG, turned)
-    solver._builder.recalibrate(change)
+    solver.builder.recalibrate(change)
     solver.recalibrate(change)
-    frames, variables, measured, _ = solver._builder.kept_observed()
+    frames, variables, measured, _ = solver.builder.kept_observed()
     expected = dict(
         zip(zip(frames.tolist(), variables.tolist(), strict=True), measured, strict=True)
     )
-    seen = solver._window.observed
+    seen = solver.window.observed
     assert seen.frame.max() == 6
     for frame, variable, found in zip(seen.frame, seen.variable, seen.measurement, strict=True):
         np.testing.assert_allclose(found, expected[frame, variable], rtol=0, atol=1e-9)
@@ -181,7 +181,7 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
     estimator.begin_in(known, np.full(20, 4), fixed=False)
     play(estimator, [matched(each, saved) for each in drive.increments[:44]], FREE)
     solver = solver_of(estimator)
-    held, window = solver._held, solver._window
+    held, window = solver.held, solver.window
     ours = held.saved.copy()
     outside = ~np.isin(np.arange(len(held)), window.landmarks.variables)
     inside = ours[window.landmarks.variables]
@@ -189,9 +189,9 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
     points, mean = held.points.copy(), window.landmarks.mean.copy()
     beside = g.se3_exp(np.array([0.0, 0.3, 0.0, 0.5, 0.0, 0.0])) @ window.poses[-1]
     there = Prediction(beside, 1e-6 * np.eye(6))
-    loop = Constraint(2, window.frames[-1], g.inverse(solver._poses[2]) @ beside, 1e-6 * np.eye(6))
-    solver._loops.accept(loop)
-    solver._move(there, loop, Drive(estimator._tracker.chain, window.poses[-1]))
+    loop = Constraint(2, window.frames[-1], g.inverse(solver.poses[2]) @ beside, 1e-6 * np.eye(6))
+    solver.loops.accept(loop)
+    solver.move_by_loop(there, loop, Drive(estimator.tracker.chain, window.poses[-1]))
     np.testing.assert_array_equal(held.points[ours & outside], points[ours & outside])
     np.testing.assert_array_equal(window.landmarks.mean[inside], mean[inside])
     went = np.linalg.norm(held.points - points, axis=1)[~ours & outside & (held.homes > 10)]

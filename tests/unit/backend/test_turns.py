@@ -152,7 +152,7 @@ def refined(seed: int = 0) -> Refined:
     """A drive's graph at its minimum."""
     estimator = made_or_given(RIG, BATCH, EgoMotionSettings(), None)
     replayed(driven(seed).log, estimator)
-    found: Refined = estimator._solver._refined()  # type: ignore[attr-defined]
+    found: Refined = estimator.solver.refined()  # type: ignore[attr-defined]
     return found
 
 
@@ -364,7 +364,7 @@ def test_a_frame_found_without_a_prior_keeps_its_turn_and_the_bias_of_it() -> No
         log.append(increment)
     estimator = made_or_given(RIG, BATCH, EgoMotionSettings(), None)
     replayed(log, estimator)
-    turns = estimator._solver._refined().graph.rest.turns  # type: ignore[attr-defined]
+    turns = estimator.solver.refined().graph.rest.turns  # type: ignore[attr-defined]
     np.testing.assert_array_equal(turns.after, [1, 2, 3, 4, 5])
     assert noise_of(turns)[:, 3, 3].argmax() == 2
 

@@ -31,7 +31,7 @@ def problem(name: Any, seed: int = 0, wrong: float = 0.05) -> tuple[Any, Any, Gr
     increments = wrong_matches(drawn(seed, frames=20).increments, wrong, rng)
     kernel = KernelSettings(name, 3.0)
     estimator, _ = run(BatchSettings(kernel=kernel, trim=False, noise_factor=1.0), increments)
-    builder, values = estimator._builder, estimator._solver._values
+    builder, values = estimator.builder, estimator.solver.values
     for before, after in LOOPS:
         motion = inverse(poses_of_frame(values, before)) @ poses_of_frame(values, after)
         motion = motion @ se3_exp(0.01 * rng.standard_normal(6))

@@ -25,14 +25,14 @@ def window() -> Window:
     estimator = build(FixedLagSettings(lag_frames=30))
     play(estimator, drawn(5, frames=FRAMES, points=80, prune_after=8).increments, FREE)
     assert isinstance(estimator, Smoother)
-    assert isinstance(estimator._solver, FixedLagSolver)
-    return estimator._solver._window
+    assert isinstance(estimator.solver, FixedLagSolver)
+    return estimator.solver.window
 
 
 def joint(window: Window, variables: IntArray) -> FloatArray:
     """Covariance of the last pose and of landmarks, linearised where the window is."""
     rows = np.searchsorted(window.landmarks.variables, variables)
-    return Eliminated(window._equations()).joint(len(window.frames) - 1, rows)
+    return Eliminated(window.equations()).joint(len(window.frames) - 1, rows)
 
 
 def assert_same(found: FloatArray, expected: FloatArray) -> None:
@@ -80,10 +80,10 @@ def test_the_place_of_rest_stays(window: Window) -> None:
 def test_an_observation_is_weighed_and_linearised_where_the_prior_was(window: Window) -> None:
     window.let_go_before(FIRST)
     tied = np.isin(window.observed.variable, window.prior.variables)
-    before = window._look(window.observed).rows
+    before = window.linearise(window.observed).rows
     moved = dataclasses.replace(window.landmarks, points=window.landmarks.points + 0.5)
     window.landmarks = moved
-    after = window._look(window.observed).rows
+    after = window.linearise(window.observed).rows
     assert tied.sum() > 50
     np.testing.assert_array_equal(after.by_point[tied], before.by_point[tied])
     far = np.linalg.norm(after.residual, axis=1) > 10.0 * np.linalg.norm(before.residual, axis=1)

@@ -6,13 +6,13 @@ import io
 
 from rich.console import Console
 
-from fgslam.cli.console import _Bars
+from fgslam.cli.console import Bars
 
 
 def test_progress_says_how_many_cases_are_done_and_the_time_left() -> None:
     now, out = [100.0], io.StringIO()
     console = Console(file=out, force_terminal=True, width=120, get_time=lambda: now[0])
-    bars = _Bars(console, begin=lambda: None)
+    bars = Bars(console, begin=lambda: None)
     for done in range(5):
         bars.tell("cases", done, 20)
         now[0] += 30.0

@@ -110,7 +110,7 @@ def test_only_a_limit_that_threads_would_fill_keeps_libraries_on_one(
     monkeypatch.setattr(start, "limit_bytes", lambda: limit)
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     monkeypatch.setattr(os, "environ", given := {"OMP_NUM_THREADS": "3"})
-    start._require_memory()
+    start.require_memory()
     others = {"OPENBLAS_NUM_THREADS": "1"} if single else {}
     assert given == {"OMP_NUM_THREADS": "3"} | others  # what the user says stays
 

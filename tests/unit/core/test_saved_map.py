@@ -105,7 +105,7 @@ def rewritten(path: Path, change: Callable[[dict[str, Any], dict[str, Any]], Non
     header = json.loads(str(arrays.pop("header")))
     del header["sha256"]
     change(header, arrays)
-    header["sha256"] = map_file._digest(header, arrays)
+    header["sha256"] = map_file.digest(header, arrays)
     write_arrays(path, {"header": np.array(json.dumps(header))} | arrays)
     return path
 

@@ -92,7 +92,7 @@ def test_libraries_are_looked_for_only_after_an_import(monkeypatch: pytest.Monke
             super().__init__()
 
     monkeypatch.setattr(threads, "ThreadpoolController", Counted)
-    limits = threads._Limits()
+    limits = threads.BlasLimits()
     for _ in range(2):
         limits.leave(limits.enter())
     assert len(searches) == 1

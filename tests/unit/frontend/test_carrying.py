@@ -69,7 +69,7 @@ def found_again(place: FloatArray, off: FloatArray) -> tuple[ReferencePatches, P
     first = Begun.new(FineImage(here), points(measurements(HERE)[:, :2], HERE))
     again = points(measurements(place)[:, :2] + off, place)
     carrier = begun(now, place)
-    return carrier._found_again(FineImage(now[0]), Begun.again(again, first.patches(here)))
+    return carrier.find_again(FineImage(now[0]), Begun.again(again, first.patches(here)))
 
 
 def dark(place: FloatArray) -> tuple[Image, ...]:
@@ -221,7 +221,8 @@ def test_looks_are_those_expected_and_noise_is_stated() -> None:
     np.testing.assert_allclose(features.orientation, 1.0, rtol=0, atol=1e-12)
     assert (features.descriptors == 7).all()
     stereo = StereoMatcher(RIG, StereoSettings(pixel_sigma=1.0), AppearanceSettings())
-    one = stereo._map @ stereo._map.T
+    linear = stereo.equally(1.0)[0]
+    one = linear @ linear.T
     share = features.measurement_covariance[0] / one
     sigma = StereoSettings().pixel_sigma * NOISE_SHARE
     crowded = crowding(features.pixels[:, 0], PATCH_PX)[0]

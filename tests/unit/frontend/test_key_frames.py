@@ -163,4 +163,4 @@ def test_many_that_contradict_the_pose_ask_for_a_key_frame(outliers: int, lastin
     pose = EgoMotion(np.eye(4), np.eye(6), used, np.zeros(100), EgoMotionStatus.OK, 1)
     tracked: Any = SimpleNamespace(ego_motion=pose)
     tracker = KeyFrameTracker(SimpleNamespace(), SimpleNamespace())  # type: ignore[arg-type]
-    assert tracker._lasting(carried, tracked, np.zeros((100, 100), np.uint8)) is lasting
+    assert tracker.lasts(carried, tracked, np.zeros((100, 100), np.uint8)) is lasting

@@ -22,7 +22,7 @@ AT = (100.0, 80.0, 10.0)
 
 @pytest.fixture(autouse=True)
 def _limited_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_matching, "_MAX_WINDOW_PX", 30.0)
+    monkeypatch.setattr(map_matching, "MAX_WINDOW_PX", 30.0)
 
 
 def _columns(rows: object, scale: float, orientation_deg: float, descriptors: FloatArray | None):
@@ -159,7 +159,7 @@ def test_widening_has_a_limit_but_never_narrows(monkeypatch: pytest.MonkeyPatch)
         found = match(landmarks(), features(row), widen_sigmas=3.0, uncertainty=vast)
         assert len(found.features) == count
     # A limit below the paper's window leaves that as it is.
-    monkeypatch.setattr(map_matching, "_MAX_WINDOW_PX", 2.0)
+    monkeypatch.setattr(map_matching, "MAX_WINDOW_PX", 2.0)
     row = (102.4, 80.0, 10.0)
     found = match(landmarks(), features(row), widen_sigmas=3.0, uncertainty=vast)
     assert len(found.features) == 1

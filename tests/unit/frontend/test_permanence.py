@@ -71,7 +71,7 @@ SEEN = {
 def test_a_feature_seen_behind_contradicts_a_missed_landmark(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fgslam.frontend.tracking.database._NEAR_PX", 20.0)
+    monkeypatch.setattr("fgslam.frontend.tracking.database.NEAR_PX", 20.0)
     shown, past = SEEN[what]
     found = seen_past(np.array([PLACE]), np.array(shown, np.float64).reshape(-1, 3))
     assert found.tolist() == [past]

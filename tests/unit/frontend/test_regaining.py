@@ -25,7 +25,7 @@ ABSURD = g.se3_exp(np.array([0.0, 2.5, 0.0, -4.0, 0.0, 1.0]))  # looks away from
 
 
 def tracked_at(scene: Scene, predicted: FloatArray, wTc: FloatArray = TURNED) -> Tracked:
-    stereo = scene._stereo.match(scene.world.features(wTc, sigma_px=0.1))
+    stereo = scene.stereo.match(scene.world.features(wTc, sigma_px=0.1))
     return scene.tracker.track(Prediction(predicted, CERTAIN), scene.map, stereo)
 
 
@@ -45,7 +45,7 @@ def test_a_frame_is_found_whatever_was_predicted(scene: Scene, predicted: FloatA
 
 
 def test_the_same_frame_gives_the_same_bits(scene: Scene) -> None:
-    stereo = scene._stereo.match(scene.world.features(TURNED, sigma_px=0.1))
+    stereo = scene.stereo.match(scene.world.features(TURNED, sigma_px=0.1))
     wrong = Prediction(ABSURD, CERTAIN)
     first, again = (scene.tracker.track(wrong, scene.map, stereo).ego_motion for _ in range(2))
     assert first.status is EgoMotionStatus.RELOCALISED
@@ -85,7 +85,7 @@ def test_a_stiff_wrong_prediction_does_not_win_by_a_handful_of_matches(scene: Sc
     """Most far landmarks stay where they were; the near ones tell that the camera moved on."""
     step = g.se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.5]))
     stiff = Prediction(np.eye(4), np.diag([1e-4] * 6) ** 2)
-    stereo = scene._stereo.match(scene.world.features(step, sigma_px=0.1))
+    stereo = scene.stereo.match(scene.world.features(step, sigma_px=0.1))
     found = scene.tracker.track(stiff, scene.map, stereo).ego_motion
     np.testing.assert_allclose(g.se3_log(g.inverse(step) @ found.wTc), 0.0, atol=4e-3)
 
@@ -94,9 +94,9 @@ def test_a_few_matches_where_they_were_predicted_do_not_hide_all_others(scene: S
     """A tenth of the landmarks, moved with the camera, fit the wrong pose that was predicted."""
     few = scene.world.points[:, 0] < np.quantile(scene.world.points[:, 0], 0.1)
     scene.world.points[few] = g.transform_to_world(TURNED, scene.world.points[few])
-    stereo = scene._stereo.match(scene.world.features(TURNED, sigma_px=0.1))
+    stereo = scene.stereo.match(scene.world.features(TURNED, sigma_px=0.1))
     around = Prediction(np.eye(4), CERTAIN)
-    wrong = scene.tracker._attempt(around, around, scene.map, stereo).ego_motion
+    wrong = scene.tracker.match_and_solve(around, around, scene.map, stereo).ego_motion
     assert wrong.status is EgoMotionStatus.OK
     assert wrong.coherent
     found = scene.tracker.track(around, scene.map, stereo).ego_motion
@@ -112,7 +112,7 @@ def test_new_ground_is_no_reason_to_look(
     monkeypatch.setattr(regaining.Regainer, "find", lambda *_: pytest.fail("looked for"))
     scene.tracker.expects_returns = returns
     known = scene.map.without(np.delete(scene.map.ids, np.s_[::3]))
-    stereo = scene._stereo.match(scene.world.features(np.eye(4), sigma_px=0.1))
+    stereo = scene.stereo.match(scene.world.features(np.eye(4), sigma_px=0.1))
     found = scene.tracker.track(Prediction(np.eye(4), CERTAIN), known, stereo).ego_motion
     assert found.status is EgoMotionStatus.OK
     assert found.inliers.sum() < 0.4 * len(stereo)
@@ -134,7 +134,7 @@ def test_only_what_was_seen_lately_is_looked_for(scene: Scene) -> None:
         scene.world,
         FeatureWorld(points_in_view(RIG, 80, (1.5, 5.0), rng), rng),
     )
-    for _ in range(regaining._LATELY + 1):
+    for _ in range(regaining.LATELY + 1):
         scene.step(np.eye(4))
     scene.world = old
     assert not tracked_at(scene, ABSURD).ego_motion.status.measured
@@ -165,7 +165,7 @@ def test_doubles_seen_before_do_not_hide_what_the_last_frame_saw(scene: Scene) -
     """Among all of lately each feature has two landmarks that look alike; at last it has one."""
     rng, before = np.random.default_rng(6), scene.world
     scene.world = FeatureWorld(points_in_view(RIG, 150, (1.5, 5.0), rng), rng)
-    scene.world._descriptors = before._descriptors
+    scene.world.descriptors = before.descriptors
     scene.step(np.eye(4))
     found = tracked_at(scene, ABSURD).ego_motion
     assert found.status is EgoMotionStatus.RELOCALISED

@@ -365,11 +365,12 @@ def test_covariances_match_monte_carlo(kind: str, vertical: float | None) -> Non
     at = [RIGHT, (118.0, 80.0), (100.0, 80.0 + 18.0 * (vertical or 0.0) / 0.1)][: rig.cameras]
     found = match(*[features(xy) for xy in at], rig=rig, measurement=kind, pixel_sigma=0.3)
     assert len(found) == 1
-    matcher = StereoMatcher(rig, dataclasses.replace(GATES, measurement=kind), PAPER)
+    wide = {"epipolar_px": 100.0, "disparity_agreement_px": 100.0}
+    matcher = StereoMatcher(rig, dataclasses.replace(GATES, measurement=kind, **wide), PAPER)
     drawn = np.array(at) + 0.3 * rng.standard_normal((100_000, rig.cameras, 2))
-    everyone = np.arange(len(drawn))
     images = [features(drawn[:, camera]) for camera in range(rig.cameras)]
-    noisy = matcher._measure(tuple(images), tuple(images), (everyone,) * rig.cameras)
+    noisy, right = matcher.measured(tuple(images), matcher.equally(1.0))
+    assert right.all()
     for sample, stated in (
         (noisy.measurement, found.measurement_covariance[0]),
         (noisy.position, found.position_covariance[0]),

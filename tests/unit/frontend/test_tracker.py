@@ -45,13 +45,13 @@ class Scene:
         rng = np.random.default_rng(12)
         self.world = FeatureWorld(points_in_view(RIG, count, (1.5, 5.0), rng), rng)
         self.tracker: LandmarkTracker = make_tracker(RIG, settings)
-        self._stereo = StereoMatcher(RIG, settings.stereo, settings.appearance)
+        self.stereo = StereoMatcher(RIG, settings.stereo, settings.appearance)
         self.settings = settings
         self.map = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def step(self, wTc: FloatArray, hidden: IntArray | None = None, predicted=None):
         """One frame; new landmarks enter the map where they were measured."""
-        stereo = self._stereo.match(self.world.features(wTc, hidden=hidden))
+        stereo = self.stereo.match(self.world.features(wTc, hidden=hidden))
         prediction = Prediction(wTc if predicted is None else predicted, CERTAIN)
         tracked = self.tracker.track(prediction, self.map, stereo)
         association = self.tracker.associate(tracked, stereo, IMAGE)
@@ -113,7 +113,7 @@ def test_what_two_images_show_is_matched_but_starts_no_landmark() -> None:
     _, association = scene.step(np.eye(4))
     first = len(association.observations)
     right, left, top = scene.world.features(np.eye(4))
-    stereo = scene._stereo.match_all((right, left, top.select(np.arange(0))))
+    stereo = scene.stereo.match_all((right, left, top.select(np.arange(0))))
     assert stereo.complete is not None
     assert not stereo.complete.any()
     fresh = Scene()
@@ -213,7 +213,7 @@ def test_outliers_count_as_misses_and_are_marked(monkeypatch: pytest.MonkeyPatch
     scene.step(np.eye(4))
     # One landmark of the map is not where it was seen: 4 px off, but inside the window.
     scene.settings = SETTINGS
-    monkeypatch.setattr(map_matching, "_WINDOW_PX", 20.0)
+    monkeypatch.setattr(map_matching, "WINDOW_PX", 20.0)
     state = scene.tracker.database.state()
     scene.tracker = make_tracker(RIG, SETTINGS)
     scene.tracker.database.restore(state)
@@ -253,12 +253,12 @@ def test_beyond_the_window_all_is_lost() -> None:
 
 @pytest.mark.parametrize("how", ["rescue", "widen"])
 def test_wider_search_finds_it_again(how: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_matching, "_MAX_WINDOW_PX", 60.0)
+    monkeypatch.setattr(map_matching, "MAX_WINDOW_PX", 60.0)
     changes = {"rescue": True} if how == "rescue" else {"widen_sigmas": 3.0}
     matching = dataclasses.replace(SETTINGS.matching, **changes)
     scene = Scene(dataclasses.replace(SETTINGS, matching=matching))
     scene.step(np.eye(4))
-    stereo = scene._stereo.match(scene.world.features(np.eye(4)))
+    stereo = scene.stereo.match(scene.world.features(np.eye(4)))
     vague = Prediction(FAR_OFF, np.diag([0.02] * 3 + [0.02] * 3) ** 2)
     tracked = scene.tracker.track(vague, scene.map, stereo)
     assert tracked.ego_motion.status is EgoMotionStatus.OK
@@ -287,13 +287,13 @@ def test_a_frame_is_matched_anew_only_where_the_prediction_was_off(
     scene = Scene(dataclasses.replace(SETTINGS, matching=matching))
     scene.step(np.eye(4))
     made: list[None] = []
-    attempt = scene.tracker._attempt
+    attempt = scene.tracker.match_and_solve
 
     def counted(*given: Any, **named: Any) -> Tracked:
         made.append(None)
         return attempt(*given, **named)
 
-    monkeypatch.setattr(scene.tracker, "_attempt", counted)
+    monkeypatch.setattr(scene.tracker, "match_and_solve", counted)
     scene.step(np.eye(4), predicted=g.se3_exp(np.array([0.0, 0.0, 0.0, sideways_m, 0.0, 0.0])))
     assert len(made) == attempts
 
@@ -301,7 +301,7 @@ def test_a_frame_is_matched_anew_only_where_the_prediction_was_off(
 def test_tracking_alone_changes_nothing() -> None:
     scene = Scene()
     scene.step(np.eye(4))
-    stereo = scene._stereo.match(scene.world.features(np.eye(4)))
+    stereo = scene.stereo.match(scene.world.features(np.eye(4)))
     given = (Prediction(np.eye(4), CERTAIN.copy()), scene.map, stereo)
     kept, state = copy.deepcopy(given), copy.deepcopy(scene.tracker.database.state())
     first, second = scene.tracker.track(*given), scene.tracker.track(*given)

@@ -52,7 +52,7 @@ class Things:
     def __init__(self, points: FloatArray, frontend: FrontendSettings) -> None:
         self.world = FeatureWorld(points, np.random.default_rng(5))
         self._tracker = make_tracker(RIG, frontend)
-        self._stereo = StereoMatcher(RIG, frontend.stereo, frontend.appearance)
+        self.stereo = StereoMatcher(RIG, frontend.stereo, frontend.appearance)
         self.map = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     @property
@@ -60,7 +60,7 @@ class Things:
         return self._tracker.database
 
     def step(self, wTc: FloatArray, hidden: IntArray | None = None) -> Association:
-        stereo = self._stereo.match(self.world.features(wTc, hidden=hidden))
+        stereo = self.stereo.match(self.world.features(wTc, hidden=hidden))
         tracked = self._tracker.track(Prediction(wTc, CERTAIN), self.map, stereo)
         association = self._tracker.associate(tracked, stereo, IMAGE)
         new = association.observations.select(association.observations.is_new)

@@ -13,7 +13,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import DatabaseSettings
-from fgslam.frontend.tracking.map_matching import _CONE_DEG, FieldOfView, directions_to
+from fgslam.frontend.tracking.map_matching import CONE_DEG, FieldOfView, directions_to
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
@@ -38,7 +38,7 @@ def full_scan(
         if disparity > MAX_DISPARITY:
             continue
         if settings.field_of_view == "cone":
-            tangent = np.tan(np.deg2rad(_CONE_DEG))
+            tangent = np.tan(np.deg2rad(CONE_DEG))
             possible[k] = certain[k] = bool((np.abs(point[:2]) < tangent * point[2]).all())
             continue
         for out, border in ((possible, -settings.border_px), (certain, settings.border_px)):

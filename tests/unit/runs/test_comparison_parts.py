@@ -47,8 +47,8 @@ from fgslam.runs.metric_tables import (
 )
 from fgslam.runs.slam_comparison import judged_apart, named
 from fgslam.runs.tasks.truth import (
-    _medians,
     at_edges,
+    medians_of,
     points_under,
     rendered_landmark_truth,
 )
@@ -409,7 +409,7 @@ def test_a_place_is_at_an_edge_where_a_patch_around_it_shows_two_surfaces() -> N
 def test_landmarks_mostly_seen_at_edges_have_no_truth() -> None:
     ids, points = np.repeat([7, 8, 9], [5, 4, 2]), np.zeros((11, 3))
     split = np.array([True, True, True, False, False, True, True, False, False, False, False])
-    truth, _ = _medians(ids, points, split)
+    truth, _ = medians_of(ids, points, split)
     assert truth.ids.tolist() == [8]  # half of the sightings do; the last one has too few
 
 

@@ -12,9 +12,9 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import compose, wrap
 from fgslam.runs.tasks.homing_pairs import (
-    _tables,
     answer_numbers,
     error_numbers,
+    error_tables,
     pair_errors,
     true_pair,
     write_pairs,
@@ -85,7 +85,7 @@ def test_shares_are_shown_as_percentages_and_what_is_not_known_as_a_dash() -> No
         answers.append(PairAnswer(2 * k, 2 * k + 1, vector(sigmas * SIGMA, 0.0), 9))
     poses = np.zeros((8, 3))
     poses[1::2, 0] = 1.0
-    (table,) = _tables(pair_errors(answers, poses, ("a",) * 8))
+    (table,) = error_tables(pair_errors(answers, poses, ("a",) * 8))
     column = [column.name for column in table.columns].index("covered joint 95 %")
     cells = {name: cells[column] for name, cells in table.rows}
     assert list(cells.values()) == ["75.0 %", "75.0 %", "-"]  # all, of one room, of different ones

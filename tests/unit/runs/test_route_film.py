@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.runs.film import _rate
-from fgslam.runs.route_film import Row, _command, _rows
+from fgslam.runs.film import frame_rate
+from fgslam.runs.route_film import Row, command_text, follow_rows
 
 ROW = {
     "image": "3",
@@ -40,14 +40,14 @@ def table(path: Path, row: Row) -> Path:
 
 
 def test_a_whole_table_is_read(tmp_path: Path) -> None:
-    assert _rows(table(tmp_path / "follow.csv", ROW)) == (ROW, ROW)
+    assert follow_rows(table(tmp_path / "follow.csv", ROW)) == (ROW, ROW)
 
 
 @pytest.mark.parametrize("column", ["state", "target", "path_image_name", "inliers", "v_mps"])
 def test_a_missing_column_is_named(column: str, tmp_path: Path) -> None:
     rest = {name: text for name, text in ROW.items() if name != column}
     with pytest.raises(DatasetError, match=f"follow.csv: lacks column {column}; follow the route"):
-        _rows(table(tmp_path / "follow.csv", rest))
+        follow_rows(table(tmp_path / "follow.csv", rest))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_missing_column_is_named(column: str, tmp_path: Path) -> None:
 )  # fmt: skip
 def test_a_damaged_cell_is_named_in_one_line(column: str, text: str, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=rf"line 2: {column} is '.*not a number") as caught:
-        _rows(table(tmp_path / "follow.csv", ROW | {column: text}))
+        follow_rows(table(tmp_path / "follow.csv", ROW | {column: text}))
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
 
@@ -67,7 +67,7 @@ def test_a_line_that_breaks_off_is_named(tmp_path: Path) -> None:
     whole = path.read_text(encoding="utf-8")
     path.write_text(whole[: whole.rindex(",41")], encoding="utf-8")
     with pytest.raises(DatasetError, match="line 3: ends before column v_mps"):
-        _rows(path)
+        follow_rows(path)
 
 
 @pytest.mark.parametrize(
@@ -76,22 +76,22 @@ def test_a_line_that_breaks_off_is_named(tmp_path: Path) -> None:
      ("-0.2", "0 degrees/s")],
 )  # fmt: skip
 def test_a_turn_has_a_side_unless_it_is_zero(turn: str, said: str) -> None:
-    assert f"omega {said}" in _command(ROW | {"omega_deg_s": turn}).splitlines()
+    assert f"omega {said}" in command_text(ROW | {"omega_deg_s": turn}).splitlines()
 
 
 def test_a_film_runs_as_fast_as_the_recording_and_at_most_30_frames_a_second() -> None:
     where = Path("run")
     epoch = 1.7e9 + np.array([0.25, 0.35, 0.45])
-    assert _rate(epoch, "images", where) == pytest.approx(10.0, abs=1e-4)
-    assert _rate(np.arange(3) / 200.0, "images", where) == 30.0
+    assert frame_rate(epoch, "images", where) == pytest.approx(10.0, abs=1e-4)
+    assert frame_rate(np.arange(3) / 200.0, "images", where) == 30.0
 
 
 @pytest.mark.parametrize("times", [[5.0, 5.0, 5.0], [3.0, 2.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
 def test_times_that_stand_still_give_no_rate(times: list[float]) -> None:
     with pytest.raises(DatasetError, match="run: the times of its images do not increase"):
-        _rate(np.array(times), "images", Path("run"))
+        frame_rate(np.array(times), "images", Path("run"))
 
 
 def test_one_image_is_no_film() -> None:
     with pytest.raises(ConfigError, match="a film needs two at least"):
-        _rate(np.zeros(1), "images", Path("run"))
+        frame_rate(np.zeros(1), "images", Path("run"))

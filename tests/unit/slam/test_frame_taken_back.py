@@ -49,8 +49,8 @@ def test_what_a_closure_ended_is_in_no_book_when_the_next_frame_is_taken_back(
         recorder.add(report, 0.0, float("nan"))
     assert pipeline.places is not None
     older, ended = pipeline.tracker.database.ids[[0, -1]].tolist()
-    pipeline.places._merging = np.array([[ended, older]])  # as a closure leaves it
-    pipeline.places._fuse_since = len(frames) - 1
+    pipeline.places.merging = np.array([[ended, older]])  # as a closure leaves it
+    pipeline.places.fuse_since = len(frames) - 1
     pipeline.describe = out_of_order
     with pytest.raises(ZeroDivisionError):
         pipeline.process(dataclasses.replace(last, features=()), last.i, float(last.i))

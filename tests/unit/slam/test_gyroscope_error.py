@@ -76,7 +76,7 @@ def driven(
 
 
 def gyroscope_of(motion: OdometryMotion) -> GyroscopeError:
-    return motion._gyroscope
+    return motion.gyroscope
 
 
 # --------------------------------------------------------------------------------------------

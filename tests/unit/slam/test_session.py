@@ -375,7 +375,7 @@ def test_a_failure_in_the_first_frame_is_why_there_is_no_result(views: Views) ->
         raise DatasetError("the depth image is missing")
 
     slam = session(views)
-    found = slam._describer.describe(0, Frame(0, 0.0, views.images(0)))
+    found = slam.describer.describe(0, Frame(0, 0.0, views.images(0)))
     with pytest.raises(DatasetError):
         slam.advance(found, 0.0, precision_of=unreadable)
     with pytest.raises(SessionError, match=r"no result: it failed .*depth image is missing"):
@@ -468,7 +468,7 @@ def test_a_frame_that_fails_after_the_update_is_in_no_result(views: Views, answe
 def test_a_frame_whose_record_fails_is_in_no_result(views: Views) -> None:
     slam = session(views)
     push(slam, views, range(3))
-    found = slam._describer.describe(3, Frame(3, 1.5, views.images(3)))
+    found = slam.describer.describe(3, Frame(3, 1.5, views.images(3)))
 
     def unreadable(report: FrameReport) -> float:
         raise DatasetError("the depth image is missing")

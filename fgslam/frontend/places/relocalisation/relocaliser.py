@@ -29,7 +29,7 @@ _NEIGHBOURS = 12  # stored views asked of the index for each feature
 _REFINED = 4  # distinct best poses that are refined and compared
 _ELSEWHERE_M = 0.5  # poses farther apart than this are different places
 _ELSEWHERE_RAD = float(np.deg2rad(15.0))  # and so are poses turned by more than this
-_VIEW_SIGMA_PX = 0.3  # added to a feature's noise: from elsewhere it is found elsewhere
+VIEW_SIGMA_PX = 0.3  # added to a feature's noise: from elsewhere it is found elsewhere
 _MAX_DISPARITY_PX = 40.0  # of mistakes, spread evenly; the scores hardly depend on it
 
 
@@ -73,7 +73,7 @@ class Relocaliser:
             rng: draws the samples.
         """
         tentative = self.tentative(features)
-        seen = SeenPoints.of(features, self._rig, _VIEW_SIGMA_PX)
+        seen = SeenPoints.of(features, self._rig, VIEW_SIGMA_PX)
         evidence = self._evidence(seen, tentative)
         proposals = propose_by_samples(evidence, self._floor, rng)
         refined = self._refine(features, seen, evidence, proposals)

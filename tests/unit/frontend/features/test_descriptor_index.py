@@ -34,7 +34,7 @@ def test_small_contents_are_answered_exactly(rng: np.random.Generator) -> None:
 def test_large_contents_are_answered_nearly(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(descriptor_index, "_EXACT", 100)
+    monkeypatch.setattr(descriptor_index, "EXACT", 100)
     held = looks(rng, 4000)
     asked = blurred(held[:200], rng)
     found = AppearanceIndex(held).query(asked, 3)
@@ -50,11 +50,11 @@ def test_every_cell_searched_finds_what_a_full_search_does(
 ) -> None:
     held, asked = looks(rng, 900), looks(rng, 40)
     held[450:600] = held[300:450]  # ties, at the last of the asked neighbours as well
-    monkeypatch.setattr(descriptor_index, "_CHUNK", chunk)
+    monkeypatch.setattr(descriptor_index, "CHUNK", chunk)
     in_full = AppearanceIndex(held).query(asked, 7)
-    monkeypatch.setattr(descriptor_index, "_EXACT", 0)
-    monkeypatch.setattr(descriptor_index, "_PROBES", 256)
-    monkeypatch.setattr(descriptor_index, "_LEADING", chunk)
+    monkeypatch.setattr(descriptor_index, "EXACT", 0)
+    monkeypatch.setattr(descriptor_index, "PROBES", 256)
+    monkeypatch.setattr(descriptor_index, "LEADING", chunk)
     probed = AppearanceIndex(held).query(asked, 7)
     _assert_equal(in_full, probed)
 
@@ -63,7 +63,7 @@ def test_every_cell_searched_finds_what_a_full_search_does(
 def test_words_at_hand_change_nothing(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "EXACT", exact)
     held, asked = looks(rng, 500), looks(rng, 30)
     found = AppearanceIndex(held).query(asked, 8)
     given = AppearanceIndex(held, descriptor_index.words_of(held)).query(asked, 8)
@@ -74,10 +74,10 @@ def test_words_at_hand_change_nothing(
 def test_queries_are_answered_one_by_one(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "EXACT", exact)
     held, asked = looks(rng, 500), looks(rng, 30)
     together = AppearanceIndex(held).query(asked, 4)
-    monkeypatch.setattr(descriptor_index, "_AT_ONCE", 7)
+    monkeypatch.setattr(descriptor_index, "AT_ONCE", 7)
     apart = AppearanceIndex(held).query(asked, 4)
     _assert_equal(together, apart)
 
@@ -86,7 +86,7 @@ def test_queries_are_answered_one_by_one(
 def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "EXACT", exact)
     look = looks(rng, 1)
     held = np.concatenate([looks(rng, 5), np.repeat(look, 6, axis=0)])
     found = AppearanceIndex(held).query(look, 3)
@@ -98,7 +98,7 @@ def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
 def test_what_is_not_held_is_marked(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
-    monkeypatch.setattr(descriptor_index, "_EXACT", exact)
+    monkeypatch.setattr(descriptor_index, "EXACT", exact)
     made = AppearanceIndex(looks(rng, 2))
     found = made.query(looks(rng, 4), 6)
     missing = found.rows == -1

@@ -16,12 +16,12 @@ from fgslam.core.errors import FrameError
 from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_sift import (
-    _SIGMA_PX,
-    _SIGMA_SCALES,
+    SIGMA_PX,
+    SIGMA_SCALES,
     up_in_image,
     wrapping_period,
 )
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor, _View
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor, View
 from fgslam.frontend.features.settings import (
     OmniFeatureSettings,
     OmniMatchingSettings,
@@ -113,7 +113,7 @@ def test_elevations_are_limited() -> None:
 def test_sigmas_grow_with_scale() -> None:
     found = extractor().extract(picture()).sift
     pixel = np.pi / 256
-    expected = pixel * np.hypot(_SIGMA_PX, _SIGMA_SCALES * found.scale / pixel)
+    expected = pixel * np.hypot(SIGMA_PX, SIGMA_SCALES * found.scale / pixel)
     np.testing.assert_allclose(np.sqrt(found.covariance[:, 1, 1]), expected, rtol=1e-3)
 
 
@@ -132,7 +132,7 @@ def test_dark_and_blank_images_have_no_features(camera: object, view: str) -> No
 def test_a_cropped_panorama_leaves_unseen_rows_black() -> None:
     whole = Equirectangular(257, 129)
     cropped = Equirectangular(257, 65, np.pi / 4, -np.pi / 4)
-    view = _View(cropped, whole)
+    view = View(cropped, whole)
     shown = view.of(np.full((65, 257, 3), 200, np.uint8))
     assert view.seen is not None
     assert not shown[~view.seen].any()

@@ -47,7 +47,7 @@ def test_parts_are_joined_where_the_first_is_recognised(estimator: EstimatorSett
 
 
 def test_without_a_join_they_stay_apart_and_that_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(PlaceRecognition, "_joined", lambda *_: None)
+    monkeypatch.setattr(PlaceRecognition, "find_join", lambda *_: None)
     pipeline, reports = driven(Isam2Settings(), WAY[: GAP + 6])
     assert pipeline.tracker.parts.connected.tolist() == [True] * GAP + [False] * 6
     later = reports[-1]

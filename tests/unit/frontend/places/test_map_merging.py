@@ -270,7 +270,7 @@ def test_landmarks_are_as_alike_as_the_nearest_of_their_views(
     which = np.arange(120)
     a, b = world.seen(which, np.eye(4)), world.seen(which, BTA)
     alone = align(a, b)
-    monkeypatch.setattr(map_alignment, "_AT_ONCE", 50)  # less than there are
+    monkeypatch.setattr(map_alignment, "AT_ONCE", 50)  # less than there are
     several = align(with_strange_views(a, 2, world.rng), with_strange_views(b, 1, world.rng))
     assert len(alone.pairs) > 100
     assert np.array_equal(several.pairs, alone.pairs)

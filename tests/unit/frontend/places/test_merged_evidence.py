@@ -11,8 +11,8 @@ from simulated import (
     RIG,
     TURN_AND_GO,
     Drive,
+    Identities,
     Simulation,
-    _Identities,
     points_in_views,
 )
 from smoothing import answer
@@ -51,7 +51,7 @@ class Place:
     def visit(self, pTw: FloatArray, noise: float = 1.0) -> tuple[SavedMap, IntArray]:
         """A map of a drive that begins at a pose, and the point of each landmark."""
         drive = replace(self.drive, noise=noise)
-        book = _Identities(drive, g.transform_to_camera(pTw, self.points))
+        book = Identities(drive, g.transform_to_camera(pTw, self.points))
         step = g.se3_exp(np.array(TURN_AND_GO))
         seen = [book.increment(k, wTc, step, self.rng) for k, wTc in enumerate(self.poses)]
         simulation = Simulation(drive, np.array(self.poses), self.points, seen)

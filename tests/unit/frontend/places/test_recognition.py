@@ -223,7 +223,7 @@ def test_only_a_closure_that_was_taken_bounds_later_drift(monkeypatch: pytest.Mo
             refuse_closures(monkeypatch)
         (report,) = drive(pipeline, [list(seen(RING, DARK))[first]])
         loop = report.increment.loops[0]
-        way[refusing] = pipeline.places._memory.way_since(loop.frame)
+        way[refusing] = pipeline.places.memory.way_since(loop.frame)
     assert way[False] < 0.01
     assert way[True] > 10.0
 
