@@ -14,7 +14,7 @@ import numpy as np
 
 import fgslam as fg
 from fgslam.datasets.simulated_homing import open_house
-from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
+from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 house = open_house(OmniHouseSettings(path=HousePathSettings(legs=6, spacing_m=2.0)), seed=0)
 camera = house.camera  # your own: fg.load_camera("calib_results.txt")

@@ -24,7 +24,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
 from fgslam.worlds.driving import paths
-from fgslam.worlds.lab_settings import LabDriveSettings
+from fgslam.worlds.settings import LabDriveSettings
 from fgslam.worlds.simulated import features
 from fgslam.worlds.simulated.features import visible
 from fgslam.worlds.simulated.landmarks import IdentityBook

@@ -25,7 +25,7 @@ from fgslam.homing.front_end import compare_views
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import DRIVING
 from fgslam.homing.teaching import with_neighbours_votes
-from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
+from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 LEGS, SPACING_M = 10, 2.0
 _WRONG_DEG = 30.0

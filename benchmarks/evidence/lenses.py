@@ -37,7 +37,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.runs.config_models import ExperimentConfig
 from fgslam.worlds.lab import make_rig
-from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.settings import RenderedLabSettings
 
 SEEDS = range(1, 11)
 CAMERAS = (3, 2)

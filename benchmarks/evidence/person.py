@@ -21,7 +21,8 @@ from fgslam.core.recordings import Sequence
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.evaluation.trajectory import to_estimate_world
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.people import WALK_FRAMES
+from fgslam.worlds.settings import RenderedLabSettings
 
 JUMP_BOUND_M = 0.05
 _NAME = "person"
@@ -81,7 +82,7 @@ SCENES: dict[str, tuple[str, ...]] = {
     # twenty times; at a twentieth it keeps looking.
     "at a twentieth of the speed": (
         "dataset.drive.frames=4980",
-        "dataset.effects.person.first_frame=400",
+        "dataset.effects.person=400",
         "dataset.start=395",
         "dataset.stop=440",
     ),
@@ -136,11 +137,10 @@ def _person_masks(sequence: RenderedLabSequence, settings: object) -> dict[int, 
     """Per frame in which the person is seen: where (height, width), as true object identities."""
     if not isinstance(settings, RenderedLabSettings) or settings.effects.person is None:
         raise ValueError("no person walks in this experiment")
-    walk = settings.effects.person
     thing = sequence.object_names.index(_NAME)
     masks = {}
-    first = walk.first_frame - settings.start
-    for i in range(first, first + walk.frames):
+    first = settings.effects.person - settings.start
+    for i in range(first, first + WALK_FRAMES):
         mask = sequence.object_ids(i) == thing
         if mask.any():
             masks[i] = mask

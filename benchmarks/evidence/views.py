@@ -18,8 +18,8 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds.driving import wheel_odometry
 from fgslam.worlds.lab import PlaceChoice, World, camera_offsets, open_room
-from fgslam.worlds.lab_settings import RenderedLabSettings
 from fgslam.worlds.rendering.image_effects import apply_effects
+from fgslam.worlds.settings import RenderedLabSettings
 
 FORWARD_M = 0.10
 CLOCKWISE_DEG = 5.0

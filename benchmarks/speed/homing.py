@@ -33,7 +33,7 @@ from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd
 from fgslam.homing.settings import FrontEndSettings, HomingControlSettings
 from fgslam.worlds.house import OmniWorld
-from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
+from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 LIMITS = {
     "homing_track_over_raw_klt": 2.0,

@@ -15,8 +15,8 @@ from fgslam.cameras.omni.settings import (
 )
 from fgslam.core.settings import STRICT
 from fgslam.datasets.settings import RecordingSettings
-from fgslam.worlds.house_settings import OmniHouseSettings as OmniHouseSettings
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings as SimulatedBearingsSettings
+from fgslam.worlds.settings import OmniHouseSettings as OmniHouseSettings
+from fgslam.worlds.settings import SimulatedBearingsSettings as SimulatedBearingsSettings
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -22,23 +21,22 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.driving.floor_space import BURST_STEP_M
-from fgslam.worlds.driving.paths import MAX_ACCELERATION_M_S2, PosesInTime
-from fgslam.worlds.driving.wheel_odometry import CONSTANTS as WHEEL_CONSTANTS
+from fgslam.worlds.driving.paths import PosesInTime
 from fgslam.worlds.lab import (
     PlaceChoice,
     World,
     camera_offsets,
     first_pose,
+    identity_values,
     make_rig,
     open_room,
     plan_in_place,
 )
-from fgslam.worlds.lab_settings import LabSettings, RenderedLabSettings
-from fgslam.worlds.people import ACROSS_M, Stance, make_walk
+from fgslam.worlds.people import Stance, make_walk
 from fgslam.worlds.rendering.cache import RenderCache, content_hash
-from fgslam.worlds.rendering.image_effects import JUMP_FRAME, WAVE_FRAMES, apply_effects, is_blocked
+from fgslam.worlds.rendering.image_effects import BLUR_RENDERS, apply_effects, is_blocked
 from fgslam.worlds.rendering.scene import Body
+from fgslam.worlds.settings import LabSettings, RenderedLabSettings
 
 RENDER_VERSION = 7
 """Part of the cache's key: raised whenever the same settings give other pixels."""
@@ -47,7 +45,6 @@ _SHAPING_KEYS = ("rig", "drive", "room_seed", "visit", "place", "posters")
 _SELECTION = ("start", "stop", "stride")
 _THREADS = 2
 _CLEARANCE_M = 0.12
-_BLUR_RENDERS = 5  # a frame with motion blur: more look the same at 8 bits
 Progress = Callable[[int, int], None]
 
 
@@ -55,7 +52,7 @@ class RenderedLabSequence:
     """A drive through a rendered place; implements :class:`fgslam.core.recordings.Sequence`.
 
     The world frame of the ground truth is the reference camera's pose at the first frame of the
-    drive, or of the drive that ``drive.world_from`` names: then truths of several drives agree.
+    drive; of random poses, at that of the place's own drive.
     """
 
     def __init__(
@@ -90,7 +87,7 @@ class RenderedLabSequence:
         self._indices = _selection(len(self._drive.timestamps), start, stop, stride)
         self._body = self._drive.body_poses(self._drive.timestamps)
         self._world_body = self._body[0]
-        if settings.drive.world_from is not None or settings.drive.path == "random_poses":
+        if settings.drive.path == "random_poses":
             self._world_body = first_pose(settings.place, settings.drive)
         self._odometry = wheel_odometry.simulate(
             settings.odometry, self._body, np.random.default_rng([seed, 1])
@@ -126,10 +123,8 @@ class RenderedLabSequence:
 
         So it is that of the whole recording, as those on disk have it: a run may go on with it.
         """
-        settings = _without_later_keys(self._settings)
+        settings = identity_values(self._settings)
         settings = {name: value for name, value in settings.items() if name not in _SELECTION}
-        if self._settings.drive.world_from is not None:
-            settings["world_from"] = self._settings.drive.world_from
         return content_hash({"settings": settings, "seed": self._seed, "render": RENDER_VERSION})
 
     @property
@@ -137,9 +132,14 @@ class RenderedLabSequence:
         """Which effects are on."""
         effects = self._settings.effects
         return tuple(
-            f"effect: {name.replace('_', ' ')}"
-            for name in ("exposure", "motion_blur", "person", "blocked_frames")
-            if getattr(effects, name) is not None
+            f"effect: {name}"
+            for name, value in (
+                ("exposure", effects.exposure),
+                ("motion blur", effects.motion_blur_s),
+                ("person", effects.person),
+                ("blocked frames", effects.blocked_frames),
+            )
+            if value not in (None, False)
         )
 
     def __len__(self) -> int:
@@ -277,11 +277,11 @@ class RenderedLabSequence:
     def _instants(self, index: int) -> FloatArray:
         """Times at which a frame is rendered: spread over the exposure, centred on its stamp."""
         stamp = self._drive.timestamps[index]
-        blur = self._settings.effects.motion_blur
-        if blur is None:
+        exposure_s = self._settings.effects.motion_blur_s
+        if exposure_s is None:
             return np.array([stamp])
-        spread = (np.arange(_BLUR_RENDERS) + 0.5) / _BLUR_RENDERS - 0.5
-        return np.asarray(stamp + blur.exposure_s * spread)
+        spread = (np.arange(BLUR_RENDERS) + 0.5) / BLUR_RENDERS - 0.5
+        return np.asarray(stamp + exposure_s * spread)
 
 
 def first_camera_pose(settings: RenderedLabSettings) -> FloatArray:
@@ -313,7 +313,7 @@ def _selection(count: int, start: int, stop: int | None, stride: int) -> IntArra
 
 def _render_description(settings: LabSettings) -> dict[str, Any]:
     """Exactly what shapes the clean images: neither noise, gain, cover, odometry nor seed."""
-    everything = _without_later_keys(settings)
+    everything = identity_values(settings)
     shaping = {key: everything[key] for key in _SHAPING_KEYS if key in everything}
     effects = everything["effects"]
     return shaping | {
@@ -321,34 +321,6 @@ def _render_description(settings: LabSettings) -> dict[str, Any]:
         "motion_blur": effects["motion_blur"],
         "person": effects["person"],
     }
-
-
-def _without_later_keys(settings: LabSettings) -> dict[str, Any]:
-    """Settings as plain values, without those of other places where this is the plain lab.
-
-    So what was rendered before there were other places keeps its name, as does what was rendered
-    when constants were settings.
-    """
-    out = asdict(settings)
-    out["odometry"] |= WHEEL_CONSTANTS
-    out["drive"]["max_acceleration_m_s2"] = MAX_ACCELERATION_M_S2
-    out["drive"]["random_poses"]["step_m"] = BURST_STEP_M
-    effects = {
-        "exposure": {"wave_period_frames": WAVE_FRAMES, "jump_frame": JUMP_FRAME},
-        "motion_blur": {"samples": _BLUR_RENDERS},
-        "person": {"distance_m": ACROSS_M},
-    }
-    for name, constants in effects.items():
-        if out["effects"][name] is not None:
-            out["effects"][name] |= constants
-    del out["drive"]["world_from"]
-    if settings.drive.path != "random_poses":
-        del out["drive"]["random_poses"]
-    if settings.place == "lab":
-        del out["place"]
-    if settings.posters == "different":
-        del out["posters"]
-    return out
 
 
 def _check_clearance(drive: PosesInTime, world: World, rig: CameraRig) -> None:

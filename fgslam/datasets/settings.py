@@ -17,8 +17,8 @@ from fgslam.datasets.odometry_settings import RecordedOdometrySettings as Record
 from fgslam.datasets.odometry_settings import (
     SyntheticOdometrySettings as SyntheticOdometrySettings,
 )
-from fgslam.worlds.lab_settings import RenderedLabSettings as RenderedLabSettings
-from fgslam.worlds.simulated.settings import (
+from fgslam.worlds.settings import RenderedLabSettings as RenderedLabSettings
+from fgslam.worlds.settings import (
     SimulatedMeasurementsSettings as SimulatedMeasurementsSettings,
 )
 

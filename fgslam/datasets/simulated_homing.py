@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.worlds.house import OmniWorld as OmniWorld
-from fgslam.worlds.house_settings import OmniHouseSettings
+from fgslam.worlds.settings import OmniHouseSettings, SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import HomingOutliers, SimulatedHoming, simulate_homing
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 
 def open_simulated_homing(

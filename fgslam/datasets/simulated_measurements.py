@@ -8,20 +8,16 @@ from dataclasses import asdict
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.datasets.measurement_files import make_log
 from fgslam.datasets.settings import OdometrySettings
-from fgslam.worlds.driving.wheel_odometry import CONSTANTS as WHEEL_CONSTANTS
 from fgslam.worlds.rendering.cache import content_hash
+from fgslam.worlds.settings import (
+    SimulatedMeasurementsSettings,
+)
 from fgslam.worlds.simulated.measurements import (
-    LEAST_RANGE_M,
-    OBLIQUE_DEG,
-    PRUNE_AFTER,
     SimulatedMeasurements,
     simulate_measurements,
 )
-from fgslam.worlds.simulated.settings import (
-    SimulatedMeasurementsSettings,
-)
 
-SIMULATION_VERSION = 1
+SIMULATION_VERSION = 2
 """Part of the identity: raised whenever the same settings and seed give other measurements."""
 
 
@@ -46,15 +42,9 @@ def open_simulated_measurements(
 
 
 def _identity(settings: SimulatedMeasurementsSettings, seed: int) -> str:
-    """SHA-256 of all settings, of the wheels' constants, the seed and the simulation's version."""
-    values = asdict(settings)
-    values["odometry"] |= WHEEL_CONSTANTS
-    values["detection"] |= {
-        "min_range_m": LEAST_RANGE_M,
-        "oblique_deg": OBLIQUE_DEG,
-        "prune_after_misses": PRUNE_AFTER,
-    }
-    return content_hash({"settings": values, "seed": seed, "simulation": SIMULATION_VERSION})
+    """SHA-256 of all settings, the seed and the simulation's version."""
+    values = {"settings": asdict(settings), "seed": seed, "simulation": SIMULATION_VERSION}
+    return content_hash(values)
 
 
 def _notes(

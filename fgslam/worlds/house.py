@@ -22,13 +22,6 @@ from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.driving.reference_paths import PathPlanner
 from fgslam.worlds.driving.wheelchair import RADIUS_M, RangeSensor, Wheelchair
-from fgslam.worlds.house_settings import (
-    HouseCalibrationSettings,
-    HouseCameraSettings,
-    HousePanoramaSettings,
-    HouseTiltSettings,
-    OmniHouseSettings,
-)
 from fgslam.worlds.people import PERSON_RADIUS, People
 from fgslam.worlds.rendering.image_effects import noisy
 from fgslam.worlds.rendering.patches import RayCaster, stack
@@ -37,6 +30,11 @@ from fgslam.worlds.rendering.scene import Layer, bake
 from fgslam.worlds.rendering.texture_bank import ColourBank
 from fgslam.worlds.rendering.texture_library import build_colour_library
 from fgslam.worlds.rendering.views import omni_view
+from fgslam.worlds.settings import (
+    HouseCalibrationSettings,
+    HouseCameraSettings,
+    OmniHouseSettings,
+)
 
 Float32 = npt.NDArray[np.float32]
 
@@ -104,10 +102,12 @@ def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
     Raises:
         CalibrationError: the mirror cannot show what is asked for.
     """
-    if isinstance(settings, HousePanoramaSettings):
-        return Equirectangular(settings.width, settings.height)
+    if settings.kind == "equirectangular":
+        width = settings.width or 1024
+        return Equirectangular(width, width // 2)
     bottom, top = np.deg2rad(_MIRROR_ELEVATIONS_DEG)
-    size = (settings.width, settings.height)
+    width = settings.width or 320
+    size = (width, width * 3 // 4)
     return HyperbolicMirror.with_view(
         size, _MIRROR_XI, (float(bottom), float(top)), margin_px=_MARGIN_PX
     )
@@ -167,9 +167,9 @@ class OmniWorld:
             settings.path.spacing_m, settings.path.legs, self._rng(0), within
         )
         self._people = People(self._people_routes(), self._rng(1), self.model.bank)
-        self._tilt = CameraTilt(settings.tilt, self._rng(2))
+        self._tilt = CameraTilt(settings, self._rng(2))
         self._sensor = RangeSensor(self.model.layer.caster)
-        self._scene = lit(self.model.layer, self.model.layer.light, settings.light.level)
+        self._scene = lit(self.model.layer, self.model.layer.light, settings.light)
         self.put(self.reference_poses[0])
 
     # ---------------------------------------------------------------------------- acting
@@ -212,7 +212,7 @@ class OmniWorld:
         s = self.settings
         pose = camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, self._tilt.angles(time))
         levels = self._renderer.levels(self._scene, pose, self._people.bodies())
-        seen = exposed(levels, s.exposure.wave, time)
+        seen = exposed(levels, s.exposure_wave, time)
         return self._with_noise(seen, 1, round(abs(time) * 1e6))
 
     def scan(self) -> tuple[FloatArray, FloatArray]:
@@ -231,7 +231,7 @@ class OmniWorld:
     @cached_property
     def targets(self) -> tuple[Image, ...]:
         """The target images, taken at another time: other light and noise, nobody about."""
-        tilt = CameraTilt(self.settings.tilt, self._rng(5))
+        tilt = CameraTilt(self.settings, self._rng(5))
         return tuple(
             self.picture(pose, k, tilt.angles(10.0 * k)) for k, pose in enumerate(self.target_poses)
         )
@@ -330,18 +330,17 @@ def exposed(levels: Float32, amplitude: float, time: float) -> Float32:
 class CameraTilt:
     """Roll and pitch of the camera over time: a constant part and a slow oscillation."""
 
-    def __init__(self, settings: HouseTiltSettings, rng: np.random.Generator) -> None:
+    def __init__(self, settings: OmniHouseSettings, rng: np.random.Generator) -> None:
         """Draws to which side the camera leans, and the swaying's phases."""
-        self._settings = settings
         side = float(rng.uniform(0.0, 2.0 * np.pi))
-        self._constant = np.deg2rad(settings.constant_deg) * np.array([np.cos(side), np.sin(side)])
+        self._constant = np.deg2rad(settings.tilt_deg) * np.array([np.cos(side), np.sin(side)])
+        self._sway = np.deg2rad(settings.sway_deg)
         self._phase = rng.uniform(0.0, 2.0 * np.pi, 2)
 
     def angles(self, time: float) -> FloatArray:
         """(2,) roll about the forward axis and pitch about the left one, radians."""
-        s = self._settings
         turn = 2.0 * np.pi * time / _SWAY_PERIOD_S * np.array([1.0, 0.77]) + self._phase
-        return np.asarray(self._constant + np.deg2rad(s.sway_deg) * np.sin(turn))
+        return np.asarray(self._constant + self._sway * np.sin(turn))
 
 
 def camera_pose(pose: FloatArray, height: float, tilt: FloatArray) -> FloatArray:

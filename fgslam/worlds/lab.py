@@ -6,8 +6,9 @@ the light and the time law are the same everywhere.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +19,15 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.buildings import corridors as alike
 from fgslam.worlds.buildings import lab, office
-from fgslam.worlds.driving.floor_space import FloorSpace, draw_poses
+from fgslam.worlds.driving import wheel_odometry
+from fgslam.worlds.driving.floor_space import (
+    BURST_STEP_M,
+    RANDOM_CLEARANCE_M,
+    FloorSpace,
+    draw_poses,
+)
 from fgslam.worlds.driving.paths import (
+    MAX_ACCELERATION_M_S2,
     PlanarPath,
     PosesInTime,
     drive_along,
@@ -27,14 +35,14 @@ from fgslam.worlds.driving.paths import (
     planar_poses,
     round_corners,
 )
-from fgslam.worlds.lab_settings import (
-    LabDriveSettings,
-    LabRigSettings,
-    LabSettings,
-    PathName,
-    PlaceName,
+from fgslam.worlds.people import ACROSS_M, WALK_FRAMES, Stance, person
+from fgslam.worlds.rendering.image_effects import (
+    BLUR_RENDERS,
+    JUMP,
+    JUMP_FRAME,
+    WAVE,
+    WAVE_FRAMES,
 )
-from fgslam.worlds.people import Stance, person
 from fgslam.worlds.rendering.patches import RayCaster, Thing, stack
 from fgslam.worlds.rendering.renderer import Renderer
 from fgslam.worlds.rendering.scene import LIGHT_SPACING_M, Body, Layer, bake, flat_light
@@ -46,7 +54,16 @@ from fgslam.worlds.rendering.texture_library import (
 )
 from fgslam.worlds.rendering.textures import Grey
 from fgslam.worlds.rendering.views import pinhole_view
+from fgslam.worlds.settings import (
+    LabDriveSettings,
+    LabRigSettings,
+    LabSettings,
+    PathName,
+    PlaceName,
+)
 
+FIELD_OF_VIEW_DEG = 60.0  # its width
+AHEAD_M, ABOVE_M = 0.25, 1.0  # reference camera from the robot's centre, and above the floor
 _BEND_M = 2.3
 """Way of a quarter turn between two rooms: fits into a corridor, and into a lane of 3.3 m twice."""
 
@@ -163,13 +180,13 @@ def plan_in_place(choice: PlaceChoice, settings: LabDriveSettings, rig: CameraRi
 
 
 def first_pose(name: PlaceName, settings: LabDriveSettings) -> FloatArray:
-    """(4, 4) robot in the room's frame where the drive begins whose start is the truth's world.
+    """(4, 4) robot in the room's frame at the start of the drive; of the place's own, if none.
 
     Raises:
         ConfigError: the place has no drive of that name.
     """
     own = PATHS[name][0] if settings.path == "random_poses" else settings.path
-    path = place_path(name, replace(settings, path=settings.world_from or own))
+    path = place_path(name, replace(settings, path=own))
     return np.asarray(planar_poses(np.array([[*path.xy[0], path.heading[0]]]))[0])
 
 
@@ -191,6 +208,44 @@ def _require_offer(choice: PlaceChoice) -> None:
         )
 
 
+def identity_values(settings: LabSettings) -> dict[str, Any]:
+    """Settings as plain values, with the constants that shape a recording of them.
+
+    By the names that they had when its identity and the name of its rendered frames were made:
+    so both stay what they are while settings become constants and other places come.
+    """
+    out = asdict(settings)
+    effects, drive = settings.effects, out["drive"]
+    out["rig"] |= {
+        "horizontal_fov_deg": FIELD_OF_VIEW_DEG,
+        "ahead_m": AHEAD_M,
+        "aside_m": 0.0,
+        "above_m": ABOVE_M,
+        "tilt_deg": 0.0,
+    }
+    out["odometry"] = wheel_odometry.identity_values(settings.odometry)
+    drive["max_acceleration_m_s2"] = MAX_ACCELERATION_M_S2
+    drive["random_poses"] |= {"clearance_m": RANDOM_CLEARANCE_M, "step_m": BURST_STEP_M}
+    exposure = {"wave": WAVE, "jump": JUMP}
+    exposure |= {"wave_period_frames": WAVE_FRAMES, "jump_frame": JUMP_FRAME}
+    blur = {"exposure_s": effects.motion_blur_s, "samples": BLUR_RENDERS}
+    walk = {"first_frame": effects.person, "frames": WALK_FRAMES, "distance_m": ACROSS_M}
+    out["effects"] = {
+        "noise_grey": effects.noise_grey,
+        "exposure": exposure if effects.exposure else None,
+        "motion_blur": None if effects.motion_blur_s is None else blur,
+        "person": None if effects.person is None else walk,
+        "blocked_frames": effects.blocked_frames,
+    }
+    if settings.drive.path != "random_poses":
+        del drive["random_poses"]
+    if settings.place == "lab":
+        del out["place"]
+    if settings.posters == "different":
+        del out["posters"]
+    return out
+
+
 # --------------------------------------------------------------------------------------------
 # Rendering
 
@@ -200,12 +255,9 @@ Float32 = npt.NDArray[np.float32]
 
 def make_rig(settings: LabRigSettings) -> CameraRig:
     """The calibrated cameras that the settings describe."""
-    focal = settings.width / 2.0 / np.tan(np.deg2rad(settings.horizontal_fov_deg) / 2.0)
-    tilt = np.deg2rad(settings.tilt_deg)
-    bTc = geometry.BODY_FORWARD_LEFT_UP_FROM_CAMERA @ geometry.pose(
-        geometry.so3_exp(np.array([tilt, 0.0, 0.0])), np.zeros(3)
-    )
-    bTc[:3, 3] = settings.ahead_m, settings.aside_m, settings.above_m
+    focal = settings.width / 2.0 / np.tan(np.deg2rad(FIELD_OF_VIEW_DEG) / 2.0)
+    bTc = geometry.BODY_FORWARD_LEFT_UP_FROM_CAMERA.copy()
+    bTc[:3, 3] = AHEAD_M, 0.0, ABOVE_M
     return CameraRig(
         width=settings.width,
         height=settings.height,

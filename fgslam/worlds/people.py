@@ -14,7 +14,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.driving.paths import PosesInTime, planar_poses
-from fgslam.worlds.lab_settings import LabPersonSettings, LabSettings
 from fgslam.worlds.rendering.patches import (
     Patch,
     RayCaster,
@@ -28,6 +27,7 @@ from fgslam.worlds.rendering.patches import (
 from fgslam.worlds.rendering.scene import Body, Layer, flat_light
 from fgslam.worlds.rendering.texture_bank import ColourBank
 from fgslam.worlds.rendering.texture_library import SHIRTS
+from fgslam.worlds.settings import LabSettings
 
 _STRIDE_M = 1.3
 _THIGH, _SHIN, _UPPER_ARM, _FOREARM = 0.43, 0.42, 0.29, 0.27
@@ -35,6 +35,7 @@ _HIP, _SHOULDER = 0.90, 1.42
 # Beyond the edge of the view at which the walk begins and ends, metres.
 _MARGIN_M = 0.45
 ACROSS_M = 1.8  # before the camera, at the middle of the walk: nearer than most of the lab
+WALK_FRAMES = 12  # of the walk, its first and last frame included
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,24 +74,19 @@ def make_walk(settings: LabSettings, drive: PosesInTime, rig: CameraRig) -> Walk
     Raises:
         ConfigError: the drive is over before the person comes.
     """
-    person_settings = settings.effects.person
-    if person_settings is None:
+    first, frames = settings.effects.person, len(drive.timestamps)
+    if first is None:
         return None
-    stamps = drive.timestamps
-    if person_settings.first_frame >= len(stamps):
+    if first >= frames:
         raise ConfigError(
-            f"effects.person.first_frame is {person_settings.first_frame}, but the drive has only "
-            f"{len(stamps)} frames; lower it"
+            f"effects.person is {first}, but the drive has only {frames} frames; lower it"
         )
-    return across_view(person_settings, drive, rig, settings.drive.frame_rate_hz)
+    rate = settings.drive.frame_rate_hz
+    return across_view(first / rate, (first + WALK_FRAMES - 1) / rate, drive, rig)
 
 
-def across_view(
-    settings: LabPersonSettings, drive: PosesInTime, rig: CameraRig, frame_rate: float
-) -> Walk:
+def across_view(begins: float, ends: float, drive: PosesInTime, rig: CameraRig) -> Walk:
     """From the right of the view at the middle of the walk to its left, square to its axis."""
-    begins = settings.first_frame / frame_rate
-    ends = (settings.first_frame + settings.frames - 1) / frame_rate
     camera = (drive.body_poses(np.array([0.5 * (begins + ends)]))[0] @ rig.bTc)[:3]
     right, ahead = camera[:2, 0], camera[:2, 2] / np.linalg.norm(camera[:2, 2])
     middle = camera[:2, 3] + ACROSS_M * ahead

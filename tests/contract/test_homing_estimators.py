@@ -22,7 +22,7 @@ from fgslam.backend.homing.settings import (
 )
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate, TrackedBearings
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
+from fgslam.worlds.settings import SimulatedBearingsSettings
 
 EVERY: list[HomingEstimatorSettings] = [
     PAPER,

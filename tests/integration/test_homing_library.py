@@ -23,7 +23,7 @@ from fgslam.homing.settings import (
 )
 from fgslam.homing.steering import RangeScan, make_avoider
 from fgslam.worlds.house import OmniWorld
-from fgslam.worlds.house_settings import HousePanoramaSettings, HousePathSettings, OmniHouseSettings
+from fgslam.worlds.settings import HouseCameraSettings, HousePathSettings, OmniHouseSettings
 
 STEPS, DT, SEED = 10, 0.1, 0
 QUIET = {"pictures": 0, "report": False}
@@ -54,7 +54,7 @@ def world() -> OmniWorld:
 def test_between_gives_the_numbers_of_the_task_homing_pairs(tmp_path: Path) -> None:
     settings = OmniHouseSettings(
         path=HousePathSettings(legs=2, spacing_m=1.0),
-        camera=HousePanoramaSettings(width=512, height=256),
+        camera=HouseCameraSettings("equirectangular", width=512),
     )
     world = open_house(settings, SEED)
     images = [world.picture(pose, k) for k, pose in enumerate(world.reference_poses[:2])]

@@ -16,7 +16,7 @@ from fgslam.core.geometry import se3_exp
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.evaluation.trajectory import moved
 from fgslam.worlds.lab import make_rig
-from fgslam.worlds.lab_settings import LabRigSettings
+from fgslam.worlds.settings import LabRigSettings
 
 UNSEEN = {"output.pictures": False, "output.report": False}
 

@@ -14,7 +14,7 @@ from fgslam.frontend.homing.bearing_tracking import BearingTracker
 from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.trackable_points import move_to_trackable
 from fgslam.worlds.house import CAMERA_HEIGHT_M, OmniWorld
-from fgslam.worlds.house_settings import HousePathSettings, OmniHouseSettings
+from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 STEPS = 20
 

@@ -8,16 +8,14 @@ import pytest
 
 from fgslam.worlds.driving.wheelchair import RADIUS_M
 from fgslam.worlds.house import OmniWorld
-from fgslam.worlds.house_settings import (
-    HouseLightSettings,
-    HousePanoramaSettings,
+from fgslam.worlds.settings import (
+    HouseCameraSettings,
     HousePathSettings,
-    HouseTiltSettings,
     OmniHouseSettings,
 )
 
 SETTINGS = OmniHouseSettings(path=HousePathSettings(legs=3, spacing_m=2.0))
-DISTURBED = replace(SETTINGS, people=3, tilt=HouseTiltSettings(constant_deg=1.0, sway_deg=1.0))
+DISTURBED = replace(SETTINGS, people=3, tilt_deg=1.0, sway_deg=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +95,7 @@ def test_truth_of_matches(world: OmniWorld) -> None:
 
 
 def test_dark_house_shows_nothing() -> None:
-    dark = OmniWorld(replace(SETTINGS, light=HouseLightSettings(level=0.02)), 1)
+    dark = OmniWorld(replace(SETTINGS, light=0.02), 1)
     assert count_sift(dark.image(0.0)) < 10
     assert count_sift(dark.targets[0]) > 100
 
@@ -117,7 +115,7 @@ def test_wheelchair_is_stopped_by_furniture_and_walls(world: OmniWorld) -> None:
 
 
 def test_people_walk_about() -> None:
-    peopled = OmniWorld(replace(DISTURBED, tilt=HouseTiltSettings(), noise_grey=0.0), 2)
+    peopled = OmniWorld(replace(DISTURBED, tilt_deg=0.0, sway_deg=0.0, noise_grey=0.0), 2)
     empty = OmniWorld(replace(SETTINGS, noise_grey=0.0), 2)
     alone = empty.image(0.0).astype(int)
     changed = []
@@ -130,7 +128,7 @@ def test_people_walk_about() -> None:
 
 
 def test_panorama_camera_takes_pictures_of_its_size() -> None:
-    settings = replace(SETTINGS, camera=HousePanoramaSettings(width=256, height=128))
+    settings = replace(SETTINGS, camera=HouseCameraSettings("equirectangular", width=256))
     picture = OmniWorld(settings, 0).picture(np.array([8.0, 3.0, 0.0]), 1000)
     assert picture.shape == (128, 256, 3)
     assert count_sift(picture) > 50

@@ -5,7 +5,7 @@ from hypothesis import assume, given, reject
 from hypothesis import strategies as st
 
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.lab_settings import LabDriveSettings
+from fgslam.worlds.settings import LabDriveSettings
 from tests.simulated import plan_drive
 
 coordinate = st.floats(-3.5, 3.5, allow_nan=False, width=32)

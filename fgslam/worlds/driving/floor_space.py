@@ -18,8 +18,8 @@ from scipy import ndimage
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.worlds.driving.paths import planar_poses
-from fgslam.worlds.lab_settings import LabDriveSettings
 from fgslam.worlds.rendering.patches import PatchArrays
+from fgslam.worlds.settings import LabDriveSettings
 
 # What is lower is driven over (rugs), what is higher driven under (lintels, lamps); metres.
 BAND = (0.03, 1.35)
@@ -135,6 +135,7 @@ def _segments(patches: PatchArrays) -> tuple[FloatArray, FloatArray]:
 _STREAM = 31  # of random numbers, apart from the world's
 _BLOCK, _BLOCKS = 64, 200
 _POSES = 200
+RANDOM_CLEARANCE_M = 0.4  # of robot and camera from walls and furniture
 BURST_STEP_M = 0.1  # between the frames of a burst: about that of the lab's drives
 
 
@@ -164,80 +165,64 @@ def draw_poses(
     """Draws the poses that the settings ask for.
 
     Args:
-        settings: how many frames, bursts, and the least clearance.
+        settings: how many frames and bursts.
         space: the free floor.
         start: (2,) a place that can be driven to: only places connected with it are drawn.
         camera: (2,) of the camera ahead and left of the robot's centre, metres.
 
     Raises:
-        ConfigError: the frames are no whole number of bursts, or no place is so free.
+        ConfigError: the frames are no whole number of bursts, or no place has room for one.
     """
-    wanted = settings.random_poses
-    frames = _POSES * wanted.burst if settings.frames is None else settings.frames
-    if frames % wanted.burst:
+    burst, seed = settings.random_poses.burst, settings.random_poses.seed
+    frames = _POSES * burst if settings.frames is None else settings.frames
+    if frames % burst:
         raise ConfigError(
-            f"dataset.drive.frames is {frames}, no multiple of random_poses.burst {wanted.burst}; "
-            "make it one"
+            f"dataset.drive.frames is {frames}, no multiple of random_poses.burst {burst}; make it "
+            "one"
         )
-    free = _Free(space, start, wanted.clearance_m)
-    ahead = BURST_STEP_M * np.arange(wanted.burst)
-    robot = np.column_stack([ahead, np.zeros(wanted.burst)])
+    robot = np.column_stack([BURST_STEP_M * np.arange(burst), np.zeros(burst)])
     offsets = np.vstack([robot, robot + camera])
+    parts, _ = ndimage.label(space.clearances >= RANDOM_CLEARANCE_M)
+    here = _cells(space, parts, np.asarray(start, dtype=np.float64)[None])[0]
     poses = [
-        _draw(free, offsets, np.random.default_rng([wanted.seed, _STREAM, k]))
-        for k in range(frames // wanted.burst)
+        _draw(space, parts == here, offsets, np.random.default_rng([seed, _STREAM, k]))
+        for k in range(frames // burst)
     ]
-    planar = np.concatenate([_moved(pose, offsets[: wanted.burst]) for pose in poses])
-    return RandomPoses(planar, wanted.burst, settings.frame_rate_hz)
+    planar = np.concatenate([_moved(pose, offsets[:burst]) for pose in poses])
+    return RandomPoses(planar, burst, settings.frame_rate_hz)
 
 
-class _Free:
-    """Places with the clearance asked for that can be driven to."""
+def _draw(
+    space: FloorSpace, reached: BoolArray, offsets: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """(3,) the first of the drawn poses at which robot and cameras are free.
 
-    def __init__(self, space: FloorSpace, start: FloatArray, clearance: float) -> None:
-        self.space, self.clearance = space, clearance
-        parts, _ = ndimage.label(space.clearances >= clearance)
-        here = self._at(parts, np.asarray(start, dtype=np.float64)[None])[0]
-        if here == 0:
-            raise ConfigError(
-                f"dataset.drive.random_poses.clearance_m {clearance:g} leaves no room for the "
-                "robot where the drive of dataset.drive.world_from starts; lower it"
-            )
-        self._reached = parts == here
-        rows, columns = space.clearances.shape
-        self.high = space.low + space.cell * np.array([columns, rows])
-
-    def probably(self, points: FloatArray) -> BoolArray:
-        """(...) whether points (..., 2) lie in free cells."""
-        flat = self._at(self._reached, points.reshape(-1, 2))
-        return np.asarray(flat.reshape(points.shape[:-1]))
-
-    def surely(self, points: FloatArray) -> bool:
-        """Whether all points (n, 2) keep their distance, exactly."""
-        return bool((self.space.clearance(points) >= self.clearance).all())
-
-    def _at(self, grid: npt.NDArray[np.generic], points: FloatArray) -> npt.NDArray[np.generic]:
-        cell = np.floor((points - self.space.low) / self.space.cell).astype(np.int64)
-        limit = np.array(grid.shape)[::-1]
-        inside = np.all((cell >= 0) & (cell < limit), axis=1)
-        column, row = np.where(inside[:, None], cell, 0).T
-        return np.where(inside, grid[row, column], 0)
-
-
-def _draw(free: _Free, offsets: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(3,) the first of the drawn poses at which robot and cameras are free."""
+    Places are tested on the grid first, ``reached`` (rows, columns) of it, then exactly.
+    """
+    rows, columns = reached.shape
+    high = space.low + space.cell * np.array([columns, rows])
     for _ in range(_BLOCKS):
-        xy = rng.uniform(free.space.low, free.high, (_BLOCK, 2))
-        heading = rng.uniform(-np.pi, np.pi, _BLOCK)
-        drawn = np.column_stack([xy, heading])
+        xy = rng.uniform(space.low, high, (_BLOCK, 2))
+        drawn = np.column_stack([xy, rng.uniform(-np.pi, np.pi, _BLOCK)])
         places = np.array([_moved(pose, offsets)[:, :2] for pose in drawn])
-        for k in np.flatnonzero(free.probably(places).all(axis=1)):
-            if free.surely(places[k]):
+        probably = _cells(space, reached, places.reshape(-1, 2)).reshape(places.shape[:-1])
+        for k in np.flatnonzero(probably.all(axis=1)):
+            if (space.clearance(places[k]) >= RANDOM_CLEARANCE_M).all():
                 return np.asarray(drawn[k])
     raise ConfigError(
-        f"no place with dataset.drive.random_poses.clearance_m {free.clearance:g} around it is "
-        "found; lower it"
+        f"no place with room for dataset.drive.random_poses.burst {len(offsets) // 2} is found; "
+        "lower it"
     )
+
+
+def _cells(
+    space: FloorSpace, grid: npt.NDArray[np.generic], points: FloatArray
+) -> npt.NDArray[np.generic]:
+    """Values (n,) of a grid (rows, columns) at points (n, 2); 0 outside."""
+    cell = np.floor((points - space.low) / space.cell).astype(np.int64)
+    inside = np.all((cell >= 0) & (cell < np.array(grid.shape)[::-1]), axis=1)
+    column, row = np.where(inside[:, None], cell, 0).T
+    return np.where(inside, grid[row, column], 0)
 
 
 def _moved(pose: FloatArray, offsets: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.lab_settings import LabDriveSettings
+from fgslam.worlds.settings import LabDriveSettings
 
 _STEP_M = 0.004
 # Waypoints must not ask for tighter turns: the curve's heading would jump between its samples.

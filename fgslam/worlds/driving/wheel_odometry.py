@@ -6,6 +6,8 @@ Of a true motion between two frames with way ``l`` and turn ``a`` the wheels rep
 * zero-mean noise, independent between frames, whose variances grow with ``l`` and ``|a|``, and
 * two scale errors, drawn once a drive: a fraction of the distance and a fraction of the turn.
 
+`noise` of the settings multiplies the noise that the wheels themselves make.
+
 The covariance stated with each increment is that of ``xi`` over all drives (noise and scale
 together). Truth has neither height, pitch nor roll; their noise is what an inertial unit would add.
 """
@@ -17,20 +19,32 @@ import numpy as np
 from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import Odometry
-from fgslam.worlds.lab_settings import WheelOdometrySettings
+from fgslam.worlds.settings import WheelOdometrySettings
 
 _YAW, _ALONG = 2, 3
+# Of the wheels: along the way, across it, and of the heading, each a root metre driven; and of the
+# heading a root radian turned.
+ALONG_M_SQRT_M, SIDEWAYS_M_SQRT_M, YAW_DEG_SQRT_M, YAW_DEG_SQRT_RAD = 0.02, 0.01, 0.5, 0.8
 # What a planar robot does not drive: height, and pitch and roll, each a root metre; and the least
 # noise of an increment, for that of a robot at rest must have a covariance that can be inverted.
 HEIGHT_M_SQRT_M, TILT_DEG_SQRT_M = 0.002, 0.1
 FLOOR_M, FLOOR_DEG = 1e-4, 0.01
-CONSTANTS = {
-    "height_m_sqrt_m": HEIGHT_M_SQRT_M,
-    "tilt_deg_sqrt_m": TILT_DEG_SQRT_M,
-    "floor_m": FLOOR_M,
-    "floor_deg": FLOOR_DEG,
-}
-"""By the names under which they are part of a recording's identity."""
+
+
+def identity_values(settings: WheelOdometrySettings) -> dict[str, float]:
+    """The drift model by the names under which it is part of a recording's identity."""
+    return {
+        "distance_scale": settings.scale_error,
+        "turn_scale": settings.scale_error,
+        "distance_m_sqrt_m": settings.noise * ALONG_M_SQRT_M,
+        "sideways_m_sqrt_m": settings.noise * SIDEWAYS_M_SQRT_M,
+        "yaw_deg_sqrt_m": settings.noise * YAW_DEG_SQRT_M,
+        "yaw_deg_sqrt_rad": settings.noise * YAW_DEG_SQRT_RAD,
+        "height_m_sqrt_m": HEIGHT_M_SQRT_M,
+        "tilt_deg_sqrt_m": TILT_DEG_SQRT_M,
+        "floor_m": FLOOR_M,
+        "floor_deg": FLOOR_DEG,
+    }
 
 
 def increment_variances(
@@ -45,11 +59,12 @@ def increment_variances(
     """
     out = np.empty((len(way), 6))
     tilt, yaw_m, yaw_rad = np.deg2rad(
-        [TILT_DEG_SQRT_M, settings.yaw_deg_sqrt_m, settings.yaw_deg_sqrt_rad]
+        [TILT_DEG_SQRT_M, settings.noise * YAW_DEG_SQRT_M, settings.noise * YAW_DEG_SQRT_RAD]
     )
     out[:, :2] = (tilt**2 * way)[:, None]
     out[:, _YAW] = yaw_m**2 * way + yaw_rad**2 * np.abs(turn)
-    sides = (settings.distance_m_sqrt_m, settings.sideways_m_sqrt_m, HEIGHT_M_SQRT_M)
+    noise = settings.noise
+    sides = (noise * ALONG_M_SQRT_M, noise * SIDEWAYS_M_SQRT_M, HEIGHT_M_SQRT_M)
     out[:, 3:] = way[:, None] * np.square(sides)
     out[:, :3] += np.deg2rad(FLOOR_DEG) ** 2
     out[:, 3:] += FLOOR_M**2
@@ -67,7 +82,7 @@ def simulate(
         rng: source of the noise; one drive's worth is drawn.
     """
     motions = geometry.inverse(body_poses[:-1]) @ body_poses[1:]
-    scale = rng.standard_normal(2) * (settings.turn_scale, settings.distance_scale)
+    scale = rng.standard_normal(2) * settings.scale_error
     noise = rng.standard_normal((len(motions), 6))
     turn = np.arctan2(motions[:, 1, 0], motions[:, 0, 0])
     way = np.linalg.norm(motions[:, :3, 3], axis=1)
@@ -78,8 +93,8 @@ def simulate(
         xi = unit * np.sqrt(variance) + scale[0] * by_turn + scale[1] * by_distance
         covariance = (
             np.diag(variance)
-            + settings.turn_scale**2 * np.outer(by_turn, by_turn)
-            + settings.distance_scale**2 * np.outer(by_distance, by_distance)
+            + settings.scale_error**2 * np.outer(by_turn, by_turn)
+            + settings.scale_error**2 * np.outer(by_distance, by_distance)
         )
         out.append(Odometry(np.asarray(motion @ geometry.se3_exp(xi)), covariance))
     return out

@@ -9,13 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import Image
-from fgslam.worlds.lab_settings import LabEffectsSettings, LabExposureSettings
+from fgslam.worlds.settings import LabEffectsSettings
 
 Float32 = npt.NDArray[np.float32]
 
 _COVER_SEED = 7
-WAVE_FRAMES = 60.0  # half a minute at two frames a second: automatic exposure follows slowly
-JUMP_FRAME = 125  # half way through the paper's drive
+# The camera's automatic exposure: a slow wave of the gain, half a minute at two frames a second,
+# and a sudden jump half way through the paper's drive.
+WAVE, WAVE_FRAMES = 0.15, 60.0
+JUMP, JUMP_FRAME = 0.7, 125
+BLUR_RENDERS = 5  # a frame with motion blur: more look the same at 8 bits
 
 
 def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
@@ -29,12 +32,10 @@ def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
     return noise
 
 
-def exposure_gain(settings: LabExposureSettings | None, index: int) -> float:
+def exposure_gain(index: int) -> float:
     """Gain of frame ``index``: a slow wave, and a factor from the jump on."""
-    if settings is None:
-        return 1.0
-    wave = 1.0 + settings.wave * np.sin(2.0 * np.pi * index / WAVE_FRAMES)
-    return float(wave * (settings.jump if index >= JUMP_FRAME else 1.0))
+    wave = 1.0 + WAVE * np.sin(2.0 * np.pi * index / WAVE_FRAMES)
+    return float(wave * (JUMP if index >= JUMP_FRAME else 1.0))
 
 
 def is_blocked(settings: LabEffectsSettings, index: int) -> bool:
@@ -67,7 +68,7 @@ def apply_effects(
         index: the recording's frame number.
         seed: of the recording; frame and seed together determine the noise.
     """
-    gain = exposure_gain(settings.exposure, index)
+    gain = exposure_gain(index) if settings.exposure else 1.0
     if is_blocked(settings, index):
         grey = cover(clean.shape)
     elif gain == 1.0 and settings.noise_grey == 0.0:

@@ -19,13 +19,13 @@ from fgslam.worlds.driving.paths import (
     planar_poses,
     straights_and_turns,
 )
-from fgslam.worlds.lab_settings import LabDriveSettings
-from fgslam.worlds.simulated.settings import MeasurementDriveSettings
+from fgslam.worlds.settings import LabDriveSettings, MeasurementDriveSettings
 
 CORRIDOR_WIDTH_M = 2.4
 
 _ROUND_M = (16.0, 10.0)  # centre line of the closed corridor
 _LEGS_M = (12.0, 8.0, 15.0, 7.0)  # of the long one, over and over
+_LEAST_WAY_M = 200.0  # in the long one
 _BEND_M = 2.5  # way over which a corridor's corner is driven
 _PLACES_OF_PATHS = {
     "room": ("lab_loop", "laps", "sharp_turns"),
@@ -73,7 +73,7 @@ def plan_measured_drive(settings: MeasurementDriveSettings, place: str) -> Plann
     elif settings.path == "laps":
         path, corners = _closed_corridor(settings.laps)
     else:
-        path, corners = _long_corridor(settings.length_m)
+        path, corners = _long_corridor()
     drive = drive_along(path, lab)
     return PlannedDrive(drive.timestamps, drive.body_poses(drive.timestamps), corners)
 
@@ -108,10 +108,10 @@ def _closed_corridor(laps: int) -> tuple[PlanarPath, FloatArray]:
     return path, np.array([[0.0, 0.0], [a, 0.0], [a, b], [0.0, b], [0.0, 0.0]])
 
 
-def _long_corridor(length_m: float) -> tuple[PlanarPath, FloatArray]:
+def _long_corridor() -> tuple[PlanarPath, FloatArray]:
     """Stairs seen from above, left and right in turns: it never meets itself."""
     legs: list[float] = []
-    while sum(legs) < length_m:
+    while sum(legs) < _LEAST_WAY_M:
         legs.append(_LEGS_M[len(legs) % len(_LEGS_M)])
     cut = _bend_cut()
     segments: list[tuple[float, float]] = []

@@ -15,8 +15,8 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.rendering.patches import stack
+from fgslam.worlds.settings import MeasurementWorldSettings
 from fgslam.worlds.simulated.drives import CORRIDOR_WIDTH_M
-from fgslam.worlds.simulated.settings import MeasurementWorldSettings
 
 _BARE = frozenset({"floor", "ceiling"})
 """Things of the lab with few features; they get this share of what their area would earn."""

@@ -20,9 +20,9 @@ from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
 from fgslam.worlds.driving import wheel_odometry
 from fgslam.worlds.lab import make_rig
+from fgslam.worlds.settings import SimulatedMeasurementsSettings
 from fgslam.worlds.simulated.drives import plan_measured_drive
 from fgslam.worlds.simulated.landmarks import IdentityBook, LandmarkWorld, Sightings, build_world
-from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 # Streams of random numbers, apart so that one imperfection does not redraw another's.
 _DETECTION, _PIXELS, _ODOMETRY, _WRONG = 1, 2, 3, 4
@@ -30,7 +30,10 @@ _MOVED = 5
 _BORDER_PX = 8.0  # nearer to the edge a landmark may be seen, but is not missed
 _STRENGTH_JITTER = 0.1
 _LEAST_DISPARITY_PX = 0.5  # a fainter one cannot be triangulated
+PIXEL_SIGMA = 0.2  # of a coordinate in each image: that of SIFT in rendered ones
 LEAST_RANGE_M = 0.4  # nearer ones are in one image only, or out of focus
+MOST_RANGE_M = 8.0  # farther ones are not in view
+_MOVED_M = 0.5  # landmarks move so far, level, in any direction
 OBLIQUE_DEG = 75.0  # off its surface's normal a landmark is foreshortened beyond recognition
 PRUNE_AFTER = 20  # consecutive misses in view until an identity is dropped, as in Se et al. 4.3
 
@@ -116,12 +119,6 @@ def _require_effect(settings: SimulatedMeasurementsSettings, frames: int) -> Non
                 f"dataset.{key} is {start}, but the drive has the frames 0 to {frames - 1}; "
                 "choose an earlier one"
             )
-    detection = settings.detection
-    if detection.max_range_m <= LEAST_RANGE_M:
-        raise ConfigError(
-            f"dataset.detection.max_range_m is {detection.max_range_m:g}, which leaves no "
-            f"landmark; raise it above {LEAST_RANGE_M:g}"
-        )
 
 
 class _Camera:
@@ -146,7 +143,7 @@ class _Camera:
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
         self._fuse = measurement_map("fused", rig.cameras, ratio)
-        self._covariance = settings.detection.pixel_sigma**2 * (self._fuse @ self._fuse.T)
+        self._covariance = PIXEL_SIGMA**2 * (self._fuse @ self._fuse.T)
         self.wrong_matches = 0
 
     def increment(
@@ -195,7 +192,7 @@ class _Camera:
         """Who is seen, and the noisy pixels (k, 2 * cameras) of the matched, then the new."""
         view, exact, inner = self._in_view(wTc, local)
         detection = self._settings.detection
-        sigma = detection.pixel_sigma * detection.noise_scale
+        sigma = PIXEL_SIGMA * detection.noise_scale
         noise = sigma * self._pixel_noise.standard_normal(exact.shape)
         found = self._detect(view, self._measurable(exact + noise))
         seen, expected = np.zeros((2, len(local)), np.bool_)
@@ -213,13 +210,13 @@ class _Camera:
 
         Inner ones keep off the edges of all images.
         """
-        detection, rig = self._settings.detection, self._rig
+        rig = self._rig
         view = self._world.in_sight(wTc[:3, 3])
         seen_from = local[view]
         distance = np.linalg.norm(seen_from, axis=1)
         ray = seen_from @ wTc[:3, :3].T
         facing = -np.einsum("ni,ni->n", ray, self._world.normals[view])
-        ok = (distance >= LEAST_RANGE_M) & (distance <= detection.max_range_m)
+        ok = (distance >= LEAST_RANGE_M) & (distance <= MOST_RANGE_M)
         ok &= facing >= np.cos(np.deg2rad(OBLIQUE_DEG)) * distance
         view = view[ok & g.in_front(rig, seen_from, LEAST_RANGE_M)]
         pixels = g.project(rig, local[view]) @ self._model.T
@@ -257,9 +254,9 @@ class _Camera:
 
     def _anywhere(self, count: int) -> FloatArray:
         """Pixels (count, 2 * cameras) of points anywhere in the reference image."""
-        rig, detection = self._rig, self._settings.detection
+        rig = self._rig
         size = np.array([rig.width - 1.0, rig.height - 1.0])
-        least = rig.fx * rig.baseline / detection.max_range_m
+        least = rig.fx * rig.baseline / MOST_RANGE_M
         most = min(rig.fx * rig.baseline / LEAST_RANGE_M, rig.width / 2)
         uniform = self._wrong.uniform(size=(count, 3))
         measurement = np.column_stack(
@@ -289,7 +286,7 @@ def _moved_points(settings: SimulatedMeasurementsSettings, world: LandmarkWorld)
     gone = rng.uniform(size=len(world)) < moved.fraction
     angle = rng.uniform(0.0, 2.0 * np.pi, size=len(world))
     shift = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(world))])
-    return np.asarray(world.points + moved.distance_m * gone[:, None] * shift)
+    return np.asarray(world.points + _MOVED_M * gone[:, None] * shift)
 
 
 # --------------------------------------------------------------------------------------------

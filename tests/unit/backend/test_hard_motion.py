@@ -10,7 +10,7 @@ from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.judging import Truth, judge_replay
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.replay import replay
-from fgslam.worlds.simulated.settings import (
+from fgslam.worlds.settings import (
     MeasurementDriveSettings,
     SimulatedMeasurementsSettings,
 )

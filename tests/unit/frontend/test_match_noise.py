@@ -17,7 +17,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, unmeasured
 from fgslam.frontend.tracking.match_noise import MatchNoise
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.replay import replay, replay_frame, replay_motion
-from fgslam.worlds.simulated.settings import (
+from fgslam.worlds.settings import (
     DetectionSettings,
     MeasurementDriveSettings,
     SimulatedMeasurementsSettings,

@@ -14,7 +14,7 @@ from fgslam.frontend.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, make_config
 from fgslam.runs.config_models import TASKS
 from fgslam.runs.config_reading import accepted_at, read_mapping, typed_value
-from fgslam.worlds.lab_settings import RenderedLabSettings
+from fgslam.worlds.settings import RenderedLabSettings
 
 EXPERIMENTS = [
     path
@@ -63,7 +63,7 @@ def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
         (LAB, "dataset.rig.baseline", "baseline_m"),
         (LAB, "dataset.drive.lap", "laps"),
         (LAB, "dataset.effects.noise_gray", "noise_grey"),
-        (LAB, "dataset.effects.person.first_frames", "first_frame"),
+        (LAB, "dataset.effects.blocked_frame", "blocked_frames"),
     ],
 )
 def test_an_unknown_key_brings_the_nearest_one(

@@ -20,15 +20,14 @@ from fgslam.worlds.house import (
     make_house_camera,
     miscalibrated,
 )
-from fgslam.worlds.house_settings import (
-    HouseCalibrationSettings,
-    HouseMirrorSettings,
-    HousePanoramaSettings,
-    HouseTiltSettings,
-)
 from fgslam.worlds.people import Walker
 from fgslam.worlds.rendering.image_effects import noisy
 from fgslam.worlds.rendering.patches import PatchArrays, RayCaster, Surface, Thing, box, stack
+from fgslam.worlds.settings import (
+    HouseCalibrationSettings,
+    HouseCameraSettings,
+    OmniHouseSettings,
+)
 
 
 @pytest.fixture
@@ -276,10 +275,10 @@ def test_walker_goes_to_and_fro_and_waits_for_the_robot() -> None:
 
 
 def test_tilt_is_bounded_and_leans_the_camera() -> None:
-    tilt = CameraTilt(HouseTiltSettings(constant_deg=2.0, sway_deg=0.0), rng(1))
+    tilt = CameraTilt(OmniHouseSettings(tilt_deg=2.0), rng(1))
     angles = np.rad2deg(tilt.angles(3.0))
     assert np.linalg.norm(angles) == pytest.approx(2.0)
-    sway = CameraTilt(HouseTiltSettings(sway_deg=1.5), rng(1))
+    sway = CameraTilt(OmniHouseSettings(sway_deg=1.5), rng(1))
     seen = np.rad2deg([sway.angles(t) for t in np.linspace(0, 60, 600)])
     np.testing.assert_allclose(np.abs(seen).max(axis=0), 1.5, atol=0.01)
     pitched = camera_pose(np.array([1.0, 2.0, 0.5]), 1.2, np.array([0.0, 0.1]))
@@ -291,7 +290,7 @@ def test_tilt_is_bounded_and_leans_the_camera() -> None:
 
 
 def test_a_wrong_calibration_is_off_by_what_is_asked_for() -> None:
-    true = make_house_camera(HouseMirrorSettings())
+    true = make_house_camera(HouseCameraSettings())
     assert isinstance(true, HyperbolicMirror)
     assert miscalibrated(true, HouseCalibrationSettings(), rng()) is true
     errors = HouseCalibrationSettings(mirror=0.05, centre_px=4.0)
@@ -306,7 +305,7 @@ def test_a_wrong_calibration_is_off_by_what_is_asked_for() -> None:
 
 
 def test_a_panorama_has_no_mirror_to_be_wrong_about() -> None:
-    camera = make_house_camera(HousePanoramaSettings())
+    camera = make_house_camera(HouseCameraSettings("equirectangular"))
     with pytest.raises(CalibrationError, match=r"dataset\.calibration: .* take mirror"):
         miscalibrated(camera, HouseCalibrationSettings(mirror=0.01), rng())
 
@@ -323,7 +322,7 @@ def test_exposure_and_noise() -> None:
 
 
 def test_mirror_shows_its_elevations(monkeypatch: pytest.MonkeyPatch) -> None:
-    camera = make_house_camera(HouseMirrorSettings())
+    camera = make_house_camera(HouseCameraSettings())
     rays = camera.rays(
         np.indices((camera.height, camera.width)).reshape(2, -1)[::-1].T.astype(float)
     )
@@ -333,4 +332,4 @@ def test_mirror_shows_its_elevations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(house_world, "_MIRROR_XI", 0.5)
     monkeypatch.setattr(house_world, "_MIRROR_ELEVATIONS_DEG", (-65.0, 40.0))
     with pytest.raises(CalibrationError, match="below arcsin"):
-        make_house_camera(HouseMirrorSettings())
+        make_house_camera(HouseCameraSettings())

@@ -5,11 +5,11 @@ import pytest
 
 from fgslam.worlds.buildings.lab import HALF_SIDE, HEIGHT, build_lab
 from fgslam.worlds.lab import make_rig
-from fgslam.worlds.lab_settings import LabDriveSettings, LabPersonSettings, LabRigSettings
 from fgslam.worlds.people import across_view, person
 from fgslam.worlds.rendering.patches import RayCaster, Thing, stack
 from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, build_library, photograph
 from fgslam.worlds.rendering.textures import book_row
+from fgslam.worlds.settings import LabDriveSettings, LabRigSettings
 from tests.simulated import plan_drive
 
 VISITS = (1, 2, 3)
@@ -99,7 +99,7 @@ def test_photographs_are_in_the_wheel(name: str, monkeypatch: pytest.MonkeyPatch
 
 def test_person_walks_through_the_middle_of_the_view() -> None:
     drive, rig = plan_drive(LabDriveSettings()), make_rig(LabRigSettings())
-    walk = across_view(LabPersonSettings(first_frame=20, frames=11), drive, rig, 2.0)
+    walk = across_view(10.0, 15.0, drive, rig)
     assert walk.stance(9.99) is None
     assert walk.stance(15.01) is None
     camera = (drive.body_poses(np.array([12.5])) @ rig.bTc)[0]
@@ -117,7 +117,7 @@ def test_person_walks_through_the_middle_of_the_view() -> None:
 
 def test_person_stands_on_the_floor_with_a_head_of_human_height() -> None:
     drive, rig = plan_drive(LabDriveSettings()), make_rig(LabRigSettings())
-    walk = across_view(LabPersonSettings(), drive, rig, 2.0)
+    walk = across_view(10.0, 15.5, drive, rig)
     spread = []
     for seconds in np.linspace(walk.begins, walk.ends, 9):
         stance = walk.stance(float(seconds))

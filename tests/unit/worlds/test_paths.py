@@ -3,7 +3,7 @@ import pytest
 
 from fgslam.core.errors import ConfigError
 from fgslam.worlds.driving.paths import MAX_ACCELERATION_M_S2, Drive
-from fgslam.worlds.lab_settings import LabDriveSettings
+from fgslam.worlds.settings import LabDriveSettings
 from tests.simulated import plan_drive
 
 SQUARE = ((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))

@@ -1,6 +1,5 @@
 """Random poses of the kidnapped robot: seeded, clear of everything, carried between."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +11,15 @@ from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.worlds.driving.floor_space import FloorSpace
 from fgslam.worlds.lab import PlaceChoice, build_place, make_rig, plan_in_place
-from fgslam.worlds.lab_settings import (
+from fgslam.worlds.rendering.cache import content_hash
+from fgslam.worlds.rendering.patches import stack
+from fgslam.worlds.settings import (
     LabDriveSettings,
     LabRigSettings,
     LabSettings,
     RandomPosesSettings,
     RenderedLabSettings,
 )
-from fgslam.worlds.rendering.cache import content_hash
-from fgslam.worlds.rendering.patches import stack
 
 RIG = make_rig(LabRigSettings(width=32, height=24))
 LAB = PlaceChoice("lab", 0, 1, identical_posters=False)
@@ -37,11 +36,11 @@ def body(settings: LabDriveSettings, place: PlaceChoice = LAB) -> np.ndarray:
 
 
 def test_robot_and_camera_keep_clear_in_all_headings_all_over_the_room() -> None:
-    poses = body(drive(200, clearance_m=0.35))
+    poses = body(drive(200))
     place = build_place(LAB)
     space = FloorSpace(stack(place.things), place.low, place.high)
     for points in (poses, poses @ RIG.bTc):
-        assert space.clearance(points[:, :2, 3]).min() >= 0.35
+        assert space.clearance(points[:, :2, 3]).min() >= 0.4
     heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
     assert np.histogram(heading, bins=4, range=(-np.pi, np.pi))[0].min() > 25
     assert (np.ptp(poses[:, :2, 3], axis=0) > 7.0).all()
@@ -81,7 +80,7 @@ def test_places_that_cannot_be_driven_to_are_not_drawn() -> None:
     ("bad", "why"),
     [
         (drive(10, burst=3), "no multiple"),
-        (drive(10, clearance_m=1.9), "leaves no room|no place"),
+        (drive(100, burst=100), "no place with room for .*burst 100"),
     ],
 )
 def test_poses_that_do_not_exist_are_refused(bad: LabDriveSettings, why: str) -> None:
@@ -107,11 +106,6 @@ def test_truth_is_in_the_world_of_the_mapping_drive() -> None:
     np.testing.assert_allclose(mapping.ground_truth.poses[0], np.eye(4), atol=1e-12)
     room = carried.room_from_world @ carried.ground_truth.poses
     np.testing.assert_allclose(room, carried.room_from_camera(carried.timestamps), atol=1e-12)
-    laps = replace(drive(6), world_from="laps")
-    other = RenderedLabSequence(LabSettings(drive=laps), 0)
-    start = RenderedLabSequence(LabSettings(drive=LabDriveSettings(path="laps", frames=None)), 0)
-    np.testing.assert_array_equal(other.room_from_world, start.room_from_world)
-    assert other.identity != carried.identity
 
 
 @pytest.mark.usefixtures("_unrendered")
@@ -144,10 +138,9 @@ def test_no_odometry_is_given_where_the_robot_was_carried() -> None:
     [
         (LabSettings(), "23b8a10e304c4be44dc4"),
         (RenderedLabSettings(start=3, stop=9, stride=2), "23b8a10e304c4be44dc4"),
-        (LabSettings(drive=LabDriveSettings(world_from="laps")), "23b8a10e304c4be44dc4"),
         (LabSettings(visit=2), "31858c82fd4d4a0de238"),
     ],
-    ids=["paper", "selection", "world", "visit"],
+    ids=["paper", "selection", "visit"],
 )
 def test_cache_keys_of_the_lab_do_not_change_with_later_settings(
     settings: LabSettings, key: str

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from fgslam.core.planar import bearings, wrap
+from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import (
     NO_OUTLIERS,
     HomingOutliers,
     SimulatedHoming,
     simulate_homing,
 )
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 CLEAN = SimulatedBearingsSettings(features=200, lost_per_s=0.0)
 
@@ -99,13 +99,3 @@ def test_following_renumbers_tracks_and_truth() -> None:
         np.testing.assert_array_equal(rows[image.ids], np.intersect1d(rows, whole.ids))
         at = np.searchsorted(whole.ids, rows[image.ids])
         np.testing.assert_array_equal(image.bearing, whole.bearing[at])
-
-
-def test_anisotropic_rooms_are_near_on_one_side() -> None:
-    homing = simulate(replace(CLEAN, surrounding="anisotropic"))
-    middle = 0.5 * homing.truth.target[:2]
-    left = np.array([-homing.truth.target[1], homing.truth.target[0]])
-    side = (homing.truth.landmarks - middle) @ left > 0.0
-    distance = np.linalg.norm(homing.truth.landmarks - middle, axis=1)
-    assert 0.65 < np.mean(side) < 0.95
-    assert np.median(distance[side]) < 0.7 * np.median(distance[~side])

@@ -26,8 +26,8 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
+from fgslam.worlds.settings import SimulatedMeasurementsSettings
 from fgslam.worlds.simulated.landmarks import IdentityBook
-from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 
 def settings(**values: Any) -> SimulatedMeasurementsSettings:
@@ -69,7 +69,7 @@ DRIVES: dict[str, dict[str, Any]] = {
     "corridor_laps": {"world": {"place": "corridor"}, "drive": {"path": "laps", "frames": None}},
     "exploring": {
         "world": {"place": "corridor"},
-        "drive": {"path": "exploring", "frames": None, "length_m": 40.0},
+        "drive": {"path": "exploring", "frames": None},
     },
 }
 
@@ -249,8 +249,8 @@ def test_detection_probability_is_respected() -> None:
 
 def test_range_limits_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgslam.worlds.simulated.measurements.LEAST_RANGE_M", 1.0)
-    limits = {"max_range_m": 3.0, "noise_scale": 0.0}
-    near = recorded(stop=None, detection=limits)
+    monkeypatch.setattr("fgslam.worlds.simulated.measurements.MOST_RANGE_M", 3.0)
+    near = recorded(stop=None, detection={"noise_scale": 0.0})
     distance = np.concatenate(
         [
             np.linalg.norm(g.triangulate(near.log.rig, i.observations.measurement), axis=1)
@@ -305,7 +305,7 @@ def test_blackout_gives_no_observation_and_keeps_identities() -> None:
 
 
 def test_moved_landmarks_are_measured_elsewhere_and_have_no_truth() -> None:
-    moved = {"frame": 20, "fraction": 0.5, "distance_m": 0.4}
+    moved = {"frame": 20, "fraction": 0.5}
     recording = recorded(detection={"noise_scale": 0.0}, moved=moved)
     assert np.abs(differences(recording)).max() < 1e-9
     truth = recording.landmark_truth
@@ -368,7 +368,6 @@ def test_the_motion_model_is_what_the_settings_ask_for() -> None:
         ({"blackout": {"start": 249}}, "blackout.start is 249, but the drive has the frames"),
         ({"moved": {"frame": 300}}, "moved.frame is 300"),
         ({"odometry_fault": {"start": 999}}, "odometry_fault.start is 999"),
-        ({"detection": {"max_range_m": 0.4}}, "leaves no landmark; raise it above 0.4"),
         ({"start": 5, "stop": 5}, "leave none of the drive's 249 frames"),
     ],
 )

@@ -5,17 +5,10 @@ import pytest
 
 from fgslam.core import geometry
 from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.lab_settings import LabDriveSettings, WheelOdometrySettings
+from fgslam.worlds.settings import LabDriveSettings, WheelOdometrySettings
 from tests.simulated import plan_drive
 
-QUIET = WheelOdometrySettings(
-    distance_scale=0.0,
-    turn_scale=0.0,
-    distance_m_sqrt_m=0.0,
-    sideways_m_sqrt_m=0.0,
-    yaw_deg_sqrt_m=0.0,
-    yaw_deg_sqrt_rad=0.0,
-)
+QUIET = WheelOdometrySettings(scale_error=0.0, noise=0.0)
 
 
 @pytest.fixture
@@ -50,7 +43,7 @@ def errors(settings: WheelOdometrySettings, poses: np.ndarray, draws: int) -> np
     ("way", "turn"), [(0.2, 0.0), (0.08, 0.06), (0.0, 0.087), (0.15, -0.03), (0.0, 0.0)]
 )
 def test_stated_covariance_is_that_of_the_samples(way: float, turn: float) -> None:
-    settings = WheelOdometrySettings(distance_scale=0.05, turn_scale=0.1)
+    settings = WheelOdometrySettings(scale_error=0.08)
     poses = arc(way, turn)
     xi = errors(settings, poses, 1500)[:, 0]
     stated = wheel_odometry.simulate(settings, poses, np.random.default_rng(0))[0].covariance
@@ -62,7 +55,7 @@ def test_stated_covariance_is_that_of_the_samples(way: float, turn: float) -> No
 
 @pytest.mark.usefixtures("no_floor")
 def test_cutting_the_way_into_more_frames_leaves_the_drift_as_it_is() -> None:
-    settings = replace(QUIET, distance_m_sqrt_m=0.02, yaw_deg_sqrt_m=0.5)
+    settings = replace(QUIET, noise=1.0)
     total = []
     for frames in (200, 400):
         drive = plan_drive(
@@ -78,7 +71,7 @@ def test_cutting_the_way_into_more_frames_leaves_the_drift_as_it_is() -> None:
 
 @pytest.mark.usefixtures("no_floor")
 def test_scale_errors_are_one_number_a_drive() -> None:
-    settings = replace(QUIET, distance_scale=0.05, turn_scale=0.08)
+    settings = replace(QUIET, scale_error=0.06)
     drive = plan_drive(LabDriveSettings())
     poses = drive.body_poses(drive.timestamps)
     truth = geometry.inverse(poses[:-1]) @ poses[1:]
@@ -112,7 +105,7 @@ def test_default_drift_is_that_of_an_indoor_robot() -> None:
     error = np.linalg.norm(ends[:, :2, 3] - true_end[:2, 3], axis=1)
     assert 0.01 < np.sqrt(np.mean(error**2)) / 5.0 < 0.03
     quarter = wheel_odometry.increment_variances(settings, np.array([1.5]), np.array([np.pi / 2]))
-    by_scale = settings.turn_scale * np.pi / 2
+    by_scale = settings.scale_error * np.pi / 2
     assert 1.0 < np.rad2deg(np.sqrt(quarter[0, 2] + by_scale**2)) < 2.0
 
 

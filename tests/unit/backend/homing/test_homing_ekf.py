@@ -15,7 +15,7 @@ from fgslam.backend.homing.settings import PAPER, FilterMotionSettings, HomingEk
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingStart, LocalMap, TrackedBearings, TwoViewVector
 from fgslam.core.planar import bearings, wrap
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
+from fgslam.worlds.settings import SimulatedBearingsSettings
 
 
 def test_deleting_features_is_marginalising_them() -> None:

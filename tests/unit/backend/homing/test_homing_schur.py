@@ -18,8 +18,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate
 from fgslam.core.planar import wrap
+from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated.bearings import HomingOutliers
-from fgslam.worlds.simulated.settings import SimulatedBearingsSettings
 
 NONE, CAUCHY, HUBER = (
     KernelSettings("none"),
