@@ -20,7 +20,7 @@ from fgslam.runs.config_models import (
     HomingExperiment,
     LocalisationConfig,
 )
-from fgslam.runs.config_reading import Reader, apply_overrides, read_mapping
+from fgslam.runs.config_reading import Override, parse, read_mapping
 
 __all__ = [
     "Experiment",
@@ -36,7 +36,6 @@ __all__ = [
     "make_experiment",
 ]
 
-_GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
 _Model = TypeVar("_Model", bound=Experiment)
 
 
@@ -58,9 +57,9 @@ def make_experiment(
         ConfigError: an override is malformed, or a key or value is wrong.
     """
     overrides = tuple(overrides)
-    asked = {"task": values["task"]} if "task" in values else {}
-    apply_overrides(asked, [o for o in overrides if o.partition("=")[0].strip() == "task"])
-    config = _reader(asked, where).make(values, overrides, where)
+    chosen = [o.value for o in map(Override.of, overrides) if o.keys == ("task",)]
+    asked = {"task": chosen[-1]} if chosen else values
+    config = parse(_model_of(asked, where), values, where, overrides)
     problem = config.problem()
     if problem:
         raise ConfigError(f"{where}: {problem}")
@@ -90,10 +89,10 @@ def is_homing(path: Path) -> bool:
     return read_mapping(path).get("task") in HOMING_TASKS
 
 
-def _reader(values: Mapping[str, Any], where: str) -> Reader[Experiment]:
-    """Reader of the values' task. Raises ConfigError where there is no such task."""
+def _model_of(values: Mapping[str, Any], where: str) -> type[Experiment]:
+    """Model of a task. Raises ConfigError where there is no such task."""
     if "task" not in values:
-        return Reader(TASKS[None], _GROUPS_OF_KINDS)
+        return TASKS[None]
     task = values["task"]
     model = TASKS.get(task) if isinstance(task, str) else None
     if model is None:
@@ -101,8 +100,7 @@ def _reader(values: Mapping[str, Any], where: str) -> Reader[Experiment]:
         close = get_close_matches(str(task), known, n=1, cutoff=0.5)
         hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}"
         raise ConfigError(f"{where}: task is {task!r}; {hint} (SLAM has no key task)")
-    groups = tuple(name for name in _GROUPS_OF_KINDS if name in model.model_fields)
-    return Reader(model, groups)
+    return model
 
 
 def _require_slam(values: Mapping[str, Any], where: str) -> None:

@@ -56,7 +56,7 @@ ComparedList: TypeAlias = Annotated[
     Field(description="further estimators on the same bearings, as under `estimator`"),
 ]
 ViewName: TypeAlias = Annotated[
-    str, BeforeValidator(lambda value: str(value) if isinstance(value, int) else value)
+    str, BeforeValidator(lambda value: str(value) if type(value) is int else value)
 ]
 
 

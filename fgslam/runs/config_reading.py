@@ -1,7 +1,6 @@
 """Strict reading of configurations: YAML and dotted overrides into a pydantic model.
 
-Knows no key by heart: what may be in a file is the model's own schema, and so are the messages
-about what may not.
+What may be in a file is the model's own fields, and so are the messages about what may not.
 """
 
 from __future__ import annotations
@@ -10,79 +9,79 @@ import copy
 import difflib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from fgslam.core.errors import ConfigError, shortened
-from fgslam.core.yaml_text import PlainLoader, composed, read_yaml
+from fgslam.core.yaml_text import composed, plain_values, read_yaml
 from fgslam.runs.named_experiments import suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
-Schema: TypeAlias = Mapping[str, Any]
-"""A node of a JSON schema, as pydantic makes it."""
+
+_GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
+"""Groups told apart by `kind`: an override of it drops the file's keys of the kind before."""
 
 
-@cache
-def _schema_of(model: type[BaseModel]) -> Schema:
-    """JSON schema of a model, read only; it takes a tenth of a second to make."""
-    return model.model_json_schema()
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The `key: value` pairs of a YAML file. Raises ConfigError, naming it."""
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file; {suggestion(path)}")
+    values = read_yaml(path, ConfigError)
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
+    for key in values:
+        if not isinstance(key, str):
+            raise ConfigError(f"{path}: key {key!r} is no text; correct it")
+    return values
 
 
-@dataclass(frozen=True, slots=True)
-class Reader(Generic[Model]):
-    """Reads one kind of configuration.
+def parse(
+    model: type[Model], values: Mapping[str, Any], where: str, overrides: Iterable[str] = ()
+) -> Model:
+    """The checked configuration of plain values with ``a.b=value`` overrides applied.
 
-    Attributes:
-        model: what comes out.
-        groups: top-level groups told apart by `kind`: an override of it drops the file's keys of
-            the kind before.
+    The value of an override is YAML, but the text as typed where the setting is text: 01, no, a: b.
+
+    Args:
+        model: its class.
+        values: plain values, as of a YAML file; they stay as they are.
+        where: their source, for messages.
+        overrides: the last one of a key wins.
+
+    Raises:
+        ConfigError: an override is malformed, or a key or value is wrong.
     """
-
-    model: type[Model]
-    groups: tuple[str, ...]
-
-    def make(self, values: Mapping[str, Any], overrides: Iterable[str], where: str) -> Model:
-        """Plain values with ``a.b=value`` overrides applied, checked; ``where`` as in parse.
-
-        Raises:
-            ConfigError: an override is malformed, or a key or value is wrong.
-        """
-        plain, overrides = copy.deepcopy(dict(values)), tuple(overrides)
-        before = {group: _kind(plain, group) for group in self.groups}
-        if overrides:
-            apply_overrides(plain, overrides, _schema_of(self.model))
-        given = {override.partition("=")[0].strip() for override in overrides}
-        for group, kind in before.items():
-            if _kind(plain, group) != kind:
-                self._drop_unknown(plain[group], group, given)
-        return self.parse(plain, where)
-
-    def parse(self, values: Mapping[str, Any], where: str) -> Model:
-        """Checks plain values against the schema; ``where`` names their source in messages."""
-        try:
-            return self.model.model_validate(values)
-        except ValidationError as error:
-            message = _describe(error.errors(), where, _schema_of(self.model))
-            raise ConfigError(message) from None
-
-    def _drop_unknown(self, inner: Any, group: str, given: set[str]) -> None:
-        """Drops keys that meant something to the file's kind, not to the one an override chose.
-
-        Keys that are overrides themselves (``given``, dotted) stay: a misspelt one is refused.
-        """
-        if not isinstance(inner, dict):
-            return
-        _, nodes = _descend(_schema_of(self.model), [group])
-        for node in nodes:
-            if _has_tag(node, str(inner.get("kind"))):
-                for key in set(inner) - set(node["properties"]):
-                    if f"{group}.{key}" not in given:
-                        del inner[key]
+    model.model_rebuild()
+    plain = copy.deepcopy(dict(values))
+    before = {group: _kind(plain, group) for group in _GROUPS_OF_KINDS}
+    given = apply_overrides(plain, overrides)
+    for group, kind in before.items():
+        if _kind(plain, group) != kind and isinstance(plain[group], dict):
+            known = _known_keys(model, [group, str(_kind(plain, group))])
+            kept = known.union(o.keys[1] for o in given if len(o.keys) > 1 and o.keys[0] == group)
+            plain[group] = {key: value for key, value in plain[group].items() if key in kept}
+    try:
+        return model.model_validate(plain)
+    except ValidationError as error:
+        wrong = {tuple(_followed(model, e["loc"])[0]): e for e in error.errors()}
+    for override in given:
+        at = {k: e for k, e in wrong.items() if _names(k, override.keys)}
+        if override.broken and any(not _wants_text(e) for e in at.values()):
+            raise ConfigError(f"--set {override.given}: the value is not valid YAML; quote it")
+        if override.keys in at and _wants_text(at[override.keys]):
+            override.apply(plain, override.text)
+        elif any(map(_wants_text, at.values())):
+            override.apply(plain, _texts(composed(override.text)))
+        else:
+            override.apply(plain, override.value)
+    try:
+        return model.model_validate(plain)
+    except ValidationError as error:
+        raise ConfigError(_describe(model, error.errors(), where)) from None
 
 
 def kind_as_settings(value: Any) -> Any:
@@ -101,20 +100,61 @@ def with_default_kind(kind: str) -> Callable[[Any], Any]:
     return given
 
 
-def apply_overrides(
-    values: dict[str, Any], overrides: Iterable[str], schema: Schema | None = None
-) -> None:
-    """Sets dotted keys, in place, to values of the type that the schema has for them.
+@dataclass(frozen=True, slots=True)
+class Override:
+    """One dotted key and its value as typed, e.g. ``frontend.sift.octave_layers=3``.
 
-    Raises:
-        ConfigError: an override is malformed.
+    Attributes:
+        given: all of it.
+        keys: from the top down.
+        text: the value.
+        value: of the text as YAML; the text itself where it is none, or plain text.
+        broken: whether it is no YAML.
     """
-    split = [_Override.of(override) for override in overrides]
-    after = copy.deepcopy(values)  # what a key means depends on the kinds in the end
-    for override in split:
-        override.apply(after, ())
-    for override in split:
-        override.apply(values, accepted_at(schema or {}, override.keys, after))
+
+    given: str
+    keys: tuple[str, ...]
+    text: str
+    value: Any
+    broken: bool
+
+    @staticmethod
+    def of(given: str) -> Override:
+        """Reads one. Raises ConfigError where it is not of the form a.b=value."""
+        dotted, separator, text = given.partition("=")
+        keys, text = tuple(dotted.strip().split(".")), text.strip()
+        if not separator or not all(keys):
+            raise ConfigError(f"--set {given}: not of the form a.b=value; e.g. --set seed=3")
+        try:
+            value, broken = plain_values(text), False
+        except yaml.YAMLError:
+            value, broken = text, True
+        if isinstance(value, str) and text[:1] not in ("'", '"'):
+            value = text  # a comment behind it belongs to it
+        return Override(given, keys, text, text if keys[-1] in ("kind", "task") else value, broken)
+
+    def apply(self, values: dict[str, Any], value: Any) -> None:
+        """Sets the key in place. Raises ConfigError where it leads through a value."""
+        for key in self.keys[:-1]:
+            values = values.setdefault(key, {})
+            if not isinstance(values, dict):
+                raise ConfigError(f"--set {self.given}: {key} holds a value, not a group of keys")
+        values[self.keys[-1]] = value
+
+
+def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> list[Override]:
+    """Sets dotted keys in place to what their texts mean as YAML. Raises ConfigError."""
+    given = [Override.of(override) for override in overrides]
+    for override in given:
+        override.apply(values, override.value)
+    return given
+
+
+def _texts(node: yaml.Node) -> Any:
+    """A YAML list's items as the texts that they are."""
+    if isinstance(node, yaml.SequenceNode):
+        return [_texts(item) for item in node.value]
+    return node.value
 
 
 def _kind(values: Mapping[str, Any], group: str) -> Any:
@@ -122,59 +162,19 @@ def _kind(values: Mapping[str, Any], group: str) -> Any:
     return inner.get("kind") if isinstance(inner, dict) else None
 
 
-def read_mapping(path: Path) -> dict[str, Any]:
-    """The `key: value` pairs of a YAML file. Raises ConfigError, naming it."""
-    if not path.exists():
-        raise ConfigError(f"{path}: no such file; {suggestion(path)}")
-    values = read_yaml(path, ConfigError)
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: holds no `key: value` pairs; see experiments/ for examples")
-    return {_key(path, key): value for key, value in values.items()}
+def _names(keys: Sequence[str], given: Sequence[str]) -> bool:
+    """Whether a place in the configuration is a given key, or an item of it."""
+    return len(keys) == len(given) and ".".join(keys).partition("[")[0] == ".".join(given)
 
 
-def _key(path: Path, key: object) -> str:
-    if not isinstance(key, str):
-        raise ConfigError(f"{path}: key {key!r} is no text; correct it")
-    return key
-
-
-@dataclass(frozen=True, slots=True)
-class _Override:
-    """One dotted key and its value as typed, e.g. ``frontend.sift.octave_layers=3``."""
-
-    given: str
-    keys: tuple[str, ...]
-    text: str
-
-    @staticmethod
-    def of(given: str) -> _Override:
-        dotted, separator, text = given.partition("=")
-        keys = tuple(dotted.strip().split("."))
-        if not separator or not all(keys):
-            raise ConfigError(f"--set {given}: not of the form a.b=value; e.g. --set seed=3")
-        return _Override(given, keys, text)
-
-    def apply(self, values: dict[str, Any], accepted: Sequence[Schema]) -> None:
-        """Sets the key; ``accepted`` empty: to plain YAML, or to text where it is none."""
-        try:
-            value = typed_value(self.text, accepted)
-        except yaml.YAMLError:
-            if accepted:
-                raise ConfigError(
-                    f"--set {self.given}: the value is not valid YAML; quote it"
-                ) from None
-            value = self.text
-        at = values
-        for key in self.keys[:-1]:
-            inner = at.setdefault(key, {})
-            if not isinstance(inner, dict):
-                raise ConfigError(f"--set {self.given}: {key} holds a value, not a group of keys")
-            at = inner
-        at[self.keys[-1]] = value
+def _wants_text(error: ErrorDetails) -> bool:
+    return error["type"] == "string_type" or (
+        error["type"] == "literal_error" and isinstance(error["input"], bool | None)
+    )
 
 
 # --------------------------------------------------------------------------------------------
-# Messages
+# Keys and messages
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
@@ -200,170 +200,70 @@ _PLAIN_WORDS = {
 """What a value must be, by pydantic's type of error; others speak for themselves."""
 
 
-def _describe(errors: list[ErrorDetails], where: str, schema: Schema) -> str:
+def _describe(model: type[BaseModel], errors: list[ErrorDetails], where: str) -> str:
     # A misspelt key also leaves the right one missing; the misspelling is the cause.
     first = sorted(errors, key=lambda e: e["type"] not in _UNKNOWN)[0]
-    names = [str(part) for part in first["loc"]]
-    key = ".".join(_without_tags(schema, names))
+    keys, groups = _followed(model, first["loc"])
+    key, kinds = ".".join(keys), ", ".join(kind for g in groups if (kind := _kind_of(g)))
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     if first["type"] in _UNKNOWN:
-        return f"{where}: unknown key {key}{_suggestion(schema, names)}{more}"
+        known = sorted(_known_keys(model, first["loc"][:-1]))
+        close = difflib.get_close_matches(str(first["loc"][-1]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"known here: {', '.join(known)}"
+        return f"{where}: unknown key {key}; {hint}{more}"
     if first["type"] in ("missing", "missing_argument"):
         return f"{where}: key {key} is missing; add it{more}"
     if first["type"] == "union_tag_not_found":
-        return f"{where}: {key}.kind is missing; add one of {_kinds(schema, names)}{more}"
+        return f"{where}: {key}.kind is missing; add one of {kinds}{more}"
     if first["type"] == "union_tag_invalid":
-        kinds, tag = _kinds(schema, names), first["ctx"]["tag"]
-        return f"{where}: {key}.kind is {shortened(repr(tag))}; use one of {kinds}{more}"
+        tag = shortened(repr(first["ctx"]["tag"]))
+        return f"{where}: {key}.kind is {tag}; use one of {kinds}{more}"
     words = _PLAIN_WORDS.get(first["type"], first["msg"])
-    if first["type"] == _NO_GROUP and (kinds := _kinds(schema, names)):
+    if first["type"] == _NO_GROUP and kinds:
         words += f"; kinds: {kinds}"
     return f"{where}: {key} = {shortened(repr(first['input']))} is not usable: {words}{more}"
 
 
-def _kinds(schema: Schema, names: list[str]) -> str:
-    _, nodes = _descend(schema, names)
-    kinds = [n.get("properties", {}).get("kind", {}).get("const") for n in nodes]
-    return ", ".join(str(kind) for kind in kinds if kind is not None)
+def _known_keys(model: type[BaseModel], place: Sequence[str | int]) -> set[str]:
+    return {key for group in _followed(model, place)[1] for key in _fields(group)}
 
 
-def _nodes(schema: Schema, node: Schema) -> list[Schema]:
-    """The object schemas that a schema node may stand for; of a list those of its items."""
-    return [
-        inner
-        for one in _alternatives(schema, node)
-        for inner in (_nodes(schema, one["items"]) if _is_list(one) else [one])
-    ]
-
-
-def _is_list(node: Schema) -> bool:
-    return isinstance(node.get("items"), Mapping)
-
-
-def _descend(schema: Schema, names: list[str]) -> tuple[list[str], list[Schema]]:
-    """Follows a location through the schema, dropping the tags of unions on the way.
+def _followed(model: type, place: Sequence[str | int]) -> tuple[list[str], list[type]]:
+    """Keys of a place that pydantic names, without tags of unions; the groups that stand there.
 
     Items of lists are written `key[3]`.
     """
-    nodes: list[Schema] = [schema]
-    kept: list[str] = []
-    for name in names:
-        if name.isdigit() and kept:  # an item of a list; `_nodes` has looked inside already
-            kept[-1] += f"[{name}]"
-            continue
-        found = [n["properties"][name] for n in nodes if name in n.get("properties", {})]
-        if not found:
-            tagged = [n for n in nodes if _has_tag(n, name)]
-            if not tagged:
-                break
-            nodes = tagged
-            continue
-        kept.append(name)
-        nodes = [inner for node in found for inner in _nodes(schema, node)]
-    return kept, nodes
+    groups: list[type] = [model]
+    keys: list[str] = []
+    for k, part in enumerate(place):
+        found = [_fields(group)[part] for group in groups if part in _fields(group)]
+        tagged = [group for group in groups if _kind_of(group) == part]
+        if isinstance(part, int):
+            keys[-1] += f"[{part}]"
+        elif found:
+            keys.append(part)
+            groups = [inner for annotation in found for inner in _groups(annotation)]
+        elif tagged:
+            groups = tagged
+        elif k == len(place) - 1:
+            keys.append(part)
+    return keys, groups
 
 
-def _has_tag(node: Schema, tag: str) -> bool:
-    kind = node.get("properties", {}).get("kind", {})
-    return bool(kind.get("const") == tag)
+def _fields(group: type) -> dict[Any, Any]:
+    """Annotations of a group's fields, by key."""
+    fields = getattr(group, "__pydantic_fields__", {})
+    return {name: field.annotation for name, field in fields.items()}
 
 
-def _without_tags(schema: Schema, names: list[str]) -> list[str]:
-    kept, nodes = _descend(schema, names[:-1])
-    if names and names[-1].isdigit():
-        return _descend(schema, names)[0]
-    return kept if any(_has_tag(n, names[-1]) for n in nodes) else [*kept, names[-1]]
+def _groups(annotation: Any) -> list[type]:
+    """Groups of keys that a value of this type may be; of a list those of its items."""
+    if isinstance(annotation, type) and hasattr(annotation, "__pydantic_fields__"):
+        return [annotation]
+    return [group for inner in get_args(annotation) for group in _groups(inner)]
 
 
-def _suggestion(schema: Schema, names: list[str]) -> str:
-    _, nodes = _descend(schema, names[:-1])
-    known = sorted({key for node in nodes for key in node.get("properties", {})})
-    close = difflib.get_close_matches(names[-1], known, n=1, cutoff=0.5)
-    return f"; did you mean {close[0]}?" if close else f"; known here: {', '.join(known)}"
-
-
-# --------------------------------------------------------------------------------------------
-# Values of --set a.b=VALUE
-#
-# A value takes the type of its setting. Text is text as typed, whatever YAML would make of it (01,
-# no, a: b); numbers, booleans, lists, groups and null are YAML.
-
-_QUOTES = ("'", '"')
-
-
-def typed_value(text: str, accepted: Sequence[Schema]) -> Any:
-    """What ``text`` means for a setting.
-
-    Args:
-        text: as typed, without the key.
-        accepted: what the setting may be (:func:`accepted_at`); empty where that is not known.
-
-    Raises:
-        yaml.YAMLError: the setting is no text, and this is not valid YAML.
-    """
-    try:
-        node = composed(text)
-    except yaml.YAMLError:
-        if _is_text(accepted):
-            return text.strip()
-        raise
-    if _is_text(accepted) and not isinstance(node, yaml.ScalarNode):
-        return text.strip()  # a comment, a list, a group: not to a setting that is text
-    value = _value(node, accepted)
-    plain = isinstance(node, yaml.ScalarNode) and node.style not in _QUOTES
-    return text.strip() if plain and isinstance(value, str) else value
-
-
-def accepted_at(schema: Schema, keys: Sequence[str], values: Any) -> list[Schema]:
-    """Alternatives that the setting at ``keys`` may be; empty for an unknown one.
-
-    Args:
-        schema: of the whole configuration.
-        keys: from the top down.
-        values: the configuration's plain values: where a group is a union, its `kind` chooses.
-    """
-    nodes = _alternatives(schema, schema)
-    for key in keys:
-        kind = values.get("kind") if isinstance(values, dict) else None
-        chosen = [n for n in nodes if n.get("properties", {}).get("kind", {}).get("const") == kind]
-        inner = [n["properties"][key] for n in chosen or nodes if key in n.get("properties", {})]
-        nodes = [found for node in inner for found in _alternatives(schema, node)]
-        values = values.get(key) if isinstance(values, dict) else None
-    return [_with_items(schema, node) for node in nodes]
-
-
-def _value(node: yaml.Node | None, accepted: Sequence[Schema]) -> Any:
-    """Value of a YAML node; scalars where text alone is accepted stay text."""
-    if node is None:
-        return "" if _is_text(accepted) and "null" not in _types(accepted) else None
-    if isinstance(node, yaml.SequenceNode):
-        items = [item for one in accepted for item in one.get("items", ())]
-        return [_value(item, items) for item in node.value]
-    value = PlainLoader("").construct_object(node, deep=True)
-    if not isinstance(node, yaml.ScalarNode) or not _is_text(accepted):
-        return value
-    return None if value is None and "null" in _types(accepted) else node.value
-
-
-def _is_text(accepted: Sequence[Schema]) -> bool:
-    """True if the setting is text, or text or null."""
-    return _types(accepted) in ({"string"}, {"string", "null"})
-
-
-def _types(accepted: Sequence[Schema]) -> set[Any]:
-    return {node.get("type") for node in accepted}
-
-
-def _alternatives(schema: Schema, node: Schema) -> list[Schema]:
-    """What a schema node may stand for: references resolved, unions opened."""
-    if "$ref" in node:
-        return _alternatives(schema, schema["$defs"][node["$ref"].rsplit("/", 1)[-1]])
-    inner = [*node.get("oneOf", ()), *node.get("anyOf", ()), *node.get("allOf", ())]
-    return [found for part in inner for found in _alternatives(schema, part)] if inner else [node]
-
-
-def _with_items(schema: Schema, node: Schema) -> Schema:
-    """A list's node with the alternatives of its items in place of their schema."""
-    items = [*node.get("prefixItems", ()), *([node["items"]] if "items" in node else ())]
-    found = [_with_items(schema, one) for item in items for one in _alternatives(schema, item)]
-    return {**node, "items": found}
+def _kind_of(group: type) -> str | None:
+    """The value of a group's key `kind`; None where it has none."""
+    kinds = get_args(_fields(group).get("kind"))
+    return kinds[0] if kinds else None

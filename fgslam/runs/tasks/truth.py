@@ -22,7 +22,7 @@ from fgslam.evaluation.trajectory import align, associate
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.config_reading import Reader
+from fgslam.runs.config_reading import parse
 from fgslam.runs.opening import open_sequence
 
 _LEAST_SIGHTINGS = 3
@@ -293,7 +293,7 @@ def _drive_config(drive: object) -> ExperimentConfig | None:
         return None
     try:
         values = {"name": "map", **drive["settings"]}
-        return Reader(ExperimentConfig, ()).parse(values, "map")
+        return parse(ExperimentConfig, values, "map")
     except FgslamError:
         return None
 
