@@ -1,7 +1,7 @@
 """Measures speed or accuracy, stores what was measured, writes the pages of results.
 
 `python -m benchmarks NAME` prints one set of tables as Markdown; `speed`, `long_drive`, `soak`,
-`submaps` and `sweep` write `bench.json`, `bench_long.json` and so on; `keep PATH` stores such a
+`ring` and `sweep` write `bench.json`, `bench_long.json` and so on; `keep PATH` stores such a
 file, or the numbers of a run folder, in benchmarks/measured; `pages` writes docs/results from
 benchmarks/results and benchmarks/measured.
 """
@@ -40,7 +40,7 @@ from benchmarks.evidence import (
 from benchmarks.measured import keep
 from benchmarks.pages import write_pages
 from benchmarks.runs import DATA, say
-from benchmarks.speed import long_drive, parts, soak, submaps, sweeps
+from benchmarks.speed import long_drive, parts, ring, soak, sweeps
 from benchmarks.tables import Table
 from fgslam.core.errors import ConfigError, FgslamError
 
@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    names = ("pages", "keep", "speed", "long_drive", "soak", "submaps", "sweep", *sorted(EVIDENCE))
+    names = ("pages", "keep", "speed", "long_drive", "soak", "ring", "sweep", *sorted(EVIDENCE))
     parser.add_argument("what", choices=names, metavar="NAME", help=", ".join(names))
     parser.add_argument("path", type=Path, nargs="?", help="keep: run folder or file of --out")
     parser.add_argument("--out", type=Path, help="write the numbers as JSON to this file")
@@ -106,8 +106,8 @@ def _do(given: argparse.Namespace) -> None:
         say(f"kept {keep(given.path)}; now `python -m benchmarks pages`")
     elif given.what == "speed":
         _write_ratios(parts.measure(given.part, given.frames), given.out or Path("bench.json"))
-    elif given.what == "submaps":
-        _write_ratios(submaps.numbers(), given.out or Path("bench_submaps.json"))
+    elif given.what == "ring":
+        _write_ratios(ring.numbers(), given.out or Path("bench_ring.json"))
     elif given.what == "sweep":
         _write_ratios(sweeps.numbers(given.cases), given.out or Path("bench_sweep.json"))
     elif given.what == "long_drive":

@@ -27,7 +27,6 @@ same bits. A graph can be had without writing one: hand a
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -122,23 +121,6 @@ class Resumable(Protocol):
 
     def restore(self, state: StateArrays) -> None:
         """Continues from what :meth:`state` gave; on a new estimator with the same settings."""
-        ...
-
-
-INPUTS = "[0-9]" * 6 + ".npz"
-"""Files of what an estimator was given."""
-
-
-@runtime_checkable
-class KeepsRecord(Protocol):
-    """An estimator whose state is all that it was given; optional."""
-
-    def keep_record_in(self, folder: Path) -> None:
-        """From now on what it was given is in files (INPUTS) of the folder, but the last frames.
-
-        Its state, whole before, is then incomplete without them. Called before the first frame,
-        and before it is restored from a state of such a run.
-        """
         ...
 
 

@@ -11,7 +11,7 @@ import json
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -177,45 +177,6 @@ def write_arrays(path: Path, arrays: StateArrays, compressed: bool = False) -> i
         return file.tell()
 
 
-@dataclass(frozen=True)
-class Pieces:
-    """An array that is written without ever being whole in memory.
-
-    Attributes:
-        dtype: of its elements.
-        shape: of the whole.
-        parts: gives its rows, one contiguous part after the other.
-    """
-
-    dtype: np.dtype[Any]
-    shape: tuple[int, ...]
-    parts: Callable[[], Iterable[np.ndarray[Any, Any]]]
-
-    @staticmethod
-    def of(array: np.ndarray[Any, Any]) -> Pieces:
-        """One that is in memory."""
-        return Pieces(array.dtype, array.shape, lambda: (array,))
-
-
-def write_pieces(path: Path, arrays: Mapping[str, Pieces]) -> None:
-    """Writes what :func:`write_arrays` would write of the whole arrays, to the same bytes.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    with replacing(path) as partial, zipfile.ZipFile(partial, "w", allowZip64=True) as file:
-        for name, array in arrays.items():
-            described = {
-                "descr": np.lib.format.dtype_to_descr(array.dtype),
-                "fortran_order": False,
-                "shape": array.shape,
-            }
-            with file.open(f"{name}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array_header_1_0(member, described)
-                for part in array.parts():
-                    member.write(np.ascontiguousarray(part).tobytes())
-
-
 def load_arrays(path: Path, names: Sequence[str] | None = None) -> StateArrays:
     """All arrays of a file of a run folder, or those of the names.
 
@@ -247,14 +208,6 @@ def rows_of(arrays: Mapping[str, Any], name: str) -> int:
 def offsets(sizes: Sequence[int]) -> IntArray:
     """Offsets (n + 1,) of parts of these sizes."""
     return np.cumsum(np.array([0, *sizes], np.int64))
-
-
-OFFSETS = "_start"  # ends the names of arrays of offsets
-
-
-def continued(parts: Sequence[IntArray]) -> IntArray:
-    """Offsets of parts one after the other, of the offsets of each."""
-    return offsets(joined([np.diff(part) for part in parts], (), np.int64).tolist())
 
 
 def joined(

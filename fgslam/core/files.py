@@ -142,16 +142,6 @@ def remove_quietly(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def named_folder(path: str | Path) -> Path:
-    """The path of a folder, which need not exist. Raises OutputError where it is something else."""
-    if not isinstance(path, str | os.PathLike):
-        raise OutputError(f"folder: it is a {type(path).__name__}; give its path")
-    folder = Path(path)
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"cannot write {folder}: it is not a folder; choose another name")
-    return folder
-
-
 def make_subfolder(run: Path, name: str) -> Path:
     """A folder inside the run folder, created when absent. Raises OutputError."""
     folder = run / name

@@ -63,9 +63,10 @@ _DEFAULTS: dict[str, Any] = {"exact": False, "places": "all"}
 
 
 def arrays_of(
-    sensor: Sensor, motion_model: dict[str, Any], frames: Sequence[Increment], version: int
+    sensor: Sensor, motion_model: dict[str, Any], frames: Sequence[Increment]
 ) -> StateArrays:
-    """Frames as the arrays of a log's file of one version (:func:`version_of`)."""
+    """Frames as the arrays of a log's file, of the first version that has a place for them."""
+    version = _version_of(frames)
     kind = "stereo" if isinstance(sensor, CameraRig) else "range_bearing"
     about = {"kind": kind} | {name: getattr(sensor, name) for name in _SENSOR_KEYS[kind]}
     if isinstance(sensor, CameraRig):
@@ -91,7 +92,7 @@ def arrays_of(
     return out
 
 
-def version_of(frames: Sequence[Increment]) -> int:
+def _version_of(frames: Sequence[Increment]) -> int:
     """The first version that has a place for all that is there."""
     steps = [s.odometry for s in frames if s.odometry is not None]
     if any(step.bias is not None for step in steps):
@@ -101,15 +102,12 @@ def version_of(frames: Sequence[Increment]) -> int:
     return WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else BEFORE_LOOPS
 
 
-def frames_of(
-    arrays: StateArrays, where: str, first: int = 0
-) -> tuple[Sensor, dict[str, Any], list[Increment]]:
+def frames_of(arrays: StateArrays, where: str) -> tuple[Sensor, dict[str, Any], list[Increment]]:
     """Sensor, motion model and frames from their arrays.
 
     Args:
         arrays: of a log's file.
         where: names the source in messages.
-        first: position in the whole log of the first frame.
 
     Raises:
         MeasurementLogError: they are damaged, foreign, or hold what no run measures.
@@ -117,7 +115,7 @@ def frames_of(
     header = _read_header(arrays, where)
     _require_consistent(arrays, where)
     _require_sound(arrays, where)
-    loops, relocalised = _loops(arrays, header["version"], where, first)
+    loops, relocalised = _loops(arrays, header["version"], where)
     sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
     _require_ahead(arrays, sensor, where)
     corrections = _corrections(arrays, header["version"], sensor, where)
@@ -262,7 +260,7 @@ def _require_consistent(arrays: StateArrays, where: str) -> None:
 
 
 def _loops(
-    arrays: StateArrays, version: int, where: str, first: int
+    arrays: StateArrays, version: int, where: str
 ) -> tuple[list[tuple[LoopClosure, ...]], BoolArray]:
     """Loop closures of each frame, and which frames (n,) were relocalised; none before version 3.
 
@@ -281,7 +279,7 @@ def _loops(
         )
     ]
     out = [tuple(of_all[a:b]) for a, b in itertools.pairwise(arrays["loop_start"])]
-    for k, loops in enumerate(out, first):
+    for k, loops in enumerate(out):
         astray = [loop.frame for loop in loops if not 0 <= loop.frame < k]
         if astray:
             raise MeasurementLogError(

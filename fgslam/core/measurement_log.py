@@ -6,7 +6,7 @@ One uncompressed ``.npz`` (:mod:`fgslam.core.log_arrays`).
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,7 @@ from fgslam.core.array_files import write_arrays
 from fgslam.core.arrays import Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.files import as_path
-from fgslam.core.log_arrays import SENSOR_ARRAYS, arrays_of, frames_of, sensor_of, version_of
-from fgslam.core.log_blocks import LogBlocks
-from fgslam.core.log_file import FramesOnDisk, LogFile
+from fgslam.core.log_arrays import SENSOR_ARRAYS, arrays_of, frames_of, sensor_of
 from fgslam.core.log_layout import LOG
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.sensors import Sensor
@@ -38,7 +36,7 @@ class MeasurementLog(Brief):
 
     rig: Sensor
     motion_model: dict[str, Any]
-    increments: list[Increment] | LogBlocks | LogFile = field(default_factory=list)
+    increments: list[Increment] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.increments)
@@ -57,68 +55,31 @@ class MeasurementLog(Brief):
                 f"after {self.increments[-1].timestamp:.9f} s; sort the measurements by time"
             )
         increment = dataclasses.replace(increment, odometry=_without_stand_in(increment.odometry))
-        if isinstance(self.increments, LogFile):
-            self.increments = list(self.increments)
         self.increments.append(increment)
-
-    def keep_in(self, folder: Path) -> None:
-        """From now on only the last few hundred frames are in memory, the others in the folder.
-
-        What is read of the log is the same. The folder is the log's own; it is made when needed.
-
-        Raises:
-            OutputError: it holds blocks of an earlier log that cannot be removed.
-        """
-        before, self.increments = self.increments, LogBlocks(self.rig, self.motion_model, folder)
-        for increment in before:
-            self.increments.append(increment)
-
-    def rest_in(self, path: Path) -> None:
-        """Of a log on disk: frames are read from now on from its file, which holds all of them."""
-        if isinstance(self.increments, LogBlocks):
-            self.increments.rest_in(path)
-
-    def continue_with(self, frames: Iterable[Increment]) -> None:
-        """Makes these the frames so far: a loaded log's."""
-        if isinstance(self.increments, LogBlocks):
-            self.increments = LogBlocks(self.rig, self.motion_model, self.increments.folder)
-            for increment in frames:
-                self.increments.append(increment)
-        else:
-            self.increments = list(frames)
 
     @property
     def timestamps(self) -> FloatArray:
         """(n,) seconds."""
-        if isinstance(self.increments, FramesOnDisk):
-            return self.increments.timestamps
         return np.array([s.timestamp for s in self], np.float64)
 
     @property
     def numbers(self) -> IntArray:
         """(n,) the frames' numbers in their recording."""
-        if isinstance(self.increments, FramesOnDisk):
-            return self.increments.numbers
         return np.array([s.index for s in self], np.int64)
 
     @property
     def relocalised(self) -> int:
         """How many frames were placed without a prior."""
-        if isinstance(self.increments, FramesOnDisk):
-            return self.increments.relocalised
         return sum(s.relocalised for s in self)
 
     @property
     def closures(self) -> list[tuple[int, LoopClosure]]:
         """All loop closures, with the position of the frame that offered each."""
-        if isinstance(self.increments, FramesOnDisk):
-            return self.increments.closures
         return [(k, loop) for k, step in enumerate(self) for loop in step.loops]
 
     def to_arrays(self) -> StateArrays:
         """The log as the arrays of its file."""
-        frames = list(self)
-        return arrays_of(self.rig, self.motion_model, frames, version_of(frames))
+        return arrays_of(self.rig, self.motion_model, self.increments)
 
     @staticmethod
     def from_arrays(arrays: StateArrays, where: str) -> MeasurementLog:
@@ -131,29 +92,12 @@ class MeasurementLog(Brief):
 
     def save(self, path: str | Path) -> None:
         """Writes the log, whole or not at all. Raises OutputError when it cannot be written."""
-        if isinstance(self.increments, LogBlocks):
-            self.increments.save(Path(path))
-        else:
-            write_arrays(Path(path), self.to_arrays())
+        write_arrays(Path(path), self.to_arrays())
 
     @staticmethod
     def load_sensor(path: Path) -> Sensor:
         """What a log's file was measured with. Raises MeasurementLogError as :meth:`load` does."""
         return sensor_of(LOG.load(path, SENSOR_ARRAYS), str(path))
-
-    @staticmethod
-    def read_from(path: Path) -> MeasurementLog:
-        """A log whose frames are read as they are asked for, best in their order.
-
-        Of a long one some hundred are in memory at a time.
-
-        Raises:
-            MeasurementLogError: as of :meth:`load`; all frames are checked at once.
-        """
-        frames = LogFile.of(path)
-        if frames is None:
-            return MeasurementLog.load(path)
-        return MeasurementLog(frames.sensor, frames.motion_model, frames)
 
     @staticmethod
     def load(path: str | Path) -> MeasurementLog:

@@ -180,9 +180,6 @@ def _map_problem(config: ExperimentConfig) -> str:
             and given.save is not None
             and Path(given.load).resolve() == Path(given.save).resolve()
         ),
-        "map.active_radius_m: what is on disk is in no session; give map.session false": (
-            given.active_radius_m is not None and given.saves_session
-        ),
         "map.start continue goes on with the run that was saved; it takes map.load alone": (
             goes_on and (first is not None or not given.extend)
         ),

@@ -108,7 +108,7 @@ class _Results:
 
     @cached_property
     def log(self) -> MeasurementLog:
-        return MeasurementLog.read_from(log_of(self._run))
+        return MeasurementLog.load(log_of(self._run))
 
     def save_trajectory(self, path: Path, remark: str) -> None:
         covariances = None

@@ -91,7 +91,7 @@ def _film_of_slam(run: Path, out: Path, estimator: str | None, progress: Progres
     """Path and landmarks are those known at the end; a landmark appears when first seen."""
     folder = run / results_folder(run, estimator)
     trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
-    log = MeasurementLog.read_from(log_of(run))
+    log = MeasurementLog.load(log_of(run))
     if not isinstance(log.rig, CameraRig):
         raise DatasetError(f"{run}: its sensor has no images, so that there is nothing to film")
     fps = frame_rate(trajectory.timestamps, "poses", run)

@@ -35,9 +35,6 @@ METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"
 LOG_FILE = "measurements.npz"
 STATE_FILE = "checkpoint.npz"
-SUBMAPS_FOLDER = "submaps"
-INPUTS_FOLDER = "inputs"
-BLOCKS_FOLDER = "measurements"
 COMPARISON_FILE = "comparison.csv"
 CALIBRATION_FILE = "calibration.csv"
 CAMERA_FILE = "camera.json"
@@ -89,10 +86,6 @@ _RESULT_FILES = (
     "follow.csv",
     "logs/*.npz",
     "units/*.npz",
-    f"{SUBMAPS_FOLDER}/*.fgmap",
-    f"{SUBMAPS_FOLDER}/*.npz",
-    f"{INPUTS_FOLDER}/*.npz",
-    f"{BLOCKS_FOLDER}/*.npz",
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )

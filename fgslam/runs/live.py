@@ -175,8 +175,6 @@ class Slam(Session):
         )
         slam.numbering = (settings.dataset.start, settings.dataset.stride)
         slam._remark = settings.remark
-        if settings.map.active_radius_m is not None:
-            slam.keep_near(settings.map.active_radius_m)
         return slam
 
     def result(self) -> Result:
@@ -186,7 +184,7 @@ class Slam(Session):
             SessionError: there is no frame yet.
         """
         found = super().result()
-        points = map_points(found.estimate.landmarks, self.pipeline.book)
+        points = map_points(found.estimate.landmarks, self.pipeline.tracker.database)
         drives = [] if self._before is None else drives_of(self._before)
         about = {"drives": [*drives, self._drive(found)]}
         evidence = evidence_of(self.pipeline, self.recorder, self._before)

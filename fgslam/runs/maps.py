@@ -23,11 +23,11 @@ from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.settings import FrontendSettings
+from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.report.point_cloud import MapPoints, write_map
 from fgslam.slam.choices import chosen_frontend
 from fgslam.slam.factory import make_describer, make_relocaliser, make_stereo
 from fgslam.slam.inputs import checked_images
-from fgslam.slam.submaps.whole import LandmarkBook
 
 if TYPE_CHECKING:
     from fgslam.frontend.places.map_alignment import Alignment
@@ -155,18 +155,18 @@ class Map:
         return self.saved.trajectory
 
 
-def map_points(landmarks: LandmarkMap, book: LandmarkBook) -> MapPoints:
+def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:
     """The estimator's geometry joined with the front-end's bookkeeping."""
-    rows = book.rows(landmarks.ids)
+    rows = database.rows(landmarks.ids)
     return MapPoints(
         ids=landmarks.ids,
         positions=landmarks.positions,
         covariances=landmarks.covariances,
-        colours=np.repeat(book.colour[rows, None], 3, axis=1),
-        hits=book.hits[rows],
-        misses=book.misses[rows],
-        valid=book.valid[rows],
-        permanent=book.permanent[rows],
+        colours=np.repeat(database.colour[rows, None], 3, axis=1),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        valid=database.valid[rows],
+        permanent=database.permanent[rows],
     )
 
 

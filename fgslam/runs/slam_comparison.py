@@ -110,7 +110,7 @@ def perform(task: ReplayTask) -> EstimatorMetrics:
     Raises:
         FgslamError: the log or the truth cannot be read, or a file cannot be written.
     """
-    log = MeasurementLog.read_from(task.run / LOG_FILE)
+    log = MeasurementLog.load(task.run / LOG_FILE)
     result = replay(log, task.settings, task.ego_motion, arrival=arrival_of(task.run))
     write_replay(task.out, result, log, task.remark, _look(task.run))
     return judge_replay(result, load_truth(task.run, log)).metrics
@@ -204,7 +204,7 @@ def load_log(run: Path) -> MeasurementLog:
         DatasetError: it holds no frame.
         MeasurementLogError: it cannot be read.
     """
-    log = MeasurementLog.read_from(run / LOG_FILE)
+    log = MeasurementLog.load(run / LOG_FILE)
     if not len(log):
         raise DatasetError(f"{run / LOG_FILE}: holds no frame; resume the run first")
     return log

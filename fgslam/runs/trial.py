@@ -58,7 +58,7 @@ def perform_trial(task: TrialTask) -> Trial:
             write_log_and_truth(run, open_measured(config))
         else:
             run_task(open_slam, config, run)
-        log = MeasurementLog.read_from(run / LOG_FILE)
+        log = MeasurementLog.load(run / LOG_FILE)
         truth = load_truth(run, log)
         arrival = None if config.on_measurements else arrival_of(run)  # these begin in no map
     metrics, nees = {}, {}

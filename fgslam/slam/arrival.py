@@ -134,19 +134,19 @@ def saved_map(
         evidence: the frames that are in it (:func:`evidence_of`).
         session: what its run needs to go on; None for nothing.
     """
-    book, places = pipeline.book, pipeline.places
+    database, places = pipeline.tracker.database, pipeline.places
     landmarks = estimate.landmarks
     if places is not None:  # no later frame of this run ends them
         landmarks = landmarks.without(places.ending)
-    rows, patches = book.rows(landmarks.ids), book.patches(landmarks.ids)
+    rows, patches = database.rows(landmarks.ids), database.patches(landmarks.ids)
     return SavedMap(
         rig=rig,
         landmarks=landmarks,
-        appearances=book.appearances(landmarks.ids),
-        hits=book.hits[rows],
-        misses=book.misses[rows],
-        permanent=book.lasting[rows],
-        colour=book.colour[rows],
+        appearances=database.appearances(landmarks.ids),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        permanent=database.lasting[rows],
+        colour=database.colour[rows],
         patches=patches if patches.kept else None,
         trajectory=estimate.trajectory,
         about=about,

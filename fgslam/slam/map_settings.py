@@ -58,16 +58,8 @@ class MapSettings:
     extend: bool = Field(default=True, description="false: only localise, the map stays as it is")
     session: bool = Field(default=True, description="save also what `start: continue` needs")
     begin: MapStartSettings = MapStartSettings()
-    active_radius_m: Positive | None = Field(
-        default=None, description="landmarks farther away go to disk until needed; null: none"
-    )
 
     @property
     def given(self) -> bool:
         """True if the run continues with a map."""
         return self.load is not None or self.made_from is not None
-
-    @property
-    def saves_session(self) -> bool:
-        """True if the map that the run leaves holds all that it takes to go on."""
-        return self.save is not None and self.session

@@ -32,12 +32,10 @@ from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import MotionModel
 from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
-from fgslam.slam.submaps.whole import LandmarkBook
 
 if TYPE_CHECKING:
     from fgslam.backend.filters.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
-    from fgslam.slam.submaps.memory import SubMaps
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +83,6 @@ class SlamPipeline:
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
         key_frames: tracking between key frames; None where every frame is one.
         watch: says which frames' images cannot be used; None uses all.
-        submaps: landmarks far from the robot, on disk; None where all are in memory.
         describe: finds the features of a frame that came without: of all images, or of the
             reference image where patches tell the rest (`frontend.stereo.others`).
         describe_reference: of the first frame, and of one that carried landmarks have placed,
@@ -93,7 +90,7 @@ class SlamPipeline:
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
         rewound: the last frame's features could not be found, and it left no trace; but what a
-            closure before it ended has ended, and sub-maps that came back are in memory.
+            closure before it ended has ended.
     """
 
     stereo: RigStereo
@@ -107,7 +104,6 @@ class SlamPipeline:
     located: Prediction | None = None
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
     describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
-    submaps: SubMaps | None = None
     rewound: bool = False
     _ended: IntArray = field(default_factory=_nobody, init=False)
     _tried: tuple[FeatureFrame, StereoFeatures] | None = field(default=None, init=False)
@@ -132,9 +128,6 @@ class SlamPipeline:
         odometry = self.motion.between(timestamp, body)
         prediction = predicted(self.estimator, odometry)
         watch.lap("predict")
-        if self.submaps is not None:
-            self.submaps.before(prediction.wTc)
-            watch.lap("places")
         landmarks = self._fused()
         carried = self._carried(prediction, found, landmarks)
         watch.lap("track")
@@ -166,9 +159,6 @@ class SlamPipeline:
         if self.calibration is not None:
             self.calibration.observe(increment, stats.wTc)
         watch.lap("calibrate")
-        if self.submaps is not None:
-            self.submaps.after(stats.wTc, described, any(stats.closed))
-            watch.lap("places")
         return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms, noise)
 
     def founds(self, found: FeatureFrame, least: int) -> bool:
@@ -185,12 +175,10 @@ class SlamPipeline:
     def estimate(self) -> Estimate:
         """The estimator's, with frames bridged that nothing measured between located ones.
 
-        Landmarks that are on disk are among it, those that have ended are not.
+        Landmarks that have ended are not among it.
         """
         found = self.estimator.estimate()
-        if self.submaps is not None:
-            found = dataclasses.replace(found, landmarks=self.submaps.whole().landmarks)
-        elif len(self._ended):
+        if len(self._ended):
             found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
         return bridged(found, self.tracker.parts)
 
@@ -204,17 +192,6 @@ class SlamPipeline:
         self._ended = state["ended"]
         self.tracker.noise.restore(state)
         self.tracker.other_motion.restore(state)
-
-    @property
-    def book(self) -> LandmarkBook:
-        """What is known of all landmarks beside their places."""
-        return self.tracker.database if self.submaps is None else self.submaps.whole()
-
-    @property
-    def remarks(self) -> tuple[str, ...]:
-        """What is to be said of landmarks on disk, and of frames that show two motions."""
-        on_disk = () if self.submaps is None else self.submaps.remarks
-        return (*self.tracker.other_motion.remarks(), *on_disk)
 
     def _before(self, found: FeatureFrame) -> _Before:
         """What a frame changes until its features are found, where it came without."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -123,7 +122,7 @@ class RunRecorder:
         self.stage_ms = list(state["stage_ms"])
         self.noise = [FrameNoise(*row) for row in state["noise"].tolist()]
         self.frame_digests = state["frame_digests"].tolist()
-        self.log.continue_with(itertools.islice(log, len(self.rows)))
+        self.log.increments[:] = log.increments[: len(self.rows)]
 
 
 def _row(report: FrameReport, stereo_precision: float) -> FrameRow:

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -16,9 +14,8 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.cameras.rig import StereoRig, require_rig
 from fgslam.core.arrays import FloatArray
-from fgslam.core.checks import is_finite_number, later_time, require_seed
+from fgslam.core.checks import later_time, require_seed
 from fgslam.core.errors import ConfigError, FrameError, SessionError
-from fgslam.core.files import named_folder
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
@@ -41,9 +38,6 @@ from fgslam.slam.motion import MotionModel, description_of
 from fgslam.slam.part_remarks import left_out_note, part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
-
-if TYPE_CHECKING:
-    from fgslam.slam.submaps.memory import ActiveArea
 
 
 @dataclass(frozen=True)
@@ -122,9 +116,6 @@ class Session:
         self.numbering = (0, 1)
         chosen = chosen_estimator(estimator)
         self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed)
-        self._seed = seed
-        self._area: ActiveArea | None = None
-        self._scratch: TemporaryDirectory[str] | None = None
         self._start: MapStart | None = None
         own = is_settings(chosen) and not hasattr(odometry, "between")
         self._movable = beginning is None and own
@@ -134,7 +125,6 @@ class Session:
         self.pipeline = self._made(beginning)
         sensor = as_measured(rig, frontend)
         self.recorder = RunRecorder(MeasurementLog(sensor, description_of(self.pipeline.motion)))
-        self._join_log()
         self._left_out = _LeftOut()
         self._seen = FirstImages()
         self._margins = rig.margins if isinstance(rig, StereoRig) else ()
@@ -146,7 +136,6 @@ class Session:
         pipeline = self._make(beginning)
         pipeline.describe = self.describer.complete
         pipeline.describe_reference = self.describer.of_reference
-        self._near(pipeline)
         return pipeline
 
     def _begun(
@@ -165,62 +154,6 @@ class Session:
         self._start, self._map = start, start.name
         self._locate = make_locator(self.rig, self.frontend, start.saved, seed)
         return start.at(np.eye(4), relocalised=True)
-
-    def keep_near(self, radius_m: float, folder: str | Path | None = None) -> None:
-        """Keeps in memory only landmarks near the robot; the others wait on disk until needed.
-
-        What is tracked, and every result, is of the whole map. Called before the first frame.
-
-        Args:
-            radius_m: landmarks farther from the robot may leave; at least twice the distance over
-                which landmarks are matched.
-            folder: for the sub-maps; made when there is one. None: a temporary one.
-
-        Raises:
-            ConfigError: the radius is not positive, or the estimator keeps all landmarks.
-            OutputError: the folder is none.
-            SessionError: frames have been tracked already.
-        """
-        if len(self) or self._left_out.count:
-            raise SessionError("keep_near comes before the first frame; make a new session")
-        if not is_finite_number(radius_m) or radius_m <= 0.0:
-            raise ConfigError(f"active radius {radius_m!r}: give a positive number of metres")
-        from fgslam.slam.submaps.memory import ActiveArea, require_sets_aside
-
-        require_sets_aside(self.pipeline.estimator)
-        resumable = folder is not None
-        if folder is not None:
-            folder = named_folder(folder)
-        else:
-            self._scratch = TemporaryDirectory(prefix="fgslam-submaps-")
-            folder = Path(self._scratch.name) / "submaps"
-        self._area = ActiveArea(radius_m, folder, resumable)
-        self._near(self.pipeline)
-
-    def keep_log(self, folder: str | Path) -> None:
-        """Keeps all but the last frames of the log in a folder of its own, for a long drive.
-
-        It is read from there where it is needed: replays and :meth:`MeasurementLog.save` give the
-        same. Blocks of an earlier log go. Called before the first frame.
-
-        Raises:
-            OutputError: that is no folder, or blocks of an earlier log cannot be removed.
-            SessionError: frames have been tracked already.
-        """
-        if len(self):
-            raise SessionError("keep_log comes before the first frame; make a new session")
-        self.log.keep_in(named_folder(folder))
-
-    def _join_log(self) -> None:
-        if self.pipeline.places is not None:
-            self.pipeline.places.read_from(self.recorder.log)
-
-    def _near(self, pipeline: SlamPipeline) -> None:
-        area, rig = self._area, self.rig
-        if area is not None:
-            from fgslam.slam.submaps.making import make_submaps
-
-            pipeline.submaps = make_submaps(area, rig, self.frontend, pipeline, self._seed)
 
     # -- frames ------------------------------------------------------------------------------
 
@@ -313,14 +246,13 @@ class Session:
         """Leaves out all frames so far: the next one is the first."""
         count = len(self)
         self._left_out = _LeftOut(self._left_out.count + count, timestamp)
-        self.log.continue_with(())
+        self.log.increments.clear()
         self.recorder = RunRecorder(self.log, left_out=self._left_out.count)
         self._begin(None, count)
 
     def _begin(self, arrival: Arrival | None, count: int) -> None:
         """New parts, for a session that begins after ``count`` frames."""
         self.pipeline = self._made(arrival)
-        self._join_log()
         first, stride = self.numbering
         self.numbering = (first + stride * count, stride)
 
@@ -387,7 +319,7 @@ class Session:
         notes = stereo_remarks(self.recorder, self._seen)
         notes = (*camera_remarks(self.recorder, self.pipeline.watch), *notes)
         notes = (*part_remarks(self.recorder, self.pipeline.tracker.parts), *notes)
-        notes = (*notes, *self.pipeline.remarks)
+        notes = (*notes, *self.pipeline.tracker.other_motion.remarks())
         if left_out.count:
             notes = (*notes, left_out_note(left_out.count))
         with one_blas_thread():

@@ -27,7 +27,6 @@ from fgslam.runs.trials import Seeds, run_trials
 
 REFUSED = 2
 _STEPS = {
-    "fgslam.core.log_blocks.BLOCK": 3,
     "fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK": 2,
     "fgslam.runs.tasks.homing_trials.TRIALS_A_BLOCK": 1,
     "fgslam.runs.tasks.homing_video.SAVE_EVERY_S": 0.0,

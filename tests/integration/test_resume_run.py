@@ -27,7 +27,6 @@ from running import (
     write_config,
 )
 
-from fgslam.backend.smoothers import recorded_inputs
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import (
     ConfigError,
@@ -97,22 +96,16 @@ def test_resumed_without_odometry(recording: Path, tmp_path: Path) -> None:
     assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
 
 
-def test_fixed_lag_resumes_from_files(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What it was given waits there until the run has ended; drawn noise goes on as well."""
+def test_fixed_lag_resumes_with_drawn_noise(recording: Path, tmp_path: Path) -> None:
     dataset = {"kind": "image_folder", "path": str(recording), "stop": 7}
     made = {"estimator": {"kind": "fixed_lag"}, "odometry": {"kind": "synthetic"}, "seed": 5}
     values = experiment(recording, dataset=dataset, **made)
     straight, run = tmp_path / "straight", tmp_path / "run"
-    run_values(values, straight)  # all of it in memory: blocks of 256 frames
-    monkeypatch.setattr(recorded_inputs, "BLOCK", 2)
+    run_values(values, straight)
     run_values(values, run, stopped=stop_after(5))
-    assert [block.name for block in (run / "inputs").iterdir()] == ["000000.npz"]
     run_values(values, run, "resume")
     names = tuple(name.replace(KIND, "fixed_lag") for name in SAME_BYTES)
     assert bytes_of(run, names) == bytes_of(straight, names)
-    assert not (run / "inputs").exists()
 
 
 def test_killed_between_the_files_of_a_checkpoint(

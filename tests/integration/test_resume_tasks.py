@@ -235,8 +235,6 @@ def doing(
 @pytest.fixture(autouse=True)
 def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Units in this process, few in a block, and every state saved."""
-    monkeypatch.setattr("fgslam.core.log_blocks.BLOCK", 3)
-    monkeypatch.setattr("fgslam.backend.smoothers.recorded_inputs.BLOCK", 1)
     monkeypatch.setattr("fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK", 2)
     monkeypatch.setattr("fgslam.runs.tasks.homing_trials.TRIALS_A_BLOCK", 1)
     monkeypatch.setattr("fgslam.runs.tasks.homing_video.SAVE_EVERY_S", 0.0)

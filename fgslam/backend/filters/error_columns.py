@@ -51,7 +51,7 @@ class ErrorColumns:
         self._held = True
 
     def forget(self, ids: IntArray) -> None:
-        """Landmarks that somebody else holds now, or nobody."""
+        """Drops landmarks; those that are unknown are passed over."""
         places, known = self._places(ids)
         if known.any():
             gone = np.zeros(len(self._order), np.bool_)

@@ -33,10 +33,9 @@ from fgslam.backend.filters.loop_correction import (
 from fgslam.backend.filters.rig_change import RigChange
 from fgslam.backend.filters.sampled_errors import Moved, SampledErrors, Step, lacking, shares
 from fgslam.backend.filters.self_calibration import SETTLING
-from fgslam.backend.filters.set_aside import SetAside
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     congruence,
@@ -155,47 +154,6 @@ class LandmarkKalman:
     def chain(self) -> Chain:
         """The drive as tracked, with the uncertainty of its steps."""
         return self._drive.chain
-
-    def poses_of(self, frames: IntArray) -> FloatArray:
-        """Poses (k, 4, 4) of earlier frames as known now."""
-        return np.array([self._past.poses[frame] for frame in frames.tolist()]).reshape(-1, 4, 4)
-
-    def settled(self, ids: IntArray) -> BoolArray:
-        """(k,) all: each is filtered by itself."""
-        return np.ones(len(ids), np.bool_)
-
-    def held_aside(self, ids: IntArray) -> SetAside:
-        """Copies of landmarks, with what it takes to give them back; nothing changes."""
-        rows = self._rows.rows(ids)
-        homes = self.homes[rows]
-        frames = np.unique(homes[homes >= 0])
-        return SetAside(
-            landmarks=self._rows.map().select(rows),
-            counts=self._rows.counts[rows],
-            homes=homes,
-            lasts=self._rows.lasts[rows],
-            frames=frames,
-            timestamps=np.array([self._past.timestamps[frame] for frame in frames.tolist()]),
-            poses=self.poses_of(frames),
-            doubt_gain=self._errors.held_aside(ids),
-            doubt_information=np.zeros((len(ids), 3, 3)),
-        )
-
-    def give_up(self, ids: IntArray) -> None:
-        """Forgets landmarks that somebody else holds now."""
-        self._rows.remove(ids)
-        self._errors.forget(ids)
-
-    def take_back(self, aside: SetAside) -> None:
-        """Landmarks come back, moved by what closures have corrected their homes since."""
-        now = aside.moved(self.poses_of(aside.frames))
-        self._rows.bring(now.landmarks, now.counts, now.homes, now.lasts)
-        self._errors.take_back(now.landmarks.ids, now.doubt_gain)
-
-    def reported(self, aside: SetAside) -> LandmarkMap:
-        """Landmarks where closures have put them by now, with the covariances reported."""
-        now = aside.moved(self.poses_of(aside.frames))
-        return self._errors.reported(now.landmarks, now.doubt_gain)
 
     def correct(self, current: Prediction, ids: IntArray, positions: FloatArray) -> None:
         """Takes over a smoother's last pose and landmark positions (k, 3), between two frames.

@@ -148,15 +148,6 @@ class OnlineDoubt(ErrorColumns):
         self.forget(increment.pruned_ids)
         self._wTc = wTc
 
-    def held_aside(self, ids: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Derivatives (k, 3, q) of landmarks and information (k, 3, 3); zero of unknown ones."""
-        return self._of("gain", ids), self._of("information", ids)
-
-    def take_back(self, ids: IntArray, gain: FloatArray, information: FloatArray) -> None:
-        """Landmarks come back with what :meth:`held_aside` gave of them."""
-        known = np.any(information, axis=(1, 2))
-        self._append({"ids": ids[known], "gain": gain[known], "information": information[known]})
-
     def of_pose(self) -> FloatArray:
         """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
         if self._terms.deviations is None:
@@ -172,13 +163,10 @@ class OnlineDoubt(ErrorColumns):
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with what the doubt adds to their covariances."""
-        return self.added(known, self._of("gain", known.ids)) if self.present else known
-
-    def added(self, known: LandmarkMap, gain: FloatArray) -> LandmarkMap:
-        """The same of landmarks with these derivatives (k, 3, q), which may have been forgotten."""
         covariance = self._terms.covariance
         if covariance is None or self._held:
             return known
+        gain = self._of("gain", known.ids)
         more = gain @ covariance @ np.swapaxes(gain, 1, 2)
         return dataclasses.replace(known, covariances=known.covariances + more)
 

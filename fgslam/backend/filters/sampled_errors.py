@@ -223,16 +223,6 @@ class SampledErrors(ErrorColumns):
             points = skew(landmarks.positions[of_home])
             self._map["gain"][rows[of_home]] -= motion[3:] - points @ motion[:3]
 
-    def held_aside(self, ids: IntArray) -> FloatArray:
-        """(k, 3, m) of landmarks, as precise as they are kept; zero of those that have none yet."""
-        return self._of("gain", ids).astype(self._map["gain"].dtype)
-
-    def take_back(self, ids: IntArray, gain: FloatArray) -> None:
-        """Landmarks come back with what :meth:`held_aside` gave of them."""
-        known = np.any(gain, axis=(1, 2))
-        if not self._off:
-            self._append({"ids": ids[known], "gain": gain[known]})
-
     # -- what is reported ----------------------------------------------------------------------
 
     def pose(self, newest: Prediction) -> Prediction:
@@ -243,10 +233,7 @@ class SampledErrors(ErrorColumns):
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with the covariances of their errors; those without keep what they have."""
-        return self.reported(known, self._of_map(known.ids))
-
-    def reported(self, known: LandmarkMap, gain: FloatArray) -> LandmarkMap:
-        """The same of landmarks with these columns (k, 3, m), which may have been forgotten."""
+        gain = self._of_map(known.ids)
         have = np.any(gain, axis=(1, 2))
         if self._held or not have.any():
             return known

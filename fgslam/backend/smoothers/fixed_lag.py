@@ -7,6 +7,7 @@ forgotten it, which is the price of a constant effort.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import ClassVar
 
 import numpy as np
@@ -20,9 +21,8 @@ from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.drift_undone import drift_undone
-from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.lag_smoother import LagSmoother
-from fgslam.backend.smoothers.smoother import GraphProblem
+from fgslam.backend.smoothers.graph_builder import NewFactors, TrackedFrame
+from fgslam.backend.smoothers.smoother import GraphProblem, Smoother
 from fgslam.backend.smoothers.solver import (
     ClosedLoop,
     Drive,
@@ -34,9 +34,9 @@ from fgslam.backend.smoothers.solver import (
 )
 from fgslam.backend.smoothers.window import Window
 from fgslam.backend.smoothers.window_parts import Landmarks, Solved
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
@@ -45,6 +45,7 @@ from fgslam.core.geometry import (
     point_pose_jacobian,
     transform_to_camera,
 )
+from fgslam.core.measurements import Increment
 from fgslam.core.sensors import Sensor
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
@@ -81,11 +82,6 @@ class FixedLagSolver:
         self._covariances: list[FloatArray] = []
         self._clock: list[float] = []
         self.remarks: list[str] = []
-
-    @property
-    def oldest(self) -> int:
-        """The first frame within the lag."""
-        return self._oldest
 
     def pose(self, frame: int) -> Prediction:
         """A frame's pose; final before the lag."""
@@ -248,6 +244,46 @@ class FixedLagSolver:
         covariance = solved.eliminated.pose(solved.frames.index(frame))
         kept = allowed_parts(self._floor, self.poses[frame][None], covariance[None])
         return np.asarray(kept[0])
+
+
+_HOLD_A_POSE = 6
+"""Landmarks in three dimensions: twice as many as determine a pose."""
+
+
+class LagSmoother(Smoother):
+    """A smoother of a bounded lag: nothing revises what the lag has left, not even a closure."""
+
+    def __init__(self, problem: GraphProblem, solver: FixedLagSolver) -> None:
+        """Starts at the problem's prior pose with an empty map."""
+        super().__init__(problem, solver)
+        self._lag = solver
+
+    def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
+        """The frame; one that was found without a prior is where a map that has left has it."""
+        tracked = super()._admitted(increment, tracking)
+        observed = increment.observations
+        matched = observed.ids[~observed.is_new][tracking.inliers]
+        if not increment.relocalised or self._within(matched) >= _HOLD_A_POSE:
+            return tracked
+        return dataclasses.replace(tracked, located=self._located(matched, tracking))
+
+    def _within(self, ids: IntArray) -> int:
+        """How many of them are variables of the lag: those hold a frame by their factors."""
+        tracks = self.builder.admission.tracks
+        return sum(i in tracks and tracks[i].variable >= 0 for i in ids.tolist())
+
+    def _located(self, matched: IntArray, tracking: EgoMotion) -> FloatArray:
+        """(6, 6) of a pose in a map that has left: as tracked, and as the map is known itself.
+
+        Its landmarks are as uncertain as the pose of the frame that began them, in the middle.
+        """
+        known = self.tracker.landmarks()
+        homes = self.tracker.homes[known.rows(matched[np.isin(matched, known.ids)])]
+        if not len(homes):
+            return tracking.covariance
+        home = self._lag.pose(int(np.sort(homes)[len(homes) // 2]))
+        there = adjoint(inverse(tracking.wTc) @ home.wTc)
+        return tracking.covariance + congruence(there, home.covariance)
 
 
 def _landmarks(new: NewFactors, entered: list[int]) -> Landmarks:

@@ -102,11 +102,6 @@ class PlaceRecognition:
         return lost is None or not 0 < self._lost < lost.give_up_after
 
     @property
-    def lost(self) -> bool:
-        """Whether the last frame was located by nothing in the map."""
-        return self._lost > 0
-
-    @property
     def taken(self) -> tuple[bool, ...]:
         """Whether the estimator took the closures so far, in the log's order."""
         return tuple(self.memory.taken)
@@ -274,10 +269,6 @@ class PlaceRecognition:
         self._pose = stats.wTc
         if len(self.memory) % _WORDS_EVERY == 0:
             self._find_words()
-
-    def read_from(self, log: MeasurementLog) -> None:
-        """Measurements of earlier frames are read from the log of the run."""
-        self.memory.read_from(log)
 
     def state(self) -> StateArrays:
         """All but what the log tells."""

@@ -23,8 +23,7 @@ _LEAST_M = 1e-6  # of an edge: none at all is no edge
 class SightingMemory:
     """Observations of all frames so far, and when each landmark was last seen.
 
-    Which landmarks a frame saw is kept; how it measured them is read from the log, once there is
-    one. A closure that the estimator refused is none: neither a return nor a sighting of the
+    A closure that the estimator refused is none: neither a return nor a sighting of the
     landmarks that it names.
 
     A run may begin in a map. That map is one place, whatever of it the run has seen: frames tied to
@@ -37,8 +36,7 @@ class SightingMemory:
     def __init__(self, given: int = -1) -> None:
         """Nothing was seen yet; ``given`` is the last identity of the map it all begins in."""
         self._given = given
-        self._log: MeasurementLog | None = None
-        self._own: list[Increment] = []  # while there is no log
+        self._frames: list[Increment] = []
         self._seen = GrowingColumns(ids=np.empty(0, np.int32))
         self._starts: list[int] = []
         self._way: list[float] = []
@@ -51,10 +49,6 @@ class SightingMemory:
 
     def __len__(self) -> int:
         return len(self._starts)
-
-    def read_from(self, log: MeasurementLog) -> None:
-        """Measurements are read from the log of the run, which has all frames so far."""
-        self._log, self._own = log, []
 
     def add(self, increment: Increment, step: FloatArray, closed: tuple[bool, ...] = ()) -> None:
         """Books a frame.
@@ -149,8 +143,7 @@ class SightingMemory:
                 frame saw them, only that map places the frame beside them.
             landmarks: the map.
         """
-        frames = self._own if self._log is None else self._log.increments
-        seen = frames[frame].kept
+        seen = self._frames[frame].kept
         keep = np.isin(seen.ids, landmarks.ids)
         if self._never_seen(ids) > int(np.isin(seen.ids, ids).sum()):
             keep &= self.of_given(seen.ids)
@@ -168,7 +161,7 @@ class SightingMemory:
         """Continues from :meth:`state` and the log of as many frames."""
         self._seen = GrowingColumns(ids=np.empty(0, np.int32))
         self._starts, self._newest, self._returns, self._ties = [], [], [], []
-        self._own = []
+        self._frames = []
         self._given, self._on_map = int(state["given"]), False
         self._last_seen = np.full(self._given + 1, -1)
         accepted, self.taken = iter(state["taken"].tolist()), []
@@ -192,8 +185,7 @@ class SightingMemory:
         if by_map >= _RETURN_MATCHES:
             self._tie(here)
         self._last_seen[ids] = here
-        if self._log is None:
-            self._own.append(increment)
+        self._frames.append(increment)
         self._starts.append(len(self._seen))
         self._seen.append({"ids": seen.ids.astype(np.int32)})
         self._returns += [(here, loop.frame) for loop in loops]

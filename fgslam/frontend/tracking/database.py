@@ -61,22 +61,14 @@ class LandmarkDatabase(LandmarkTable):
     @property
     def valid(self) -> BoolArray:
         """(n,) landmarks seen often enough to be trusted (6.1)."""
-        return self.are_valid(self.hits)
-
-    def are_valid(self, hits: IntArray) -> BoolArray:
-        """(k,) which landmarks of so many hits are to be trusted (6.1)."""
-        return np.asarray(hits >= self._settings.valid_hits)
+        return np.asarray(self.hits >= self._settings.valid_hits)
 
     @property
     def lasting(self) -> BoolArray:
         """(n,) landmarks that a map saved now should hold as permanent ones."""
-        return self.would_last(self.permanent, self.hits, self.misses)
-
-    def would_last(self, permanent: BoolArray, hits: IntArray, misses: IntArray) -> BoolArray:
-        """(k,) as :attr:`lasting`, of landmarks of these flags and counts."""
         if self._settings.permanence is None:
-            return permanent.copy()
-        return permanent | self._reliable(hits, misses, self._settings.permanence)
+            return self.permanent.copy()
+        return self.permanent | self._reliable(self.hits, self.misses, self._settings.permanence)
 
     def expected(self, landmarks: LandmarkMap, wTc: FloatArray) -> ExpectedLandmarks:
         """Landmarks of the map that should or may be in view from ``wTc`` (4.4)."""
@@ -245,7 +237,8 @@ class LandmarkDatabase(LandmarkTable):
     def _reliable(
         self, hits: IntArray, misses: IntArray, permanence: PermanenceSettings
     ) -> BoolArray:
-        return self.are_valid(hits) & reliable(hits, misses, permanence)
+        valid = hits >= self._settings.valid_hits
+        return valid & reliable(hits, misses, permanence)
 
 
 NEAR_PX = 40.0  # what is seen past a place is this near to it in the image

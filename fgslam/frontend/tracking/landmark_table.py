@@ -20,7 +20,6 @@ from fgslam.frontend.tracking.views import Places, ViewPool, Views
 
 _COUNTS = ("hits", "misses", "missed", "unlooked", "seen", "contradicted")
 _PATCH = ("patch", "patch_distance")
-_HELD = ("ids", "colour", "permanent", *_PATCH, *_COUNTS)
 _PLACES = "places"
 _VIEWS = ("size", "orientation", "descriptors", "direction", "used")
 
@@ -218,34 +217,6 @@ class LandmarkTable:
         )
         self._next_id = int(ids[-1]) + 1 if len(ids) else 0
         self._frame = 0
-
-    def unseen_for(self, frames: int) -> BoolArray:
-        """(n,) landmarks that none of the last ``frames`` frames matched."""
-        return np.asarray(self._columns["seen"] + frames <= self._frame)
-
-    def held_aside(self, ids: IntArray) -> StateArrays:
-        """All entries of landmarks (ascending) and their views, as arrays; nothing changes."""
-        rows = self.rows(ids)
-        out: StateArrays = {name: self._columns[name][rows] for name in _HELD}
-        owner, places = self._places_of(rows)
-        views = self._pool.at(places)
-        out |= {name: getattr(views, name) for name in _VIEWS}
-        out["view_counts"] = np.bincount(owner, minlength=len(rows))
-        return out
-
-    def give_up(self, ids: IntArray) -> None:
-        """Forgets landmarks that somebody else holds now."""
-        gone = np.zeros(len(self), np.bool_)
-        gone[self.rows(ids)] = True
-        self._remove(gone)
-
-    def take_back(self, held: StateArrays) -> None:
-        """What :meth:`held_aside` gave comes back."""
-        before = len(self)
-        views = Views(**{name: held[name] for name in _VIEWS})
-        places = self._pool.load(held["view_counts"], views)
-        self._columns.append({name: held[name] for name in _HELD} | {_PLACES: places})
-        self._columns.keep_ascending("ids", before)
 
     def state(self) -> StateArrays:
         """All entries, as arrays; a snapshot."""

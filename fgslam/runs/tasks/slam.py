@@ -20,7 +20,7 @@ from fgslam.evaluation.metrics import EstimatorMetrics
 from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
-from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, ExistingFolder, is_run_folder
+from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder
 from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.owner import give_back
 from fgslam.runs.report import report_from_folder
@@ -91,7 +91,6 @@ def _run(opened: OpenedRun, context: Context, watch: Watch | None) -> SlamResult
         opened = begin_later(opened, saved.frame)
         outputs = begin(opened, context.progress)
     if saved is not None:
-        outputs.recorder.log.rest_in(outputs.folder / LOG_FILE)
         return _result(outputs, "interrupted", saved)
     return _finish(outputs, context)
 
@@ -196,7 +195,6 @@ def _advance(
 def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
     pictures: tuple[Path, ...] = ()
     live = outputs.write_results("finished")
-    outputs.recorder.log.rest_in(outputs.folder / LOG_FILE)
     about_map = state.leave_map(outputs)
     if outputs.config.output.pictures:
         pictures = tuple(draw_run(outputs.folder, figures_of(outputs)))

@@ -7,17 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fgslam.backend.protocol import KeepsRecord
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import remove_files
 from fgslam.core.recordings import Sequence
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Opening, provenance_of
 from fgslam.runs.folder import (
-    BLOCKS_FOLDER,
-    INPUTS_FOLDER,
     RUN_MARKER,
-    SUBMAPS_FOLDER,
     write_config,
 )
 from fgslam.runs.opening import open_sequence
@@ -88,12 +84,6 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
         opened = state.window(config, given)
     sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
-    if config.map.active_radius_m is not None:
-        from fgslam.slam.submaps.memory import require_sets_aside
-
-        require_sets_aside(
-            make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
-        )
     if config.map.given and config.map.start != "continue":
         estimator = make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
         user = require_map_user(estimator, config.map.extend)
@@ -137,7 +127,6 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         seed=config.seed,
         beginning=arrival,
     )
-    _keep_on_disk(session, run)
     session.recorder.left_out = left_out
     first_frame = opened.dataset.start
     outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
@@ -161,16 +150,6 @@ def begin_later(run: OpenedRun, frames: int) -> OpenedRun:
     remove_files(run.folder / PICTURES, "*.png")
     write_config(run.folder, run.config, run.provenance)
     return run
-
-
-def _keep_on_disk(session: Session, run: OpenedRun) -> None:
-    """What no frame needs is in files: the log, landmarks far away, what an estimator was given."""
-    about_map, estimator = run.config.map, session.pipeline.estimator
-    if about_map.active_radius_m is not None:
-        session.keep_near(about_map.active_radius_m, run.folder / SUBMAPS_FOLDER)
-    elif isinstance(estimator, KeepsRecord) and not about_map.saves_session:
-        estimator.keep_record_in(run.folder / INPUTS_FOLDER)
-    session.keep_log(run.folder / BLOCKS_FOLDER)
 
 
 def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:

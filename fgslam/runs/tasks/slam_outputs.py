@@ -157,7 +157,7 @@ class RunOutputs:
         online = Trajectory(
             estimate.trajectory.timestamps, np.array(self.recorder.online_poses).reshape(-1, 4, 4)
         )
-        points = map_points(estimate.landmarks, self.pipeline.book)
+        points = map_points(estimate.landmarks, self.pipeline.tracker.database)
         write_estimate(folder, online, estimate, points, self.remark)
         write_noise(folder / NOISE_TABLE, online.timestamps, self.recorder.noise)
 
@@ -184,7 +184,7 @@ class RunOutputs:
         of_images = stereo_remarks(self.recorder)
         of_parts = part_remarks(self.recorder, self.pipeline.tracker.parts)
         of_run = (*self.sequence.notes, *self.notes, *self._unlocated(), *of_parts)
-        return (*of_run, *of_cameras, *of_images, *self.pipeline.remarks)
+        return (*of_run, *of_cameras, *of_images, *self.pipeline.tracker.other_motion.remarks())
 
     def _unlocated(self) -> tuple[str, ...]:
         found = located(self.recorder)
@@ -199,7 +199,7 @@ class RunOutputs:
             "frames_in_recording": self.frames,
             "odometry": self.config.odometry.kind,
             "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
-            "landmarks_permanent": int(self.pipeline.book.permanent.sum()),
+            "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
             "notes": list(self.remarks()),
         }
@@ -383,13 +383,13 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
     """A live run's figures."""
     # Once for all pictures: a smoother's estimate may take long.
     estimate = outputs.pipeline.estimate()
-    book, recorder = outputs.pipeline.book, outputs.recorder
+    database, recorder = outputs.pipeline.tracker.database, outputs.recorder
     return RunFigures(
         name=outputs.config.name,
         synthetic=bool(outputs.remark),
         estimate=estimate,
         truth=outputs.sequence.ground_truth,
-        valid=book.valid[book.rows(estimate.landmarks.ids)],
+        valid=database.valid[database.rows(estimate.landmarks.ids)],
         frames=recorder.log.numbers,
         predicted=predicted_poses(recorder.column("status").tolist()),
         matched=recorder.column("matched"),

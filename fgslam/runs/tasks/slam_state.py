@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.backend.protocol import INPUTS, Estimator, Resumable
+from fgslam.backend.protocol import Estimator, Resumable
 from fgslam.core import __version__
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import ConfigError, MapError, MeasurementLogError, OutputError
 from fgslam.core.estimates import Estimate
-from fgslam.core.files import remove_file, remove_files, require_writable
+from fgslam.core.files import remove_file, require_writable
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap, require_rig, save_map
 from fgslam.runs.config import ExperimentConfig, make_config
-from fgslam.runs.folder import INPUTS_FOLDER, LOG_FILE, STATE_FILE, SUBMAPS_FOLDER
+from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.arrival import evidence_of, saved_map
@@ -32,8 +32,6 @@ from fgslam.slam.results import RunRecorder
 def save_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
     """Writes the state. The log must have been written before: it may not lack a frame of it."""
     write_arrays(folder / STATE_FILE, state_of(pipeline, recorder))
-    if pipeline.submaps is not None:
-        pipeline.submaps.tidy()
 
 
 def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
@@ -54,8 +52,6 @@ def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
         parts["key_frames"] = pipeline.key_frames.state()
     if pipeline.watch is not None:
         parts["watch"] = pipeline.watch.state()
-    if pipeline.submaps is not None:
-        parts["submaps"] = pipeline.submaps.state()
     return {
         f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
     }
@@ -84,8 +80,6 @@ def restore(
         pipeline.key_frames.restore(_part(state, "key_frames"))
     if pipeline.watch is not None:
         pipeline.watch.restore(_part(state, "watch"))
-    if pipeline.submaps is not None:
-        pipeline.submaps.restore(_part(state, "submaps"))
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -101,7 +95,7 @@ def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
         MeasurementLogError: one of the two files cannot be read.
     """
     state = load_arrays(folder / STATE_FILE)
-    log = MeasurementLog.read_from(folder / LOG_FILE)
+    log = MeasurementLog.load(folder / LOG_FILE)
     try:
         restore(state, log, pipeline, recorder)
     except (KeyError, ValueError, IndexError) as error:
@@ -136,10 +130,8 @@ def _part(state: StateArrays, part: str) -> StateArrays:
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """Drops the state once the run has finished, and what an estimator kept of it in files."""
+    """Drops the state once the run has finished."""
     remove_file(folder / STATE_FILE)
-    for name in (SUBMAPS_FOLDER, INPUTS_FOLDER):
-        remove_files(folder / name, INPUTS)
 
 
 _LOG = "log/"

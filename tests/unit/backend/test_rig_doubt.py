@@ -12,7 +12,6 @@ from simulated import RIG, assert_same_bits, play
 from smoothing import FREE, drawn, run
 
 from fgslam.backend.filters import online_doubt
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
 from fgslam.backend.filters.online_doubt import OnlineDoubt, shared_covariance
 from fgslam.backend.protocol import FullEstimator
 from fgslam.backend.settings import (
@@ -26,12 +25,11 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers.border import Bordered
-from fgslam.backend.smoothers.lag_smoother import LagSmoother
 from fgslam.backend.smoothers.refinement import Refined
 from fgslam.backend.smoothers.rig_doubt import doubted, shifts
 from fgslam.core import geometry as g
-from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap, Prediction, UpdateStats
+from fgslam.core.arrays import FloatArray
+from fgslam.core.estimates import Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment, SettledRig
 from fgslam.core.rig_correction import (
@@ -318,81 +316,6 @@ def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: st
     second.restore(dict(sorted(first.state().items())))  # as a saved map's session has it
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), through.estimate())
-
-
-def played_with_some_set_aside(
-    estimator: LandmarkKalman | LagSmoother, increments: list[Increment]
-) -> tuple[LandmarkMap, IntArray]:
-    """The map after a drive; what is seen no more in its second half is given up for that half.
-
-    Returns:
-        All landmarks as reported, ascending, and the identities of those given up.
-    """
-    half = len(increments) // 2
-    play(estimator, increments[:half], FREE, CALIBRATED.rig)
-    later = [
-        np.concatenate([each.observations.ids, each.missed_ids, each.pruned_ids])
-        for each in increments[half:]
-    ]
-    gone = np.setdiff1d(estimator.landmarks().ids, np.concatenate(later))
-    gone = gone[estimator.settled(gone)]
-    aside = estimator.held_aside(gone)
-    estimator.give_up(gone)
-    play(estimator, increments[half:], FREE, CALIBRATED.rig)
-    there, away = estimator.estimate().landmarks, estimator.reported(aside)
-    estimator.take_back(aside)
-    ids = np.concatenate([there.ids, away.ids])
-    order = np.argsort(ids)
-    return LandmarkMap(
-        ids[order],
-        np.concatenate([there.positions, away.positions])[order],
-        np.concatenate([there.covariances, away.covariances])[order],
-    ), gone
-
-
-@pytest.mark.parametrize("kind", ["landmark_kalman", "fixed_lag"])
-def test_landmarks_set_aside_are_reported_as_uncertain_as_those_that_stayed(kind: str) -> None:
-    settings = FixedLagSettings(lag_frames=1) if kind == "fixed_lag" else ONLINE[kind]
-    estimator, stayed = (make_estimator(CALIBRATED.rig, settings, FREE) for _ in range(2))
-    assert isinstance(estimator, LandmarkKalman | LagSmoother)
-    found, gone = played_with_some_set_aside(estimator, increments_of(12))
-    play(stayed, increments_of(12), FREE, CALIBRATED.rig)
-    meant = stayed.estimate().landmarks
-    assert len(gone) > 2
-    assert_same_bits(found, meant)
-    rows = meant.rows(gone)
-    plain = stayed.landmarks().covariances[rows]
-    more = np.trace(meant.covariances[rows] - plain, axis1=1, axis2=2)
-    assert (more > 0.0).mean() > 0.9, "the doubt is theirs, too"
-    # Once back, they are known as if they had never left.
-    assert_same_bits(estimator.estimate().landmarks, meant)
-    np.testing.assert_array_equal(
-        estimator.landmark_covariances(gone), stayed.landmark_covariances(gone)
-    )
-
-
-@pytest.mark.slow
-def test_sigmas_of_landmarks_set_aside_hold_their_errors() -> None:
-    """Share within two sigmas over 50 drives, each with a calibration of its own."""
-    covariance, rng = shared_covariance(CALIBRATED), np.random.default_rng(7)
-    shares, without = [], []
-    for seed in range(50):
-        terms = np.zeros(len(ALL))
-        terms[OF_SHARED] = rng.multivariate_normal(np.zeros(len(SHARED)), covariance)
-        drive = drawn(seed)
-        increments = [
-            dataclasses.replace(displaced(each, terms), rig_correction=UNCORRECTED)
-            for each in drive.increments
-        ]
-        estimator = LandmarkKalman(CALIBRATED.rig, LandmarkKalmanSettings(), FIRST, FREE)
-        found, gone = played_with_some_set_aside(estimator, increments)
-        found = found.select(found.rows(gone))
-        off = drive.points_by_id[gone] - found.positions
-        shares.append(within(off, found.covariances))
-        plain = estimator.landmarks()
-        without.append(within(off, plain.covariances[plain.rows(gone)]))
-    assert 0.88 < np.mean(shares) < 0.99, np.mean(shares)
-    assert np.mean(without) < 0.8, np.mean(without)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from loops import CLOSED, Rounds, drive_rounds
 from scipy import stats
-from simulated import RIG, Simulation, assert_same_bits, play
+from simulated import RIG, Simulation, play
 from smoothing import FREE, drawn
 
 from fgslam.backend.filters import sampled_errors
@@ -202,19 +202,6 @@ def test_estimates_do_not_depend_on_what_is_reported(update: str) -> None:
     np.testing.assert_array_equal(*poses)
     np.testing.assert_array_equal(sampled.landmarks().positions, own.landmarks().positions)
     np.testing.assert_array_equal(sampled.landmarks().covariances, own.landmarks().covariances)
-
-
-def test_landmarks_set_aside_hold_samples_as_memory_does_and_come_back_to_the_bit() -> None:
-    estimator = played(drawn(1, frames=4).increments)
-    before = estimator.estimate().landmarks
-    ids = before.ids
-    aside = estimator.held_aside(ids[::2])
-    assert aside.doubt_gain.dtype == np.float32
-    expected = before.select(np.arange(0, len(ids), 2))
-    assert_same_bits(estimator.reported(aside), expected)
-    estimator.give_up(ids[::2])
-    estimator.take_back(aside)
-    assert_same_bits(estimator.estimate().landmarks, before)
 
 
 @pytest.mark.parametrize("variance", [0.0, -1e-18])

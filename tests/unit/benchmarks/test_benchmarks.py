@@ -21,7 +21,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import growth, images, parts, soak, submaps, sweeps
+from benchmarks.speed import growth, images, parts, ring, soak, sweeps
 from benchmarks.tables import Table
 
 
@@ -235,7 +235,7 @@ def test_a_soak_gives_time_and_memory_of_every_block() -> None:
 
 @pytest.mark.parametrize("frames", [100, 400, 1000, 10_000])
 def test_a_street_of_any_length_is_a_ring_that_the_robot_is_carried_back_into(frames: int) -> None:
-    course = submaps.Course(frames, 0.8 * frames * 0.25, carries=submaps.CARRIES)
+    course = ring.Course(frames, 0.8 * frames * 0.25, carries=ring.CARRIES)
     first_round = int(0.8 * frames)
     assert (np.diff(course.carried) > 0).all()
     assert frames - first_round < course.carried[0]

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
-from rings import SETTINGS, assert_same_increments, on_ring, pipeline_of, seen
+from rings import assert_same_increments, on_ring, pipeline_of, seen
 from simulated import RIG, assert_same_bits
 
 from fgslam.core.measurement_log import MeasurementLog
@@ -18,31 +17,21 @@ from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
-from fgslam.slam.submaps.making import make_submaps
-from fgslam.slam.submaps.memory import ActiveArea
 
 POSES = [on_ring(k) for k in range(6)]
 MOTION = ConstantVelocityMotion(ConstantVelocitySettings()).description()
 
 
-def new(folder: Path | None) -> tuple[SlamPipeline, RunRecorder]:
-    pipeline = pipeline_of(POSES, 0.0)
-    if folder is not None:
-        area = ActiveArea(1.2, folder, resumable=True)
-        pipeline.submaps = make_submaps(area, RIG, SETTINGS, pipeline, seed=0)
-    return pipeline, RunRecorder(MeasurementLog(RIG, MOTION))
+def new() -> tuple[SlamPipeline, RunRecorder]:
+    return pipeline_of(POSES, 0.0), RunRecorder(MeasurementLog(RIG, MOTION))
 
 
 def out_of_order(_: FeatureFrame) -> FeatureFrame:
     raise ZeroDivisionError
 
 
-@pytest.mark.parametrize("on_disk", [False, True])
-def test_what_a_closure_ended_is_in_no_book_when_the_next_frame_is_taken_back(
-    on_disk: bool, tmp_path: Path
-) -> None:
-    folder = tmp_path / "submaps" if on_disk else None
-    pipeline, recorder = new(folder)
+def test_what_a_closure_ended_is_in_no_book_when_the_next_frame_is_taken_back() -> None:
+    pipeline, recorder = new()
     *frames, last = list(seen(POSES))
     for frame in frames:
         report = pipeline.process(frame, frame.i, float(frame.i))
@@ -62,7 +51,7 @@ def test_what_a_closure_ended_is_in_no_book_when_the_next_frame_is_taken_back(
     assert ended not in saved.landmarks.ids
     assert len(saved) > 100
 
-    again, resumed = new(folder)
+    again, resumed = new()
     restore(state_of(pipeline, recorder), recorder.log, again, resumed)
     reports = [each.process(last, last.i, float(last.i)) for each in (pipeline, again)]
     assert ended in reports[0].increment.pruned_ids

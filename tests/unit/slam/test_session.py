@@ -6,7 +6,6 @@ import dataclasses
 import threading
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from fgslam.core.errors import (
     FgslamError,
     FrameError,
     OdometryError,
-    OutputError,
     SessionError,
 )
 from fgslam.core.estimates import EgoMotionStatus, Prediction
@@ -108,10 +106,9 @@ def straight(views: Views, estimator: str = "landmark_kalman") -> Session:
 
 @pytest.mark.parametrize("estimator", [LandmarkKalmanSettings(), Isam2Settings()])
 def test_the_world_begins_with_the_first_frame_that_shows_enough(
-    views: Views, estimator: EstimatorSettings, tmp_path: Path
+    views: Views, estimator: EstimatorSettings
 ) -> None:
     late, straight = session(views, estimator), session(views, estimator)
-    late.keep_log(tmp_path / "log")
     straight.numbering = (2, 1)
     for k, images in enumerate((None, views.images(views.blank))):
         assert not late.track(0.1 * k, images).status.measured
@@ -515,21 +512,10 @@ def test_a_negative_seed_is_refused() -> None:
         Session(RIG, seed=-1)
 
 
-def test_what_is_no_extractor_radius_or_folder_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_extractor_is_refused() -> None:
     given: Any = 5
     with pytest.raises(ConfigError, match="features: int cannot be called; give a function"):
         Session(RIG, features=given)
-    slam, file, number = Session(RIG, "landmark_kalman"), tmp_path / "file", "5"
-    file.touch()
-    for radius in (number, 0.0, float("nan")):
-        with pytest.raises(ConfigError, match="give a positive number of metres"):
-            slam.keep_near(radius)  # type: ignore[arg-type]
-    for keep in (slam.keep_log, lambda folder: slam.keep_near(50.0, folder)):
-        with pytest.raises(OutputError, match="it is not a folder; choose another name"):
-            keep(str(file))
-        with pytest.raises(OutputError, match="folder: it is a int; give its path"):
-            keep(given)
-    slam.keep_log(str(tmp_path / "log"))
 
 
 def test_what_is_no_rig_is_refused() -> None:
@@ -580,24 +566,3 @@ def test_features_of_another_form_are_refused_and_the_session_goes_on(
     broken = False
     push(slam, views, range(3, FRAMES))
     assert_same_result(slam, straight(views))
-
-
-def test_a_log_kept_in_a_folder_is_the_log(
-    views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fgslam.core.log_blocks.BLOCK", 2)
-    memory, disk = session(views), session(views)
-    disk.keep_log(tmp_path / "log")
-    for name, one in (("memory", memory), ("disk", disk)):
-        for k in range(FRAMES):
-            one.track(float(k), views.images(k), views.odometry(k) if k else None)
-        one.log.save(tmp_path / name)
-    assert (tmp_path / "memory").read_bytes() == (tmp_path / "disk").read_bytes()
-    assert len(list((tmp_path / "log").iterdir())) == 2
-    assert_same_bits(disk.result().trajectory, memory.result().trajectory)
-    assert_same_bits(
-        replay(disk.log, LandmarkKalmanSettings(), EgoMotionSettings()).estimate,
-        replay(memory.log, LandmarkKalmanSettings(), EgoMotionSettings()).estimate,
-    )
-    with pytest.raises(SessionError, match="before the first frame"):
-        disk.keep_log(tmp_path / "other")

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
-from fgslam.core import log_blocks
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Relocalisation, RelocalisationStatus
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
@@ -224,24 +222,6 @@ def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
         assert one.best_view_of(unseen, held) == 1
         assert one.last_seen(unseen) == 4
     assert again.way_since(30) == memory.way_since(30)
-
-
-def test_measurements_are_read_from_the_log_once_there_is_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(log_blocks, "BLOCK", 8)
-    memory, log, held = SightingMemory(59), MeasurementLog(RIG, {}), _map(MAP, np.zeros((60, 3)))
-    log.keep_in(tmp_path / "log")
-    memory.read_from(log)
-    rng = np.random.default_rng(4)
-    given = [sight(np.eye(4), cloud(12, rng), rng.permutation(60)[:12]) for _ in range(47)]
-    for k, seen in enumerate(given):
-        memory.add(frame(k, seen), np.eye(4))
-        log.append(frame(k, seen))
-    assert not memory._own
-    assert len(list((tmp_path / "log").iterdir())) == 4
-    for k in (0, 9, 46):
-        assert_same_bits(memory.view(k, MAP, held), given[k])
 
 
 @pytest.mark.parametrize("given", [-1, 8])

@@ -1,24 +1,19 @@
-"""10,000 frames along a course far larger than what is kept in memory: time, memory, answers.
+"""10,000 frames along a course far longer than what is seen at once: time, memory, answers.
 
 A street of points with an appearance, without images, closed to a ring; the whole front-end and the
-paper's filter run on it. Once with sub-maps on disk, once with one map; each in a process of its
-own. On a course where both fit, the trajectories' errors are compared over several seeds.
-
-At the end of the drive with sub-maps single frames from beside the way ask which sub-map they see,
-as a lost robot does, and as many of a street that was never driven; then the robot is carried off,
-several times, to where it was thousands of frames ago.
+paper's filter run on it, and fixed lag, each in a process of its own; and several seeds of a ring
+of 200 m. At the end of the drive the robot is carried off, several times, to where it was thousands
+of frames ago.
 """
 
 from __future__ import annotations
 
 import itertools
 import multiprocessing
-import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -37,7 +32,6 @@ from fgslam.worlds.driving.paths import planar_poses, straights_and_turns
 from fgslam.worlds.simulated.features import FeatureWorld
 
 FRAMES, BLOCK = 10_000, 1_000
-RADIUS_M = 20.0
 SEEDS = range(1, 5)
 ESTIMATORS = ("landmark_kalman", "fixed_lag")
 SETTINGS = FrontendSettings(
@@ -47,7 +41,6 @@ SETTINGS = FrontendSettings(
     self_calibration=False,
     watch_cameras=False,
 )
-LIMITS = {"submaps_ate_over_one_map": 1.05, "fixed_lag_submaps_ate_over_one_map": 1.05}
 _SIGMA_PX = 0.2
 _TURN_M = 40.0  # way of a bend of 90 degrees, on a ring that is long enough
 _APART = 500  # frames to the end of the drive from where the robot is carried, at least
@@ -57,8 +50,6 @@ _HEIGHTS_M = (-1.2, 1.2)
 _A_METRE = 9.0  # points
 _WHEELS = np.array([1e-6, 0.002, 1e-6, 0.01, 1e-6, 0.01])  # deviations a step, camera axes
 CARRIES, CARRIED_FRAMES = 5, 40
-ASKED = 100  # single frames of either street
-_BESIDE = np.array([0.0, 5.0, 0.0, 0.3, 0.0, 0.3])  # degrees, metres: deviations, camera axes
 RIGHT_M = 0.5  # off where the map has the place: what is farther is another place
 _IMAGES = (np.zeros((RIG.height, RIG.width), np.uint8),) * 3
 
@@ -160,18 +151,10 @@ class Driven:
 
 
 @one_blas_thread()
-def drive(
-    course: Course, radius_m: float | None, block: int = BLOCK, estimator: str = ESTIMATORS[0]
-) -> Driven:
-    """Drives a course, with sub-maps of a radius or with one map; the log goes to disk."""
+def drive(course: Course, block: int = BLOCK, estimator: str = ESTIMATORS[0]) -> Driven:
+    """Drives a course, and is carried off as often as it says."""
     out, poses = Driven(), course.poses()
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Session(RIG, estimator, frontend=SETTINGS) as session,
-    ):
-        session.keep_log(Path(folder) / "log")
-        if radius_m is not None:
-            session.keep_near(radius_m, Path(folder) / "submaps")
+    with Session(RIG, estimator, frontend=SETTINGS) as session:
         ahead = zip(course.features(poses), course.wheels(poses), strict=True)
         for found, wheels in itertools.islice(ahead, course.frames):
             start = time.process_time()
@@ -182,64 +165,15 @@ def drive(
                 out.closed.append(found.i)
             if (found.i + 1) % block == 0:
                 out.memory.book()
-                if session.pipeline.submaps is not None:
-                    session.pipeline.submaps.tidy()
         result = session.result()
         out.whole = len(result.estimate.landmarks)
         tTe = align(result.trajectory.poses, poses[: course.frames])
         assert tTe is not None
         off = position_errors(moved(tTe, result.trajectory.poses), poses[: course.frames])
         out.ate_m = float(np.sqrt(np.mean(off**2)))
-        submaps = session.pipeline.submaps
-        if submaps is not None:
-            out.about = {
-                "came_near": float(submaps.came_near),
-                "recognised": float(submaps.recognised),
-            }
-            mapped = result.trajectory.poses
-            if course.carries:
-                out.about |= asked(course, session, mapped) | carried(
-                    course, session, mapped, ahead
-                )
+        if course.carries:
+            out.about = carried(course, session, result.trajectory.poses, ahead)
     return out
-
-
-def asked(course: Course, session: Session, mapped: FloatArray) -> dict[str, float]:
-    """Recall and precision of single frames beside the way, and of a street never driven.
-
-    Args:
-        course: that was driven.
-        session: after it.
-        mapped: (n, 4, 4) its poses as estimated.
-    """
-    submaps, rng = session.pipeline.submaps, np.random.default_rng([course.seed, 3])
-    assert submaps is not None
-    first, last = course.carried[[0, -1]]
-    frames = rng.integers(first, last, ASKED)
-    beside = _BESIDE * np.r_[np.full(3, np.pi / 180.0), np.ones(3)]
-    true = course.at(frames)
-    seen = np.array([wTc @ g.se3_exp(beside * rng.standard_normal(6)) for wTc in true])
-    meant = mapped[frames] @ g.inverse(true) @ seen
-    off, cpu = [], []
-    other = Course(course.frames, course.round_m, course.seed + 100)
-    for of, there in ((course, meant), (other, None)):
-        for k, found in enumerate(of.features(seen)):
-            features = session.pipeline.stereo.match(None, found.features)
-            start = time.process_time()
-            number, position = submaps.recognise(features, lost=True)
-            cpu.append(time.process_time() - start)
-            if number >= 0:
-                apart = np.inf if there is None else np.linalg.norm(position - there[k, :3, 3])
-                off.append(float(apart))
-    right = sum(one <= RIGHT_M for one in off)
-    return {
-        "asked": float(ASKED),
-        "recall": right / ASKED,
-        "precision": right / len(off) if off else np.nan,
-        "asked_off_m": float(np.median(off)) if off else np.nan,
-        "asked_ms": 1e3 * float(np.median(cpu)),
-        "on_disk": float(len(submaps)),
-    }
 
 
 def carried(
@@ -278,42 +212,27 @@ def numbers(frames: int = FRAMES) -> dict[str, float]:
 
 
 def of_estimator(estimator: str, frames: int = FRAMES) -> dict[str, float]:
-    """Of the long course, with sub-maps and with one map, and of the seeds."""
+    """Of the long course, and of the seeds of the short one."""
     long = Course(frames, 0.8 * frames * 0.25, carries=CARRIES)
     short = [Course(450, 200.0, seed, 0.5) for seed in SEEDS]
     block = max(frames * BLOCK // FRAMES, 1)
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as processes:
-        work = {
-            (k, title): processes.submit(drive, course, radius, block, estimator)
-            for k, course in enumerate((long, *short))
-            for title, radius in (("submaps", RADIUS_M), ("one_map", None))
-        }
-        found = {name: future.result() for name, future in work.items()}
-    out: dict[str, float] = {}
-    for title in ("submaps", "one_map"):
-        out |= _trace(title, found[0, title], block)
-    ratios = []
-    for k, course in enumerate(short, 1):
-        for title in ("submaps", "one_map"):
-            out[f"{title}_seed_{course.seed}_ate_m"] = found[k, title].ate_m
-        ratios.append(found[k, "submaps"].ate_m / found[k, "one_map"].ate_m)
-    every = [
-        sum(found[k, t].ate_m for k in range(1, 1 + len(short))) for t in ("submaps", "one_map")
-    ]
-    return out | {
-        "submaps_ate_over_one_map": every[0] / every[1],
-        "submaps_ate_over_one_map_worst": max(ratios),
+        work = [processes.submit(drive, course, block, estimator) for course in (long, *short)]
+        first, *others = [future.result() for future in work]
+    of_seeds = zip(SEEDS, others, strict=True)
+    return _trace(first, block) | {
+        f"ring_seed_{seed}_ate_m": driven.ate_m for seed, driven in of_seeds
     }
 
 
-def _trace(title: str, driven: Driven, block: int) -> dict[str, float]:
+def _trace(driven: Driven, block: int) -> dict[str, float]:
     """Blocks of a long drive: median time, most landmarks in memory, memory of the process."""
-    out = {f"{title}_ate_m": driven.ate_m, f"{title}_landmarks": float(driven.whole)}
-    out |= {f"{title}_{name}": value for name, value in driven.about.items()}
-    out |= of_blocks(title, np.array(driven.cpu_s), driven.memory.process_mb, block)
+    out = {"ring_ate_m": driven.ate_m, "ring_landmarks": float(driven.whole)}
+    out |= {f"ring_{name}": value for name, value in driven.about.items()}
+    out |= of_blocks("ring", np.array(driven.cpu_s), driven.memory.process_mb, block)
     for stop in range(block, len(driven.landmarks) + 1, block):
         most = max(driven.landmarks[stop - block : stop])
-        out[f"{title}_{stop}_landmarks_in_memory"] = float(most)
+        out[f"ring_{stop}_landmarks_in_memory"] = float(most)
     for k, frame in enumerate(driven.closed):
-        out[f"{title}_closed_{k}"] = float(frame)
+        out[f"ring_closed_{k}"] = float(frame)
     return out
