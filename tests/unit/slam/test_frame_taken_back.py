@@ -46,7 +46,7 @@ def test_what_a_closure_ended_is_in_no_book_when_the_next_frame_is_taken_back() 
     assert pipeline.rewound
     pipeline.describe = None
 
-    saved = saved_map(pipeline, RIG, pipeline.estimate(), {})
+    saved = saved_map(pipeline, RIG, pipeline.estimate(), {}, evidence=np.empty(0, np.int64))
     np.testing.assert_array_equal(saved.landmarks.ids, pipeline.tracker.database.ids)
     assert ended not in saved.landmarks.ids
     assert len(saved) > 100
