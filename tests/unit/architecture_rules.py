@@ -459,7 +459,6 @@ PRIVATE_IN_TESTS = frozenset(
         "tests/unit/datasets/test_stereo_video.py",
         "tests/unit/datasets/test_synthetic_odometry.py",
         "tests/unit/frontend/homing/test_homing_vector.py",
-        "tests/unit/frontend/places/test_returns.py",
         "tests/unit/frontend/test_lasting_database.py",
         "tests/unit/homing/test_homing_controller.py",
         "tests/unit/homing/test_path_following.py",
