@@ -212,7 +212,7 @@ def _map_of(pipeline: SlamPipeline, sequence: Sequence) -> SavedMap:
     return SavedMap(
         sequence.rig, estimate.landmarks, database.appearances(), database.hits.copy(),
         database.misses.copy(), database.permanent.copy(), database.colour.copy(),
-        estimate.trajectory, {}, {}, np.empty(0, np.int64),
+        estimate.trajectory, {}, np.empty(0, np.int64),
     )  # fmt: skip
 
 

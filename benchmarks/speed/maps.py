@@ -91,7 +91,6 @@ def saved_map(landmarks: int) -> SavedMap:
         colour=np.zeros(landmarks, np.uint8),
         trajectory=Trajectory(np.zeros(1), np.eye(4)[None]),
         about={},
-        session={},
         evidence=np.empty(0, np.int64),
     )
 

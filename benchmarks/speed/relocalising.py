@@ -180,7 +180,6 @@ def saved(known: tuple[LandmarkMap, LandmarkAppearances], rig: CameraRig) -> Sav
         colour=np.zeros(n, np.uint8),
         trajectory=Trajectory(np.zeros(1), np.eye(4)[None]),
         about={},
-        session={},
         evidence=np.empty(0, np.int64),
     )
 

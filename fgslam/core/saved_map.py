@@ -28,12 +28,11 @@ from fgslam.core.sensors import CameraRig
 
 FILE = ArrayFile(
     name="fgslam map",
-    versions=(2, 3),  # 3 has patches
+    versions=(4,),
     error=MapError,
     give="give a file that fgslam run --map-out wrote",
     again="make the map again",
 )
-_SESSION = "session/"
 _EVIDENCE = "evidence_frame"
 _PATCH, _PATCH_DISTANCE = "landmark_patch", "landmark_patch_distance"
 _UPPER = np.triu_indices(3)
@@ -67,7 +66,7 @@ _ITEMS: dict[str, Items] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SavedMap:
-    """A map with all that a later run needs to localise in it or to continue it.
+    """A map with all that a later run needs to localise in it or to extend it.
 
     Attributes:
         rig: the cameras that saw it.
@@ -79,7 +78,6 @@ class SavedMap:
         colour: (n,) grey value.
         trajectory: the drive that made the map.
         about: where it comes from: names, versions, the recording's identity (plain JSON values).
-        session: state of the run that made it, for continuing it to the bit; may be empty.
         evidence: (f,) the frames whose measurements are in it (``Frame.digest``), ascending.
         patches: the landmarks' own; None where they were not carried.
     """
@@ -93,7 +91,6 @@ class SavedMap:
     colour: ByteArray
     trajectory: Trajectory
     about: dict[str, Any]
-    session: StateArrays
     evidence: IntArray
     patches: LandmarkPatches | None = None
 
@@ -115,7 +112,6 @@ def save_map(saved: SavedMap, path: Path) -> int:
     header = _header(saved, str(path))
     _require_consistent(header, arrays, str(path))
     arrays, header["triangles"] = _without_mirrors(arrays)
-    arrays, header["same_as"] = _without_repeats(arrays)
     header["sha256"] = digest(header, arrays)
     members = FILE.header(**header) | arrays
     with replacing(path) as partial, partial.open("wb") as file:
@@ -138,7 +134,7 @@ def load_map(path: Path) -> SavedMap:
             f"{path}: damaged: its contents do not have the checksum that they were saved with; "
             "restore the file or make the map again"
         )
-    arrays = _with_mirrors(_with_repeats(arrays, header, str(path)), header, str(path))
+    arrays = _with_mirrors(arrays, header, str(path))
     _require_consistent(header, arrays, str(path))
     return _from_arrays(header, arrays, str(path))
 
@@ -189,7 +185,6 @@ def _to_arrays(saved: SavedMap) -> StateArrays:
         "pose": saved.trajectory.poses,
         _EVIDENCE: saved.evidence,
         **_patch_arrays(saved.patches),
-        **{f"{_SESSION}{name}": array for name, array in sorted(saved.session.items())},
     }
 
 
@@ -217,11 +212,6 @@ def _from_arrays(header: dict[str, Any], arrays: StateArrays, where: str) -> Sav
         colour=arrays["landmark_colour"],
         trajectory=Trajectory(arrays["pose_time"], arrays["pose"]),
         about=header["about"],
-        session={
-            name.removeprefix(_SESSION): array
-            for name, array in arrays.items()
-            if name.startswith(_SESSION)
-        },
         evidence=arrays[_EVIDENCE],
         patches=LandmarkPatches(arrays[_PATCH], arrays[_PATCH_DISTANCE])
         if _PATCH in arrays
@@ -254,33 +244,6 @@ def _with_mirrors(arrays: StateArrays, header: dict[str, Any], where: str) -> St
     return out
 
 
-def _without_repeats(arrays: StateArrays) -> tuple[StateArrays, dict[str, str]]:
-    """Arrays without those whose content equals another's, and the names that they equal.
-
-    What the map holds the session often holds, too, and a smoother's inputs are the log.
-    """
-    kept: StateArrays = {}
-    same_as: dict[str, str] = {}
-    first: dict[bytes, str] = {}
-    for name, array in arrays.items():
-        digest = _digest_of("", array)
-        if digest in first:
-            same_as[name] = first[digest]
-        else:
-            first[digest] = name
-            kept[name] = array
-    return kept, same_as
-
-
-def _with_repeats(arrays: StateArrays, header: dict[str, Any], where: str) -> StateArrays:
-    out = dict(arrays)
-    for name, source in header["same_as"].items():
-        if source not in arrays:
-            raise FILE.damaged(source, where)
-        out[name] = arrays[source].copy()  # owners write to what they restore
-    return out
-
-
 # --------------------------------------------------------------------------------------------
 # Header and checks
 
@@ -289,7 +252,7 @@ def _header(saved: SavedMap, where: str) -> dict[str, Any]:
     optional = {"patches": len(saved)} if _patch_arrays(saved.patches) else {}
     header = {
         "format": FILE.name,
-        "version": 3 if optional else 2,
+        "version": FILE.versions[-1],
         "counts": {
             "landmarks": len(saved),
             "views": len(saved.appearances),
@@ -311,7 +274,7 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     """The header's values; removes it from the arrays."""
     header = FILE.read_header(arrays, where)
     del arrays["header"]
-    groups = ("counts", "rig", "about", "same_as")
+    groups = ("counts", "rig", "about")
     sound = all(isinstance(header.get(name), dict) for name in groups)
     if not sound or not isinstance(header.get("triangles"), list):
         raise MapError(f"{where}: the map's header is damaged; make the map again")
@@ -365,9 +328,8 @@ def _ascending(values: np.ndarray[Any, Any]) -> bool:
 
 
 def _has_patches(header: dict[str, Any], arrays: StateArrays) -> bool:
-    """Whether any of the three places that tell of patches does; then all of them must."""
-    counted = header["version"] == 3 or "patches" in header["counts"]
-    return counted or not _ITEMS["patches"].keys().isdisjoint(arrays)
+    """Whether the header counts patches or an array of them is there; then both must be."""
+    return "patches" in header["counts"] or not _ITEMS["patches"].keys().isdisjoint(arrays)
 
 
 def _rig_values(rig: CameraRig) -> dict[str, Any]:

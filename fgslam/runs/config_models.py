@@ -161,7 +161,6 @@ def _map_problem(config: ExperimentConfig) -> str:
     datasets = (config.dataset, *(() if first is None else (first.dataset,)))
     measurements = any(isinstance(one, MeasurementDatasetSettings) for one in datasets)
     as_default = (given.start, given.extend) == ("relocalise", True)
-    goes_on = given.start == "continue"
     problems = {
         "map: measurements have no appearance to keep; give recordings of images": (
             measurements and given != MapSettings()
@@ -179,9 +178,6 @@ def _map_problem(config: ExperimentConfig) -> str:
             given.load is not None
             and given.save is not None
             and Path(given.load).resolve() == Path(given.save).resolve()
-        ),
-        "map.start continue goes on with the run that was saved; it takes map.load alone": (
-            goes_on and (first is not None or not given.extend)
         ),
     }
     return next((words for words, wrong in problems.items() if wrong), "")

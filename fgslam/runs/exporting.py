@@ -234,8 +234,7 @@ def describe_map(saved: SavedMap, path: Path) -> list[str]:
         lines.append(f"bounds      {', '.join(spans)} m (x right, y down, z forward)")
     lines += [_about_drive(drive) for drive in drives_of(saved)]
     lines.append(f"trajectory  {len(saved.trajectory)} poses")
-    goes_on = "kept: map.start continue can go on" if saved.session else "not kept"
-    return [*lines, f"session     {goes_on}"]
+    return lines
 
 
 def _about_drive(drive: dict[str, Any]) -> str:

@@ -207,10 +207,10 @@ class Slam(Session):
 def _beginning(config: ExperimentConfig) -> MapStart | None:
     """The map that an experiment loads; None where it begins with an empty one."""
     settings = config.map
-    if settings.made_from is not None or (settings.given and settings.start == "continue"):
+    if settings.made_from is not None:
         raise ConfigError(
-            f"{config.name}: its map is made by a drive of its own, or another run goes on; use "
-            "fgslam.run, or Slam(start_map=...) with a map that is there"
+            f"{config.name}: its map is made by a drive of its own; use fgslam.run, or "
+            "Slam(start_map=...) with a map that is there"
         )
     if settings.load is None:
         return None

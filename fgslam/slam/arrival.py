@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.backend.protocol import Estimator, MapUser
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
 from fgslam.core.features import LandmarkAppearances
@@ -122,7 +122,6 @@ def saved_map(
     estimate: Estimate,
     about: dict[str, Any],
     evidence: IntArray,
-    session: StateArrays | None = None,
 ) -> SavedMap:
     """The estimator's geometry joined with the database's appearances and counts.
 
@@ -132,7 +131,6 @@ def saved_map(
         estimate: the estimator's.
         about: where the map comes from; plain JSON values.
         evidence: the frames that are in it (:func:`evidence_of`).
-        session: what its run needs to go on; None for nothing.
     """
     database, places = pipeline.tracker.database, pipeline.places
     landmarks = estimate.landmarks
@@ -150,7 +148,6 @@ def saved_map(
         patches=patches if patches.kept else None,
         trajectory=estimate.trajectory,
         about=about,
-        session=session or {},
         evidence=evidence,
     )
 

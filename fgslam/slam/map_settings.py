@@ -51,12 +51,11 @@ class MapSettings:
     made_from: FirstDriveSettings | None = Field(
         default=None, description="drive this first, into RUN/first, and go on with its map"
     )
-    start: Literal["relocalise", "origin", "last", "continue"] = Field(
+    start: Literal["relocalise", "origin", "last"] = Field(
         default="relocalise",
         description="first pose: found, the map's first or last, or the same run goes on",
     )
     extend: bool = Field(default=True, description="false: only localise, the map stays as it is")
-    session: bool = Field(default=True, description="save also what `start: continue` needs")
     begin: MapStartSettings = MapStartSettings()
 
     @property

@@ -24,7 +24,7 @@ from running import (
     write_config,
 )
 
-from fgslam.core.errors import DatasetError, MapError, OutputError
+from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.features import StereoFeatures
 from fgslam.core.recordings import Sequence
 from fgslam.core.trajectories import Trajectory
@@ -213,20 +213,6 @@ def test_the_world_begins_where_something_is_seen(own_recording: Path, tmp_path:
     assert "the first 3 frames could not be located: left out" in metrics["notes"]
     assert metrics["estimators"][KIND]["ate_rmse_m"] < 0.01
     assert [increment.index for increment in straight.result.outputs.recorder.log] == [3, 4, 5]
-    shorter = {"dataset": dataset | {"stop": 5}, "map": {"save": str(tmp_path / "begun.fgmap")}}
-    run_values(values | shorter, tmp_path / "begun")
-    on = values | {"map": {"load": str(tmp_path / "begun.fgmap"), "start": "continue"}}
-    for start in (0, 5):
-        ended = run_values(on | {"dataset": dataset | {"start": start}}, tmp_path / f"on{start}")
-        assert bytes_of(ended.folder) == bytes_of(straight.folder)
-        for name in ("located", "frames_in_recording", "notes"):
-            assert metrics_of(ended.folder)[name] == metrics[name]
-    with pytest.raises(MapError, match=r"set dataset\.start to 5, or as it was, to 0"):
-        run_values(on | {"dataset": dataset | {"start": 1}}, tmp_path / "no")
-    run_values(values, tmp_path / "run", stopped=stop_after(2))  # nothing is seen as yet
-    run_values(values, tmp_path / "run", "resume", stopped=stop_after(3))
-    run_values(values, tmp_path / "run", "resume")
-    assert bytes_of(tmp_path / "run") == bytes_of(straight.folder)
 
 
 def test_a_bad_frame_keeps_its_own_number(own_recording: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Maps that outlive their run: saved, gone on with to the bit, localised in, exported, refused."""
+"""Maps that outlive their run: saved, localised in, exported, refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import yaml
 from recordings import experiment, write_recording
 from running import (
     KIND,
-    SAME_BYTES,
     bytes_of,
     main,
     metrics_of,
@@ -78,74 +77,6 @@ def unaligned_errors(run: Path, kind: str = KIND) -> FloatArray:
     rows = np.searchsorted(truth.timestamps, found.timestamps - 1e-6)
     apart = truth.poses[rows, :3, 3] - found.poses[:, :3, 3]
     return np.asarray(np.linalg.norm(apart, axis=1))
-
-
-# --------------------------------------------------------------------------------------------
-# Going on, to the bit
-
-
-@pytest.mark.parametrize("kind", EVERY)
-@pytest.mark.parametrize("start", [pytest.param(0, marks=pytest.mark.slow), CUT])
-def test_a_run_that_goes_on_equals_the_uninterrupted_one(
-    kind: str, start: int, recording: Path, tmp_path: Path
-) -> None:
-    """Trajectories, covariances, log, map and the whole session: to the byte."""
-    maps = {name: str(tmp_path / f"{name}.fgmap") for name in ("whole", "begun", "ended")}
-    whole = run_values(mapped(recording, kind=kind, save=maps["whole"]), tmp_path / "whole")
-    run_values(mapped(recording, stop=CUT, kind=kind, save=maps["begun"]), tmp_path / "begun")
-    more = {"load": maps["begun"], "save": maps["ended"], "start": "continue"}
-    ended = run_values(mapped(recording, first=start, kind=kind, **more), tmp_path / "ended")
-    names = tuple(name.replace(KIND, kind) for name in SAME_BYTES)
-    assert bytes_of(ended.folder, names) == bytes_of(whole.folder, names)
-    assert Path(maps["ended"]).read_bytes() == Path(maps["whole"]).read_bytes()
-    assert metrics_of(ended.folder)["frames"] == 12
-
-
-@pytest.mark.slow
-def test_going_on_may_be_interrupted_too(
-    recording: Path, shorter: Path, map_file: Path, tmp_path: Path
-) -> None:
-    saved = tmp_path / "b.fgmap"
-    values = mapped(recording, load=str(shorter), save=str(saved), start="continue")
-    partial = run_values(values, tmp_path / "run", stopped=stop_after(2))
-    assert partial.result.status == "interrupted"
-    assert not saved.exists()
-    assert run_values(values, partial.folder, "resume").result.status == "finished"
-    assert saved.read_bytes() == map_file.read_bytes()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", [KIND, "isam2"])
-def test_going_on_with_a_run_that_began_in_a_map(
-    kind: str, recording: Path, map_file: Path, tmp_path: Path
-) -> None:
-    """Its first pose and its landmarks are that map's, also for those who replay it."""
-    maps = {name: str(tmp_path / f"{name}.fgmap") for name in ("whole", "begun", "ended")}
-    entering = {"load": str(map_file), "start": "last", "begin": {"sigma_m": 0.5}}
-    run_values(mapped(recording, kind=kind, save=maps["whole"], **entering), tmp_path / "whole")
-    part = mapped(recording, stop=CUT, kind=kind, save=maps["begun"], **entering)
-    run_values(part, tmp_path / "begun")
-    more = {"load": maps["begun"], "save": maps["ended"], "start": "continue"}
-    values = mapped(recording, kind=kind, **more)
-    values["compare"] = [{"kind": kind, "label": "again"}]
-    folder = run_values(values, tmp_path / "ended").folder
-    assert Path(maps["ended"]).read_bytes() == Path(maps["whole"]).read_bytes()
-    for name in ("final.tum", "covariance.csv"):
-        assert (folder / kind / name).read_bytes() == (folder / "again" / name).read_bytes()
-
-
-@pytest.mark.slow
-def test_without_visual_or_wheel_odometry_it_goes_on_as_exactly(
-    recording: Path, tmp_path: Path
-) -> None:
-    """Constant velocity has a memory of its own."""
-    odometry = {"odometry": {"kind": "constant_velocity"}}
-    maps = {name: str(tmp_path / f"{name}.fgmap") for name in ("whole", "begun", "ended")}
-    run_values(mapped(recording, save=maps["whole"]) | odometry, tmp_path / "whole")
-    run_values(mapped(recording, stop=CUT, save=maps["begun"]) | odometry, tmp_path / "begun")
-    more = {"load": maps["begun"], "save": maps["ended"], "start": "continue"}
-    run_values(mapped(recording, **more) | odometry, tmp_path / "ended")
-    assert Path(maps["ended"]).read_bytes() == Path(maps["whole"]).read_bytes()
 
 
 @pytest.mark.slow
@@ -304,10 +235,6 @@ def test_maps_that_cannot_be_used(
     for values, reported in (
         (mapped(recording, load=str(tmp_path / "none")), "no such file"),
         (mapped(other, load=given), "another rig .vertical_baseline 0.1"),
-        (mapped(recording, load=given, start="continue"), "nothing is left to go on with"),
-        (mapped(recording, 5, load=str(shorter), start="continue"), "set dataset.start to 7"),
-        (mapped(recording, load=given, start="continue", kind="ekf"), "another estimator"),
-        (mapped(recording, load=given, start="continue") | {"seed": 4}, "another seed"),
     ):
         refused(values, run, reported, MapError)
     for values, reported in (
@@ -321,30 +248,6 @@ def test_maps_that_cannot_be_used(
     refused(small, run, r"the saved map: .* exceed max_landmarks 100", EstimatorError)
     refused(mapped(recording, save=str(tmp_path / "no" / "m")), run, "does not exist", OutputError)
     refused(mapped(recording, save=str(tmp_path)), run, "is a folder", MapError)
-
-
-@pytest.mark.slow
-def test_a_changed_recording_is_no_continuation(own_recording: Path, tmp_path: Path) -> None:
-    saved = str(tmp_path / "a.fgmap")
-    run_values(mapped(own_recording, stop=CUT, save=saved), tmp_path / "a")
-    stamps = own_recording / "times.txt"
-    stamps.write_text(stamps.read_text().replace("100.250000", "100.260000"))
-    values = mapped(own_recording, load=saved, start="continue")
-    refused(values, tmp_path / "run", "was made of another recording", MapError)
-
-
-@pytest.mark.slow
-def test_a_map_saved_without_its_session_cannot_be_continued(
-    recording: Path, tmp_path: Path
-) -> None:
-    with_it, without = tmp_path / "with.fgmap", tmp_path / "without.fgmap"
-    run_values(mapped(recording, stop=CUT, save=str(with_it)), tmp_path / "a")
-    run_values(mapped(recording, stop=CUT, save=str(without), session=False), tmp_path / "b")
-    assert without.stat().st_size < 0.6 * with_it.stat().st_size
-    for name, array in landmarks_of(without).items():
-        np.testing.assert_array_equal(array, landmarks_of(with_it)[name])
-    values = mapped(recording, load=str(without), start="continue")
-    refused(values, tmp_path / "run", "saved without its session", MapError)
 
 
 def test_nothing_is_located_in_the_map_of_another_place(map_file: Path, tmp_path: Path) -> None:
@@ -372,7 +275,6 @@ def test_saved_and_used_from_the_command_line(
     assert main(monkeypatch, "export", saved) == 0
     reported = capsys.readouterr().out
     assert "12 frames of" in reported
-    assert "map.start continue can go on" in reported
 
 
 def test_exported_as_of_a_run(

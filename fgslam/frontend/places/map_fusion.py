@@ -33,8 +33,7 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
     ``b`` without a frame that a lacks leaves ``a`` as it is.
 
     Permanent is what either holds so, and all views are kept. Others of b get identities after a's
-    last. The trajectory is both drives, where b's came later, else a's alone; a session is not
-    kept, since no run had this map.
+    last. The trajectory is both drives, where b's came later, else a's alone.
     """
     if adds_nothing(b, a):
         return a
@@ -56,7 +55,6 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
         colour=np.concatenate([a.colour, b.colour[rest]]),
         trajectory=_trajectory(a.trajectory, b.trajectory, alignment.aTb),
         about={"drives": [*a.about.get("drives", ()), *b.about.get("drives", ())]},
-        session={},
         evidence=np.union1d(a.evidence, b.evidence),
         patches=_patches(a, b, alignment.pairs, rest),
     )

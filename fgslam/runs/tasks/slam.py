@@ -134,7 +134,7 @@ def _loop(
         for found in stream:
             wait_ms = 1e3 * (time.perf_counter() - waiting)
             body = body_motion(sequence, found.i, outputs.pipeline.motion)
-            # A run that goes on with another one's session keeps its frames and its world.
+            # In a map the world is the map's.
             if outputs.given is None and outputs.session.begins_anew(found, body):
                 return _Founding(found.i)
             report = _advance(outputs, found, body, wait_ms)

@@ -45,7 +45,7 @@ class Entry:
     """How a run entered a map: kept in its config.yaml, for those who resume or replay it.
 
     Attributes:
-        file: the map's; a run that goes on with this one knows its own map's only.
+        file: the map's.
         identity: of the map's file.
         frames_before: selected frames left out because they could not be located.
         relocalised: the first pose was found without a prior.
@@ -166,7 +166,7 @@ def arrival_of(run: Path) -> Arrival | None:
 
 
 def entry_of(run: Path) -> Entry | None:
-    """How the run in a folder, or the one that it goes on with, entered its map; None without.
+    """How the run in a folder entered its map; None without.
 
     Raises:
         ConfigError: config.yaml says it in words of another fgslam.

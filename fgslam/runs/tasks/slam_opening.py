@@ -36,7 +36,7 @@ class OpenedRun:
     """A run whose recording is open.
 
     Attributes:
-        config: as given; ``opened`` is what its recording was opened with.
+        config: as given.
         given: the map to go on with; None without one, or while it is still to be made.
         entry: how the run enters it; None where it does not, or that is not yet known.
         resumed: the folder holds a state to go on from.
@@ -44,7 +44,6 @@ class OpenedRun:
     """
 
     config: ExperimentConfig
-    opened: ExperimentConfig
     folder: Path
     sequence: Sequence
     given: GivenMap | None
@@ -58,16 +57,9 @@ class OpenedRun:
         out = provenance_of(self.sequence)
         if self.entry is not None:
             out["map"] = self.entry.as_values()
-        elif self.given is not None and (entered := state.entered_by(self.given)):
-            out["map"] = entered
         if self.frames_before:
             out[_FRAMES_BEFORE] = self.frames_before
         return out
-
-    @property
-    def goes_on(self) -> bool:
-        """Whether the run is the continuation of the one that made its map."""
-        return self.given is not None and self.config.map.start == "continue"
 
 
 def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
@@ -79,12 +71,9 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
     folder, progress = opening.folder, opening.progress
     state.require_savable(config.map, folder)
     given = None if config.map.load is None else map_entry.open_map(Path(config.map.load))
-    opened = config
-    if given is not None and config.map.start == "continue":
-        opened = state.window(config, given)
-    sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
+    sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)
-    if config.map.given and config.map.start != "continue":
+    if config.map.given:
         estimator = make_estimator(sequence.rig, config.estimator, config.frontend.ego_motion)
         user = require_map_user(estimator, config.map.extend)
         if given is not None:  # one that is too large is refused now, not in a folder begun
@@ -92,7 +81,7 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
             user.begin_in(landmarks, given.saved.hits, fixed=not config.map.extend)
     resumed = opening.resumed and state.has_checkpoint(folder)
     before = _frames_before(folder) if resumed else 0
-    run = OpenedRun(config, opened, folder, sequence, given, None, resumed, before)
+    run = OpenedRun(config, folder, sequence, given, None, resumed, before)
     return dataclasses.replace(run, entry=_entry(run, given))
 
 
@@ -107,15 +96,12 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         made = map_entry.open_map(run.folder / map_entry.FIRST_FOLDER / map_entry.MAP_FILE)
         run = dataclasses.replace(run, given=made, entry=_entry(run, made))
         write_config(run.folder, config, run.provenance)
-    given, entry, sequence, opened = run.given, run.entry, run.sequence, run.opened
+    given, entry, sequence = run.given, run.entry, run.sequence
     before = run.frames_before if entry is None else entry.frames_before
     if before:
-        opened = _later(opened, before)
-        sequence = open_sequence(opened, lambda done, total: progress("rendering", done, total))
-    arrival = None
-    left_out = run.frames_before
-    if given is not None and run.goes_on:
-        left_out = state.left_out_before(given)
+        config = _later(config, before)
+        sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
+    arrival, left_out = None, run.frames_before
     notes: tuple[str, ...] = (left_out_note(left_out),) if left_out else ()
     if entry is not None and given is not None:
         arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
@@ -128,12 +114,10 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         beginning=arrival,
     )
     session.recorder.left_out = left_out
-    first_frame = opened.dataset.start
-    outputs = RunOutputs(run.folder, config, sequence, session, first_frame, notes, given)
+    first = config.dataset.start
+    outputs = RunOutputs(run.folder, run.config, sequence, session, first, notes, given)
     if run.resumed:
         state.load_checkpoint(run.folder, session.pipeline, session.recorder)
-    elif given is not None and run.goes_on:
-        state.go_on(given, session.pipeline, session.recorder)
     return outputs
 
 
@@ -155,9 +139,6 @@ def begin_later(run: OpenedRun, frames: int) -> OpenedRun:
 def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:
     """How the run enters the map; on resuming, how it did."""
     if given is None:
-        return None
-    if run.goes_on:
-        state.require_continuable(given, run.sequence)
         return None
     known = map_entry.entry_of(run.folder) if run.resumed else None
     if known is not None:

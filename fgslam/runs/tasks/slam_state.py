@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from fgslam.backend.protocol import Estimator, Resumable
 from fgslam.core import __version__
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
-from fgslam.core.errors import ConfigError, MapError, MeasurementLogError, OutputError
+from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import Estimate
 from fgslam.core.files import remove_file, require_writable
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.recordings import Sequence
-from fgslam.core.saved_map import SavedMap, require_rig, save_map
-from fgslam.runs.config import ExperimentConfig, make_config
+from fgslam.core.saved_map import SavedMap, save_map
+from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.folder import LOG_FILE, STATE_FILE
-from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, entry_of
+from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.arrival import evidence_of, saved_map
 from fgslam.slam.map_settings import MapSettings
@@ -134,12 +130,6 @@ def remove_checkpoint(folder: Path) -> None:
     remove_file(folder / STATE_FILE)
 
 
-_LOG = "log/"
-_TIMES = "recorder/stage_ms"
-_LEFT_OUT = "frames_left_out"
-_SAME_SETTINGS = ("seed", "odometry", "frontend", "estimator")
-
-
 def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | None:
     """The drive that makes the map of a run in ``folder``; None where none is asked for."""
     first = config.map.made_from
@@ -176,122 +166,6 @@ def require_savable(settings: MapSettings, run: Path) -> None:
 
 
 # --------------------------------------------------------------------------------------------
-# Going on where the run of a map stopped
-
-
-def window(config: ExperimentConfig, given: GivenMap) -> ExperimentConfig:
-    """The configuration with the frames that the map's run had, too: it goes on after them.
-
-    Raises:
-        MapError: the map keeps no session, or one of other settings.
-    """
-    saved, where = given.saved, str(given.path)
-    drive = _last_drive(saved)
-    if not saved.session or "settings" not in drive:
-        raise MapError(
-            f"{where}: was saved without its session, so no run can go on with it; save with "
-            "map.session true, or use map.start last"
-        )
-    now, then = config.as_values(), _settings_of(drive, where)
-    for name in _SAME_SETTINGS:
-        if now[name] != then[name]:
-            raise MapError(
-                f"{where}: its run had another {name}; map.start continue needs the same one, "
-                "map.start last does not"
-            )
-    start, stride = then["dataset"]["start"], then["dataset"]["stride"]
-    after = start + stride * drive["frames"]
-    asked = start - stride * _frames_before(drive)
-    same = {name: value for name, value in then["dataset"].items() if name not in ("start", "stop")}
-    if any(now["dataset"].get(name) != value for name, value in same.items()):
-        raise MapError(
-            f"{where}: its run had another dataset; map.start continue needs the same one, "
-            "map.start last does not"
-        )
-    if config.dataset.start not in (asked, start, after):
-        raise MapError(
-            f"{where}: its run stopped before frame {after}; set dataset.start to {after}, or as "
-            f"it was, to {asked}"
-        )
-    dataset = dataclasses.replace(config.dataset, start=start)
-    return config.model_copy(update={"dataset": dataset})
-
-
-def require_continuable(given: GivenMap, sequence: Sequence) -> None:
-    """Refuses a session of another recording, of another fgslam, or with nothing left to do.
-
-    Raises:
-        MapError: which it is.
-    """
-    saved, where, drive = given.saved, str(given.path), _last_drive(given.saved)
-    require_rig(saved, sequence.rig, where)
-    done = drive["frames"]
-    same = drive["recording"]["identity"] == sequence.identity
-    stamps = saved.session.get(f"{_LOG}timestamp", np.empty(0))
-    if not same or not np.array_equal(sequence.timestamps[:done], stamps):
-        raise MapError(
-            f"{where}: was made of another recording than {sequence.name}, or it has changed; "
-            "map.start continue needs the same one, map.start last does not"
-        )
-    if drive["fgslam"] != __version__:
-        raise MapError(
-            f"{where}: its session is of fgslam {drive['fgslam']}, this is {__version__}; use "
-            "that one, or map.start last"
-        )
-    if done >= len(sequence):
-        raise MapError(
-            f"{where}: its run had all {done} frames up to dataset.stop already; nothing is left "
-            "to go on with"
-        )
-
-
-def entered_by(given: GivenMap) -> dict[str, Any] | None:
-    """How the run that is gone on with entered a map of its own; None where it had none."""
-    return _last_drive(given.saved).get("entered")
-
-
-def left_out_before(given: GivenMap) -> int:
-    """How many frames the run that is gone on with left out, before the first that began a map."""
-    return int(_last_drive(given.saved).get(_LEFT_OUT, 0))
-
-
-def go_on(given: GivenMap, pipeline: SlamPipeline, recorder: RunRecorder) -> None:
-    """Takes the session up where it stopped. Raises MapError where its arrays do not fit."""
-    session, where = given.saved.session, str(given.path)
-    logged = {n.removeprefix(_LOG): a for n, a in session.items() if n.startswith(_LOG)}
-    try:
-        log = MeasurementLog.from_arrays(logged, where)
-        restore(session, log, pipeline, recorder)
-    except (KeyError, ValueError, IndexError, MeasurementLogError) as error:
-        raise MapError(
-            f"{where}: its session is not one that this fgslam wrote ({error}); use map.start last"
-        ) from None
-
-
-def _settings_of(drive: dict[str, Any], where: str) -> dict[str, Any]:
-    """A drive's settings, with the defaults of keys that are newer than it."""
-    try:
-        return make_config({"name": drive["name"], **drive["settings"]}, where).as_values()
-    except ConfigError as error:
-        raise MapError(
-            f"{where}: its run had settings that this fgslam does not know ({error}); use "
-            "map.start last"
-        ) from None
-
-
-def _frames_before(drive: dict[str, Any]) -> int:
-    """How many selected frames of a drive came before its first one."""
-    entered = drive.get("entered") or {}
-    return int(drive.get(_LEFT_OUT, 0)) + int(entered.get("frames_before", 0))
-
-
-def _last_drive(saved: SavedMap) -> dict[str, Any]:
-    drives = saved.about.get("drives")
-    last = drives[-1] if isinstance(drives, list) and drives else {}
-    return last if isinstance(last, dict) else {}
-
-
-# --------------------------------------------------------------------------------------------
 # The map that is left
 
 
@@ -311,42 +185,28 @@ def _saved_map(outputs: RunOutputs) -> SavedMap:
     """The session's map with what is known of its drives."""
     estimate = outputs.pipeline.estimate()
     about = {"drives": [*_drives_before(outputs), _drive(outputs, estimate)]}
-    session = _session(outputs) if outputs.config.map.session else None
     before = None if outputs.given is None else outputs.given.saved
     evidence = evidence_of(outputs.pipeline, outputs.recorder, before)
-    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, evidence, session)
+    return saved_map(outputs.pipeline, outputs.sequence.rig, estimate, about, evidence)
 
 
 def _drives_before(outputs: RunOutputs) -> list[Any]:
     if outputs.given is None:
         return []
-    before = list(outputs.given.saved.about.get("drives", ()))
-    return before[:-1] if outputs.config.map.start == "continue" else before
+    return list(outputs.given.saved.about.get("drives", ()))
 
 
 def _drive(outputs: RunOutputs, estimate: Estimate) -> dict[str, Any]:
     config, values = outputs.config, outputs.config.as_values()
-    settings = {name: values[name] for name in (*_SAME_SETTINGS, "dataset")}
-    settings["dataset"]["start"] = outputs.first_frame
-    entry = entry_of(outputs.folder)
+    names = ("seed", "odometry", "frontend", "estimator", "dataset")
     return {
         "name": config.name,
         "fgslam": __version__,
         "recording": {"name": outputs.sequence.name, "identity": outputs.sequence.identity},
         "frames": len(outputs.recorder),
-        _LEFT_OUT: outputs.recorder.left_out,
-        "entered": None if entry is None else entry.as_values(),
         "estimator": outputs.pipeline.estimator.kind,
         "valid_hits": config.frontend.database.valid_hits,
         "remark": outputs.remark,
         "remarks": list(estimate.remarks),
-        "settings": settings,
+        "settings": {name: values[name] for name in names},
     }
-
-
-def _session(outputs: RunOutputs) -> StateArrays:
-    """What the run needs to go on; its times are the clock's, and no part of it."""
-    log = outputs.recorder.log.to_arrays()
-    state = state_of(outputs.pipeline, outputs.recorder)
-    state[_TIMES] = np.full_like(state[_TIMES], np.nan)
-    return state | {f"{_LOG}{name}": array for name, array in log.items()}

@@ -67,7 +67,6 @@ def half_a_ring() -> SavedMap:
         colour=database.colour[rows],
         trajectory=estimate.trajectory,
         about={},
-        session={},
         evidence=np.empty(0, np.int64),
     )
 

@@ -223,7 +223,6 @@ def saved(database: LandmarkDatabase, positions: FloatArray) -> SavedMap:
         colour=database.colour.copy(),
         trajectory=Trajectory(np.empty(0), np.empty((0, 4, 4))),
         about={},
-        session={},
         evidence=np.empty(0, np.int64),
     )
 

@@ -445,7 +445,6 @@ def test_a_name_with_bytes_that_are_no_utf_8_is_told() -> None:
         ({"load": "a", "save": "b", "extend": False}, "no new map to save"),
         ({"load": "a", "save": "a"}, "are one file"),
         ({"load": "maps/../a", "save": "./a"}, "are one file"),
-        ({"load": "a", "start": "continue", "extend": False}, "takes map.load alone"),
     ],
 )
 def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) -> None:

@@ -67,7 +67,6 @@ def saved(rng: np.random.Generator) -> SavedMap:
         colour=np.zeros(n, np.uint8),
         trajectory=Trajectory(np.empty(0), np.empty((0, 4, 4))),
         about={},
-        session={},
         evidence=np.empty(0, np.int64),
     )
 

@@ -54,7 +54,6 @@ class World:
             colour=np.full(n, 90, np.uint8),
             trajectory=Trajectory(stamp + np.arange(5.0), np.tile(np.eye(4), (5, 1, 1))),
             about={"drives": [{"name": "drive", "frames": 5}]},
-            session={"a": np.zeros(3)},
             evidence=np.sort(rng.integers(1, 2**60, 5)),
         )
 
@@ -201,7 +200,6 @@ def test_what_both_hold_is_fused_by_covariance_and_the_rest_kept(world: World) -
     assert len(merged.trajectory) == 10
     np.testing.assert_allclose(merged.trajectory.poses[5:], np.tile(found.aTb, (5, 1, 1)))
     assert [drive["name"] for drive in merged.about["drives"]] == ["drive", "drive"]
-    assert merged.session == {}
 
 
 def test_views_turn_with_their_map(world: World) -> None:

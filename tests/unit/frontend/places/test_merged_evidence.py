@@ -76,7 +76,6 @@ class Place:
             colour=np.zeros(n, np.uint8),
             trajectory=estimate.trajectory,
             about={"drives": [{"name": "visit"}]},
-            session={},
             evidence=np.sort(self.rng.integers(1, 2**60, len(seen))),
         ), which
 
