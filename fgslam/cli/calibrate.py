@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from fgslam.cli import options
 from fgslam.core.errors import ConfigError
+from fgslam.core.files import require_output
 
 if TYPE_CHECKING:
     from fgslam.cameras.boards import Board as CalibrationBoard
@@ -62,7 +65,7 @@ MirrorOut = Annotated[Path, typer.Option(metavar="FILE", help="where to write it
 
 
 @app.command()
-def stereo(
+def stereo(  # noqa: PLR0913 - each option is a parameter
     images: Annotated[
         list[Path],
         typer.Argument(metavar="IMAGES...", help="folder of both cameras, or two: left right"),
@@ -74,6 +77,7 @@ def stereo(
     dictionary: Dictionary = "DICT_4X4_50",
     lens: Lens = "radtan",
     out: Out = Path("rig.json"),
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Calibrate two cameras: intrinsics, pose to each other, and whether that is good enough.
 
@@ -84,7 +88,7 @@ def stereo(
             f"{len(images)} folders or files were given; give the folder of all images, or that of "
             "the left and that of the right ones"
         )
-    _calibrate(images, (target, board, square, spacing, dictionary), lens, out)
+    _calibrate(images, (target, board, square, spacing, dictionary), lens, out, overwrite)
 
 
 @app.command()
@@ -99,9 +103,12 @@ def trinocular(  # noqa: PLR0913 - each option is a parameter
     dictionary: Dictionary = "DICT_4X4_50",
     lens: Lens = "radtan",
     out: Out = Path("rig.json"),
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Calibrate three cameras, in an L or a line; images of one moment in the same order."""
-    _calibrate([left, right, top], (target, board, square, spacing, dictionary), lens, out)
+    _calibrate(
+        [left, right, top], (target, board, square, spacing, dictionary), lens, out, overwrite
+    )
 
 
 @app.command()
@@ -117,6 +124,7 @@ def omni(  # noqa: PLR0913 - each option is a parameter
     out: CameraOut = Path("camera.yaml"),
     elevations: OfRings = None,
     inner: OfRings = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Calibrate one fisheye, or a camera below a mirror, from images of a board."""
     from fgslam.cli.console import progress_bar
@@ -125,6 +133,8 @@ def omni(  # noqa: PLR0913 - each option is a parameter
     known = _board(target, board, square, spacing, dictionary)
     wide = calibrating.WideLens(lens, mount)
     del elevations, inner  # refused before
+    require_output(out, overwrite, [images])
+    _require_outputs(calibrating.numbers_beside(out), overwrite, [images])
     with progress_bar() as progress:
         found = calibrating.calibrate_wide_camera(images, known, wide, out, progress)
     _tell(found)
@@ -143,6 +153,7 @@ def rings(
         float, typer.Option(metavar="PX", help="radius that all rings lie outside of")
     ],
     out: MirrorOut = Path("mirror.yaml"),
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Calibrate a mirror from one image of an upright cylinder with black and white bands."""
     from fgslam.runs.calibrating import calibrate_mirror
@@ -153,20 +164,33 @@ def rings(
         raise ConfigError(
             f"--elevations {elevations}: give degrees as --elevations=-15,-5,5,15"
         ) from None
+    require_output(out, overwrite, [image])
     for line in calibrate_mirror(image, degrees, inner, out):
         typer.echo(line)
 
 
 def _calibrate(
-    folders: list[Path], board: tuple[str, str, float, float, str], lens: str, out: Path
+    folders: list[Path],
+    board: tuple[str, str, float, float, str],
+    lens: str,
+    out: Path,
+    overwrite: bool,
 ) -> None:
     from fgslam.cli.console import progress_bar
     from fgslam.runs.calibrating import calibrate_cameras
 
     known = _board(*board)
+    _require_outputs(out, overwrite, folders)
     with progress_bar() as progress:
         found = calibrate_cameras(folders, known, lens, out, progress)
     _tell(found)
+
+
+def _require_outputs(numbers: Path, overwrite: bool, images: Sequence[Path]) -> None:
+    """The gate of a calibration's numbers, picture and tables. Raises OutputError."""
+    tables = [numbers.with_name(f"{numbers.stem}_{part}.csv") for part in ("images", "parameters")]
+    for path in (numbers, numbers.with_suffix(".png"), *tables):
+        require_output(path, overwrite, images)
 
 
 def _board(

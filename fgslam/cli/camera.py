@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from fgslam.cli import options
+from fgslam.core.files import require_output
+
 app = typer.Typer(help="Calibration files: what one says, and the same in another format.")
 
 _FILE = "calibration file, or the folder that holds one"
@@ -33,7 +36,7 @@ Cameras = Annotated[
 
 
 @app.command()
-def show(
+def show(  # noqa: PLR0913 - each option is a parameter
     file: File,
     second: Second = None,
     size: Size = None,
@@ -44,11 +47,14 @@ def show(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="the picture; default none")
     ] = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Say what a calibration file says: cameras, fields of view, baselines, rectified view."""
     from fgslam.runs.camera_files import Asked, show_calibration
 
     asked = Asked(file, second, size, scale, unit, fov, cameras)
+    if out is not None:
+        require_output(out, overwrite, [file, *([] if second is None else [second])])
     for line in show_calibration(asked, out):
         typer.echo(line)
 
@@ -78,10 +84,15 @@ def convert(  # noqa: PLR0913 - each option is a parameter
     unit: Unit = 1.0,
     fov: Fov = None,
     cameras: Cameras = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Write a calibration in another tool's format, number by number."""
     from fgslam.runs.camera_files import Asked, convert_calibration
 
     asked = Asked(file, second, size, scale, unit, fov, cameras)
+    # Of a folder, which may hold a recording, the files that it gets.
+    parts = [*out.glob("*.yaml"), *out.glob("*/sensor.yaml")] if out.is_dir() else [out]
+    for path in parts:
+        require_output(path, overwrite, [file, *([] if second is None else [second])])
     for line in convert_calibration(asked, out, form):
         typer.echo(line)

@@ -24,6 +24,7 @@ def film(
             "the pictures of path images",
         ),
     ] = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Make a film of a run: images with their matches, beside the map as it grows.
 
@@ -34,5 +35,5 @@ def film(
     from fgslam.runs.film import film_of_run
 
     with progress_bar() as progress:
-        line = film_of_run(run_folder, out, estimator, taught, progress)
+        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite)
     typer.echo(line)

@@ -97,11 +97,12 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     # Not before: a wrong key is answered before any library of numbers is loaded.
     from fgslam.runs.engine import resume_command
-    from fgslam.runs.run import run_experiment
-    from fgslam.runs.tasks.slam_calibration import corrected_camera, require_camera
+    from fgslam.runs.run import require_outputs, run_experiment
+    from fgslam.runs.tasks.slam_calibration import corrected_camera, require_self_calibration
 
+    require_outputs(settings, folder, existing, (camera_out, save_rrd), config)
     if camera_out is not None:
-        require_camera(settings, camera_out)
+        require_self_calibration(settings)
     with watched_by(settings, live, save_rrd) as watch, under_way() as (progress, stopped):
         result = run_experiment(settings, folder, existing, progress, stopped, watch)
     show_all([result], resume_command(folder))
@@ -244,7 +245,7 @@ def localize(  # noqa: PLR0913 - each option is a parameter
 
 
 @app.command()
-def export(
+def export(  # noqa: PLR0913 - each option is a parameter
     run_folder: options.RunOrMap,
     map_file: Annotated[
         Path | None, typer.Option("--map", help="landmarks as .ply or .pcd")
@@ -270,6 +271,7 @@ def export(
     colour: Annotated[
         bool, typer.Option("--colour", help="--map in the images' colours, with normals")
     ] = False,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
 
@@ -285,6 +287,7 @@ def export(
         estimator=estimator,
         valid_only=valid_only,
         colour=colour,
+        overwrite=overwrite,
     )
     for line in export_run(run_folder, wanted):
         typer.echo(line)
@@ -313,11 +316,12 @@ def view(
     save: Annotated[
         Path | None, typer.Option(help="write an .rrd file for the viewer instead of a window")
     ] = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Open a run in the rerun viewer, where that extra is installed."""
     from fgslam.runs.viewing import view_run
 
-    typer.echo(view_run(run_folder, save))
+    typer.echo(view_run(run_folder, save, overwrite))
 
 
 @app.command()

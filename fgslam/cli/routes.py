@@ -9,7 +9,6 @@ import typer
 
 from fgslam.cli import options
 from fgslam.cli.performing import existing_folder, exit_as, show_all, under_way
-from fgslam.core.errors import OutputError
 
 if TYPE_CHECKING:
     from fgslam.runs.config_models import Experiment
@@ -61,7 +60,6 @@ def teach(  # noqa: PLR0913 - each option is a parameter
     chosen = options.of_recording(start=start, stop=stop, stride=stride)
     chosen += options.as_overrides({"poses": poses})
     config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
-    _keep(out, overwrite, (recording, poses, Path(camera) if camera else None))
     _perform(config, report, overwrite)
 
 
@@ -107,7 +105,6 @@ def join(
     from fgslam.runs.bare_routes import joining
 
     config = joining(routes, out, overrides or ())
-    _keep(out, overwrite)
     _perform(config, report, overwrite)
 
 
@@ -128,6 +125,7 @@ def route(
     out: Annotated[
         Path | None, typer.Option(metavar="ROUTE", help="write the way as a route, to be followed")
     ] = None,
+    overwrite: options.Overwrite = False,
 ) -> None:
     """Say the shortest way on a map of routes, and write it as a route of its own.
 
@@ -135,23 +133,16 @@ def route(
     """
     from fgslam.runs.bare_routes import way_said
 
-    for line in way_said(stored, start, goal, camera, out):
+    for line in way_said(stored, start, goal, camera, out, overwrite):
         typer.echo(line)
 
 
-def _keep(out: Path, overwrite: bool, inputs: tuple[Path | None, ...] = ()) -> None:
-    """Raises OutputError where another route or map would be lost, or an input in any case."""
-    if out.resolve() in [one.resolve() for one in inputs if one is not None]:
-        raise OutputError(f"{out}: is read, and would be lost; choose another --out")
-    if out.exists() and not overwrite:
-        raise OutputError(f"{out}: is there already; choose another --out, or add --overwrite")
-
-
 def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:
-    from fgslam.runs.run import run_experiment
+    from fgslam.runs.run import require_outputs, run_experiment
 
-    place = folder or Path("runs") / config.name
+    place, existing = folder or Path("runs") / config.name, existing_folder(overwrite)
+    require_outputs(config, place, existing)
     with under_way() as (progress, stopped):
-        result = run_experiment(config, place, existing_folder(overwrite), progress, stopped)
+        result = run_experiment(config, place, existing, progress, stopped)
     show_all([result], "the same command with --overwrite")
     exit_as([result])

@@ -11,7 +11,7 @@ import itertools
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -59,9 +59,11 @@ def replacing(path: Path) -> Iterator[Path]:
         The temporary path, with the same suffix, for writers that choose the format by it.
 
     Raises:
-        OutputError: the folder cannot be written to, or the disk is full.
+        OutputError: the folder cannot be written to, the disk is full, or at ``path`` is something
+            else than a regular file.
     """
     partial = _beside(path)
+    _require_replaceable(path)
     with clear_output_errors(path):
         try:
             yield partial
@@ -69,6 +71,56 @@ def replacing(path: Path) -> Iterator[Path]:
         finally:
             # Still there only when something failed: that error must not be hidden by another.
             remove_quietly(partial)
+
+
+def require_output(
+    path: Path, overwrite: bool, inputs: Iterable[Path] = (), folder: bool = False
+) -> None:
+    """The gate, before any work, of every file that a command writes under a name it is given.
+
+    Args:
+        path: a new file, or with ``overwrite`` a regular one.
+        overwrite: whether `--overwrite` was given.
+        inputs: files and folders that the command reads: nothing of them is replaced.
+        folder: ``path`` is a folder for files, new, empty, or with ``overwrite`` any.
+
+    Raises:
+        OutputError: it is none of these, or its folder cannot be written to.
+    """
+    require_writable(path.parent)
+    if folder:
+        if not path.exists():
+            return
+        if not path.is_dir():
+            raise OutputError(f"cannot write {path}: it is not a folder; choose another name")
+        if not any(path.iterdir()):
+            return
+    elif not _require_replaceable(path):
+        return
+    place = path.resolve()
+    for source in inputs:
+        known = source.resolve()
+        if place == known or known in place.parents:
+            what = "it is read" if place == known else f"it is part of {source}, which is read"
+            raise OutputError(f"cannot write {path}: {what}; choose another name")
+    if not overwrite:
+        raise OutputError(f"{path}: is there already; choose another name, or add --overwrite")
+
+
+def _require_replaceable(path: Path) -> bool:
+    """Whether a regular file is at this place. Raises OutputError where something else is."""
+    with clear_output_errors(path):
+        try:
+            mode = path.lstat().st_mode
+        except FileNotFoundError:
+            return False
+    if not stat.S_ISREG(mode):
+        raise OutputError(f"cannot write {path}: it is {_kind_of(mode)}; choose another name")
+    return True
+
+
+def _kind_of(mode: int) -> str:
+    return next((word for is_it, word in _KINDS if is_it(mode)), "no file")
 
 
 def _beside(path: Path) -> Path:
@@ -203,8 +255,7 @@ def require_file(
         reason = cause.strerror if isinstance(cause, OSError) else str(cause)
         raise error(f"cannot read {path}: {reason}; {remedy}") from cause
     if not stat.S_ISREG(found.st_mode):
-        kind = next((word for is_it, word in _KINDS if is_it(found.st_mode)), "no file")
-        raise error(f"cannot read {path}: it is {kind}; {remedy}")
+        raise error(f"cannot read {path}: it is {_kind_of(found.st_mode)}; {remedy}")
     if most_bytes is not None and found.st_size > most_bytes:
         size, most = found.st_size / 1e6, most_bytes / 1e6
         raise error(f"cannot read {path}: {size:.1f} MB, {most:g} MB at most; {remedy}")
@@ -242,6 +293,7 @@ _KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISLNK, "a link"),
 )
 
 

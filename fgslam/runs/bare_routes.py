@@ -9,7 +9,8 @@ from math import degrees, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fgslam.core.errors import CalibrationError, DatasetError, OutputError, StoredMapError
+from fgslam.core.errors import CalibrationError, DatasetError, StoredMapError
+from fgslam.core.files import require_output
 from fgslam.runs.config import make_experiment
 from fgslam.runs.config_models import Experiment
 
@@ -78,7 +79,12 @@ def joining(routes: Sequence[Path], out: Path, overrides: Iterable[str] = ()) ->
 
 
 def way_said(
-    stored: Path, start: str, goal: str, camera: str | None = None, out: Path | None = None
+    stored: Path,
+    start: str,
+    goal: str,
+    camera: str | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
 ) -> list[str]:
     """The shortest way on a map, in lines.
 
@@ -88,14 +94,15 @@ def way_said(
         goal: name of a place or a route.
         camera: of the picture; None: the routes' own.
         out: where the way is written as a route; None: nowhere.
+        overwrite: replace a file that is there.
 
     Raises:
         FgslamError: file, picture or place cannot be used, or there is no way.
     """
     from fgslam.homing.route_map import RouteMap  # loads arrays
 
-    if out is not None and out.resolve() == stored.resolve():
-        raise OutputError(f"{out}: the map itself, which would be lost; choose another --out")
+    if out is not None:
+        require_output(out, overwrite, (stored, Path(start)))
     joined = RouteMap.load(stored)
     lines = []
     if joined.knows(start):

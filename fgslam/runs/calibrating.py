@@ -81,6 +81,11 @@ class WideLens:
         return {"kind": "lens", "file": numbers, "middle": middle, "clockwise": clockwise}
 
 
+def numbers_beside(out: Path) -> Path:
+    """Where the calibration is that the camera file ``out`` of one wide camera names."""
+    return out.with_name(f"{out.stem}_lens.json")
+
+
 def _require_model(model: str, known: Sequence[str]) -> None:
     if model not in known:
         raise ConfigError(f"lens {model!r} is not known; use {' or '.join(known)}")
@@ -147,7 +152,7 @@ def calibrate_wide_camera(
     found = calibrate(board, views, size, lens.model)
     checked = held_out_alone(board, views, size, lens.model)
     # Not rig.json of rig.yaml, which may be the calibration of a rig, with a picture and tables.
-    numbers = out.with_name(f"{out.stem}_lens.json")
+    numbers = numbers_beside(out)
     calibration = Calibration(str(numbers), "fgslam calibrate", found.cameras)
     write_text(numbers, json.dumps(raw_values(calibration), indent=2) + "\n")
     write_text(out, yaml.safe_dump(lens.camera_file(numbers.name), sort_keys=False))

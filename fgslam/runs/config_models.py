@@ -6,6 +6,7 @@ Each field has its unit and meaning. A file without the key `task` is one of SLA
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
@@ -104,6 +105,17 @@ class Experiment(BaseModel):
         """Whether report.html is to be written."""
         return bool(getattr(self, "output", OutputSettings()).report)
 
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """Files that it writes outside the run folder."""
+        return ()
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Files and folders that it reads, of a pattern of names the folder."""
+        found = map(Path, _paths_in(self.as_values()))
+        return tuple(path.parent if "*" in path.name else path for path in found)
+
     def resolved(self) -> Experiment:
         """What the run's own config.yaml says: all that the task settles by itself filled in."""
         return self
@@ -120,6 +132,21 @@ class Experiment(BaseModel):
             if titles.count(title) > 1:
                 return f"two different estimators are called {title}; give one of them a label"
         return ""
+
+
+_PATHS = ("path", "file", "camera_file", "odometry_file", "load", "poses", "routes")
+"""Keys of files and folders that are read, in the experiments of all tasks."""
+
+
+def _paths_in(values: Any, key: str = "") -> Iterator[str]:
+    if isinstance(values, dict):
+        for name, value in values.items():
+            yield from _paths_in(value, name)
+    elif isinstance(values, list):
+        for value in values:
+            yield from _paths_in(value, key)
+    elif isinstance(values, str) and key in _PATHS:
+        yield values
 
 
 # --------------------------------------------------------------------------------------------
@@ -139,6 +166,11 @@ class ExperimentConfig(Experiment):
     )
     map: MapSettings = MapSettings()
     output: OutputSettings = OutputSettings()
+
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The map, where a name is given."""
+        return () if self.map.save is None else (Path(self.map.save),)
 
     @property
     def on_measurements(self) -> bool:
@@ -294,6 +326,11 @@ class TeachConfig(HomingExperiment):
         "covariance.csv beside it is taken, too; null: a route without metres",
     )
 
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The route, where a name is given."""
+        return () if self.route is None else (Path(self.route),)
+
 
 class FollowConfig(HomingExperiment):
     """A recording along a taught route: place, homing vector and command of each image."""
@@ -306,6 +343,11 @@ class FollowConfig(HomingExperiment):
     )
     steering: SteeringSettings = SteeringSettings()
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """Also the route."""
+        return (*super().inputs, Path(self.route))
+
 
 class JoinConfig(HomingExperiment):
     """Taught routes as one map, joined where their views match."""
@@ -315,6 +357,11 @@ class JoinConfig(HomingExperiment):
         min_length=1, description="files that routes were taught into; named after them"
     )
     map: str | None = Field(default=None, description="file to write; null: RUN/routes.fgmap alone")
+
+    @property
+    def outputs(self) -> tuple[Path, ...]:
+        """The map, where a name is given."""
+        return () if self.map is None else (Path(self.map),)
 
 
 class HomingTrialsConfig(HomingExperiment):

@@ -13,6 +13,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.estimates import Trajectory
+from fgslam.core.files import require_output
 from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment
@@ -23,7 +24,7 @@ from fgslam.report.point_cloud import MapPoints, read_ply, write_map
 from fgslam.report.ros_bag import SUFFIX as MCAP
 from fgslam.report.ros_bag import write_mcap
 from fgslam.report.tables import read_metrics
-from fgslam.runs.config import load_config
+from fgslam.runs.config import load_config, load_experiment
 from fgslam.runs.config_reading import read_mapping
 from fgslam.runs.exporting_images import export_images, rows_of_frames
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
@@ -42,6 +43,7 @@ class Wanted:
         estimator: whose; None for the one that steered.
         valid_only: only landmarks that were seen often enough to be trusted.
         colour: the map in the images' colours, with normals.
+        overwrite: replace files that are there.
     """
 
     map: Path | None = None
@@ -51,6 +53,7 @@ class Wanted:
     estimator: str | None = None
     valid_only: bool = False
     colour: bool = False
+    overwrite: bool = False
 
     @property
     def targets(self) -> tuple[Path | None, ...]:
@@ -71,6 +74,7 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
+    _require_outputs(run, wanted)
     if run.is_file():
         if wanted.needs_run:
             raise ConfigError(
@@ -84,12 +88,27 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
             "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or "
             "--images FOLDER"
         )
-    _require_elsewhere(run, wanted.targets)
     if wanted.graph is not None:
         require_graph_suffix(wanted.graph)  # now, not after seconds of reading
     remark = read_metrics(run / "metrics.json").get("remark") or ""
     lines = [f"note: {remark}"] if remark else []
     return [*lines, *_export(run, folder, wanted, remark)]
+
+
+def _require_outputs(run: Path, wanted: Wanted) -> None:
+    """Nothing of the run is replaced, nor of what it was made from. Raises OutputError."""
+    inputs = sources_of(run)
+    for path in filter(None, (wanted.map, wanted.trajectory, wanted.graph)):
+        require_output(path, wanted.overwrite, inputs)
+    if wanted.images is not None:
+        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
+
+
+def sources_of(run: Path) -> tuple[Path, ...]:
+    """A run or a saved map, and what that was made from as far as it says so."""
+    if not is_run_folder(run):
+        return (run,)
+    return (run, *load_experiment(run / RUN_MARKER).inputs)
 
 
 class _Results:
@@ -147,14 +166,6 @@ def log_of(run: Path) -> Path:
     """The measurements: of a comparison, which has none of its own, those of the run above it."""
     own, above = run / LOG_FILE, run.resolve().parent / LOG_FILE
     return above if above.is_file() and not own.is_file() else own
-
-
-def _require_elsewhere(run: Path, targets: tuple[Path | None, ...]) -> None:
-    """The run's own files are what a run is judged by: an export may not replace them."""
-    own = {file.resolve() for file in run.rglob("*") if file.is_file()}
-    for target in targets:
-        if target is not None and target.resolve() in own:
-            raise ConfigError(f"{target}: is one of the run's own files; export to another name")
 
 
 def results_folder(run: Path, wanted: str | None) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
+from fgslam.core.files import require_output
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, moved_pixels
 from fgslam.core.sensors import CameraRig
@@ -22,7 +23,7 @@ from fgslam.report.pictures.film import FilmCanvas, Moment
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.runs.config import load_config, load_experiment
 from fgslam.runs.config_models import FollowConfig
-from fgslam.runs.exporting import log_of, results_folder
+from fgslam.runs.exporting import log_of, results_folder, sources_of
 from fgslam.runs.exporting_images import Pictures, frames_of, rows_of_frames
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.report import load_report
@@ -33,7 +34,12 @@ Progress = Callable[[str, int, int], None]
 
 
 def film_of_run(
-    run: Path, out: Path, estimator: str | None, taught: Path | None, progress: Progress
+    run: Path,
+    out: Path,
+    estimator: str | None,
+    taught: Path | None,
+    progress: Progress,
+    overwrite: bool = False,
 ) -> str:
     """Writes the film of a run, of SLAM or of a route that was followed; a line about it.
 
@@ -45,11 +51,13 @@ def film_of_run(
         estimator: whose path and map; None for the one that steered.
         taught: what ``fgslam teach`` wrote, for the pictures of path images; None: their features.
         progress: called with what is done, how far, of how much.
+        overwrite: replace a file that is there.
 
     Raises:
         FgslamError: no run of cameras there, its recording is gone, or the film cannot be written.
     """
     require_film_suffix(out)
+    require_output(out, overwrite, (*sources_of(run), *([] if taught is None else [taught])))
     if is_run_folder(run) and isinstance(config := load_experiment(run / RUN_MARKER), FollowConfig):
         if estimator is not None:
             raise ConfigError(

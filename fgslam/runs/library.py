@@ -26,7 +26,7 @@ from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.live import Overrides, override_texts, slam_config
 from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.run import run_experiment
+from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, crew_of, make_plan, run_sweep
 from fgslam.slam.choices import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
@@ -199,7 +199,8 @@ def run(
         as_path(experiment, DatasetError, "experiment"), calibration, override_texts(overrides)
     )
     folder = Path("runs") / config.name if out is None else Path(out)
-    return run_experiment(config, folder, _checked_existing(existing), progress)
+    require_outputs(config, folder, _checked_existing(existing), source=Path(experiment))
+    return run_experiment(config, folder, existing, progress)
 
 
 def sweep(  # noqa: PLR0913 - each is an option of the command

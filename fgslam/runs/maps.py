@@ -15,7 +15,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.checks import require_seed
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Relocalisation, Trajectory
-from fgslam.core.files import as_path
+from fgslam.core.files import as_path, require_output
 from fgslam.core.geometry import so3_log
 from fgslam.core.recordings import Frame
 from fgslam.core.saved_map import SavedMap, load_map, save_map
@@ -215,18 +215,14 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
     Where every frame of the second is in the first already, that one is written as it is.
 
     Raises:
-        MapError: one is no map, another rig made it, they do not overlap or that is ambiguous, or
-            ``out`` is there already, or one of the two.
-        OutputError: the map cannot be written.
+        MapError: one is no map, another rig made it, they do not overlap or that is ambiguous.
+        OutputError: ``out`` is there already, is one of the two, or cannot be written.
     """
     # Not before: no run merges maps, and these load much of SciPy.
     from fgslam.frontend.places.map_alignment import align_maps
     from fgslam.frontend.places.map_fusion import adds_nothing, merge_maps
 
-    if out.resolve() in (first.resolve(), second.resolve()):
-        raise MapError(f"{out}: is merged, and would be lost; choose another --out")
-    if out.exists() and not overwrite:
-        raise MapError(f"{out}: is there already; choose another --out, or add --overwrite")
+    require_output(out, overwrite, (first, second))
     a, b = load_map(first), load_map(second)
     require_rig_of_map(b, a.rig, str(second))
     if adds_nothing(b, a):

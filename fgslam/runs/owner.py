@@ -13,6 +13,7 @@ from fgslam.core.errors import OutputError
 from fgslam.core.files import clear_output_errors, remove_unfinished_files
 
 OWNER_NAME = ".owner"
+_OPENED = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """Said by file systems that know no locks: there a run goes without."""
 
@@ -58,7 +59,7 @@ class Owner:
         """
         while self._file is None:
             with clear_output_errors(self._path):
-                file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                file = os.open(self._path, _OPENED, 0o644)
             try:
                 self._lock(file)
             except OutputError:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fgslam.core.errors import ConfigError
+from fgslam.core.files import require_output
 from fgslam.runs.config_models import (
     CrossroadsConfig,
     DrivingConfig,
@@ -27,6 +29,31 @@ from fgslam.runs.units import Progress, Stopped
 
 if TYPE_CHECKING:
     from fgslam.runs.tasks.slam import Watch
+
+
+def require_outputs(
+    config: Experiment,
+    folder: Path,
+    existing: ExistingFolder,
+    others: Iterable[Path | None] = (),
+    source: Path | None = None,
+) -> None:
+    """The gate of what a run writes outside its folder.
+
+    Args:
+        config: the experiment, whose inputs are never replaced.
+        folder: the run folder; what is in there is its own affair.
+        existing: other files are replaced, unless it is `refuse`.
+        others: files that are written beside those of the configuration.
+        source: the experiment's file or the recording.
+
+    Raises:
+        OutputError: a file is there already, or is something else than a regular file.
+    """
+    inputs = (*config.inputs, *([] if source is None else [source]))
+    for path in (*config.outputs, *(one for one in others if one is not None)):
+        if path.parent.resolve() != folder.resolve():
+            require_output(path, existing != "refuse", inputs)
 
 
 def run_experiment(

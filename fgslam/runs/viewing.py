@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import MissingDependencyError, OutputError
-from fgslam.core.files import replacing
+from fgslam.core.files import replacing, require_output
 from fgslam.report.figures.palette import COUNT, ON_DARK
 from fgslam.report.figures.traces import thinned, world_position_covariances
 from fgslam.report.figures.trajectory import level_axes
@@ -34,13 +34,14 @@ WHITE = (235, 235, 235)
 _LEAST_RADIUS_M = 1e-4
 
 
-def view_run(run: Path, save: Path | None) -> str:
+def view_run(run: Path, save: Path | None, overwrite: bool = False) -> str:
     """Opens a run in the viewer, or saves it for the viewer where there is no screen.
 
     Args:
         run: what `fgslam run` or `fgslam compare` wrote.
         save: the .rrd file to write instead of opening a window; None for a window, or on a
             machine without a screen for ``view.rrd`` in ``run``.
+        overwrite: replace the file ``save`` where it is there.
 
     Returns:
         A line about what was done.
@@ -51,7 +52,8 @@ def view_run(run: Path, save: Path | None) -> str:
     """
     rerun = library()
     if save is not None:
-        require_writable(save)
+        require_ending(save)
+        require_output(save, overwrite, (run,))
     data = load_report(run)
     stream = rerun.RecordingStream(f"fgslam {data.title}")
     if save is None and has_screen():
@@ -79,12 +81,10 @@ def library() -> Any:
     return rerun
 
 
-def require_writable(file: Path) -> None:
-    """Raises OutputError where the viewer's file has another ending, or no folder to be in."""
+def require_ending(file: Path) -> None:
+    """Raises OutputError where the viewer's file has another ending."""
     if file.suffix.lower() != SUFFIX:
         raise OutputError(f"cannot write {file}: the viewer opens {SUFFIX} files; use that ending")
-    if not file.parent.is_dir():
-        raise OutputError(f"cannot write {file}: its folder does not exist; choose another folder")
 
 
 def has_screen() -> bool:

@@ -36,7 +36,7 @@ from fgslam.runs.viewing import (
     half_axes,
     has_screen,
     library,
-    require_writable,
+    require_ending,
     rgb,
 )
 from fgslam.slam.pipeline import FrameReport
@@ -108,7 +108,7 @@ def _usable(config: Experiment, live: bool, file: Path | None) -> Any:
         )
     rerun = library()
     if file is not None:
-        require_writable(file)
+        require_ending(file)
     if live and not has_screen():
         raise OutputError("--live needs a screen, and there is none; use --save-rrd FILE.rrd")
     return rerun

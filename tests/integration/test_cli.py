@@ -354,8 +354,10 @@ def test_an_export_never_replaces_the_run_itself(
 ) -> None:
     own = finished.folder / KIND / "map.ply"
     before = own.read_bytes()
-    text = mistake(capfd, monkeypatch, "export", finished.folder, "--map", own, "--valid-only")
-    assert "is one of the run's own files; export to another name" in text
+    given = ("export", finished.folder, "--map", own, "--valid-only")
+    for more in ((), ("--overwrite",)):
+        text = mistake(capfd, monkeypatch, *given, *more)
+        assert f"it is part of {finished.folder}, which is read; choose another name" in text
     assert own.read_bytes() == before
 
 

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.errors import ConfigError
 from fgslam.core.homing import OmniFeatures
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.links import Pair
@@ -25,12 +25,7 @@ MAP_FILE = "routes.fgmap"
 
 
 def open_joining(config: JoinConfig, opening: Opening) -> Task[RunResult]:
-    """Opens the routes. Raises StoredMapError, ConfigError, or OutputError."""
-    if config.map is not None and not Path(config.map).resolve().parent.is_dir():
-        raise OutputError(f"{config.map}: its folder does not exist; choose another one")
-    written = None if config.map is None else Path(config.map).resolve()
-    if written in [Path(one).resolve() for one in config.routes]:
-        raise ConfigError(f"{config.map}: one of the routes, which would be lost; choose another")
+    """Opens the routes. Raises StoredMapError or ConfigError."""
     routes = {Path(one).stem: PathMemory.load(one) for one in config.routes}
     if len(routes) < len(config.routes):
         name, _ = Counter(Path(one).stem for one in config.routes).most_common(1)[0]

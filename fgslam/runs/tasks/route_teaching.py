@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgslam.core.errors import FrameError, OutputError
+from fgslam.core.errors import FrameError
 from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
@@ -55,8 +55,6 @@ _COLUMNS = (
 
 def open_teaching(config: TeachConfig, opening: Opening) -> Task[RunResult]:
     """Opens the recording and checks its mirror. Raises DatasetError, or OutputError."""
-    if config.route is not None and not Path(config.route).resolve().parent.is_dir():
-        raise OutputError(f"{config.route}: its folder does not exist; choose another one")
     recording = open_checked(config.dataset)
     drive = None if config.poses is None else MetricDrive.load(Path(config.poses))
     if drive is not None:

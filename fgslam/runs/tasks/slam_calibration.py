@@ -11,7 +11,7 @@ from fgslam.backend.filters.self_calibration import SelfCalibration
 from fgslam.cameras.corrected import write_corrected
 from fgslam.cameras.rectification import Rectifier
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.core.files import read_text, require_writable, write_text
+from fgslam.core.files import read_text, write_text
 from fgslam.core.rig_correction import IMPLAUSIBLE_PX, RigCorrection, term_names
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
@@ -133,13 +133,8 @@ def _told(known: RigCorrection, camera: str) -> str:
     return f"the {camera} camera is {', '.join(told)}" if told else ""
 
 
-def require_camera(config: Experiment, path: Path) -> None:
-    """Refuses, before a run, to write the calibration that it will not find.
-
-    Raises:
-        ConfigError: its rig does not calibrate itself.
-        OutputError: the folder of the file is not there or not writable.
-    """
+def require_self_calibration(config: Experiment) -> None:
+    """Refuses, before a run, to write the calibration that it will not find. Raises ConfigError."""
     slam = config if isinstance(config, ExperimentConfig) else None
     measured = slam is not None and isinstance(slam.dataset, MeasurementDatasetSettings)
     if slam is None or measured or not calibrates_itself(slam.frontend):
@@ -147,7 +142,6 @@ def require_camera(config: Experiment, path: Path) -> None:
             "--camera-out: this run takes its cameras as calibrated; it needs SLAM on images with "
             "frontend.self_calibration true and stereo.measurement fused"
         )
-    require_writable(path.parent)
 
 
 def corrected_camera(run: Path, path: Path) -> str:

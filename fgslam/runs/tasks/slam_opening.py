@@ -69,7 +69,6 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
         FgslamError: of any kind, with a message for the user.
     """
     folder, progress = opening.folder, opening.progress
-    state.require_savable(config.map, folder)
     given = None if config.map.load is None else map_entry.open_map(Path(config.map.load))
     sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     _require_odometry(config, sequence)

@@ -9,9 +9,9 @@ from fgslam.backend.protocol import Estimator, Resumable
 from fgslam.core import __version__
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
-from fgslam.core.errors import MapError, OutputError
+from fgslam.core.errors import OutputError
 from fgslam.core.estimates import Estimate
-from fgslam.core.files import remove_file, require_writable
+from fgslam.core.files import remove_file
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, save_map
 from fgslam.runs.config import ExperimentConfig
@@ -145,24 +145,6 @@ def first_config(config: ExperimentConfig, folder: Path) -> ExperimentConfig | N
             "map": MapSettings(save=str(folder / MAP_FILE)),
         }
     )
-
-
-def require_savable(settings: MapSettings, run: Path) -> None:
-    """Refuses, before the drive, a map file that could not be written after it.
-
-    The folder ``run`` of the run itself is none of its business.
-
-    Raises:
-        MapError: the name is a folder's.
-        OutputError: its folder does not exist or is not writable.
-    """
-    if settings.save is None:
-        return
-    path = Path(settings.save)
-    if path.is_dir():
-        raise MapError(f"{path}: is a folder; name the map's file, e.g. {path / MAP_FILE}")
-    if path.parent.resolve() != run.resolve():
-        require_writable(path.parent)
 
 
 # --------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
-from fgslam.core.errors import MapError
+from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap, load_map, save_map
@@ -246,14 +246,14 @@ def test_merged_files(world: World, tmp_path: Path) -> None:
     assert any("landmarks fused, residual" in line for line in lines)
     merged = load_map(out)
     assert 390 <= len(merged) <= 420
-    with pytest.raises(MapError, match="is there already"):
+    with pytest.raises(OutputError, match="is there already"):
         merge_files(a, b, out)
     content = out.read_bytes()
     merge_files(a, b, out, overwrite=True)
     assert out.read_bytes() == content
     (tmp_path / "link").symlink_to(a)
-    for lost in (a, b, tmp_path / "link"):
-        with pytest.raises(MapError, match="is merged, and would be lost; choose another --out"):
+    for lost, why in ((a, "it is read"), (b, "it is read"), (tmp_path / "link", "it is a link")):
+        with pytest.raises(OutputError, match=f"{why}; choose another name"):
             merge_files(a, b, lost, overwrite=True)
     other = replace(world.seen(np.arange(50), BTA), rig=replace(RIG, fx=300.0))
     save_map(other, b)
