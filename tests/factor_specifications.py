@@ -20,7 +20,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     inverse,
-    measurement_difference,
     project,
     se3_log,
     so3_log,
@@ -29,9 +28,6 @@ from fgslam.core.geometry import (
 from fgslam.core.planar import between, rotation
 from fgslam.core.sensors import (
     CameraRig,
-    RangeBearingSensor,
-    range_bearing_point_jacobian,
-    triangulate_range_bearing,
     vertical_to_horizontal,
 )
 from fgslam.factors.noise import Whitening
@@ -93,73 +89,6 @@ def _image(rig: CameraRig, wTc: FloatArray, point: FloatArray) -> FloatArray | N
 
 def _behind(rig: CameraRig, coordinates: int) -> FloatArray:
     return np.full(coordinates, 2.0 * rig.fx)
-
-
-# --------------------------------------------------------------------------------------------
-# Range and bearing
-
-
-def range_bearing(
-    sensor: RangeBearingSensor, wTc: FloatArray, point: FloatArray, measured: FloatArray
-) -> FloatArray:
-    """Residual (3,) of (azimuth, elevation, range), radians and metres, the azimuth wrapped.
-
-    The point must lie off the sensor's vertical axis.
-    """
-    predicted = project(sensor, transform_to_camera(wTc, point[None, :]))
-    return np.asarray(measurement_difference(sensor, predicted, measured[None, :])[0])
-
-
-def range_bearing_on_sphere(wTc: FloatArray, point: FloatArray, measured: FloatArray) -> FloatArray:
-    """Residual (4,): the turn from the measured to the predicted direction (3,), then the range.
-
-    The direction's part is a vector in the sensor's axes, perpendicular to the measured
-    direction, as long as the angle between both, radians: the sphere's logarithm. It knows
-    neither poles nor jumps of the azimuth.
-
-    Args:
-        wTc: pose of the sensor.
-        point: world point, away from the sensor's centre.
-        measured: (3,) azimuth, elevation, range.
-    """
-    local = transform_to_camera(wTc, point[None, :])[0]
-    distance = float(np.linalg.norm(local))
-    unit = np.array([measured[0], measured[1], 1.0])
-    turn = turn_between(triangulate_range_bearing(unit[None, :])[0], local / distance)
-    return np.append(turn, distance - measured[2])
-
-
-def range_bearing_as_image(wTc: FloatArray, point: FloatArray, measured: FloatArray) -> FloatArray:
-    """Residual (3,) of a camera that looks along the measured bearing, to first order the same.
-
-    Tangents of the angles towards growing azimuth and elevation, and the inverse of the distance
-    along the bearing, 1/m. A right angle away or more there is no image: the
-    constant that GTSAM's (u_left, u_right, v) = (2, 2, 2) is in these directions.
-
-    Args:
-        wTc: pose of the sensor.
-        point: world point.
-        measured: (3,) azimuth, elevation, range.
-    """
-    sensor_axes = range_bearing_point_jacobian(np.array([[measured[0], measured[1], 1.0]]))[0]
-    axes = sensor_axes / np.linalg.norm(sensor_axes, axis=0)
-    azimuth, elevation, ahead = axes.T @ transform_to_camera(wTc, point[None, :])[0]
-    if ahead <= 0.0:
-        return np.array([2.0, -2.0, 0.0])
-    return np.array([azimuth / ahead, elevation / ahead, 1.0 / ahead - 1.0 / measured[2]])
-
-
-def turn_between(start: FloatArray, end: FloatArray) -> FloatArray:
-    """Logarithm (3,) at the unit vector ``start`` of the unit vector ``end``, radians.
-
-    Half a turn to the exact opposite goes in one of the directions that are equally good.
-    """
-    cosine = float(start @ end)
-    across = end - start * cosine
-    sine = float(np.linalg.norm(across))
-    if sine > 0.0:
-        return np.asarray(across * (np.arctan2(sine, cosine) / sine))
-    return across if cosine > 0.0 else np.asarray(np.pi * np.linalg.svd(start[None, :])[2][1])
 
 
 # --------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
@@ -175,7 +175,7 @@ def play(
     estimator: Estimator,
     increments: list[Increment],
     settings: EgoMotionSettings | None = None,
-    rig: Sensor = RIG,
+    rig: CameraRig = RIG,
 ) -> list[UpdateStats]:
     """Gives increments to an estimator as the replay of a log does."""
     solver = EgoMotionSolver(rig, settings or EgoMotionSettings())

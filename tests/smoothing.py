@@ -124,7 +124,8 @@ class Failing:
 def counting(graph: Any, whole: WholeGraph) -> Any:
     """Those of GTSAM's factors that count in a graph in arrays made of them, without kernels."""
     left = np.zeros(graph.size(), np.bool_)
-    left[np.concatenate([kind.rows for kind in whole.kinds])[whole.weights <= 0.0]] = True
+    if whole.seen is not None:
+        left[whole.seen.rows[whole.weights <= 0.0]] = True
     out = gtsam.NonlinearFactorGraph()
     for row in np.flatnonzero(~left).tolist():
         out.add(plain(graph.at(row)))

@@ -20,14 +20,13 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     inverse_spd3,
-    measurement_difference,
     project,
     projection_jacobian,
     reorthonormalise,
     triangulate,
 )
 from fgslam.core.measurements import Increment, Observations
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 _EVERY = 5  # frames between judgements
 _ITERATIONS = 5
@@ -100,7 +99,7 @@ class StatedNoise:
 class Persistence:
     """Variances of measurements over the stated ones: of a single one, and by whole tracks."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: CameraRig) -> None:
         """As stated, until tracks have ended."""
         self._sensor = sensor
         self._tracks = OpenTracks()
@@ -262,7 +261,7 @@ class _Sightings:
         rows, tracks = kept[self.tracks.track], self.tracks.select(kept)
         return _Sightings(self.cTw[rows], self.measurement[rows], self.whitening[rows], tracks)
 
-    def fitted(self, sensor: Sensor) -> Fitted | None:
+    def fitted(self, sensor: CameraRig) -> Fitted | None:
         """With each landmark where its sightings have it; without those that hold a wrong match."""
         last = self.tracks.start + self.tracks.counts - 1
         local = triangulate(sensor, self.measurement[last])
@@ -271,7 +270,7 @@ class _Sightings:
         found = self
         for iteration in range(_ITERATIONS):
             points = found._points(places)
-            sound = in_front(sensor, points) & np.isfinite(points).all(axis=1)
+            sound = in_front(points) & np.isfinite(points).all(axis=1)
             before = np.logical_and.reduceat(sound, found.tracks.start)
             if not before.all():
                 found, places = found.select(before), places[before]
@@ -289,9 +288,9 @@ class _Sightings:
         moved = np.einsum("nij,nj->ni", self.cTw[:, :3, :3], places[self.tracks.track])
         return np.asarray(moved + self.cTw[:, :3, 3])
 
-    def _linear(self, sensor: Sensor, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _linear(self, sensor: CameraRig, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Normalised residuals (n, 3) and their derivative (n, 3, 3) by the place."""
-        off = measurement_difference(sensor, self.measurement, project(sensor, points))
+        off = self.measurement - project(sensor, points)
         jacobian = projection_jacobian(sensor, points) @ self.cTw[:, :3, :3]
         return np.einsum("nij,nj->ni", self.whitening, off), self.whitening @ jacobian
 

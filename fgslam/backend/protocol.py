@@ -38,7 +38,7 @@ from fgslam.core.measurements import Increment, MeasurementType, Odometry
 
 
 class Estimator(Protocol):
-    """A SLAM estimator over landmarks of a stereo, trinocular or range-bearing sensor.
+    """A SLAM estimator over landmarks of a stereo or trinocular rig.
 
     Calls come in time order; a time stamp that does not increase raises EstimatorError and leaves
     the state as it was. Arguments are never mutated. Returned arrays must not be written to.

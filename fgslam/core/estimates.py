@@ -89,7 +89,7 @@ class EgoMotion(Brief):
         wTc: (4, 4) estimated pose.
         covariance: (6, 6) in the tangent space at ``wTc``.
         inliers: (k,) which of the given matches were used in the last iteration.
-        residuals: (k,) image residual E of every match at ``wTc``, pixels (range sensor: radians).
+        residuals: (k,) image residual E of every match at ``wTc``, pixels.
         status: how it ended.
         iterations: Newton steps taken.
         weighted_at: (4, 4) pose at which the last minimisation's weights were evaluated; None

@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import congruence, pose, so3_exp
-from fgslam.core.sensors import Sensor, vertical_of
+from fgslam.core.sensors import CameraRig, vertical_of
 
 DegreesOfFreedom: TypeAlias = Literal[3, 5, 6]
 
@@ -38,7 +38,7 @@ class Floor:
     tilt_sigma_rad: float = 0.0
 
     @staticmethod
-    def under(rig: Sensor, dof: DegreesOfFreedom) -> Floor:
+    def under(rig: CameraRig, dof: DegreesOfFreedom) -> Floor:
         """The exact floor that is level with the robot's body in the first camera frame.
 
         Where nothing is known of how the camera is mounted, it is taken as level.

@@ -1,4 +1,4 @@
-"""Pure geometry: rigid motions, the sensors and their Jacobians, triangulation, frame changes.
+"""Pure geometry: rigid motions, the stereo camera and its Jacobians, triangulation, frame changes.
 
 Conventions as in :mod:`fgslam.core`: ``wTc`` poses as 4x4 matrices, tangent vectors
 [rotation, translation] on the right (``T * Exp(xi)``), which is GTSAM's ``Pose3`` convention.
@@ -14,16 +14,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.measurements import Odometry
-from fgslam.core.planar import wrap
-from fgslam.core.sensors import (
-    CameraRig,
-    Sensor,
-    level_distance,
-    project_range_bearing,
-    range_bearing_jacobian,
-    range_bearing_point_jacobian,
-    triangulate_range_bearing,
-)
+from fgslam.core.sensors import CameraRig
 
 # Below this rotation angle the series of sin and cos are exact to double precision.
 _SMALL_ANGLE = 1e-4
@@ -278,7 +269,7 @@ def yaw_pitch_roll(wTc: FloatArray) -> tuple[float, float, float]:
 
 
 # --------------------------------------------------------------------------------------------
-# The sensors: stereo camera and range-bearing
+# The stereo camera
 
 
 def transform_to_camera(wTc: FloatArray, points: FloatArray) -> FloatArray:
@@ -291,51 +282,31 @@ def transform_to_world(wTc: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points @ wTc[:3, :3].T + wTc[:3, 3])
 
 
-def in_front(sensor: Sensor, points: FloatArray, nearest_m: float = 1e-3) -> BoolArray:
-    """Which points (n, 3) in the sensor's frame it can measure, by their side alone.
-
-    Those before the camera, or off the range sensor's vertical axis, by more than ``nearest_m``.
-    """
-    if isinstance(sensor, CameraRig):
-        return np.asarray(points[:, 2] > nearest_m)
-    return np.asarray(level_distance(points) > nearest_m)
+def in_front(points: FloatArray, nearest_m: float = 1e-3) -> BoolArray:
+    """Which points (n, 3) in the camera's frame lie before it, by more than ``nearest_m``."""
+    return np.asarray(points[:, 2] > nearest_m)
 
 
-def project(sensor: Sensor, points: FloatArray) -> FloatArray:
-    """Measurements (n, 3) of points (n, 3) in the sensor's frame, which must be :func:`in_front`.
-
-    (column, row, disparity) of the reference camera, or (azimuth, elevation, range).
-    """
-    if not isinstance(sensor, CameraRig):
-        return project_range_bearing(points)
+def project(rig: CameraRig, points: FloatArray) -> FloatArray:
+    """(column, row, disparity) (n, 3) of points (n, 3) before the reference camera."""
     inverse_depth = 1.0 / points[:, 2]
     out = np.empty_like(points)
-    out[:, 0] = sensor.cx + sensor.fx * points[:, 0] * inverse_depth
-    out[:, 1] = sensor.cy + sensor.fy * points[:, 1] * inverse_depth
-    out[:, 2] = sensor.fx * sensor.baseline * inverse_depth
+    out[:, 0] = rig.cx + rig.fx * points[:, 0] * inverse_depth
+    out[:, 1] = rig.cy + rig.fy * points[:, 1] * inverse_depth
+    out[:, 2] = rig.fx * rig.baseline * inverse_depth
     return out
 
 
-def measurement_difference(sensor: Sensor, a: FloatArray, b: FloatArray) -> FloatArray:
-    """``a - b`` of measurements (n, 3), the azimuth of a range-bearing sensor wrapped."""
-    out = np.asarray(a - b)
-    if not isinstance(sensor, CameraRig):
-        out[:, 0] = wrap(out[:, 0])
-    return out
-
-
-def projection_jacobian(sensor: Sensor, points: FloatArray) -> FloatArray:
-    """d(measurement)/d(point) (n, 3, 3) at points (n, 3) in the sensor's frame."""
-    if not isinstance(sensor, CameraRig):
-        return range_bearing_jacobian(points)
+def projection_jacobian(rig: CameraRig, points: FloatArray) -> FloatArray:
+    """d(measurement)/d(point) (n, 3, 3) at points (n, 3) in the camera's frame."""
     inverse_depth = 1.0 / points[:, 2]
     inverse_depth2 = inverse_depth * inverse_depth
     out = np.zeros((len(points), 3, 3))
-    out[:, 0, 0] = sensor.fx * inverse_depth
-    out[:, 0, 2] = -sensor.fx * points[:, 0] * inverse_depth2
-    out[:, 1, 1] = sensor.fy * inverse_depth
-    out[:, 1, 2] = -sensor.fy * points[:, 1] * inverse_depth2
-    out[:, 2, 2] = -sensor.fx * sensor.baseline * inverse_depth2
+    out[:, 0, 0] = rig.fx * inverse_depth
+    out[:, 0, 2] = -rig.fx * points[:, 0] * inverse_depth2
+    out[:, 1, 1] = rig.fy * inverse_depth
+    out[:, 1, 2] = -rig.fy * points[:, 1] * inverse_depth2
+    out[:, 2, 2] = -rig.fx * rig.baseline * inverse_depth2
     return out
 
 
@@ -346,41 +317,37 @@ def point_pose_jacobian(points: FloatArray) -> FloatArray:
     return out
 
 
-def triangulate(sensor: Sensor, measurement: FloatArray) -> FloatArray:
-    """Points (n, 3) in the sensor's frame from measurements (n, 3); inverse of :func:`project`.
+def triangulate(rig: CameraRig, measurement: FloatArray) -> FloatArray:
+    """Points (n, 3) in the camera's frame from measurements (n, 3); inverse of :func:`project`.
 
-    Of a camera rig (Se et al. 2.2) the disparity must be positive.
+    The disparity must be positive (Se et al. 2.2).
     """
-    if not isinstance(sensor, CameraRig):
-        return triangulate_range_bearing(measurement)
-    depth = sensor.fx * sensor.baseline / measurement[:, 2]
+    depth = rig.fx * rig.baseline / measurement[:, 2]
     out = np.empty(measurement.shape)
-    out[:, 0] = (measurement[:, 0] - sensor.cx) * depth / sensor.fx
-    out[:, 1] = (measurement[:, 1] - sensor.cy) * depth / sensor.fy
+    out[:, 0] = (measurement[:, 0] - rig.cx) * depth / rig.fx
+    out[:, 1] = (measurement[:, 1] - rig.cy) * depth / rig.fy
     out[:, 2] = depth
     return out
 
 
 def triangulation_covariance(
-    sensor: Sensor, measurement: FloatArray, covariance: FloatArray
+    rig: CameraRig, measurement: FloatArray, covariance: FloatArray
 ) -> FloatArray:
     """Full covariance (n, 3, 3) of triangulated points by first-order propagation.
 
     Keeps the off-diagonals, so that the ellipsoids lie along the rays.
 
     Args:
-        sensor: the cameras, or the range-bearing sensor.
-        measurement: (n, 3), its units.
-        covariance: (n, 3, 3) of the measurement, its units squared.
+        rig: the cameras.
+        measurement: (n, 3) column, row, disparity, pixels.
+        covariance: (n, 3, 3) of the measurement, pixels squared.
     """
-    if not isinstance(sensor, CameraRig):
-        return congruence(range_bearing_point_jacobian(measurement), covariance)
-    d, fx, fy, baseline = measurement[:, 2], sensor.fx, sensor.fy, sensor.baseline
+    d, fx, fy, baseline = measurement[:, 2], rig.fx, rig.fy, rig.baseline
     jacobian = np.zeros((len(d), 3, 3))
     jacobian[:, 0, 0] = baseline / d
-    jacobian[:, 0, 2] = -(measurement[:, 0] - sensor.cx) * baseline / d**2
+    jacobian[:, 0, 2] = -(measurement[:, 0] - rig.cx) * baseline / d**2
     jacobian[:, 1, 1] = fx * baseline / (fy * d)
-    jacobian[:, 1, 2] = -(measurement[:, 1] - sensor.cy) * fx * baseline / (fy * d**2)
+    jacobian[:, 1, 2] = -(measurement[:, 1] - rig.cy) * fx * baseline / (fy * d**2)
     jacobian[:, 2, 2] = -fx * baseline / d**2
     return congruence(jacobian, covariance)
 

@@ -52,26 +52,23 @@ from fgslam.core.measurements import (
 )
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.rig_correction import term_names
-from fgslam.core.sensors import CameraRig, RangeBearingSensor, Sensor
+from fgslam.core.sensors import CameraRig
 
 _UPPER = np.triu_indices(3)
 _UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig
 _RIG = ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline")
-_SENSOR_KEYS = {"stereo": _RIG, "range_bearing": ("max_range_m",)}
 _DEFAULTS: dict[str, Any] = {"exact": False, "places": "all"}
 """Of a rig: written where it is otherwise."""
 
 
 def arrays_of(
-    sensor: Sensor, motion_model: dict[str, Any], frames: Sequence[Increment]
+    sensor: CameraRig, motion_model: dict[str, Any], frames: Sequence[Increment]
 ) -> StateArrays:
     """Frames as the arrays of a log's file, of the first version that has a place for them."""
     version = _version_of(frames)
-    kind = "stereo" if isinstance(sensor, CameraRig) else "range_bearing"
-    about = {"kind": kind} | {name: getattr(sensor, name) for name in _SENSOR_KEYS[kind]}
-    if isinstance(sensor, CameraRig):
-        stated = {name: type(usual)(getattr(sensor, name)) for name, usual in _DEFAULTS.items()}
-        about |= {name: value for name, value in stated.items() if value != _DEFAULTS[name]}
+    about = {"kind": "stereo"} | {name: getattr(sensor, name) for name in _RIG}
+    stated = {name: type(usual)(getattr(sensor, name)) for name, usual in _DEFAULTS.items()}
+    about |= {name: value for name, value in stated.items() if value != _DEFAULTS[name]}
     out = LOG.header(version, sensor=about, motion=motion_model) | {
         SENSOR_POSE: sensor.bTc,
         "frame_index": np.array([s.index for s in frames], np.int64),
@@ -85,7 +82,7 @@ def arrays_of(
     out["rejected"] = joined([s.rejected for s in frames], (), np.bool_)
     if version >= WITH_LOOPS:
         out |= _loop_arrays(frames)
-    if version >= WITH_CORRECTIONS and isinstance(sensor, CameraRig):
+    if version >= WITH_CORRECTIONS:
         out |= _correction_arrays(frames, len(term_names(sensor)))
     if version >= WITH_EVERYTHING:
         out |= _bias_arrays(frames)
@@ -102,7 +99,7 @@ def _version_of(frames: Sequence[Increment]) -> int:
     return WITH_LOOPS if any(s.loops or s.relocalised for s in frames) else BEFORE_LOOPS
 
 
-def frames_of(arrays: StateArrays, where: str) -> tuple[Sensor, dict[str, Any], list[Increment]]:
+def frames_of(arrays: StateArrays, where: str) -> tuple[CameraRig, dict[str, Any], list[Increment]]:
     """Sensor, motion model and frames from their arrays.
 
     Args:
@@ -117,7 +114,7 @@ def frames_of(arrays: StateArrays, where: str) -> tuple[Sensor, dict[str, Any], 
     _require_sound(arrays, where)
     loops, relocalised = _loops(arrays, header["version"], where)
     sensor = _sensor(header["sensor"], arrays[SENSOR_POSE], where)
-    _require_ahead(arrays, sensor, where)
+    _require_ahead(arrays, where)
     corrections = _corrections(arrays, header["version"], sensor, where)
     settled = _settled(arrays, header["version"], corrections, where)
     biases = _biases(arrays, header["version"], where)
@@ -186,11 +183,9 @@ def _bias_arrays(frames: Sequence[Increment]) -> StateArrays:
 def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
     header = LOG.read_header(arrays, where)
     sensor = header.get("sensor")
-    keys = _SENSOR_KEYS.get(str(sensor.get("kind"))) if isinstance(sensor, dict) else None
-    given = set(sensor if isinstance(sensor, dict) else ())
-    optional = set(_DEFAULTS) if keys is _RIG else set()
-    if keys is None or given - optional != {"kind", *keys}:
-        raise MeasurementLogError(f"{where}: the log's header names no sensor; run again")
+    given = sensor if isinstance(sensor, dict) else {}
+    if given.get("kind") != "stereo" or given.keys() - _DEFAULTS != {"kind", *_RIG}:
+        raise MeasurementLogError(f"{where}: the log's header names no rig; run again")
     if not isinstance(header.get("motion"), dict):
         raise MeasurementLogError(f"{where}: the log's header has no motion model; run again")
     return header
@@ -199,7 +194,7 @@ def _read_header(arrays: StateArrays, where: str) -> dict[str, Any]:
 SENSOR_ARRAYS = ("header", SENSOR_POSE)
 
 
-def sensor_of(arrays: StateArrays, where: str) -> Sensor:
+def sensor_of(arrays: StateArrays, where: str) -> CameraRig:
     """The sensor that :data:`SENSOR_ARRAYS` tell of. Raises MeasurementLogError."""
     header = _read_header(arrays, where)
     LOG.require(arrays, {SENSOR_POSE: ("f", (4, 4))}, where)
@@ -207,10 +202,8 @@ def sensor_of(arrays: StateArrays, where: str) -> Sensor:
     return _sensor(header["sensor"], arrays[SENSOR_POSE], where)
 
 
-def _sensor(values: dict[str, Any], bTc: FloatArray, where: str) -> Sensor:
+def _sensor(values: dict[str, Any], bTc: FloatArray, where: str) -> CameraRig:
     numbers = {name: value for name, value in values.items() if name != "kind"}
-    if values["kind"] != "stereo":
-        return RangeBearingSensor(**numbers, bTc=bTc)
     rig = CameraRig(**numbers, bTc=bTc)
     if fault := rig_fault(rig):
         raise MeasurementLogError(f"{where}: the log's rig cannot be one: {fault}; run again")
@@ -232,18 +225,16 @@ def _require_sound(arrays: StateArrays, where: str) -> None:
     require_single(LOG, "observation_id", ids, start, where)
 
 
-def _require_ahead(arrays: StateArrays, sensor: Sensor, where: str) -> None:
-    """Raises MeasurementLogError where most disparities or ranges are not positive.
+def _require_ahead(arrays: StateArrays, where: str) -> None:
+    """Raises MeasurementLogError where most disparities are not positive.
 
     Single ones are noise about what is far away.
     """
     measured = arrays["measurement"][:, 2]
     if len(measured) and not np.median(measured) > 0.0:
-        what = "disparities" if isinstance(sensor, CameraRig) else "ranges"
-        swapped = ": left and right are swapped" if isinstance(sensor, CameraRig) else ""
         raise MeasurementLogError(
-            f"{where}: {int((measured <= 0.0).sum())} of {len(measured)} {what} are not positive"
-            f"{swapped}, or it is damaged; run again"
+            f"{where}: {int((measured <= 0.0).sum())} of {len(measured)} disparities are not "
+            "positive: left and right are swapped, or it is damaged; run again"
         )
 
 
@@ -301,14 +292,14 @@ def _require_consistent_loops(arrays: StateArrays, where: str) -> None:
 
 
 def _corrections(
-    arrays: StateArrays, version: int, rig: Sensor, where: str
+    arrays: StateArrays, version: int, rig: CameraRig, where: str
 ) -> list[FloatArray | None]:
     """The rig's correction in each frame; None before version 6, and in a log of NaN.
 
     Raises MeasurementLogError where they are not there, or of another rig.
     """
     frames = len(arrays["frame_index"])
-    if version < WITH_CORRECTIONS or not isinstance(rig, CameraRig):
+    if version < WITH_CORRECTIONS:
         return [None] * frames
     LOG.require(arrays, {CORRECTIONS: ("f", (frames, len(term_names(rig))))}, where)
     rows = arrays[CORRECTIONS]

@@ -20,7 +20,7 @@ from fgslam.core.files import as_path
 from fgslam.core.log_arrays import SENSOR_ARRAYS, arrays_of, frames_of, sensor_of
 from fgslam.core.log_layout import LOG
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 
 @dataclass(slots=True, eq=False, repr=False)
@@ -28,13 +28,13 @@ class MeasurementLog(Brief):
     """Measurements of a run, frame by frame.
 
     Attributes:
-        rig: the cameras, or the range-bearing sensor; with the lever arm.
+        rig: the cameras, with the lever arm.
         motion_model: how odometry came about, and the stand-in's numbers where there was none
             (plain JSON values): replays need it to predict as the live run did.
         increments: one a frame, time increasing.
     """
 
-    rig: Sensor
+    rig: CameraRig
     motion_model: dict[str, Any]
     increments: list[Increment] = field(default_factory=list)
 
@@ -95,7 +95,7 @@ class MeasurementLog(Brief):
         write_arrays(Path(path), self.to_arrays())
 
     @staticmethod
-    def load_sensor(path: Path) -> Sensor:
+    def load_sensor(path: Path) -> CameraRig:
         """What a log's file was measured with. Raises MeasurementLogError as :meth:`load` does."""
         return sensor_of(LOG.load(path, SENSOR_ARRAYS), str(path))
 

@@ -18,7 +18,6 @@ class MeasurementType(str, Enum):
 
     ODOMETRY = "odometry"
     STEREO = "stereo"
-    RANGE_BEARING = "range_bearing"
     LOOP = "loop"
 
 
@@ -78,8 +77,7 @@ class Observations(Rows):
 
     Attributes:
         ids: (k,) landmark identities, unique within the frame.
-        measurement: (k, 3) (column, row, disparity), pixels; of a range-bearing sensor
-            (azimuth, elevation, range), radians and metres.
+        measurement: (k, 3) (column, row, disparity), pixels.
         covariance: (k, 3, 3) of the measurement.
         pixels: (k, 3, 2) raw pixels in right, left, top; NaN where there is no such camera, or
             its image did not show the landmark.

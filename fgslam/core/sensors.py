@@ -1,7 +1,6 @@
-"""The sensors: rectified camera rigs and range-bearing, and the equations of their measurements.
+"""The rectified camera rig and the linear model of its pixels.
 
-:mod:`fgslam.core.geometry` chooses between the sensors. Derived in
-docs/derivations/stereo_measurement.md and docs/derivations/range_bearing.md.
+Derived in docs/derivations/stereo_measurement.md.
 """
 
 from __future__ import annotations
@@ -9,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TypeAlias
 
 import numpy as np
 
@@ -63,82 +61,8 @@ class CameraRig(Brief):
         return 2 if self.vertical_baseline is None else 3
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class RangeBearingSensor(Brief):
-    """Measures (azimuth, elevation, range) of landmarks: radians, metres; axes as a camera's.
-
-    ``azimuth = atan2(x, z)`` is positive to the right, ``elevation = atan2(-y, hypot(x, z))`` up.
-
-    Attributes:
-        max_range_m: farthest landmark seen.
-        bTc: (4, 4) pose of the sensor in the robot's body frame.
-    """
-
-    max_range_m: float
-    bTc: FloatArray
-
-
 CAMERA_NAMES = ("right", "left", "top")
 """Of a rig's cameras in their order, the reference first."""
-
-Sensor: TypeAlias = CameraRig | RangeBearingSensor
-"""What measures landmarks; each by three numbers."""
-
-
-# --------------------------------------------------------------------------------------------
-# Range-bearing: points (n, 3) in the sensor's frame, measured as (azimuth, elevation, range)
-
-
-def project_range_bearing(points: FloatArray) -> FloatArray:
-    """(azimuth, elevation, range) (n, 3) of points off the sensor's vertical axis."""
-    x, y, z = points.T
-    level = np.hypot(x, z)
-    return np.column_stack([np.arctan2(x, z), np.arctan2(-y, level), np.hypot(level, y)])
-
-
-def range_bearing_jacobian(points: FloatArray) -> FloatArray:
-    """d(azimuth, elevation, range)/d(point) (n, 3, 3), off the sensor's vertical axis."""
-    x, y, z = points.T
-    level2 = x * x + z * z
-    level = np.sqrt(level2)
-    distance2 = level2 + y * y
-    distance = np.sqrt(distance2)
-    out = np.zeros((len(points), 3, 3))
-    out[:, 0, 0] = z / level2
-    out[:, 0, 2] = -x / level2
-    out[:, 1, 0] = x * y / (level * distance2)
-    out[:, 1, 1] = -level / distance2
-    out[:, 1, 2] = z * y / (level * distance2)
-    out[:, 2] = points / distance[:, None]
-    return out
-
-
-def triangulate_range_bearing(measurement: FloatArray) -> FloatArray:
-    """Points (n, 3) of (azimuth, elevation, range) (n, 3); see :func:`project_range_bearing`."""
-    azimuth, elevation, distance = measurement.T
-    level = distance * np.cos(elevation)
-    return np.column_stack(
-        [level * np.sin(azimuth), -distance * np.sin(elevation), level * np.cos(azimuth)]
-    )
-
-
-def range_bearing_point_jacobian(measurement: FloatArray) -> FloatArray:
-    """d(point)/d(azimuth, elevation, range) (n, 3, 3)."""
-    azimuth, elevation, distance = measurement.T
-    sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
-    sin_e, cos_e = np.sin(elevation), np.cos(elevation)
-    out = np.zeros((len(measurement), 3, 3))
-    out[:, 0, 0], out[:, 2, 0] = distance * cos_e * cos_a, -distance * cos_e * sin_a
-    out[:, 0, 1], out[:, 2, 1] = -distance * sin_e * sin_a, -distance * sin_e * cos_a
-    out[:, 1, 1] = -distance * cos_e
-    out[:, 0, 2], out[:, 1, 2], out[:, 2, 2] = cos_e * sin_a, -sin_e, cos_e * cos_a
-    return out
-
-
-def level_distance(points: FloatArray) -> FloatArray:
-    """Distances (n,) from the sensor's vertical axis, on which the azimuth is undefined."""
-    return np.hypot(points[:, 0], points[:, 2])
-
 
 # --------------------------------------------------------------------------------------------
 # The rig's linear model: raw pixels of its images and (column, row, disparity)

@@ -24,7 +24,7 @@ from fgslam.core.recordings import (
     MeasurementRecording,
     read_landmark_truth,
 )
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.core.trajectories import Trajectory
 from fgslam.datasets.images import require_folder
 from fgslam.datasets.recording import select_of
@@ -141,7 +141,7 @@ def files_identity(files: Iterable[Path], settings: Mapping[str, Any]) -> str:
 
 
 def make_log(
-    sensor: Sensor, increments: list[Increment], odometry: OdometrySettings
+    sensor: CameraRig, increments: list[Increment], odometry: OdometrySettings
 ) -> MeasurementLog:
     """A log whose motion model is what the settings of odometry ask for.
 

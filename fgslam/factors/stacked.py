@@ -1,8 +1,7 @@
 """Landmark observations of many frames, linearised together: the factors of landmark.py as arrays.
 
-For solvers that eliminate landmarks themselves. An observation that cannot be predicted, of a point
-behind the camera (or on the range sensor's vertical axis), pulls nothing; in a camera it costs as
-much as GTSAM's stereo factor then does.
+For solvers that eliminate landmarks themselves. An observation of a point behind the camera pulls
+nothing and costs as much as GTSAM's stereo factor then does.
 """
 
 from __future__ import annotations
@@ -15,12 +14,11 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import (
     in_front,
-    measurement_difference,
     project,
     projection_jacobian,
     skew,
 )
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,18 +48,18 @@ def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def residuals(
-    sensor: Sensor,
+    rig: CameraRig,
     poses: FloatArray,
     points: FloatArray,
     measurement: FloatArray,
     roots: FloatArray,
 ) -> FloatArray:
     """Whitened residuals (k, 3), predicted minus measured; arguments of :func:`linearised`."""
-    return products(roots, _off(sensor, in_cameras(poses, points), measurement)[0])
+    return products(roots, _off(rig, in_cameras(poses, points), measurement)[0])
 
 
 def linearised(
-    sensor: Sensor,
+    rig: CameraRig,
     poses: FloatArray,
     points: FloatArray,
     measurement: FloatArray,
@@ -70,15 +68,15 @@ def linearised(
     """Whitened observations, predicted minus measured.
 
     Args:
-        sensor: the cameras, or the range-bearing sensor.
+        rig: the cameras.
         poses: (k, 4, 4) ``wTc`` of each observation.
         points: (k, 3) of its landmark, world.
         measurement: (k, 3).
         roots: (k, 3, 3) of :func:`whitening`.
     """
     local = in_cameras(poses, points)
-    off, seen = _off(sensor, local, measurement)
-    jacobian = roots @ projection_jacobian(sensor, np.where(seen[:, None], local, 1.0))
+    off, seen = _off(rig, local, measurement)
+    jacobian = roots @ projection_jacobian(rig, np.where(seen[:, None], local, 1.0))
     jacobian[~seen] = 0.0
     by_pose = np.empty((len(local), 3, 6))
     by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
@@ -87,15 +85,14 @@ def linearised(
 
 
 def _off(
-    sensor: Sensor, local: FloatArray, measurement: FloatArray
+    rig: CameraRig, local: FloatArray, measurement: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Residuals (k, 3) of points in the sensor's frame, and which can be predicted (k,)."""
-    seen = in_front(sensor, local)
-    predicted = project(sensor, np.where(seen[:, None], local, 1.0))
-    off = measurement_difference(sensor, predicted, measurement)
+    """Residuals (k, 3) of points in the camera's frame, and which are in front (k,)."""
+    seen = in_front(local)
+    predicted = project(rig, np.where(seen[:, None], local, 1.0))
+    off = predicted - measurement
     # As GTSAM's factor has it: both columns and the row are two focal lengths off.
-    unseen = [2.0 * sensor.fx, 2.0 * sensor.fx, 0.0] if isinstance(sensor, CameraRig) else [0.0] * 3
-    off[~seen] = unseen
+    off[~seen] = [2.0 * rig.fx, 2.0 * rig.fx, 0.0]
     return off, seen
 
 

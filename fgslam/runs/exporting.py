@@ -273,7 +273,7 @@ def export_graph(
 ) -> str:
     """Writes a log's measurements around an estimator's final answer, as .g2o.
 
-    Stereo and range-bearing observations become points with their first-order covariance.
+    Observations become points with their first-order covariance.
 
     Args:
         path: the file.

@@ -93,8 +93,6 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
         trajectory: poses of the reference camera.
         points: the map, ascending by identity.
     """
-    if not isinstance(log.rig, CameraRig):
-        raise DatasetError("the run's sensor has no images; export a run of cameras")
     rig, parts = log.rig, []
     for increment, row in zip(log, rows_of_frames(log, trajectory).tolist(), strict=True):
         if row >= 0:

@@ -15,7 +15,6 @@ from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.files import require_output
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, moved_pixels
-from fgslam.core.sensors import CameraRig
 from fgslam.core.trajectories import Trajectory
 from fgslam.datasets.film_files import require_film_suffix, write_film
 from fgslam.report.figures.trajectory import level_axes
@@ -100,8 +99,6 @@ def _film_of_slam(run: Path, out: Path, estimator: str | None, progress: Progres
     folder = run / results_folder(run, estimator)
     trajectory, points = Trajectory.load(folder / "final.tum"), read_ply(folder / "map.ply")
     log = MeasurementLog.load(log_of(run))
-    if not isinstance(log.rig, CameraRig):
-        raise DatasetError(f"{run}: its sensor has no images, so that there is nothing to film")
     fps = frame_rate(trajectory.timestamps, "poses", run)
     rows, pictures = frames_of(load_config(run / RUN_MARKER), trajectory)
     moments = _moments(log, rows_of_frames(log, trajectory), points, rows, pictures)

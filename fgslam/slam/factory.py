@@ -31,7 +31,7 @@ from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.measurements import MeasurementType
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     OdometrySettings,
@@ -145,7 +145,7 @@ def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> Mot
 
 
 def make_estimator(
-    rig: Sensor,
+    rig: CameraRig,
     settings: EstimatorSettings,
     ego_motion: EgoMotionSettings | None = None,
     prior: Prediction | None = None,
@@ -201,7 +201,7 @@ def make_estimator(
 
 
 def made_or_given(
-    rig: Sensor,
+    rig: CameraRig,
     estimator: EstimatorSettings | Estimator,
     ego_motion: EgoMotionSettings | None = None,
     prior: Prediction | None = None,
@@ -212,7 +212,7 @@ def made_or_given(
     return cast("Estimator", estimator)
 
 
-def make_floor(rig: Sensor, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
+def make_floor(rig: CameraRig, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
     """The floor as an estimator is to use it."""
     if settings.mode == "auto":
         return Floor.under(rig, dof)

@@ -34,7 +34,6 @@ from fgslam.core.estimates import (
 )
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, MeasurementType, Observations
-from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
@@ -255,8 +254,7 @@ def peak_memory_mb() -> float:
 
 def _require_support(estimator: Estimator, log: MeasurementLog) -> None:
     """Refuses an estimator that cannot use what the log holds."""
-    camera = isinstance(log.rig, CameraRig)
-    needed = {MeasurementType.STEREO if camera else MeasurementType.RANGE_BEARING}
+    needed = {MeasurementType.STEREO}
     if any(increment.odometry is not None for increment in log):
         needed.add(MeasurementType.ODOMETRY)
     lacking = sorted(kind.value for kind in needed - estimator.supports)

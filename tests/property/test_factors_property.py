@@ -17,12 +17,9 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Odometry
-from fgslam.core.sensors import RangeBearingSensor
-from fgslam.factors.landmark import RangeBearingFactors, StereoFactors
+from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor
 from fgslam.factors.noise import Whitening, positive_definite
-
-SENSOR = RangeBearingSensor(20.0, g.BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 
 
 def vectors(size: float, n: int = 3) -> st.SearchStrategy[FloatArray]:
@@ -69,29 +66,6 @@ def test_a_stereo_factor_is_its_specification_and_knows_no_world(
     assert close(found, 0.5 * float(residual @ np.linalg.solve(covariance, residual)))
     elsewhere = g.transform_to_world(move, point[None, :])[0]
     assert close(found, cost(factor, move @ wTc, elsewhere))
-
-
-@given(
-    poses(),
-    st.floats(-np.pi, np.pi),
-    st.floats(-np.pi / 2, np.pi / 2),
-    st.floats(0.3, 15.0),
-    covariances(0.02),
-)
-@example(np.eye(4), 0.0, 0.0, 1.0, np.diag([1e-4, 1e-6, 1e-4]))
-@example(np.eye(4), np.pi, 0.0, 1.0, np.diag([1e-4, 1e-4, 1e-4]))
-@example(np.eye(4), 0.3, np.pi / 2, 1.0, np.diag([1e-4, 1e-4, 1e-4]))
-def test_a_range_bearing_factor_is_zero_and_finite_where_it_was_measured(
-    wTc: FloatArray, azimuth: float, elevation: float, distance: float, covariance: FloatArray
-) -> None:
-    measured = np.array([azimuth, elevation, distance])
-    point = g.transform_to_world(wTc, g.triangulate(SENSOR, measured[None, :]))[0]
-    factor = RangeBearingFactors(Whitening()).factor(0, 1, measured, covariance)
-    values = values_of(wTc, point)
-    assert np.abs(factor.unwhitenedError(values)).max() < 1e-11 * (1.0 + 15.0 / distance**2)
-    jacobian, rhs = factor.linearize(values).jacobian()
-    assert np.isfinite(jacobian).all()
-    assert np.isfinite(rhs).all()
 
 
 @given(poses(), poses(), vectors(0.3, 6), poses())

@@ -21,7 +21,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 
 class DeadReckoning:
@@ -30,7 +30,7 @@ class DeadReckoning:
     kind: ClassVar[str] = "odometry"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
 
-    def __init__(self, sensor: Sensor, prior: Prediction) -> None:
+    def __init__(self, sensor: CameraRig, prior: Prediction) -> None:
         """Starts at the prior: pose of the first frame and its covariance."""
         self._sensor = sensor
         self._current = prior

@@ -41,7 +41,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
 _ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted
@@ -58,7 +58,7 @@ class FullEkf:
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
 
     def __init__(
-        self, sensor: Sensor, settings: EkfSettings, floor: Floor, prior: Prediction
+        self, sensor: CameraRig, settings: EkfSettings, floor: Floor, prior: Prediction
     ) -> None:
         """Starts at the prior pose, brought onto a hard floor, with an empty map."""
         self._sensor = sensor

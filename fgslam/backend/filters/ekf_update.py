@@ -17,7 +17,6 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     in_front,
-    measurement_difference,
     point_pose_jacobian,
     project,
     projection_jacobian,
@@ -26,7 +25,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Observations
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 _ITERATIONS = 30
 _SETTLED = 1e-5  # radians and metres: far below what any measurement resolves
@@ -56,7 +55,7 @@ class Matches:
 
     @staticmethod
     def of(
-        sensor: Sensor,
+        sensor: CameraRig,
         wTc: FloatArray,
         blocks: IntArray,
         positions: FloatArray,
@@ -64,12 +63,12 @@ class Matches:
     ) -> Matches:
         """Linearises at the landmarks' positions (k, 3); those not before the sensor drop out."""
         points = transform_to_camera(wTc, positions)
-        usable = in_front(sensor, points)
+        usable = in_front(points)
         points, observed = points[usable], observed.select(usable)
         jacobian = projection_jacobian(sensor, points)
         return Matches(
             blocks[usable],
-            measurement_difference(sensor, observed.measurement, project(sensor, points)),
+            observed.measurement - project(sensor, points),
             jacobian @ point_pose_jacobian(points),
             jacobian @ wTc[:3, :3].T,
             observed.covariance,
@@ -207,7 +206,7 @@ class Sightings:
         fixed: landmarks are not to change.
     """
 
-    sensor: Sensor
+    sensor: CameraRig
     blocks: IntArray
     positions: FloatArray
     observed: Observations

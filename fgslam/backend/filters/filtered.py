@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Prediction, Trajectory
 from fgslam.core.geometry import (
@@ -19,7 +19,7 @@ from fgslam.core.geometry import (
     triangulation_covariance,
 )
 from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 
 
 @dataclass(slots=True, eq=False)
@@ -119,7 +119,7 @@ def moved(current: Prediction, odometry: Odometry | None) -> Prediction:
 
 
 def placed(
-    sensor: Sensor,
+    sensor: CameraRig,
     wTc: FloatArray,
     measurement: FloatArray,
     covariance: FloatArray,
@@ -156,20 +156,14 @@ class FirstSights:
     covariances: FloatArray
 
     @staticmethod
-    def of(sensor: Sensor, observed: Observations) -> FirstSights:
+    def of(sensor: CameraRig, observed: Observations) -> FirstSights:
         """Triangulates; what lies at infinity or behind the sensor is left out."""
-        observed = observed.select(_placeable(sensor, observed.measurement))
+        finite = np.isfinite(observed.measurement).all(axis=1)
+        disparity = np.where(finite, observed.measurement[:, 2], 0.0)
+        # Far below any disparity that a camera can tell from zero, far above one that overflows.
+        observed = observed.select(disparity > 1e-6)
         points = triangulate(sensor, observed.measurement)
-        kept = in_front(sensor, points)
+        kept = in_front(points)
         observed, points = observed.select(kept), points[kept]
         covariances = triangulation_covariance(sensor, observed.measurement, observed.covariance)
         return FirstSights(observed, points, covariances)
-
-
-def _placeable(sensor: Sensor, measurement: FloatArray) -> BoolArray:
-    """Positive disparity, or range: otherwise the triangulation has nothing to divide by."""
-    finite = np.isfinite(measurement).all(axis=1)
-    last = np.where(finite, measurement[:, 2], 0.0)
-    # Far below any disparity that a camera can tell from zero, far above one that overflows.
-    least = 1e-6 if isinstance(sensor, CameraRig) else 0.0
-    return np.asarray(last > least)

@@ -41,14 +41,13 @@ from fgslam.core.geometry import (
     congruence,
     inverse,
     inverse_spd3,
-    measurement_difference,
     point_pose_jacobian,
     project,
     projection_jacobian,
     transform_to_camera,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
@@ -66,7 +65,7 @@ class LandmarkKalman:
 
     def __init__(
         self,
-        rig: Sensor,
+        rig: CameraRig,
         settings: LandmarkKalmanSettings,
         prior: Prediction,
         ego_motion: EgoMotionSettings | None = None,
@@ -74,7 +73,7 @@ class LandmarkKalman:
         """Starts at the prior pose with an empty map.
 
         Args:
-            rig: the cameras, or the range-bearing sensor.
+            rig: the cameras.
             settings: which update, and its noise.
             prior: pose of the first frame and its covariance.
             ego_motion: of the least squares that finds the poses, for the covariances reported;
@@ -181,7 +180,7 @@ class LandmarkKalman:
         before, self._applied = self._applied, correction
         known = np.flatnonzero(self._rows.homes >= 0)
         early = 0 < len(self._past) < SETTLING
-        if not (early and before.size and len(known) and isinstance(self._rig, CameraRig)):
+        if not (early and before.size and len(known)):
             return None
         change = RigChange(self._rig, correction - before)
         poses = np.array([*self._past.poses[:-1], self._current.wTc])[self._rows.lasts[known]]
@@ -310,7 +309,7 @@ class LandmarkKalman:
             by_pose = jacobian @ point_pose_jacobian(points)
             noise = noise + congruence(by_pose, self._by_pose)
         expected = project(self._rig, points)
-        innovation = measurement_difference(self._rig, observed.measurement, expected)
+        innovation = observed.measurement - expected
         return self._kalman(rows, jacobian @ wTc[:3, :3].T, innovation, noise)
 
     def _world_update(self, rows: IntArray, observed: Observations) -> float:

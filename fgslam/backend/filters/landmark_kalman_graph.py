@@ -31,7 +31,7 @@ from fgslam.core.geometry import (
     triangulate,
 )
 from fgslam.core.measurements import Increment, MeasurementType, Observations
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
 from fgslam.factors.noise import Whitening
@@ -291,7 +291,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
 
     def __init__(
         self,
-        rig: Sensor,
+        rig: CameraRig,
         settings: LandmarkKalmanGraphSettings,
         prior: Prediction,
         ego_motion: EgoMotionSettings,
@@ -299,16 +299,11 @@ class LandmarkKalmanGraph(LandmarkKalman):
         """Starts at the prior pose with an empty map.
 
         Args:
-            rig: the cameras. Raises EstimatorError for another sensor.
+            rig: the cameras.
             settings: which update, and its noise.
             prior: pose of the first frame and its covariance.
             ego_motion: the front-end's, whose cost the pose's graph repeats.
         """
-        if not isinstance(rig, CameraRig):
-            raise EstimatorError(
-                "landmark_kalman_graph is built on stereo factors; for a range-bearing sensor use "
-                "landmark_kalman"
-            )
         closed_form = LandmarkKalmanSettings(
             update=settings.update,
             pose_covariance=settings.pose_covariance,

@@ -34,13 +34,7 @@ from fgslam.core.rig_correction import (
     shared_information,
 )
 from fgslam.core.rig_field import field_displacements, field_modes
-from fgslam.core.sensors import (
-    CameraRig,
-    Sensor,
-    pixel_model,
-    rig_map,
-    vertical_to_horizontal,
-)
+from fgslam.core.sensors import CameraRig, pixel_model, rig_map, vertical_to_horizontal
 
 _LEAST_MATCHES = 6  # of a frame; with fewer, its pose follows the one before
 _LEAST_DISPARITY_PX = 0.5  # farther points are known no better than their noise
@@ -54,9 +48,9 @@ class RigTerms:
     Of a rig that is exact, or that is taken as stated, there is no doubt.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
-        """``sensor``: that measures; only a rig of cameras is ever in doubt."""
-        self.rig = sensor if isinstance(sensor, CameraRig) and not sensor.exact else None
+    def __init__(self, sensor: CameraRig) -> None:
+        """Those of a rig that is not exact."""
+        self.rig = None if sensor.exact else sensor
         self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig))
         """How many there are, q."""
         self.deviations: FloatArray | None = None
@@ -110,7 +104,7 @@ class OnlineDoubt(ErrorColumns):
     Of a rig that is exact, or that is taken as stated, there is no doubt: nothing is added.
     """
 
-    def __init__(self, sensor: Sensor, floor: Floor) -> None:
+    def __init__(self, sensor: CameraRig, floor: Floor) -> None:
         """The first pose is known, the map empty.
 
         Args:

@@ -50,7 +50,7 @@ class RigChange:
         """
         turn, place = poses[:, :3, :3], poses[:, :3, 3]
         local = np.einsum("kji,kj->ki", turn, positions - place)
-        ahead = in_front(self.rig, local)
+        ahead = in_front(local)
         before = project(self.rig, np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
         after = self.measured(before)
         size = np.array([self.rig.width, self.rig.height])

@@ -191,7 +191,7 @@ class SampledErrors(ErrorColumns):
         """New landmarks, where the frame at ``wTc`` has them."""
         if not self._off:
             points = transform_to_camera(wTc, placed.points)
-            near = in_front(self._sensor, points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
+            near = in_front(points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
             gain = np.zeros((len(ids), 3, self._count + SAMPLES))
             gain[near] = self._sights(wTc, placed.select(near)).placed(self._gain)
             self._append({"ids": ids, "gain": gain})
@@ -310,7 +310,7 @@ class SampledErrors(ErrorColumns):
         seen = loop.observations
         seen = seen.select(self._rows(seen.ids)[1] & np.isin(seen.ids, landmarks.ids))
         problem = PoseProblem.of(landmarks, seen)
-        ahead = in_front(self._sensor, transform_to_camera(wTc, problem.points))
+        ahead = in_front(transform_to_camera(wTc, problem.points))
         if ahead.sum() < _LEAST_MATCHES:
             gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
             gain[:, self._count :] += _root(loop.covariance) @ self._signs(1, 6)[0]

@@ -19,7 +19,7 @@ from fgslam.backend.settings import GraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap
 from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 
 LEAST_SIGHTINGS = 2  # frames in which a landmark is seen before it enters: one match may be wrong
 LEAST_PARALLAX = 3.0
@@ -71,7 +71,7 @@ class LandmarkAdmission:
         remarks: which landmarks started anew, in words.
     """
 
-    def __init__(self, sensor: Sensor, settings: GraphSettings) -> None:
+    def __init__(self, sensor: CameraRig, settings: GraphSettings) -> None:
         """No landmark yet."""
         self._sensor = sensor
         self._settings = settings
@@ -93,9 +93,7 @@ class LandmarkAdmission:
             Two masks (m,).
         """
         gate_px = self._settings.gate_px
-        astray = ~tracking.inliers
-        if isinstance(self._sensor, CameraRig):
-            astray = astray & ~(tracking.residuals <= (gate_px or _ASTRAY_PX))
+        astray = ~tracking.inliers & ~(tracking.residuals <= (gate_px or _ASTRAY_PX))
         return (~astray if gate_px else np.ones(len(astray), np.bool_)), astray
 
     def confirmed(self, identities: IntArray) -> None:

@@ -27,11 +27,11 @@ from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import reorthonormalise
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 
 def batch_smoother(
-    sensor: Sensor, settings: BatchSettings, floor: Floor, prior: Prediction
+    sensor: CameraRig, settings: BatchSettings, floor: Floor, prior: Prediction
 ) -> MapSmoother:
     """Estimator of kind ``batch``, at the prior pose with an empty map."""
     if settings.method == "gnc":

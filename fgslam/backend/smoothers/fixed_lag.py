@@ -46,13 +46,13 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Increment
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 
 
 def fixed_lag_smoother(
-    sensor: Sensor, settings: FixedLagSettings, floor: Floor, prior: Prediction
+    sensor: CameraRig, settings: FixedLagSettings, floor: Floor, prior: Prediction
 ) -> LagSmoother:
     """Estimator of kind ``fixed_lag``, at the prior pose with an empty map.
 

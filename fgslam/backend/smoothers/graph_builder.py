@@ -22,9 +22,9 @@ from fgslam.core.floor import Floor
 from fgslam.core.geometry import triangulate
 from fgslam.core.measurements import Observations, Odometry
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, pose_key
-from fgslam.factors.landmark import landmark_factors
+from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
 from fgslam.factors.noise import Whitening, scaled
 from fgslam.factors.stacked import whitening
@@ -87,7 +87,7 @@ class GraphBuilder:
 
     def __init__(
         self,
-        sensor: Sensor,
+        sensor: CameraRig,
         settings: GraphSettings,
         floor: Floor,
         prior: Prediction,
@@ -143,7 +143,7 @@ class GraphBuilder:
     def doubted(self) -> RigCorrection | None:
         """A rig that calibrates itself, with the correction applied last; None for a known one."""
         applied = self.corrections.applied
-        if not applied or not isinstance(self._sensor, CameraRig):
+        if not applied:
             return None
         none, px = RigCorrection.none(self._sensor), self.corrections.field_px
         return dataclasses.replace(none, values=applied[-1], field_px=px)
@@ -229,7 +229,7 @@ class GraphBuilder:
             poses: (n, 4, 4) ``wTc`` by frame, those of the graph at least.
             points: positions (3,) by variable.
         """
-        if not points or not isinstance(self._sensor, CameraRig):
+        if not points:
             return []
         frames, seen = self.observed["frame"], self.observed["variable"]
         position = np.full((self.variables, 3), np.nan)
@@ -252,9 +252,7 @@ class GraphBuilder:
 
     def kept_factors(self) -> Any:
         """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
-        return self._with_observations(self._other_factors())
-
-    def _with_observations(self, out: Any) -> Any:
+        out = self._other_factors()
         seen = self.kept_observed()
         for frame, variable, measurement, covariance in zip(*seen, strict=True):
             out.add(self._observation(int(variable), Sighting(int(frame), measurement, covariance)))
@@ -282,8 +280,6 @@ class GraphBuilder:
     ) -> tuple[WholeGraph, State]:
         """Without turns of a gyroscope."""
         others = self._other_factors(turned=False)
-        if not isinstance(self._sensor, CameraRig):
-            return WholeGraph.of(self._with_observations(others), values, kernel)
         frames, variables, measured, covariances = self.kept_observed()
         if settled:
             measured = self.corrections.settle(self._sensor, frames, measured)
@@ -325,7 +321,7 @@ class GraphBuilder:
         """New factors weigh what depends on the noise as is known now."""
         kernel = self.kernel
         self._power, self._persistence = self.noise.power, self.noise_factor**2
-        self._factors = landmark_factors(self._sensor, Whitening(kernel.name, kernel.width))
+        self._factors = StereoFactors(self._sensor, Whitening(kernel.name, kernel.width))
 
     def _weighed(self, step: Any, then: float) -> Any:
         """A guessed step as is known now; ``then`` multiplied its variance when it was made."""

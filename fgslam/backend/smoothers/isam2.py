@@ -32,7 +32,7 @@ from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import (
     is_pose,
     isam2_parameters,
@@ -47,7 +47,7 @@ _SINGLE = 3  # of these, before Cholesky's rounding is suspected
 
 
 def isam2_smoother(
-    sensor: Sensor, settings: Isam2Settings, floor: Floor, prior: Prediction
+    sensor: CameraRig, settings: Isam2Settings, floor: Floor, prior: Prediction
 ) -> MapSmoother:
     """Estimator of kind ``isam2``, at the prior pose with an empty map."""
     problem = GraphProblem.of(sensor, settings, floor, prior)

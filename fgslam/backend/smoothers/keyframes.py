@@ -35,7 +35,6 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     inverse_spd3,
-    measurement_difference,
     point_pose_jacobian,
     project,
     projection_jacobian,
@@ -45,7 +44,7 @@ from fgslam.core.geometry import (
     triangulate,
 )
 from fgslam.core.measurements import Observations, Odometry
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 
@@ -57,7 +56,7 @@ _LEAST_OBSERVATIONS = 4  # of landmarks in the graph; fewer leave a frame to its
 
 
 def summarise(
-    sensor: Sensor, block: list[TrackedFrame], middle: TrackedFrame, landmarks: LandmarkMap
+    sensor: CameraRig, block: list[TrackedFrame], middle: TrackedFrame, landmarks: LandmarkMap
 ) -> Observations:
     """The observations of all frames of a block as observations from its middle frame.
 
@@ -74,16 +73,14 @@ def summarise(
         np.concatenate([frame.accepted.ids for frame in block]), return_inverse=True
     )
     at_middle = transform_to_camera(middle.wTc, landmarks.positions[landmarks.rows(ids)])
-    ahead = in_front(sensor, at_middle)
+    ahead = in_front(at_middle)
     at_middle[~ahead] = [0.0, 0.0, 1.0]
     fused = project(sensor, at_middle)
     for _ in range(_FUSING_ITERATIONS):
         information, gradient = _stacked(sensor, block, middle, which, fused)
         covariance = inverse_spd3(information)
         fused = fused + np.einsum("kij,kj->ki", covariance, gradient)
-    usable = ahead & np.isfinite(fused).all(axis=1)
-    if isinstance(sensor, CameraRig):
-        usable &= fused[:, 2] > 0.0
+    usable = ahead & np.isfinite(fused).all(axis=1) & (fused[:, 2] > 0.0)
     return Observations(
         ids=ids[usable],
         measurement=fused[usable],
@@ -94,7 +91,7 @@ def summarise(
 
 
 def _stacked(
-    sensor: Sensor,
+    sensor: CameraRig,
     block: list[TrackedFrame],
     middle: TrackedFrame,
     which: IntArray,
@@ -115,9 +112,7 @@ def _stacked(
         fTm = inverse(frame.wTc) @ middle.wTc
         local = points[rows] @ fTm[:3, :3].T + fTm[:3, 3]
         jacobian = projection_jacobian(sensor, local) @ fTm[:3, :3] @ by_measurement[rows]
-        residual = measurement_difference(
-            sensor, frame.accepted.measurement, project(sensor, local)
-        )
+        residual = frame.accepted.measurement - project(sensor, local)
         weighted = np.swapaxes(jacobian, 1, 2) @ inverse_spd3(frame.accepted.covariance)
         # Identities are unique within a frame: no row is added to twice.
         information[rows] += weighted @ jacobian
@@ -128,7 +123,7 @@ def _stacked(
 class Segments:
     """Turns tracked frames into those that enter the graph."""
 
-    def __init__(self, sensor: Sensor, keyframe_every: int) -> None:
+    def __init__(self, sensor: CameraRig, keyframe_every: int) -> None:
         """``keyframe_every`` frames make a segment; 1: every frame enters as it is."""
         self._sensor = sensor
         self._every = keyframe_every
@@ -178,8 +173,6 @@ class Segments:
     def settled(self, known: KnownCorrections) -> list[TrackedFrame]:
         """Those between, by what was known last of a rig that calibrates itself."""
         rig = self._sensor
-        if not isinstance(rig, CameraRig):
-            return self.between
         return [_measured(frame, known.settle(rig, *_seen_in(frame))) for frame in self.between]
 
     def forget(self, identities: list[int]) -> None:
@@ -240,7 +233,7 @@ def _without(frame: TrackedFrame, gone: IntArray) -> TrackedFrame:
 
 
 def fill_between(
-    sensor: Sensor,
+    sensor: CameraRig,
     floor: Floor,
     solved: Solution,
     frames: list[TrackedFrame],
@@ -303,7 +296,7 @@ def _starting_poses(
 
 
 def _locate(
-    sensor: Sensor,
+    sensor: CameraRig,
     solved: Solution,
     frames: list[TrackedFrame],
     start: FloatArray,
@@ -355,7 +348,7 @@ def _observations(
 
 
 def _normal_equations(
-    sensor: Sensor,
+    sensor: CameraRig,
     poses: FloatArray,
     which: IntArray,
     points: FloatArray,
@@ -365,9 +358,9 @@ def _normal_equations(
     """Per frame Hessian (f, 6, 6) and gradient (f, 6), and squared residuals (n,)."""
     rotation, origin = poses[which, :3, :3], poses[which, :3, 3]
     local = np.einsum("nji,nj->ni", rotation, points - origin)
-    ahead = in_front(sensor, local)
+    ahead = in_front(local)
     local[~ahead] = [0.0, 0.0, 1.0]
-    residual = measurement_difference(sensor, measured, project(sensor, local))
+    residual = measured - project(sensor, local)
     jacobian = projection_jacobian(sensor, local) @ point_pose_jacobian(local)
     weighted = np.swapaxes(jacobian, 1, 2) @ weights
     weighted[~ahead] = 0.0

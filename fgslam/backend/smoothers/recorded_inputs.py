@@ -17,7 +17,7 @@ from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.log_arrays import frames_of
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 Input: TypeAlias = tuple[Increment, EgoMotion]
 
@@ -25,7 +25,7 @@ Input: TypeAlias = tuple[Increment, EgoMotion]
 class RecordedInputs:
     """Arguments of all updates so far."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: CameraRig) -> None:
         """None yet."""
         self._sensor = sensor
         self._inputs: list[Input] = []
@@ -64,7 +64,7 @@ class RecordedInputs:
         return _inputs(state)
 
 
-def _arrays(sensor: Sensor, inputs: Sequence[Input]) -> StateArrays:
+def _arrays(sensor: CameraRig, inputs: Sequence[Input]) -> StateArrays:
     """Inputs as plain arrays."""
     log, trackings = MeasurementLog(sensor, {}), [tracking for _, tracking in inputs]
     for increment, _ in inputs:

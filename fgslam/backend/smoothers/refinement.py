@@ -209,7 +209,7 @@ class Refined:
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
-        if self.doubted is not None and self.graph.kinds:
+        if self.doubted is not None and self.graph.seen is not None:
             return doubted(self.graph, self.state, self.doubted)
         return reduced(self.graph.linear(self.state))
 

@@ -27,7 +27,7 @@ from fgslam.core.geometry import (
     triangulation_covariance,
 )
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 LEAST = 6  # landmarks that agree: as many as join two parts of a map
 _FITS = float(chi_square_quantile(0.999, 3))
@@ -49,7 +49,7 @@ class SeenAgain(Rows):
 
     @staticmethod
     def of(
-        sensor: Sensor,
+        sensor: CameraRig,
         known: Landmarks,
         poses: FloatArray,
         measured: FloatArray,
@@ -60,10 +60,10 @@ class SeenAgain(Rows):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             local = triangulate(sensor, measured)
             covariances = triangulation_covariance(sensor, measured, noise)
-        near = in_front(sensor, local) & np.isfinite(covariances).all(axis=(1, 2))
+        near = in_front(local) & np.isfinite(covariances).all(axis=(1, 2))
         near[near] = parallax(local[near], covariances[near]) >= LEAST_PARALLAX
         before = ((known.points - poses[:, :3, 3])[:, None] @ poses[:, :3, :3])[:, 0]
-        far = ~near & in_front(sensor, before)
+        far = ~near & in_front(before)
         about = _at_known_depth(sensor, before[far], measured[far], noise[far])
         local[far], covariances[far] = about
         kept = near | far
@@ -93,7 +93,7 @@ class SeenAgain(Rows):
 
 
 def _at_known_depth(
-    sensor: Sensor, before: FloatArray, measured: FloatArray, noise: FloatArray
+    sensor: CameraRig, before: FloatArray, measured: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Points (k, 3) of measurements, and covariances, to first order about the depths of others.
 

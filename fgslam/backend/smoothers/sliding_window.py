@@ -45,7 +45,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 from fgslam.factors.motion import pose_prior
 
@@ -55,7 +55,7 @@ _STIFF = 1e-4  # radians and metres: the least deviation between two places
 
 
 def sliding_window_smoother(
-    sensor: Sensor, settings: SlidingWindowSettings, floor: Floor, prior: Prediction
+    sensor: CameraRig, settings: SlidingWindowSettings, floor: Floor, prior: Prediction
 ) -> MapSmoother:
     """Estimator of kind ``sliding_window``, at the prior pose with an empty map."""
     problem = GraphProblem.of(sensor, settings, floor, prior)

@@ -55,7 +55,7 @@ from fgslam.core.geometry import (
     reorthonormalise,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +63,7 @@ class GraphProblem:
     """Where a run takes place, what its graph is made by, and from where it starts.
 
     Attributes:
-        sensor: the cameras, or the range-bearing sensor.
+        sensor: the cameras.
         settings: of the graph.
         floor: on which the robot stays.
         prior: pose of the first frame and its covariance.
@@ -71,7 +71,7 @@ class GraphProblem:
         builder: of the graph.
     """
 
-    sensor: Sensor
+    sensor: CameraRig
     settings: GraphSettings
     floor: Floor
     prior: Prediction
@@ -80,7 +80,7 @@ class GraphProblem:
 
     @staticmethod
     def of(
-        sensor: Sensor,
+        sensor: CameraRig,
         settings: GraphSettings,
         floor: Floor,
         prior: Prediction,

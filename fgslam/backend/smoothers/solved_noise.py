@@ -22,18 +22,17 @@ def power_ratio(graph: WholeGraph, state: State) -> float:
 
     Tracks are as :class:`~fgslam.backend.persistence.Persistence` judges them.
     """
+    if graph.seen is None:
+        return 1.0
     frame_of = np.array([number(key) for key in graph.pose_keys])
-    sums, counted = np.full(2, STATED[1]), 0
-    for kind in graph.kinds:
-        counts = graph.weights[counted : counted + len(kind.rows)] > 0.0
-        counted += len(kind.rows)
-        order, tracks = _in_tracks(kind.points, frame_of[kind.poses], counts)
-        if not len(order):
-            continue
-        seen = kind.look(state.poses, state.points)
-        fitted = Fitted.of(tracks, seen.residual[order], seen.by_point[order])
-        if fitted is not None:
-            sums += fitted.powers()[1]
+    order, tracks = _in_tracks(graph.seen.points, frame_of[graph.seen.poses], graph.weights > 0.0)
+    if not len(order):
+        return 1.0
+    look = graph.seen.look(state.poses, state.points)
+    fitted = Fitted.of(tracks, look.residual[order], look.by_point[order])
+    if fitted is None:
+        return 1.0
+    sums = STATED[1] + fitted.powers()[1]
     return float(sums[0] / sums[1])
 
 

@@ -24,7 +24,7 @@ from fgslam.core.geometry import (
     inverse,
     transform_to_world,
 )
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmarks_in, pose_key, poses_of_frame
 
 
@@ -32,7 +32,7 @@ class TrackerMap:
     """Keeps the tracker's map in step with the graph's."""
 
     def __init__(
-        self, sensor: Sensor, tracker: LandmarkKalman, admission: LandmarkAdmission
+        self, sensor: CameraRig, tracker: LandmarkKalman, admission: LandmarkAdmission
     ) -> None:
         """The two maps, both still empty."""
         self._sensor = sensor

@@ -27,12 +27,7 @@ from fgslam.backend.smoothers.marginals import (
     with_border,
 )
 from fgslam.backend.smoothers.other_factors import OtherFactors
-from fgslam.backend.smoothers.sightings import (
-    FactorSightings,
-    Sightings,
-    StereoSightings,
-    values_of,
-)
+from fgslam.backend.smoothers.sightings import StereoSightings, values_of
 from fgslam.backend.smoothers.turns import TurnedStep, Turns
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
@@ -40,9 +35,9 @@ from fgslam.core.levenberg import Damping
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose, number
 from fgslam.factors.noise import kernel_losses, kernel_weights
-from fgslam.factors.stacked import LinearRows
 
 PLAIN = KernelSettings("none")
+_NONE: IntArray = np.empty(0, np.int64)
 _SLOW = 0.1  # of the last step's gain: beyond, a kept system has become another
 _AT_ONCE = 20_000  # observations, of which each takes some kilobytes
 
@@ -81,15 +76,15 @@ class WholeGraph:
 
     Attributes:
         pose_keys, landmark_keys: of the variables, ascending.
-        kinds: the observations.
-        weights: (k,) of all observations, in the order of ``kinds``; 0: left out.
+        seen: the observations; None without any.
+        weights: (k,) of the observations; 0: left out.
         rest: the other factors.
         kernel: around each observation.
     """
 
     pose_keys: list[int]
     landmark_keys: list[int]
-    kinds: list[Sightings]
+    seen: StereoSightings | None
     weights: FloatArray
     rest: OtherFactors
     kernel: KernelSettings
@@ -99,26 +94,21 @@ class WholeGraph:
         """A graph of GTSAM's without empty slots, whose observations have this kernel."""
         poses, landmarks = keys_of(values)
         rows = {key: row for keys in (poses, landmarks) for row, key in enumerate(keys)}
-        rest = gtsam.NonlinearFactorGraph()
-        found: dict[Any, list[tuple[Any, int, int, int]]] = {
-            StereoSightings: [],
-            FactorSightings: [],
-        }
+        rest, found = gtsam.NonlinearFactorGraph(), list[tuple[Any, int, int, int]]()
         for row in range(graph.size()):
             factor = graph.at(row)
-            keys = list(factor.keys())
-            if not (_observes(keys) and factor.dim() == 3):
+            if isinstance(factor, gtsam.GenericStereoFactor3D):
+                pose, landmark = factor.keys()
+                found.append((factor, row, rows[pose], rows[landmark]))
+            else:
                 rest.add(factor)
-                continue
-            kind = StereoSightings if _is_of_rig(factor) else FactorSightings
-            found[kind].append((factor, row, rows[keys[0]], rows[keys[1]]))
-        kinds = []
-        for kind, each in ((kind, each) for kind, each in found.items() if each):
-            factors, *which = zip(*each, strict=True)
-            kinds.append(kind.of(list(factors), *(np.array(w, np.int64) for w in which)))
-        weights = np.ones(sum(len(kind.rows) for kind in kinds))
+        seen = None
+        if found:
+            factors, *which = zip(*found, strict=True)
+            seen = StereoSightings.of(list(factors), *(np.array(w, np.int64) for w in which))
+        weights = np.ones(len(found))
         others = OtherFactors(rest, poses, landmarks)
-        return WholeGraph(poses, landmarks, kinds, weights, others, kernel), State.of(values)
+        return WholeGraph(poses, landmarks, seen, weights, others, kernel), State.of(values)
 
     @staticmethod
     def of_rig(
@@ -145,13 +135,10 @@ class WholeGraph:
             for have, which in zip((poses, landmarks), keys, strict=True)
         )
         rows = others.size() + np.arange(len(of_pose))
-        kinds: list[Sightings] = []
-        if len(rows):
-            kinds.append(StereoSightings(rows, of_pose, of_landmark, *measured, rig))
+        seen = StereoSightings(rows, of_pose, of_landmark, *measured, rig) if len(rows) else None
         rest = OtherFactors(others, poses, landmarks)
-        return WholeGraph(poses, landmarks, kinds, np.ones(len(rows)), rest, kernel), State.of(
-            values
-        )
+        graph = WholeGraph(poses, landmarks, seen, np.ones(len(rows)), rest, kernel)
+        return graph, State.of(values)
 
     def with_turns(
         self, steps: list[TurnedStep], state: State, persistence: float
@@ -183,7 +170,7 @@ class WholeGraph:
         left = dataclasses.replace(
             self,
             landmark_keys=[key for key in self.landmark_keys if key not in gone],
-            kinds=[kind.of_points(kept) for kind in self.kinds],
+            seen=self.seen and self.seen.of_points(kept),
             weights=self.weights[kept[self._points]],
             rest=self.rest.without(gone),
         )
@@ -206,10 +193,10 @@ class WholeGraph:
 
     def squared(self, state: State) -> FloatArray:
         """(k,) squared whitened residuals of the observations, without weights and kernel."""
-        if not self.kinds:
+        if self.seen is None:
             return np.empty(0)
-        found = [kind.residuals(state.poses, state.points) for kind in self.kinds]
-        return np.concatenate([np.einsum("ki,ki->k", r, r) for r in found])
+        residuals = self.seen.residuals(state.poses, state.points)
+        return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
 
     def cost(self, state: State) -> float:
         """Half the robust sum of squares of all that counts."""
@@ -220,10 +207,9 @@ class WholeGraph:
     def linear(self, state: State) -> LinearSystem:
         """Normal equations at a state, robust weights as they are there."""
         rest = self.rest.linear(state.poses, state.points, state.bias)
-        looks = [kind.look(state.poses, state.points) for kind in self.kinds]
-        if not looks:
+        if self.seen is None:
             return rest
-        rows = reduce(LinearRows.join, looks)
+        rows = self.seen.look(state.poses, state.points)
         residual, by_pose, by_point = rows.residual, rows.by_pose, rows.by_point
         squared = self.weights * np.einsum("ki,ki->k", residual, residual)
         weights = self.weights * kernel_weights(self.kernel.name, self.kernel.width, squared)
@@ -253,12 +239,12 @@ class WholeGraph:
         Returns:
             Gradients (3m + 6n, p) by the parameters, and the parameters' own information (p, p).
         """
-        (kind,) = self.kinds
-        if not isinstance(kind, StereoSightings):
-            raise TypeError("only a rig's measurements are shifted")
-        rows, parts = kind.look(state.poses, state.points), []
-        for few in np.array_split(np.arange(len(kind.rows)), len(kind.rows) // _AT_ONCE + 1):
-            by = -kind.roots[few] @ shifts(kind.measured[few])
+        seen = self.seen
+        if seen is None:
+            raise ValueError("without observations there is nothing to shift")
+        rows, parts = seen.look(state.poses, state.points), []
+        for few in np.array_split(np.arange(len(seen.rows)), len(seen.rows) // _AT_ONCE + 1):
+            by = -seen.roots[few] @ shifts(seen.measured[few])
             known = self.weights[few, None, None] * by
             poses, points = (which[:, few] for which in self._incidence)
             of_points = _summed(points, np.swapaxes(rows.by_point[few], 1, 2) @ known)
@@ -303,12 +289,12 @@ class WholeGraph:
     @cached_property
     def _poses(self) -> IntArray:
         """(k,) rows of the observations' poses."""
-        return _joined([kind.poses for kind in self.kinds])
+        return _NONE if self.seen is None else self.seen.poses
 
     @cached_property
     def _points(self) -> IntArray:
         """(k,) rows of the observations' landmarks."""
-        return _joined([kind.points for kind in self.kinds])
+        return _NONE if self.seen is None else self.seen.points
 
     @cached_property
     def _incidence(self) -> tuple[csr_matrix, csr_matrix]:
@@ -393,20 +379,6 @@ def keys_of(values: Any) -> tuple[list[int], list[int]]:
     for key in values.keys():  # noqa: SIM118 - GTSAM's values do not iterate
         (poses if is_pose(key) else landmarks).append(key)
     return poses, landmarks
-
-
-def _observes(keys: list[int]) -> bool:
-    """Whether a factor of these variables is an observation of a landmark from a pose."""
-    return len(keys) == 2 and is_pose(keys[0]) and not is_pose(keys[1])
-
-
-def _is_of_rig(factor: Any) -> bool:
-    """Whether a factor is a rig's, not the camera that stands in for a range and a bearing."""
-    return isinstance(factor, gtsam.GenericStereoFactor3D) and factor.calibration().fx() != 1.0
-
-
-def _joined(arrays: list[IntArray]) -> IntArray:
-    return np.concatenate(arrays) if arrays else np.empty(0, np.int64)
 
 
 def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:

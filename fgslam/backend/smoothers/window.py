@@ -44,7 +44,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.sensors import Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
 from fgslam.factors.noise import kernel_weights
 from fgslam.factors.stacked import (
@@ -79,7 +79,7 @@ class Window:
         kernel: around each observation.
     """
 
-    def __init__(self, sensor: Sensor, kernel: KernelSettings) -> None:
+    def __init__(self, sensor: CameraRig, kernel: KernelSettings) -> None:
         """Empty."""
         self._sensor, self.kernel = sensor, kernel
         self.frames: list[int] = []

@@ -21,7 +21,6 @@ from fgslam.core.geometry import (
     in_front,
     inverse,
     inverse_spd3,
-    measurement_difference,
     moved_apart,
     point_pose_jacobian,
     project,
@@ -34,7 +33,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Observations
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.sensors import CameraRig, Sensor
+from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.match_noise import MatchNoise
 
@@ -56,7 +55,7 @@ class PoseProblem(Rows):
     Attributes:
         points: (k, 3) world, metres.
         point_covariances: (k, 3, 3).
-        measurement: (k, 3) (column, row, disparity), pixels; or (azimuth, elevation, range).
+        measurement: (k, 3) (column, row, disparity), pixels.
         measurement_covariance: (k, 3, 3).
     """
 
@@ -94,11 +93,8 @@ class _Minimum:
 class EgoMotionSolver:
     """Solves for ``wTc`` from matched landmarks and a predicted pose."""
 
-    def __init__(self, sensor: Sensor, settings: EgoMotionSettings) -> None:
-        """The world's vertical is that of the robot's body in the first camera frame.
-
-        Of a range-bearing sensor, matches are judged by ``outlier_sigmas`` alone.
-        """
+    def __init__(self, sensor: CameraRig, settings: EgoMotionSettings) -> None:
+        """The world's vertical is that of the robot's body in the first camera frame."""
         self.sensor = sensor
         self._settings = settings
         self.floor = Floor.under(sensor, settings.dof)
@@ -113,7 +109,7 @@ class EgoMotionSolver:
         """Pose with covariance, inliers, residuals and a status; the odometry's where it fails."""
         prediction = Prediction(self.floor.constrain(prediction.wTc), prediction.covariance)
         start = prediction.wTc
-        used = inliers = in_front(self.sensor, transform_to_camera(start, problem.points))
+        used = inliers = in_front(transform_to_camera(start, problem.points))
         iterations = 0
         wTc, robust = start, self._settings.kernel != "none"
         weights = self._information(wTc, problem)
@@ -224,7 +220,7 @@ class EgoMotionSolver:
             covariance = problem.measurement_covariance
         if settings.weighting == "landmark":
             points = transform_to_camera(wTc, problem.points)
-            points[~in_front(self.sensor, points)] = (0.0, 0.0, 1.0)  # of no use
+            points[~in_front(points)] = (0.0, 0.0, 1.0)  # of no use
             jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
             covariance = covariance + congruence(jacobian, problem.point_covariances)
         covariance = covariance * (self.noise.variance if noise is None else noise)
@@ -239,9 +235,9 @@ class EgoMotionSolver:
     ) -> tuple[float, FloatArray, FloatArray]:
         """Cost, Gauss-Newton Hessian (6, 6) and gradient (6,) at ``wTc``."""
         points = transform_to_camera(wTc, problem.points)
-        if not in_front(self.sensor, points).all():
+        if not in_front(points).all():
             return np.inf, np.eye(6), np.zeros(6)
-        residual = self._residual(points, problem.measurement)
+        residual = project(self.sensor, points) - problem.measurement
         jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
         squared = _squared(residual, information)
         rho, weight = self._kernel(squared, robust)
@@ -277,12 +273,8 @@ class EgoMotionSolver:
 
     @property
     def farthest(self) -> float:
-        """Largest image residual of an inlier; of a range sensor, more than any angle."""
-        return self._settings.outlier_px if isinstance(self.sensor, CameraRig) else 2.0 * math.pi
-
-    def _residual(self, points: FloatArray, measurement: FloatArray) -> FloatArray:
-        """Predicted less measured (k, 3)."""
-        return measurement_difference(self.sensor, project(self.sensor, points), measurement)
+        """Largest image residual of an inlier, pixels."""
+        return self._settings.outlier_px
 
     def _inliers(
         self, residual: FloatArray, distance: FloatArray, information: FloatArray
@@ -371,7 +363,7 @@ class EgoMotionSolver:
     def image_residuals(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
         """The paper's E (..., k), distance of projection and measurement in the image; inf behind.
 
-        Of poses (..., 4, 4). Pixels; of a range-bearing sensor the angle in radians, range aside.
+        Of poses (..., 4, 4), in pixels.
         """
         return self._measured(wTc, problem)[1]
 
@@ -379,10 +371,10 @@ class EgoMotionSolver:
         """Residuals (..., k, 3), and distances (..., k) in the image; inf if behind."""
         every = transform_to_camera(wTc, problem.points)
         points = every.reshape(-1, 3)
-        behind = ~in_front(self.sensor, points)
+        behind = ~in_front(points)
         points[behind] = (0.0, 0.0, 1.0)
         measurement = np.broadcast_to(problem.measurement, every.shape).reshape(-1, 3)
-        residual = self._residual(points, measurement)
+        residual = project(self.sensor, points) - measurement
         across, down = residual[:, 0], residual[:, 1]
         distance = np.where(behind, np.inf, np.sqrt(across * across + down * down))
         return residual.reshape(every.shape), distance.reshape(every.shape[:-1])

@@ -157,7 +157,7 @@ class LandmarkTracker:
             return False
         expected = tracked.expected
         points = transform_to_camera(tracked.ego_motion.wTc, landmarks.positions[expected.rows])
-        ahead = in_front(self._rig, points)
+        ahead = in_front(points)
         shift = project(self._rig, points[ahead]) - expected.measurement[ahead]
         return bool(np.median(np.abs(shift[:, :2]).max(axis=1)) > REFINE_SHIFT_PX)
 

@@ -218,7 +218,7 @@ class _Camera:
         facing = -np.einsum("ni,ni->n", ray, self._world.normals[view])
         ok = (distance >= LEAST_RANGE_M) & (distance <= MOST_RANGE_M)
         ok &= facing >= np.cos(np.deg2rad(OBLIQUE_DEG)) * distance
-        view = view[ok & g.in_front(rig, seen_from, LEAST_RANGE_M)]
+        view = view[ok & g.in_front(seen_from, LEAST_RANGE_M)]
         pixels = g.project(rig, local[view]) @ self._model.T
         margin = np.min(
             [pixels, np.tile([rig.width - 1.0, rig.height - 1.0], rig.cameras) - pixels], axis=0

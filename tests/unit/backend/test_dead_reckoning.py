@@ -13,7 +13,6 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
-from fgslam.core.sensors import RangeBearingSensor
 from fgslam.evaluation.consistency import judge, nees, pose_nees
 
 DRIVE = Drive(frames=10, points=60, odometry_sigma=(1e-3,) * 3 + (2e-3,) * 3)
@@ -172,18 +171,3 @@ def test_a_frame_without_any_motion_is_refused_and_changes_nothing() -> None:
     with pytest.raises(EstimatorError, match="frame 6: neither odometry nor"):
         estimator.update(blind, tracked_at(prediction, 0))
     assert len(estimator.estimate().trajectory) == 3
-
-
-def test_a_range_bearing_sensor_places_landmarks_too() -> None:
-    sensor = RangeBearingSensor(10.0, np.eye(4))
-    increment = drawn(7).increments[0]
-    measurement = np.array([[0.3, -0.1, 4.0], [-0.5, 0.2, 2.0]])
-    seen = dataclasses.replace(
-        increment.observations.select(np.arange(2)),
-        measurement=measurement,
-        covariance=np.tile(np.diag([0.01, 0.01, 0.1]) ** 2, (2, 1, 1)),
-    )
-    estimator = DeadReckoning(sensor, Prediction(np.eye(4), NO_PRIOR))
-    play(estimator, [dataclasses.replace(increment, observations=seen)])
-    found = g.project(sensor, estimator.landmarks().positions)
-    np.testing.assert_allclose(found, measurement, rtol=0, atol=1e-12)

@@ -29,7 +29,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
-from fgslam.core.sensors import RangeBearingSensor
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import pose_prior
@@ -238,16 +237,6 @@ def test_the_pose_comes_from_the_graph_and_not_from_the_tracking() -> None:
     own = graph.predict(None).covariance
     np.testing.assert_allclose(own, solved.covariance, rtol=0, atol=1e-9)
     assert np.abs(solved.wTc - prediction.wTc).max() > 1e-3
-
-
-def test_a_range_bearing_sensor_is_refused() -> None:
-    with pytest.raises(EstimatorError, match="use landmark_kalman"):
-        LandmarkKalmanGraph(
-            RangeBearingSensor(10.0, np.eye(4)),
-            LandmarkKalmanGraphSettings(),
-            Prediction(np.eye(4), EXACT),
-            EgoMotionSettings(),
-        )
 
 
 def test_a_new_landmark_at_infinity_is_refused() -> None:

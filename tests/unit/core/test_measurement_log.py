@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.core import geometry as g
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.geometry import se3_exp
@@ -27,7 +26,7 @@ from fgslam.core.measurements import (
     SettledRig,
 )
 from fgslam.core.rig_correction import term_names
-from fgslam.core.sensors import CameraRig, RangeBearingSensor
+from fgslam.core.sensors import CameraRig
 from fgslam.core.settings import RigPlaces
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
@@ -250,19 +249,6 @@ def test_offsets_that_step_back_are_refused(file: Path) -> None:
     arrays["observation_start"][1] = 15
     with pytest.raises(MeasurementLogError, match="observation_start"):
         MeasurementLog.from_arrays(arrays, "x.npz")
-
-
-def test_a_log_of_a_range_sensor_round_trips(file: Path, tmp_path: Path) -> None:
-    lever = g.pose(np.eye(3), np.array([0.2, 0.0, 0.1]))
-    log = MeasurementLog(RangeBearingSensor(4.5, lever), {"kind": "recorded", "stand_in": {}})
-    for one in MeasurementLog.load(file):
-        log.append(one)
-    path = tmp_path / "ranges.npz"
-    write_arrays(path, log.to_arrays())
-    back = MeasurementLog.load(path)
-    assert_same(back.rig, log.rig)
-    for before, after in zip(log, back, strict=True):
-        assert_same(before, after)
 
 
 # --------------------------------------------------------------------------------------------
