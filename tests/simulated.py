@@ -23,7 +23,9 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
-from fgslam.worlds.driving import paths
+from fgslam.worlds.driving.paths import Drive as RobotDrive
+from fgslam.worlds.driving.paths import drive_along
+from fgslam.worlds.lab import place_path
 from fgslam.worlds.settings import LabDriveSettings
 from fgslam.worlds.simulated import features
 from fgslam.worlds.simulated.features import visible
@@ -246,6 +248,6 @@ class FeatureWorld(features.FeatureWorld):
         super().__init__(points, rng, rig)
 
 
-def plan_drive(settings: LabDriveSettings) -> paths.Drive:
+def plan_drive(settings: LabDriveSettings) -> RobotDrive:
     """Path and time stamps of a drive in the lab. Raises ConfigError where it cannot be driven."""
-    return paths.drive_along(paths.plan_path(settings), settings)
+    return drive_along(place_path("lab", settings), settings, settings.frames)

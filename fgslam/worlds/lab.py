@@ -31,9 +31,11 @@ from fgslam.worlds.driving.paths import (
     PlanarPath,
     PosesInTime,
     drive_along,
-    plan_path,
+    paper_loop,
     planar_poses,
+    room_laps,
     round_corners,
+    through_waypoints,
 )
 from fgslam.worlds.people import ACROSS_M, WALK_FRAMES, Stance, person
 from fgslam.worlds.rendering.image_effects import (
@@ -161,7 +163,12 @@ def place_path(name: PlaceName, settings: LabDriveSettings) -> PlanarPath:
         return round_corners(corners, _BEND_M)
     if settings.path == "one_way":
         return round_corners(alike.one_way(), _BEND_M)
-    return plan_path(settings)
+    if settings.path == "paper_loop":
+        return paper_loop()
+    if settings.path == "laps":
+        return room_laps(settings.laps)
+    points = np.array(settings.waypoints_m, dtype=np.float64).reshape(-1, 2)
+    return through_waypoints(points, settings.closed)
 
 
 def plan_in_place(choice: PlaceChoice, settings: LabDriveSettings, rig: CameraRig) -> PosesInTime:
@@ -172,7 +179,7 @@ def plan_in_place(choice: PlaceChoice, settings: LabDriveSettings, rig: CameraRi
             or there are no such poses.
     """
     if settings.path != "random_poses":
-        return drive_along(place_path(choice.name, settings), settings)
+        return drive_along(place_path(choice.name, settings), settings, settings.frames)
     place = build_place(choice)
     space = FloorSpace(stack(place.things), place.low, place.high)
     start = first_pose(choice.name, settings)[:2, 3]

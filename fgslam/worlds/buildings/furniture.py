@@ -136,9 +136,7 @@ def sofa(width: float, cover: str) -> list[Patch]:
 
 def hanging(width: float, height: float, surface: Surface) -> list[Patch]:
     """A flat board, its lower edge at z = 0, just before y = 0: posters, windows, doors."""
-    gap = 0.004
-    upright = rectangle((-width / 2, -gap, height), (width, 0, 0), (0, 0, -height), surface)
-    return [upright]
+    return [rectangle((-width / 2, -0.004, height), (width, 0, 0), (0, 0, -height), surface)]
 
 
 # --------------------------------------------------------------------------------------------
@@ -159,13 +157,10 @@ def plant(rng: np.random.Generator) -> list[Patch]:
     out = prism((0, 0, 0), (0, 0, 0.35), 0.17, _POT)
     for _ in range(9):
         yaw, lean, tall = rng.uniform(0, 360), rng.uniform(0.05, 0.35), rng.uniform(0.5, 1.0)
-        leaf = rectangle((-0.08, -lean, 0.3 + tall), (0.16, 0, 0), (0, lean, -tall), _leaf(rng))
+        green = Surface("cloth_green", float(rng.uniform(0.3, 0.9)))
+        leaf = rectangle((-0.08, -lean, 0.3 + tall), (0.16, 0, 0), (0, lean, -tall), green)
         out += placed([leaf], 0.0, 0.0, 0.0, float(yaw))
     return out
-
-
-def _leaf(rng: np.random.Generator) -> Surface:
-    return Surface("cloth_green", float(rng.uniform(0.3, 0.9)))
 
 
 def pillar(side: float, height: float, cover: str) -> list[Patch]:

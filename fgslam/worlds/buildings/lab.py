@@ -5,7 +5,6 @@ The room's frame has its origin on the floor in the middle, x east, y north, z u
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -77,37 +76,34 @@ def _against(
     return placed(at_north, 0.0, 0.0, 0.0, _WALLS[wall])
 
 
-def _along_walls(rng: np.random.Generator) -> list[Thing]:
-    """Shelves, desks and cabinets with their backs to the walls."""
-    out: list[Thing] = []
-
-    def add(name: str, patches: list[Patch], wall: str, along: float) -> None:
-        number = 1 + sum(thing.name.startswith(name + "_") for thing in out)
-        out.append(Thing(f"{name}_{number}", tuple(_against(patches, wall, along))))
-
-    def shelf(width: float, height: float) -> list[Patch]:
-        return furniture.shelf(rng, width, height, 0.32)
-
-    def desk(width: float, screens: int) -> list[Patch]:
-        return placed(furniture.desk(rng, width, screens), 0, -0.4, 0, 0)
-
-    metal = Surface("metal", 0.9)
-    for wall, along, width, height in (
+# Width of each, then its height or, of a desk, the number of screens.
+_AT_WALLS = {
+    "shelf": (
         ("north", -3.8, 1.2, 2.1), ("north", -2.5, 1.2, 2.1), ("north", 2.9, 1.4, 1.8),
         ("east", -3.6, 1.2, 2.0), ("east", 3.3, 1.3, 2.2),
         ("south", -2.4, 1.3, 2.1), ("south", 3.6, 1.2, 1.9),
         ("west", -0.3, 1.3, 1.8), ("west", 3.5, 1.2, 2.1),
-    ):  # fmt: skip
-        add("shelf", shelf(width, height), wall, along)
-    for wall, along, width, screens in (
+    ),
+    "desk": (
         ("north", 0.3, 2.4, 2), ("east", -1.6, 2.2, 2), ("east", 1.1, 2.2, 2),
         ("south", 0.5, 2.6, 3), ("west", -2.6, 2.2, 2), ("west", 1.8, 1.8, 1),
-    ):  # fmt: skip
-        add("desk", desk(width, screens), wall, along)
-    for wall, along, width, height in (
-        ("north", 4.3, 0.9, 1.35), ("south", -4.0, 1.0, 1.5), ("west", -4.3, 0.9, 1.2),
-    ):  # fmt: skip
-        add("cabinet", furniture.cabinet(width, height, 0.5, metal), wall, along)
+    ),
+    "cabinet": (("north", 4.3, 0.9, 1.35), ("south", -4.0, 1.0, 1.5), ("west", -4.3, 0.9, 1.2)),
+}  # fmt: skip
+
+
+def _along_walls(rng: np.random.Generator) -> list[Thing]:
+    """Shelves, desks and cabinets with their backs to the walls."""
+    out: list[Thing] = []
+    for name, places in _AT_WALLS.items():
+        for number, (wall, along, width, size) in enumerate(places, start=1):
+            if name == "shelf":
+                patches = furniture.shelf(rng, width, size, 0.32)
+            elif name == "desk":
+                patches = placed(furniture.desk(rng, width, int(size)), 0, -0.4, 0, 0)
+            else:
+                patches = furniture.cabinet(width, size, 0.5, Surface("metal", 0.9))
+            out.append(Thing(f"{name}_{number}", tuple(_against(patches, wall, along))))
     return out
 
 
@@ -205,35 +201,32 @@ def _islands(rng: np.random.Generator) -> list[Thing]:
     return [Thing("island_desk", tuple(north)), Thing("island_shelf", tuple(south + back))]
 
 
+# Size of a carton; x, y, z and yaw in degrees at the first visit, and at the second.
+_LOOSE = (
+    ("chair", None, (0.0, 0.0, 0.0, 25.0), (0.35, -0.1, 0.0, -70.0)),
+    ("chair_desk_1", None, (4.0, 1.5, 0.0, 70.0), (4.0, -1.2, 0.0, 110.0)),
+    ("chair_desk_2", None, (-4.0, 1.9, 0.0, 240.0), (-4.0, -2.4, 0.0, 280.0)),
+    ("chair_desk_3", None, (0.5, 4.05, 0.0, 190.0), (-0.5, 4.1, 0.0, 160.0)),
+    ("carton_1", (0.5, 0.4, 0.35), (4.62, -4.22, 0.0, 5.0), (-4.7, 4.4, 0.0, 75.0)),
+    ("carton_2", (0.4, 0.4, 0.3), (4.62, -4.22, 0.35, 20.0), (3.25, -4.5, 0.0, 5.0)),
+    ("carton_3", (0.6, 0.45, 0.4), (1.7, 2.35, 0.0, 80.0), (-1.4, 2.4, 0.0, 15.0)),
+    ("carton_4", (0.35, 0.3, 0.25), (-0.1, -2.45, 1.1, 25.0), (-0.9, -2.45, 1.1, -30.0)),
+    ("carton_5", (0.3, 0.3, 0.3), (-0.8, -2.45, 1.1, -15.0), (0.1, -2.5, 1.1, 10.0)),
+    ("carton_6", (0.45, 0.4, 0.4), (4.25, 4.15, 0.0, 5.0), (1.5, -2.4, 0.0, 40.0)),
+    ("carton_7", (0.4, 0.35, 0.35), (4.0, -4.72, 1.5, 12.0), (3.85, -4.72, 1.5, -20.0)),
+    ("plotter", None, (-2.0, 2.6, 0.0, 0.0), (1.9, 2.7, 0.0, 15.0)),
+)
+
+
 def _loose_things(rng: np.random.Generator, moved: bool) -> list[Thing]:
     """What people move about: chairs, cartons, a plotter; ``moved`` puts them elsewhere."""
-    out: list[Thing] = []
-    for name, build, first, second in _loose_places(rng):
-        x, y, z, yaw = second if moved else first
-        out.append(Thing(name, tuple(placed(build, x, y, z, yaw))))
+    out = []
+    for name, size, first, second in _LOOSE:
+        if size is not None:
+            patches = furniture.carton(rng, size)
+        elif name == "plotter":
+            patches = furniture.cabinet(0.7, 1.0, 0.5, Surface("metal", 0.8))
+        else:
+            patches = furniture.chair()
+        out.append(Thing(name, tuple(placed(patches, *(second if moved else first)))))
     return out
-
-
-_Place = tuple[float, float, float, float]
-
-
-def _loose_places(rng: np.random.Generator) -> list[tuple[str, list[Patch], _Place, _Place]]:
-    """(name, patches, place at the first visit, place at the second), x, y, z, yaw in degrees."""
-    make: Callable[[float, float, float], list[Patch]] = lambda w, d, h: furniture.carton(  # noqa: E731
-        rng, (w, d, h)
-    )
-    return [
-        ("chair", furniture.chair(), (0.0, 0.0, 0.0, 25.0), (0.35, -0.1, 0.0, -70.0)),
-        ("chair_desk_1", furniture.chair(), (4.0, 1.5, 0, 70), (4.0, -1.2, 0, 110)),
-        ("chair_desk_2", furniture.chair(), (-4.0, 1.9, 0, 240), (-4.0, -2.4, 0, 280)),
-        ("chair_desk_3", furniture.chair(), (0.5, 4.05, 0, 190), (-0.5, 4.1, 0, 160)),
-        ("carton_1", make(0.5, 0.4, 0.35), (4.62, -4.22, 0, 5), (-4.7, 4.4, 0, 75)),
-        ("carton_2", make(0.4, 0.4, 0.3), (4.62, -4.22, 0.35, 20), (3.25, -4.5, 0, 5)),
-        ("carton_3", make(0.6, 0.45, 0.4), (1.7, 2.35, 0, 80), (-1.4, 2.4, 0, 15)),
-        ("carton_4", make(0.35, 0.3, 0.25), (-0.1, -2.45, 1.1, 25), (-0.9, -2.45, 1.1, -30)),
-        ("carton_5", make(0.3, 0.3, 0.3), (-0.8, -2.45, 1.1, -15), (0.1, -2.5, 1.1, 10)),
-        ("carton_6", make(0.45, 0.4, 0.4), (4.25, 4.15, 0, 5), (1.5, -2.4, 0, 40)),
-        ("carton_7", make(0.4, 0.35, 0.35), (4.0, -4.72, 1.5, 12), (3.85, -4.72, 1.5, -20)),
-        ("plotter", furniture.cabinet(0.7, 1.0, 0.5, Surface("metal", 0.8)),
-         (-2.0, 2.6, 0, 0), (1.9, 2.7, 0, 15)),
-    ]  # fmt: skip

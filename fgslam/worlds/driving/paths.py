@@ -15,7 +15,7 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.worlds.settings import LabDriveSettings
+from fgslam.worlds.settings import DriveLimits
 
 _STEP_M = 0.004
 # Waypoints must not ask for tighter turns: the curve's heading would jump between its samples.
@@ -303,36 +303,20 @@ def fastest_law(
     return TimeLaw(np.concatenate([[0.0], np.cumsum(seconds)]), path.arc)
 
 
-def plan_path(settings: LabDriveSettings) -> PlanarPath:
-    """The curve in the lab that the settings name; :func:`places.place_path` knows those elsewhere.
-
-    Raises:
-        ConfigError: the waypoints make none.
-    """
-    if settings.path == "paper_loop":
-        return paper_loop()
-    if settings.path == "laps":
-        return room_laps(settings.laps)
-    return through_waypoints(
-        np.array(settings.waypoints_m, dtype=np.float64).reshape(-1, 2), settings.closed
-    )
-
-
-def drive_along(path: PlanarPath, settings: LabDriveSettings) -> Drive:
-    """A given path, driven as the settings say; their own ``path`` is not looked at.
+def drive_along(path: PlanarPath, limits: DriveLimits, frames: int | None) -> Drive:
+    """A path, driven within limits in a number of frames; None: as fast as is comfortable.
 
     Raises:
         ConfigError: the path cannot be driven in so few frames.
     """
     law = fastest_law(
         path,
-        settings.max_speed_m_s,
-        np.deg2rad(settings.max_turn_deg_s),
+        limits.max_speed_m_s,
+        np.deg2rad(limits.max_turn_deg_s),
         MAX_ACCELERATION_M_S2,
     )
-    rate = settings.frame_rate_hz
+    rate = limits.frame_rate_hz
     least = int(np.ceil(law.duration * rate - 1e-9)) + 1
-    frames = settings.frames
     if frames is None:
         frames = int(np.ceil(law.duration / _CRUISE * rate)) + 1
     if frames < least:

@@ -60,11 +60,6 @@ class Renderer:
         self._view, self._bank, self._edge_contrast = view, bank, edge_contrast
         self._pairs = _neighbours(view.valid, view.shape)
 
-    @property
-    def valid(self) -> BoolArray:
-        """(h, w) pixels within the camera's field of view."""
-        return self._filled(np.ones(len(self._view.valid), dtype=np.bool_), False)
-
     def levels(self, scene: Layer, pose: FloatArray, bodies: Sequence[Body] = ()) -> Float32:
         """(channels, n) levels of the valid pixels, not yet rounded; 0 where nothing is seen.
 

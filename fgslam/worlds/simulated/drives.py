@@ -15,11 +15,12 @@ from fgslam.core.errors import ConfigError
 from fgslam.worlds.driving.paths import (
     PlanarPath,
     drive_along,
-    plan_path,
+    paper_loop,
     planar_poses,
+    room_laps,
     straights_and_turns,
 )
-from fgslam.worlds.settings import LabDriveSettings, MeasurementDriveSettings
+from fgslam.worlds.settings import MeasurementDriveSettings
 
 CORRIDOR_WIDTH_M = 2.4
 
@@ -66,31 +67,17 @@ def plan_measured_drive(settings: MeasurementDriveSettings, place: str) -> Plann
         )
     if settings.path == "sharp_turns":
         planar = _sharp_turns(settings)
-        return PlannedDrive(_stamps(len(planar), settings), planar_poses(planar), None)
-    lab = _lab_settings(settings)
+        stamps = np.arange(len(planar)) / settings.frame_rate_hz
+        return PlannedDrive(stamps, planar_poses(planar), None)
+    corners = None
     if place == "room":
-        path, corners = plan_path(lab), None
+        path = paper_loop() if settings.path == "lab_loop" else room_laps(settings.laps)
     elif settings.path == "laps":
         path, corners = _closed_corridor(settings.laps)
     else:
         path, corners = _long_corridor()
-    drive = drive_along(path, lab)
+    drive = drive_along(path, settings, settings.frames)
     return PlannedDrive(drive.timestamps, drive.body_poses(drive.timestamps), corners)
-
-
-def _lab_settings(settings: MeasurementDriveSettings) -> LabDriveSettings:
-    return LabDriveSettings(
-        path="laps" if settings.path == "laps" else "paper_loop",
-        frames=settings.frames,
-        frame_rate_hz=settings.frame_rate_hz,
-        max_speed_m_s=settings.max_speed_m_s,
-        max_turn_deg_s=settings.max_turn_deg_s,
-        laps=settings.laps,
-    )
-
-
-def _stamps(count: int, settings: MeasurementDriveSettings) -> FloatArray:
-    return np.asarray(np.arange(count) / settings.frame_rate_hz)
 
 
 # --------------------------------------------------------------------------------------------
@@ -138,8 +125,12 @@ def _sharp_turns(settings: MeasurementDriveSettings) -> FloatArray:
     """(n, 3) x, y, heading: spins on the spot and tight bends, round after round."""
     step = _CRUISE * settings.max_speed_m_s / settings.frame_rate_hz
     turn = np.deg2rad(settings.turn_deg_per_frame)
-    moves = np.vstack([_moves(way, np.deg2rad(angle), step, turn) for way, angle in _SHARP_HALF])
-    moves = np.vstack([moves, moves])
+    segments = []
+    for way, degrees in _SHARP_HALF:  # in equal chords and turns, each within step and turn
+        angle = np.deg2rad(degrees)
+        count = int(np.ceil(max(way / step, abs(angle) / turn) - 1e-9))
+        segments.append(np.tile([way / count, angle / count], (count, 1)))
+    moves = np.vstack([*segments, *segments])
     wanted = len(moves) + 1 if settings.frames is None else settings.frames
     moves = np.tile(moves, (-(-wanted // len(moves)), 1))[: wanted - 1]
     out = np.zeros((wanted, 3))
@@ -149,9 +140,3 @@ def _sharp_turns(settings: MeasurementDriveSettings) -> FloatArray:
     out[:, :2] = _SHARP_START[:2]
     out[1:, :2] += np.cumsum(steps, axis=0)
     return out
-
-
-def _moves(way: float, angle: float, step: float, turn: float) -> FloatArray:
-    """(k, 2) equal chords and turns of one segment, each within ``step`` and ``turn``."""
-    count = int(np.ceil(max(way / step, abs(angle) / turn) - 1e-9))
-    return np.tile([way / count, angle / count], (count, 1))

@@ -106,15 +106,14 @@ def _selection(count: int, settings: SimulatedMeasurementsSettings) -> IntArray:
 
 def _require_effect(settings: SimulatedMeasurementsSettings, frames: int) -> None:
     """Refuses keys that would do nothing."""
-    starts: dict[str, int] = {}
-    if settings.odometry_fault is not None:
-        starts["odometry_fault.start"] = settings.odometry_fault.start
-    if settings.blackout is not None:
-        starts["blackout.start"] = settings.blackout.start
-    if settings.moved is not None:
-        starts["moved.frame"] = settings.moved.frame
+    fault, blackout, moved = settings.odometry_fault, settings.blackout, settings.moved
+    starts = {
+        "odometry_fault.start": None if fault is None else fault.start,
+        "blackout.start": None if blackout is None else blackout.start,
+        "moved.frame": None if moved is None else moved.frame,
+    }
     for key, start in starts.items():
-        if start >= frames:
+        if start is not None and start >= frames:
             raise ConfigError(
                 f"dataset.{key} is {start}, but the drive has the frames 0 to {frames - 1}; "
                 "choose an earlier one"
