@@ -14,7 +14,7 @@ from hypothesis import settings
 
 from fgslam.core.errors import MissingDependencyError
 from fgslam.core.threads import one_blas_thread
-from fgslam.worlds.rendering.open3d_library import load_open3d
+from fgslam.worlds.open3d_library import load_open3d
 
 # A red test must be red again on the next run, and slow machines must not make one red.
 settings.register_profile("fgslam", derandomize=True, deadline=None, print_blob=True)

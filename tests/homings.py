@@ -12,7 +12,7 @@ from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import make_local_map
 from fgslam.worlds.settings import SimulatedBearingsSettings
-from fgslam.worlds.simulated.bearings import NO_OUTLIERS, HomingOutliers, simulate_homing
+from fgslam.worlds.simulated_bearings import NO_OUTLIERS, HomingOutliers, simulate_homing
 
 LEVEL = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0, max_direction_sigma_deg=15.0)
 """The simulated camera neither tilts nor rises; sparse rooms are to be answered, too."""

@@ -6,9 +6,9 @@ import numpy as np
 
 from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, rectangle, stack
-from fgslam.worlds.rendering.scene import Layer, flat_light
-from fgslam.worlds.rendering.texture_bank import ColourBank
+from fgslam.worlds.patches import RayCaster, Surface, Thing, rectangle, stack
+from fgslam.worlds.renderer import Layer, flat_light
+from fgslam.worlds.textures import ColourBank
 
 PANORAMA = Equirectangular(512, 256)
 

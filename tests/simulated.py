@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks import feature_world
+from benchmarks.feature_world import visible
 from fgslam.backend.protocol import Estimator
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -23,13 +25,11 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
-from fgslam.worlds.driving.paths import Drive as RobotDrive
-from fgslam.worlds.driving.paths import drive_along
+from fgslam.worlds.driving import Drive as RobotDrive
+from fgslam.worlds.driving import drive_along
 from fgslam.worlds.lab import place_path
 from fgslam.worlds.settings import LabDriveSettings
-from fgslam.worlds.simulated import features
-from fgslam.worlds.simulated.features import visible
-from fgslam.worlds.simulated.landmarks import IdentityBook
+from fgslam.worlds.simulated_measurements import IdentityBook
 
 RIG = CameraRig(
     width=320,
@@ -241,7 +241,7 @@ def assert_same_bits(first: object, second: object) -> None:
         np.testing.assert_array_equal(x, y)
 
 
-class FeatureWorld(features.FeatureWorld):
+class FeatureWorld(feature_world.FeatureWorld):
     """As the project's own; by default of the paper's rig."""
 
     def __init__(self, points: FloatArray, rng: np.random.Generator, rig: CameraRig = RIG) -> None:

@@ -29,10 +29,7 @@ from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.rendered_lab import RENDER_VERSION, RenderedLabSequence
 from fgslam.worlds.lab import PlaceChoice, Room, World, camera_offsets, open_room
-from fgslam.worlds.rendering.cache import RenderCache, content_hash
-from fgslam.worlds.rendering.image_effects import apply_effects
-from fgslam.worlds.rendering.renderer import Renderer
-from fgslam.worlds.rendering.views import omni_view
+from fgslam.worlds.renderer import RenderCache, Renderer, apply_effects, content_hash, omni_view
 from fgslam.worlds.settings import RenderedLabSettings
 
 _THREADS = 2

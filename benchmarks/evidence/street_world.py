@@ -19,11 +19,9 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import pose
 from fgslam.core.rig_correction import camera_displacements
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.rendering.patches import Patch, RayCaster, Surface, Thing, rectangle, stack
-from fgslam.worlds.rendering.renderer import Renderer
-from fgslam.worlds.rendering.scene import Layer, LightMaps
-from fgslam.worlds.rendering.texture_bank import GreyBank
-from fgslam.worlds.rendering.views import PixelRays, pinhole_view
+from fgslam.worlds.patches import Patch, RayCaster, Surface, Thing, rectangle, stack
+from fgslam.worlds.renderer import Layer, LightMaps, PixelRays, Renderer, pinhole_view
+from fgslam.worlds.textures import GreyBank
 
 Float32 = npt.NDArray[np.float32]
 

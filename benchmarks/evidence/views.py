@@ -16,9 +16,9 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
-from fgslam.worlds.driving import wheel_odometry
+from fgslam.worlds.driving import simulate_wheels
 from fgslam.worlds.lab import PlaceChoice, World, camera_offsets, open_room
-from fgslam.worlds.rendering.image_effects import apply_effects
+from fgslam.worlds.renderer import apply_effects
 from fgslam.worlds.settings import RenderedLabSettings
 
 FORWARD_M = 0.10
@@ -129,4 +129,4 @@ class ViewPair:
 def make_pair(lab: LabViews, views: tuple[View, View], rng: np.random.Generator) -> ViewPair:
     """Two views with wheel odometry of the lab's own drift model between them."""
     bodies = np.array([view.wTc @ inverse(lab.rig.bTc) for view in views])
-    return ViewPair(lab.rig, views, wheel_odometry.simulate(lab.settings.odometry, bodies, rng)[0])
+    return ViewPair(lab.rig, views, simulate_wheels(lab.settings.odometry, bodies, rng)[0])

@@ -19,7 +19,7 @@ from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.runs.tasks.slam_map_entry import MAP_FILE
 from fgslam.runs.tasks.slam_state import first_config
 from fgslam.worlds.buildings.lab import build_lab
-from fgslam.worlds.rendering.patches import Thing
+from fgslam.worlds.patches import Thing
 
 EXPERIMENT = "two_visits"
 UNCHANGED = "nothing moved"

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from benchmarks.feature_world import FeatureWorld
 from benchmarks.speed.blocks import Memory, of_blocks
 from benchmarks.speed.maps import RIG
 from fgslam.core import geometry as g
@@ -28,8 +29,7 @@ from fgslam.evaluation.trajectory import align, moved, position_errors
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings, LoopSettings, LostSettings
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.session import Session
-from fgslam.worlds.driving.paths import planar_poses, straights_and_turns
-from fgslam.worlds.simulated.features import FeatureWorld
+from fgslam.worlds.driving import planar_poses, straights_and_turns
 
 FRAMES, BLOCK = 10_000, 1_000
 SEEDS = range(1, 5)

@@ -20,8 +20,7 @@ from fgslam.core.estimates import Trajectory
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.driving.paths import PosesInTime
+from fgslam.worlds.driving import PosesInTime, simulate_wheels
 from fgslam.worlds.lab import (
     PlaceChoice,
     World,
@@ -33,9 +32,14 @@ from fgslam.worlds.lab import (
     plan_in_place,
 )
 from fgslam.worlds.people import Stance, make_walk
-from fgslam.worlds.rendering.cache import RenderCache, content_hash
-from fgslam.worlds.rendering.image_effects import BLUR_RENDERS, apply_effects, is_blocked
-from fgslam.worlds.rendering.scene import Body
+from fgslam.worlds.renderer import (
+    BLUR_RENDERS,
+    Body,
+    RenderCache,
+    apply_effects,
+    content_hash,
+    is_blocked,
+)
 from fgslam.worlds.settings import LabSettings, RenderedLabSettings
 
 RENDER_VERSION = 7
@@ -89,7 +93,7 @@ class RenderedLabSequence:
         self._world_body = self._body[0]
         if settings.drive.path == "random_poses":
             self._world_body = first_pose(settings.place, settings.drive)
-        self._odometry = wheel_odometry.simulate(
+        self._odometry = simulate_wheels(
             settings.odometry, self._body, np.random.default_rng([seed, 1])
         )
         self._walk = make_walk(settings, self._drive, self._rig)

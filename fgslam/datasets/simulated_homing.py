@@ -6,7 +6,7 @@ import numpy as np
 
 from fgslam.worlds.house import OmniWorld as OmniWorld
 from fgslam.worlds.settings import OmniHouseSettings, SimulatedBearingsSettings
-from fgslam.worlds.simulated.bearings import HomingOutliers, SimulatedHoming, simulate_homing
+from fgslam.worlds.simulated_bearings import HomingOutliers, SimulatedHoming, simulate_homing
 
 
 def open_simulated_homing(

@@ -8,11 +8,11 @@ from dataclasses import asdict
 from fgslam.core.recordings import LandmarkTruth, MeasurementRecording
 from fgslam.datasets.measurement_files import make_log
 from fgslam.datasets.settings import OdometrySettings
-from fgslam.worlds.rendering.cache import content_hash
+from fgslam.worlds.renderer import content_hash
 from fgslam.worlds.settings import (
     SimulatedMeasurementsSettings,
 )
-from fgslam.worlds.simulated.measurements import (
+from fgslam.worlds.simulated_measurements import (
     SimulatedMeasurements,
     simulate_measurements,
 )

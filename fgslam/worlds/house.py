@@ -19,22 +19,17 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.errors import CalibrationError
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
-from fgslam.worlds.driving.floor_space import FloorSpace
-from fgslam.worlds.driving.reference_paths import PathPlanner
-from fgslam.worlds.driving.wheelchair import RADIUS_M, RangeSensor, Wheelchair
+from fgslam.worlds.driving import RADIUS_M, RangeSensor, Wheelchair
+from fgslam.worlds.floor import FloorSpace, PathPlanner
+from fgslam.worlds.patches import RayCaster, stack
 from fgslam.worlds.people import PERSON_RADIUS, People
-from fgslam.worlds.rendering.image_effects import noisy
-from fgslam.worlds.rendering.patches import RayCaster, stack
-from fgslam.worlds.rendering.renderer import Renderer, surface_points, visible
-from fgslam.worlds.rendering.scene import Layer, bake
-from fgslam.worlds.rendering.texture_bank import ColourBank
-from fgslam.worlds.rendering.texture_library import build_colour_library
-from fgslam.worlds.rendering.views import omni_view
+from fgslam.worlds.renderer import Layer, Renderer, bake, noisy, omni_view, surface_points, visible
 from fgslam.worlds.settings import (
     HouseCalibrationSettings,
     HouseCameraSettings,
     OmniHouseSettings,
 )
+from fgslam.worlds.textures import ColourBank, build_colour_library
 
 Float32 = npt.NDArray[np.float32]
 
@@ -52,8 +47,8 @@ _PATH_CLEARANCE_M = 0.55
 _CONTACT_M = 0.06
 # The mirror, Goedemé et al. 2005: eccentricity of the unified model; elevations at the inner edge,
 # below which the camera sees itself, and at its rim, which touches the image's border.
-_MIRROR_XI = 0.92
-_MIRROR_ELEVATIONS_DEG = (-65.0, 15.0)
+MIRROR_XI = 0.92
+MIRROR_ELEVATIONS_DEG = (-65.0, 15.0)
 # Between the mirror's rim and the nearest border of the image.
 _MARGIN_PX = 0.5
 # The target images are taken at another time of day.
@@ -105,11 +100,11 @@ def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
     if settings.kind == "equirectangular":
         width = settings.width or 1024
         return Equirectangular(width, width // 2)
-    bottom, top = np.deg2rad(_MIRROR_ELEVATIONS_DEG)
+    bottom, top = np.deg2rad(MIRROR_ELEVATIONS_DEG)
     width = settings.width or 320
     size = (width, width * 3 // 4)
     return HyperbolicMirror.with_view(
-        size, _MIRROR_XI, (float(bottom), float(top)), margin_px=_MARGIN_PX
+        size, MIRROR_XI, (float(bottom), float(top)), margin_px=_MARGIN_PX
     )
 
 

@@ -19,14 +19,7 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.buildings import corridors as alike
 from fgslam.worlds.buildings import lab, office
-from fgslam.worlds.driving import wheel_odometry
-from fgslam.worlds.driving.floor_space import (
-    BURST_STEP_M,
-    RANDOM_CLEARANCE_M,
-    FloorSpace,
-    draw_poses,
-)
-from fgslam.worlds.driving.paths import (
+from fgslam.worlds.driving import (
     MAX_ACCELERATION_M_S2,
     PlanarPath,
     PosesInTime,
@@ -36,32 +29,43 @@ from fgslam.worlds.driving.paths import (
     room_laps,
     round_corners,
     through_waypoints,
+    wheel_identity,
 )
+from fgslam.worlds.floor import (
+    BURST_STEP_M,
+    RANDOM_CLEARANCE_M,
+    FloorSpace,
+    draw_poses,
+)
+from fgslam.worlds.patches import RayCaster, Thing, stack
 from fgslam.worlds.people import ACROSS_M, WALK_FRAMES, Stance, person
-from fgslam.worlds.rendering.image_effects import (
+from fgslam.worlds.renderer import (
     BLUR_RENDERS,
     JUMP,
     JUMP_FRAME,
+    LIGHT_SPACING_M,
     WAVE,
     WAVE_FRAMES,
+    Body,
+    Layer,
+    Renderer,
+    bake,
+    flat_light,
+    pinhole_view,
 )
-from fgslam.worlds.rendering.patches import RayCaster, Thing, stack
-from fgslam.worlds.rendering.renderer import Renderer
-from fgslam.worlds.rendering.scene import LIGHT_SPACING_M, Body, Layer, bake, flat_light
-from fgslam.worlds.rendering.texture_bank import GreyBank
-from fgslam.worlds.rendering.texture_library import (
-    build_library,
-    building_library,
-    corridor_library,
-)
-from fgslam.worlds.rendering.textures import Grey
-from fgslam.worlds.rendering.views import pinhole_view
 from fgslam.worlds.settings import (
     LabDriveSettings,
     LabRigSettings,
     LabSettings,
     PathName,
     PlaceName,
+)
+from fgslam.worlds.textures import (
+    Grey,
+    GreyBank,
+    build_library,
+    building_library,
+    corridor_library,
 )
 
 FIELD_OF_VIEW_DEG = 60.0  # its width
@@ -230,7 +234,7 @@ def identity_values(settings: LabSettings) -> dict[str, Any]:
         "above_m": ABOVE_M,
         "tilt_deg": 0.0,
     }
-    out["odometry"] = wheel_odometry.identity_values(settings.odometry)
+    out["odometry"] = wheel_identity(settings.odometry)
     drive["max_acceleration_m_s2"] = MAX_ACCELERATION_M_S2
     drive["random_poses"] |= {"clearance_m": RANDOM_CLEARANCE_M, "step_m": BURST_STEP_M}
     exposure = {"wave": WAVE, "jump": JUMP}

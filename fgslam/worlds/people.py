@@ -13,8 +13,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.driving.paths import PosesInTime, planar_poses
-from fgslam.worlds.rendering.patches import (
+from fgslam.worlds.driving import PosesInTime, planar_poses
+from fgslam.worlds.patches import (
     Patch,
     RayCaster,
     Surface,
@@ -24,10 +24,9 @@ from fgslam.worlds.rendering.patches import (
     prism,
     stack,
 )
-from fgslam.worlds.rendering.scene import Body, Layer, flat_light
-from fgslam.worlds.rendering.texture_bank import ColourBank
-from fgslam.worlds.rendering.texture_library import SHIRTS
+from fgslam.worlds.renderer import Body, Layer, flat_light
 from fgslam.worlds.settings import LabSettings
+from fgslam.worlds.textures import SHIRTS, ColourBank
 
 _STRIDE_M = 1.3
 _THIGH, _SHIN, _UPPER_ARM, _FOREARM = 0.43, 0.42, 0.29, 0.27

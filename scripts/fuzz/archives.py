@@ -24,7 +24,7 @@ from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import make_local_map
 from fgslam.homing.path_memory import MetricPoses
 from fgslam.worlds.settings import SimulatedBearingsSettings
-from fgslam.worlds.simulated.bearings import simulate_homing
+from fgslam.worlds.simulated_bearings import simulate_homing
 from scripts.fuzz.damage import Arrays, Rng, damaged_arrays, damaged_bytes, written
 
 

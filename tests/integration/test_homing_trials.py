@@ -19,7 +19,7 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
 )
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
-from fgslam.worlds.simulated.bearings import HomingOutliers
+from fgslam.worlds.simulated_bearings import HomingOutliers
 
 GRAPH = HomingGraphSettings()
 

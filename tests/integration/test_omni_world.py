@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.worlds.driving.wheelchair import RADIUS_M
+from fgslam.worlds.driving import RADIUS_M
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.settings import (
     HouseCameraSettings,

@@ -12,7 +12,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.buildings import furniture
 from fgslam.worlds.buildings.floor_plan import DOOR_HEIGHT, HEIGHT, lamp_things
-from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, rectangle
+from fgslam.worlds.patches import Patch, Surface, Thing, box, placed, rectangle
 
 SECTION, SECTIONS = 6.0, 4
 SIDE = SECTION * SECTIONS

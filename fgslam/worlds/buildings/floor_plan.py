@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, rectangle
+from fgslam.worlds.patches import Patch, Surface, Thing, box, rectangle
 
 HEIGHT = 2.7
 DOOR_HEIGHT = 2.1

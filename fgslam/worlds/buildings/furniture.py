@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.worlds.buildings.floor_plan import HALF_WALL, Opening, Room
-from fgslam.worlds.rendering.patches import Patch, Surface, Thing, box, placed, prism, rectangle
-from fgslam.worlds.rendering.texture_library import BINDER_ROWS, BOOK_ROWS, CARTONS, SCREENS
+from fgslam.worlds.patches import Patch, Surface, Thing, box, placed, prism, rectangle
+from fgslam.worlds.textures import BINDER_ROWS, BOOK_ROWS, CARTONS, SCREENS
 
 _METAL = Surface("metal_dark", 0.8)
 _BLACK = Surface("plain_dark", 0.6)

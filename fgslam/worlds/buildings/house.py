@@ -22,8 +22,8 @@ from fgslam.worlds.buildings.floor_plan import (
     shell,
 )
 from fgslam.worlds.buildings.furniture import FittingStyle, RoomFitter
-from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
-from fgslam.worlds.rendering.texture_library import PAINTINGS, PHOTOGRAPHS, POSTERS
+from fgslam.worlds.patches import Patch, Surface, Thing, placed
+from fgslam.worlds.textures import PAINTINGS, PHOTOGRAPHS, POSTERS
 
 _FLOOR_TILE_M = 5.3
 """No whole number of legs: with tiles of 4 m a leg of 4 m shows the same floor at the same place,

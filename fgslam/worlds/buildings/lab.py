@@ -12,8 +12,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.buildings import furniture
 from fgslam.worlds.buildings.floor_plan import lamp_things
-from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed, rectangle
-from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, POSTERS
+from fgslam.worlds.patches import Patch, Surface, Thing, placed, rectangle
+from fgslam.worlds.textures import PHOTOGRAPHS, POSTERS
 
 HALF_SIDE = 5.0
 HEIGHT = 3.0

@@ -21,8 +21,8 @@ from fgslam.worlds.buildings.floor_plan import (
     shell,
 )
 from fgslam.worlds.buildings.furniture import FittingStyle, RoomFitter
-from fgslam.worlds.rendering.patches import Patch, Surface, Thing, placed
-from fgslam.worlds.rendering.texture_library import PICTURES
+from fgslam.worlds.patches import Patch, Surface, Thing, placed
+from fgslam.worlds.textures import PICTURES
 
 WIDTH, DEPTH = 36.0, 24.0
 _DOOR_WIDTH, _FIRE_DOOR_WIDTH = 1.3, 1.9

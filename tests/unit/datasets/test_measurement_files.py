@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fgslam.worlds.simulated.settings import SimulatedMeasurementsSettings
 
 from fgslam.core.errors import ConfigError, DatasetError, MeasurementLogError
 from fgslam.core.measurement_log import MeasurementLog
@@ -18,6 +17,7 @@ from fgslam.datasets.settings import (
     SyntheticOdometrySettings,
 )
 from fgslam.runs.tasks.slam_measurements import write_log_and_truth
+from fgslam.worlds.settings import SimulatedMeasurementsSettings
 
 
 @pytest.fixture

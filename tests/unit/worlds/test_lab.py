@@ -5,11 +5,10 @@ import pytest
 
 from fgslam.worlds.buildings.lab import HALF_SIDE, HEIGHT, build_lab
 from fgslam.worlds.lab import make_rig
+from fgslam.worlds.patches import RayCaster, Thing, stack
 from fgslam.worlds.people import across_view, person
-from fgslam.worlds.rendering.patches import RayCaster, Thing, stack
-from fgslam.worlds.rendering.texture_library import PHOTOGRAPHS, build_library, photograph
-from fgslam.worlds.rendering.textures import book_row
 from fgslam.worlds.settings import LabDriveSettings, LabRigSettings
+from fgslam.worlds.textures import PHOTOGRAPHS, book_row, build_library, photograph
 from tests.simulated import plan_drive
 
 VISITS = (1, 2, 3)

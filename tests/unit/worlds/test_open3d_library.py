@@ -6,8 +6,8 @@ from types import ModuleType
 import pytest
 
 from fgslam.core.errors import MemoryShortageError, MissingDependencyError
-from fgslam.worlds.rendering import open3d_library
-from fgslam.worlds.rendering.open3d_library import (
+from fgslam.worlds import open3d_library
+from fgslam.worlds.open3d_library import (
     explain_missing_library,
     find_bundled_libusb,
     load_open3d,

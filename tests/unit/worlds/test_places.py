@@ -11,8 +11,8 @@ from fgslam.core.planar import wrap
 from fgslam.worlds.buildings import corridors as alike
 from fgslam.worlds.buildings import office
 from fgslam.worlds.buildings.lab import build_lab
-from fgslam.worlds.driving.floor_space import FloorSpace
-from fgslam.worlds.driving.paths import Drive, round_corners
+from fgslam.worlds.driving import Drive, round_corners
+from fgslam.worlds.floor import FloorSpace
 from fgslam.worlds.lab import (
     PATHS,
     PlaceChoice,
@@ -22,17 +22,15 @@ from fgslam.worlds.lab import (
     place_path,
     plan_in_place,
 )
-from fgslam.worlds.rendering.patches import RayCaster, Surface, Thing, box, rectangle, stack
-from fgslam.worlds.rendering.renderer import Renderer
-from fgslam.worlds.rendering.scene import Layer, bake
-from fgslam.worlds.rendering.texture_bank import GreyBank
-from fgslam.worlds.rendering.views import pinhole_view
+from fgslam.worlds.patches import RayCaster, Surface, Thing, box, rectangle, stack
+from fgslam.worlds.renderer import Layer, Renderer, bake, pinhole_view
 from fgslam.worlds.settings import (
     LabDriveSettings,
     LabRigSettings,
     PathName,
     PlaceName,
 )
+from fgslam.worlds.textures import GreyBank
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
 ROOMS = PlaceChoice("rooms", 0, 1, identical_posters=False)

@@ -10,7 +10,7 @@ import pytest
 
 from fgslam.core.planar import bearings, wrap
 from fgslam.worlds.settings import SimulatedBearingsSettings
-from fgslam.worlds.simulated.bearings import (
+from fgslam.worlds.simulated_bearings import (
     NO_OUTLIERS,
     HomingOutliers,
     SimulatedHoming,

@@ -27,7 +27,7 @@ from fgslam.runs.config import ExperimentConfig, load_experiment, make_config
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
 from fgslam.worlds.settings import SimulatedMeasurementsSettings
-from fgslam.worlds.simulated.landmarks import IdentityBook
+from fgslam.worlds.simulated_measurements import IdentityBook
 
 
 def settings(**values: Any) -> SimulatedMeasurementsSettings:
@@ -207,7 +207,7 @@ def test_an_identity_is_kept_through_misses_and_new_after_pruning() -> None:
 
 def test_every_observation_is_new_matched_or_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every observation is of a landmark known and not pruned, or new under the next number."""
-    monkeypatch.setattr("fgslam.worlds.simulated.measurements.PRUNE_AFTER", 3)
+    monkeypatch.setattr("fgslam.worlds.simulated_measurements.PRUNE_AFTER", 3)
     recording = recorded(stop=None, detection={"probability": 0.5})
     alive: set[int] = set()
     count = pruned = 0
@@ -248,8 +248,8 @@ def test_detection_probability_is_respected() -> None:
 
 
 def test_range_limits_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.worlds.simulated.measurements.LEAST_RANGE_M", 1.0)
-    monkeypatch.setattr("fgslam.worlds.simulated.measurements.MOST_RANGE_M", 3.0)
+    monkeypatch.setattr("fgslam.worlds.simulated_measurements.LEAST_RANGE_M", 1.0)
+    monkeypatch.setattr("fgslam.worlds.simulated_measurements.MOST_RANGE_M", 3.0)
     near = recorded(stop=None, detection={"noise_scale": 0.0})
     distance = np.concatenate(
         [

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.worlds.rendering import open3d_library
+from fgslam.worlds import open3d_library
 
 ROOT = Path(__file__).parents[3]
 # What a surrounding `make test FGSLAM_PYTHON=...` hands down must not steer the runs in here.

@@ -19,7 +19,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate
 from fgslam.core.planar import wrap
 from fgslam.worlds.settings import SimulatedBearingsSettings
-from fgslam.worlds.simulated.bearings import HomingOutliers
+from fgslam.worlds.simulated_bearings import HomingOutliers
 
 NONE, CAUCHY, HUBER = (
     KernelSettings("none"),

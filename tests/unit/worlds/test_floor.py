@@ -1,4 +1,4 @@
-"""Random poses of the kidnapped robot: seeded, clear of everything, carried between."""
+"""The free floor, random poses all over it, reference paths, and range finders in the house."""
 
 from pathlib import Path
 
@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from fgslam.core import geometry
-from fgslam.core.errors import ConfigError
+from fgslam.core.errors import ConfigError, DatasetError
+from fgslam.core.planar import wrap
 from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.worlds.driving.floor_space import FloorSpace
+from fgslam.worlds.buildings.house import DEPTH, PLAN, WIDTH, build_house
+from fgslam.worlds.driving import RangeSensor
+from fgslam.worlds.floor import FloorSpace, PathPlanner
 from fgslam.worlds.lab import PlaceChoice, build_place, make_rig, plan_in_place
-from fgslam.worlds.rendering.cache import content_hash
-from fgslam.worlds.rendering.patches import stack
+from fgslam.worlds.patches import PatchArrays, RayCaster, Surface, Thing, box, stack
+from fgslam.worlds.renderer import content_hash
 from fgslam.worlds.settings import (
     LabDriveSettings,
     LabRigSettings,
@@ -161,3 +164,130 @@ def test_other_places_and_posters_have_other_cache_keys() -> None:
         )
     ]
     assert len(set(keys)) == len(keys)
+
+
+# --------------------------------------------------------------------------------------------
+# The house's floor and paths
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+@pytest.fixture(scope="module")
+def house() -> tuple[Thing, ...]:
+    return build_house(rng(0))[0]
+
+
+@pytest.fixture(scope="module")
+def patches(house: tuple[Thing, ...]) -> PatchArrays:
+    return stack(house)
+
+
+@pytest.fixture(scope="module")
+def space(patches: PatchArrays) -> FloorSpace:
+    return FloorSpace(patches, np.zeros(2), np.array([WIDTH, DEPTH]))
+
+
+def textures(patches: PatchArrays) -> list[str]:
+    return [surface.texture for surface in patches.surfaces]
+
+
+def test_same_seed_gives_the_same_house(house: tuple[Thing, ...], patches: PatchArrays) -> None:
+    again = stack(build_house(rng(0))[0])
+    np.testing.assert_array_equal(again.corner, patches.corner)
+    assert textures(again) == textures(patches)
+    other = stack(build_house(rng(1))[0])
+    assert textures(other) != textures(patches)
+
+
+def test_some_picture_hangs_in_every_room(house: tuple[Thing, ...]) -> None:
+    for name in ("painting_0", "poster_0"):
+        rooms = {
+            thing.name.split("_")[0]
+            for thing in house
+            if "picture" in thing.name and thing.patches[0].surface.texture == name
+        }
+        assert len(rooms) >= 5
+
+
+def test_all_furniture_stands_in_its_room(house: tuple[Thing, ...]) -> None:
+    low, high = np.array([0.0, 0.0, 0.0]), np.array([WIDTH, DEPTH, 2.7])
+    for thing in house:
+        for patch in thing.patches:
+            corners = patch.corner + np.array(
+                [0 * patch.edge_u, patch.edge_u, patch.edge_v, patch.edge_u + patch.edge_v]
+            )
+            assert (corners > low - 0.1).all(), thing.name
+            assert (corners < high + 0.1).all(), thing.name
+
+
+def test_clearance_is_the_distance_to_a_box() -> None:
+    things = [Thing("box", tuple(box((1.0, 1.0, 0.0), (2.0, 2.0, 0.8), Surface("any"))))]
+    high = [Thing("lintel", tuple(box((0.0, 0.0, 2.1), (3.0, 3.0, 2.4), Surface("any"))))]
+    space = FloorSpace(stack(things + high), np.zeros(2), np.array([3.0, 3.0]))
+    points = np.array([[0.5, 1.5], [2.4, 2.3], [1.5, 0.9]])
+    np.testing.assert_allclose(space.clearance(points), [0.5, 0.5, 0.1], atol=1e-12)
+    assert space.line_is_free(
+        np.array([0.4, 0.4]), np.array([[0.4, 2.6], [2.6, 2.6]]), 0.3
+    ).tolist() == [
+        True,
+        False,
+    ]
+
+
+@pytest.mark.parametrize("within", [None, "hall"])
+@pytest.mark.parametrize("spacing", [2.0, 3.0, 4.0])
+def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: str | None) -> None:
+    planner = PathPlanner(space, 0.55)
+    rooms = set()
+    for seed in range(5):
+        poses = planner.reference_path(spacing, 10, rng(seed), within)
+        assert poses.shape == (11, 3)
+        step = np.diff(poses[:, :2], axis=0)
+        np.testing.assert_allclose(np.linalg.norm(step, axis=1), spacing)
+        heading = np.arctan2(step[:, 1], step[:, 0])
+        np.testing.assert_allclose(wrap(heading - poses[:-1, 2]), 0.0, atol=1e-12)
+        part = np.linspace(0.0, 1.0, 25)[:, None]
+        for start, move in zip(poses[:-1, :2], step, strict=True):
+            assert space.clearance(start + part * move).min() > 0.52
+        names = {room.name for x, y, _ in poses if (room := PLAN.room_at(x, y))}
+        assert within is None or names == {within}
+        rooms |= names
+    np.testing.assert_array_equal(poses, planner.reference_path(spacing, 10, rng(4), within))
+    assert within is not None or len(rooms) >= 4
+
+
+def test_impossible_path_is_refused(space: FloorSpace) -> None:
+    with pytest.raises(DatasetError, match=r"no path of 60 legs of 8\.0 m .* in the hall; lower"):
+        PathPlanner(space, 0.9).reference_path(8.0, 60, rng(), "hall")
+
+
+def make_sensor(noise: float, patches: PatchArrays) -> RangeSensor:
+    return RangeSensor(RayCaster(patches), noise)
+
+
+def test_scan_agrees_with_the_floors_outlines(patches: PatchArrays, space: FloorSpace) -> None:
+    """No beam ends before the nearest obstacle; the nearest beam ends close to it."""
+    sensor = make_sensor(0.0, patches)
+    for pose in PathPlanner(space, 0.55).reference_path(2.0, 4, rng(3)):
+        angles, ranges = sensor.scan(pose, np.empty((0, 3)), rng())
+        clearance = space.clearance(pose[None, :2])[0]
+        assert ranges.min() > clearance - 1e-5
+        ends = pose[:2] + ranges[:, None] * np.column_stack(
+            [np.cos(angles + pose[2]), np.sin(angles + pose[2])]
+        )
+        hit = ranges < 5.0
+        assert np.median(space.clearance(ends[hit])) < 0.02
+
+
+def test_scan_sees_people_with_noise_and_nothing_beyond_its_range(patches: PatchArrays) -> None:
+    sensor = make_sensor(0.02, patches)
+    pose = np.array([10.0, 8.7, 0.0])
+    disc = np.array([[11.5, 8.7, 0.3]])
+    ahead = [sensor.scan(pose, disc, rng(seed))[1][0] for seed in range(300)]
+    assert np.mean(ahead) == pytest.approx(1.2, abs=0.005)
+    assert np.std(ahead) == pytest.approx(0.02, rel=0.2)
+    angles, ranges = sensor.scan(pose, np.empty((0, 3)), rng())
+    assert angles[0] == 0.0
+    assert ranges[0] == 5.0

@@ -2,9 +2,9 @@
 
 Open3D's wheel links against libusb, OpenGL, X11 and others even where only its ray caster is
 used. libusb also lives on PyPI, so its absence is handled here; for the others a message says
-what to install. ``make setup`` runs this module: ``python -m
-fgslam.worlds.rendering.open3d_library`` says in one line what is missing and how to provide it, and
-``--packages`` prints the Debian package names alone.
+what to install. ``make setup`` runs this module: ``python -m fgslam.worlds.open3d_library`` says
+in one line what is missing and how to provide it, and ``--packages`` prints the Debian package
+names alone.
 """
 
 from __future__ import annotations

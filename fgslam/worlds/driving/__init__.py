@@ -1,1 +1,0 @@
-"""How robots move through places: paths, free floor, wheels, wheelchair, range sensor."""

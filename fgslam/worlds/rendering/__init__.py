@@ -1,1 +1,0 @@
-"""Rendering of textured patch scenes: pinhole and omnidirectional images, light, textures."""

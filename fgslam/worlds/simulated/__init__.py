@@ -1,1 +1,0 @@
-"""Measurements and bearings simulated without images."""
