@@ -17,7 +17,7 @@ from fgslam.core.estimates import EgoMotionStatus, Trajectory
 from fgslam.core.recordings import Frame, Sequence
 from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
-from fgslam.frontend.features.sift import EDGE_THRESHOLD
+from fgslam.frontend.features.sift import EDGE_THRESHOLD, OCTAVE_LAYERS
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import run_task
@@ -130,7 +130,7 @@ def found_features(sequence: Sequence, settings: FrontendSettings) -> FoundFeatu
 def plain_sift(settings: SiftSettings) -> cv2.Feature2D:
     """OpenCV's own SIFT with the front-end's settings: what costs are compared with."""
     return cv2.SIFT.create(
-        settings.max_features, settings.octave_layers, settings.contrast_threshold, EDGE_THRESHOLD,
+        settings.max_features, OCTAVE_LAYERS, settings.contrast_threshold, EDGE_THRESHOLD,
         settings.base_sigma_px, cv2.CV_8U, True,
     )  # fmt: skip
 

@@ -36,7 +36,7 @@ FIRST = {
     "estimator.noise_factor": "a number in place of the estimate",
     "estimator.lag_frames, estimator.keyframe_every": "how far back `fixed_lag` looks; every how "
     "many frames `isam2` keeps one",
-    "frontend.loops": "`{}` switches loop closing on",
+    "frontend.loops": "`true` switches loop closing on",
     "map.load, map.save": "saved maps: begin in one, write one",
 }
 """What a user sets first, by key."""
@@ -46,7 +46,7 @@ _INTRODUCTION = """# Settings
 <!-- Made by `python -m scripts.make_reference`: edit the settings' descriptions, not this page. -->
 
 Every key of an experiment, which is one YAML file (examples in `experiments/`). Any key can be set
-from the command line: `fgslam run CONFIG.yaml --set frontend.sift.octave_layers=3`. The last value
+from the command line: `fgslam run CONFIG.yaml --set frontend.sift.max_features=500`. The last value
 of a key wins; choosing another `kind` drops the file's keys of the old one. Unknown keys, keys
 given twice, NaN and infinity are refused. `RUN/config.yaml` holds every key with its value.
 

@@ -15,10 +15,12 @@ from fgslam.core.estimates import Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.recordings import Frame
-from fgslam.frontend.places.closures import difference
-from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings, LoopSettings, LostSettings
+from fgslam.frontend.places.closures import LoopGates, difference
+from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
+from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
+from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.factory import make_estimator, make_places, make_stereo, make_tracker
+from fgslam.slam.factory import make_estimator, make_relocaliser, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -27,11 +29,9 @@ IMAGES = (np.zeros((240, 320), np.uint8),) * 3
 RADIUS = 3.0
 ROUND = 72  # frames
 NOISE = np.diag(np.concatenate([[1e-6, 0.02, 1e-6], [0.03, 1e-6, 0.03]]) ** 2)
-SETTINGS = FrontendSettings(
-    ego_motion=EgoMotionSettings(dof=3),
-    loops=LoopSettings(every=2, forgotten_after=25, confirm=2, rest=6),
-    lost=LostSettings(after=2, give_up_after=20),
-)
+SETTINGS = FrontendSettings(ego_motion=EgoMotionSettings(dof=3))
+LOOPS = LoopGates(every=2, forgotten_after=25, confirm=2, rest=6)
+LOST = LostRules(after=2, give_up_after=20)
 
 
 def on_ring(k: float) -> FloatArray:
@@ -88,8 +88,11 @@ def pipeline_of(
     settings: FrontendSettings = SETTINGS,
     estimator: EstimatorSettings = LandmarkKalmanSettings(),  # noqa: B008 (frozen)
     arrival: Arrival | None = None,
+    loops: LoopGates | None = LOOPS,
+    lost: LostRules | None = LOST,
 ) -> SlamPipeline:
     """The loop on a ring's odometry, in an empty map or a given one."""
+    settings = dataclasses.replace(settings, loops=loops is not None, lost=lost is not None)
     tracker = make_tracker(RIG, settings)
     prior = None if arrival is None else arrival.prior
     solving = make_estimator(RIG, estimator, settings.ego_motion, prior)
@@ -102,9 +105,29 @@ def pipeline_of(
         tracker=tracker,
         motion=RingMotion(poses, drift_deg),
         estimator=solving,
-        places=make_places(RIG, settings, tracker, seed=0),
+        places=places_of(settings, tracker, loops, lost),
         located=prior if arrival is not None and arrival.relocalised else None,
     )
+
+
+def places_of(
+    settings: FrontendSettings,
+    tracker: LandmarkTracker,
+    loops: LoopGates | None,
+    lost: LostRules | None,
+) -> PlaceRecognition | None:
+    """Place recognition by these rules; None where neither is given."""
+    if loops is None and lost is None:
+        return None
+    parts = RecognitionParts(
+        joins=False,
+        loops=loops,
+        lost=lost,
+        appearance=settings.appearance,
+        relocaliser=make_relocaliser(RIG, settings),
+        seed=0,
+    )
+    return PlaceRecognition(parts, tracker)
 
 
 def seen(

@@ -25,7 +25,6 @@ from fgslam.frontend.settings import (
     DatabaseSettings,
     FrontendSettings,
     PermanenceSettings,
-    ViewpointSettings,
 )
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import LandmarkTracker
@@ -40,9 +39,7 @@ RIG = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, g.BODY_FORWARD_L
 SIGMA_PX = 0.2
 NEW_A_FRAME = 40
 FRONTEND = FrontendSettings(
-    database=DatabaseSettings(
-        least_scale_px=0.8, permanence=PermanenceSettings(), viewpoints=ViewpointSettings()
-    )
+    database=DatabaseSettings(least_scale_px=0.8, permanence=PermanenceSettings(), viewpoints=True)
 )
 IMAGE = np.full((RIG.height, RIG.width), 128, np.uint8)
 VAGUE = np.diag([0.002] * 3 + [0.01] * 3) ** 2

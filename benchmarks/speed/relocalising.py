@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -28,12 +28,12 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.places.recognition import PlaceRecognition
-from fgslam.frontend.settings import FrontendSettings, LostSettings
+from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
+from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.runs.config import load_config
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_pipeline, make_places, make_stereo, make_tracker
+from fgslam.slam.factory import make_pipeline, make_relocaliser, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 
@@ -83,12 +83,17 @@ class Lost:
     @staticmethod
     def among(known: SavedMap, settings: FrontendSettings) -> Lost:
         """In a saved map; every frame that is not located by tracking is sought at once."""
-        settings = replace(settings, lost=LostSettings(after=1))
         tracker = make_tracker(known.rig, settings)
         tracker.database.load(known)
-        places = make_places(known.rig, settings, tracker, seed=0)
-        assert places is not None
-        return Lost(known.landmarks, tracker, places)
+        parts = RecognitionParts(
+            joins=False,
+            loops=None,
+            lost=LostRules(after=1),
+            appearance=settings.appearance,
+            relocaliser=make_relocaliser(known.rig, settings),
+            seed=0,
+        )
+        return Lost(known.landmarks, tracker, PlaceRecognition(parts, tracker))
 
     def look(self, features: StereoFeatures, wTc: FloatArray) -> None:
         """One frame, timed; tracked from far away, it is not located before."""

@@ -26,7 +26,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.trajectory import align, moved, position_errors
-from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings, LoopSettings, LostSettings
+from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.session import Session
 from fgslam.worlds.driving import planar_poses, straights_and_turns
@@ -36,8 +36,8 @@ SEEDS = range(1, 5)
 ESTIMATORS = ("landmark_kalman", "fixed_lag")
 SETTINGS = FrontendSettings(
     ego_motion=EgoMotionSettings(dof=3),
-    loops=LoopSettings(),
-    lost=LostSettings(),
+    loops=True,
+    lost=True,
     self_calibration=False,
     watch_cameras=False,
 )

@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, Count, Degrees, Index, NonNegative, Positive, Share
+from fgslam.core.settings import STRICT, Count, Degrees, NonNegative, Positive, Share
 from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
 
 _ROWS_PX = 2.0
@@ -113,18 +113,6 @@ class PermanenceSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class ViewpointSettings:
-    """Several views of a landmark, from different directions (Se et al. 6.3)."""
-
-    max_views: int = Field(
-        default=8,
-        ge=2,
-        le=64,
-        description="views a landmark; a further one replaces that matched longest ago",
-    )
-
-
-@dataclass(frozen=True, config=STRICT)
 class DatabaseSettings:
     """Initiation, validation and pruning of landmarks (Se et al. 4 and 6.1)."""
 
@@ -142,17 +130,14 @@ class DatabaseSettings:
         default="image",
         description="`image`: within its bounds; `cone`: the paper's 30 degrees (4.4)",
     )
-    border_px: NonNegative = Field(
-        default=8.0, description="nearer to an image's edge a landmark is not missed"
-    )
     least_scale_px: Positive | None = Field(
         default=None, description="smaller landmarks are not expected; 0.8 suits base_sigma_px 2"
     )
     permanence: PermanenceSettings | None = Field(
         default=None, description="permanent landmarks (6.2); null: none but those of a map loaded"
     )
-    viewpoints: ViewpointSettings | None = Field(
-        default=None, description="several views a landmark (6.3); null: the latest one alone"
+    viewpoints: bool = Field(
+        default=False, description="several views a landmark (6.3); false: the latest one alone"
     )
 
 
@@ -210,46 +195,6 @@ class RelocalisationSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class LostSettings:
-    """When a robot counts as lost, and what it then does."""
-
-    after: Count = Field(
-        default=2, description="unlocated frames in a row until the whole map is searched"
-    )
-    give_up_after: Count = Field(
-        default=10, description="frames lost until mapping goes on from the odometry"
-    )
-
-
-@dataclass(frozen=True, config=STRICT)
-class LoopSettings:
-    """When a return is looked for, and what it takes to be believed."""
-
-    every: Count = Field(
-        default=4, description="frames between looks; after a place was recognised, every frame"
-    )
-    forgotten_after: int = Field(
-        default=60, ge=2, description="frames unseen until a landmark counts as old"
-    )
-    confirm: Count = Field(default=3, description="frames in a row that find the same offset")
-    max_drift_share: NonNegative = Field(
-        default=0.08, description="largest drift as a share of the way since (poor wheels: 0.05)"
-    )
-    min_matches: int = Field(
-        default=12, ge=3, description="old landmarks that must agree on the closure in the end"
-    )
-    max_sigma_m: Positive = Field(
-        default=0.10, description="largest standard deviation of a closure's position, metres"
-    )
-    max_sigma_deg: Positive = Field(
-        default=1.0, description="largest standard deviation of a closure's heading, degrees"
-    )
-    rest: Index = Field(
-        default=15, description="frames after a closure in which no other is looked for"
-    )
-
-
-@dataclass(frozen=True, config=STRICT)
 class FrontendSettings:
     """All of the front-end."""
 
@@ -265,9 +210,9 @@ class FrontendSettings:
     database: DatabaseSettings = DatabaseSettings()
     ego_motion: EgoMotionSettings = EgoMotionSettings()
     relocalisation: RelocalisationSettings = RelocalisationSettings()
-    loops: LoopSettings | None = Field(default=None, description="close loops; null: off")
-    lost: LostSettings | None = Field(
-        default=None, description="search the whole map when lost; null: odometry alone"
+    loops: bool = Field(default=False, description="close loops")
+    lost: bool = Field(
+        default=False, description="search the whole map when lost; false: odometry alone"
     )
     watch_cameras: bool = Field(
         default=True, description="leave out frames of late or swapped cameras, report darker ones"

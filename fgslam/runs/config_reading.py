@@ -102,7 +102,7 @@ def with_default_kind(kind: str) -> Callable[[Any], Any]:
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """One dotted key and its value as typed, e.g. ``frontend.sift.octave_layers=3``.
+    """One dotted key and its value as typed, e.g. ``frontend.sift.max_features=500``.
 
     Attributes:
         given: all of it.

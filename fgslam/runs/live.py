@@ -33,7 +33,7 @@ from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session
 
 Overrides = Mapping[str, Any] | Iterable[str]
-"""Settings by dotted key, {"seed": 3, "frontend.sift.scale_levels": 6}; or as texts "seed=3"."""
+"""Settings by dotted key, {"seed": 3, "frontend.sift.max_features": 500}; or as texts "seed=3"."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

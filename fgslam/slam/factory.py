@@ -120,7 +120,7 @@ def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
     solver = EgoMotionSolver(rig, settings.ego_motion)
     matcher = MapMatcher(settings.matching, settings.appearance)
     tracker = LandmarkTracker(rig, database, matcher, solver)
-    tracker.expects_returns = settings.loops is not None
+    tracker.expects_returns = settings.loops
     return tracker
 
 
@@ -248,7 +248,7 @@ def make_pipeline(
     prior = None if arrival is None else arrival.prior
     estimator = made_or_given(rig, estimator_settings, frontend.ego_motion, prior)
     measured_odometry = not isinstance(odometry, ConstantVelocitySettings)
-    require_support(estimator, measured_odometry, loops=frontend.loops is not None)
+    require_support(estimator, measured_odometry, loops=frontend.loops)
     tracker = make_tracker(rig, frontend)
     if arrival is not None:
         take_over(estimator, arrival)
@@ -297,14 +297,15 @@ def make_places(
 
     Where the estimator takes closures it joins parts of the map (``joins``).
     """
-    if settings.loops is None and settings.lost is None and not joins:
+    if not (settings.loops or settings.lost or joins):
         return None
-    from fgslam.frontend.places.recognition import PlaceRecognition, RecognitionParts
+    from fgslam.frontend.places.closures import LoopGates
+    from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
 
     parts = RecognitionParts(
         joins=joins,
-        loops=settings.loops,
-        lost=settings.lost,
+        loops=LoopGates() if settings.loops else None,
+        lost=LostRules() if settings.lost else None,
         appearance=settings.appearance,
         relocaliser=make_relocaliser(rig, settings),
         seed=seed,

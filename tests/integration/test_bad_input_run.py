@@ -384,8 +384,8 @@ def test_ranges_that_leave_nothing(recording: Path, refusal: Refusal) -> None:
 
 
 def test_an_unknown_key(recording: Path, refusal: Refusal) -> None:
-    line = refusal(experiment(recording), "--set", "frontend.sift.octav_layers=3")
-    assert "unknown key frontend.sift.octav_layers; did you mean octave_layers?" in line
+    line = refusal(experiment(recording), "--set", "frontend.sift.max_feature=3")
+    assert "unknown key frontend.sift.max_feature; did you mean max_features?" in line
 
 
 # --------------------------------------------------------------------------------------------

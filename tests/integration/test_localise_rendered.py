@@ -30,7 +30,7 @@ VALUES: dict[str, Any] = {
         "start": 9,
         "stop": 11,
     },
-    "frontend": {"ego_motion": {"dof": 3}, "database": {"viewpoints": {}}},
+    "frontend": {"ego_motion": {"dof": 3}, "database": {"viewpoints": True}},
     "localisation": {"frames": [1, 2]},
     "output": {"pictures": False, "report": False},
 }

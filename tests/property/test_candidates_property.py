@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from fgslam.frontend.features import matching
 from fgslam.frontend.features.matching import (
     alike,
     choose,
@@ -73,8 +74,10 @@ def test_no_feature_is_used_twice(mode, found, seed, ratio) -> None:
     second = (60 * rng.integers(0, 3, (8, 1)) * np.ones((1, 128))).astype(np.uint8)
     i = np.array([a for a, _ in found], np.int64)
     j = np.array([b for _, b in found], np.int64)
-    settings = AppearanceSettings(mode=mode, max_distance=1e4, ratio=ratio)
-    a, b = choose(i, j, (first, second), settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(matching, "MAX_DISTANCE", 1e4)
+        patch.setattr(matching, "RATIO", ratio)
+        a, b = choose(i, j, (first, second), AppearanceSettings(mode=mode))
     assert len(set(a.tolist())) == len(a)
     assert len(set(b.tolist())) == len(b)
     assert set(zip(a.tolist(), b.tolist(), strict=True)) <= set(found)
@@ -88,8 +91,10 @@ def test_the_mutually_closest_win(found, seed) -> None:
     second = rng.integers(0, 256, (8, 128)).astype(np.uint8)
     i = np.array([a for a, _ in found], np.int64)
     j = np.array([b for _, b in found], np.int64)
-    settings = AppearanceSettings(mode="descriptor", max_distance=1e4, ratio=0.99)
-    a, b = choose(i, j, (first, second), settings)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(matching, "MAX_DISTANCE", 1e4)
+        patch.setattr(matching, "RATIO", 0.99)
+        a, b = choose(i, j, (first, second), AppearanceSettings(mode="descriptor"))
 
     def cost(x: int, y: int) -> float:
         return float(np.linalg.norm(first[x].astype(float) - second[y].astype(float)))

@@ -37,7 +37,7 @@ from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 _AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
 _OBSERVED = float(chi_square_quantile(0.999, 3))  # of an observation that fits
-LONG_UNSEEN = 60  # frames, as the front-end's LoopSettings.forgotten_after
+LONG_UNSEEN = 60  # frames, as the front-end's LoopGates.forgotten_after
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small

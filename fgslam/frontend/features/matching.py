@@ -9,6 +9,9 @@ from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.settings import AppearanceSettings
 
+MAX_DISTANCE = 350.0  # of descriptors of the same point, whose norm is 512
+RATIO = 0.85  # of the best distance to the second best, at most
+
 
 def pairs_within(
     center: FloatArray, reach: FloatArray | float, values: FloatArray
@@ -60,8 +63,8 @@ def unambiguous(i: IntArray, j: IntArray) -> BoolArray:
     return np.asarray((np.bincount(i)[i] == 1) & (np.bincount(j)[j] == 1))
 
 
-def _wins(group: IntArray, cost: FloatArray, ratio: float) -> BoolArray:
-    """Pairs that are the cheapest of their group, at most ``ratio`` times the next."""
+def _wins(group: IntArray, cost: FloatArray) -> BoolArray:
+    """Pairs that are the cheapest of their group, and clearly so."""
     order = np.lexsort((cost, group))
     first = np.ones(len(order), np.bool_)
     first[1:] = group[order][1:] != group[order][:-1]
@@ -69,7 +72,7 @@ def _wins(group: IntArray, cost: FloatArray, ratio: float) -> BoolArray:
     has_next = first[:-1] & ~first[1:]
     runner_up[:-1][has_next] = cost[order][1:][has_next]
     wins = np.zeros(len(order), np.bool_)
-    wins[order] = first & (cost[order] <= ratio * runner_up)
+    wins[order] = first & (cost[order] <= RATIO * runner_up)
     return wins
 
 
@@ -86,7 +89,7 @@ def resembling(
     if settings.mode == "paper":
         return i, j, np.zeros(len(i))
     cost = descriptor_distance(descriptors[0][i], descriptors[1][j])
-    near = cost <= settings.max_distance
+    near = cost <= MAX_DISTANCE
     return i[near], j[near], cost[near]
 
 
@@ -103,7 +106,7 @@ def pick(
     elif not len(i):
         return i, j
     else:
-        keep = _wins(i, cost, settings.ratio) & _wins(j, cost, settings.ratio)
+        keep = _wins(i, cost) & _wins(j, cost)
     return i[keep], j[keep]
 
 

@@ -16,14 +16,8 @@ Appearance: TypeAlias = Literal["descriptor", "paper"]
 class SiftSettings:
     """SIFT features of one image (Se et al. 2.1)."""
 
-    scale_levels: int = Field(
-        default=8, ge=1, le=64, description="scale levels searched, finest first; 8 in the paper"
-    )
-    octave_layers: int = Field(
-        default=2, ge=1, le=8, description="levels an octave; 2: factor 1.41 (paper: 1.5)"
-    )
     contrast_threshold: NonNegative = Field(
-        default=0.03, description="OpenCV's contrast threshold, divided by octave_layers inside"
+        default=0.03, description="OpenCV's contrast threshold, halved inside"
     )
     contrast: Literal["relative", "absolute"] = Field(
         default="relative",
@@ -47,15 +41,6 @@ class AppearanceSettings:
     mode: Appearance = Field(
         default="descriptor",
         description="`descriptor`: the closest admissible wins; `paper`: none are used",
-    )
-    max_distance: Positive = Field(
-        default=350.0, description="largest distance of descriptors, whose norm is 512"
-    )
-    ratio: float = Field(
-        default=0.85,
-        gt=0.0,
-        le=1.0,
-        description="best distance at most this fraction of second best",
     )
 
 

@@ -13,6 +13,8 @@ from fgslam.core.features import Features
 from fgslam.frontend.features.exposure import contrast_share, noise_sigma
 from fgslam.frontend.features.settings import Appearance, SiftSettings
 
+SCALE_LEVELS = 8  # searched, finest first, as in the paper
+OCTAVE_LAYERS = 2  # levels an octave: a factor of 1.41; the paper's is 1.5
 EDGE_THRESHOLD = 10.0  # ratio of principal curvatures above which edges go: OpenCV's own
 _NOISE_ANSWER = 0.4
 """Contrast that 1 of 100 features of white noise exceed at the first level, in the noise's sigmas.
@@ -24,7 +26,7 @@ _WHITE = 255.0
 
 
 class SiftExtractor:
-    """Finds SIFT features; keeps the finest ``scale_levels`` levels of the pyramid.
+    """Finds SIFT features; keeps the finest levels of the pyramid.
 
     The first level is that of the doubled image, as Lowe proposed. Up-scaling is precise: without
     it OpenCV's key points are a quarter of a pixel off in both axes.
@@ -56,7 +58,7 @@ class SiftExtractor:
     def _detector(self, contrast_threshold: float) -> cv2.SIFT:
         return cv2.SIFT.create(
             self._settings.max_features,
-            self._settings.octave_layers,
+            OCTAVE_LAYERS,
             contrast_threshold,
             EDGE_THRESHOLD,
             self._settings.base_sigma_px,
@@ -80,9 +82,9 @@ class SiftExtractor:
         """Features of the levels searched that answer more than noise of that sigma would."""
         # Column by column: half the time of one row a key point.
         level = self._levels_of(np.array([kp.octave for kp in keypoints], np.int64))
-        by_noise = _NOISE_ANSWER * noise * 2.0 ** (-level / self._settings.octave_layers)
+        by_noise = _NOISE_ANSWER * noise * 2.0 ** (-level / OCTAVE_LAYERS)
         response = np.array([kp.response for kp in keypoints])
-        keep = (level < self._settings.scale_levels) & (_WHITE * response >= by_noise)
+        keep = (level < SCALE_LEVELS) & (_WHITE * response >= by_noise)
         xy = np.asarray(cv2.KeyPoint.convert(keypoints), np.float64).reshape(-1, 2)
         return Features(
             xy=xy[keep],
@@ -95,4 +97,4 @@ class SiftExtractor:
         """Levels counted from the finest, 0-based, of OpenCV's packed octave and layer."""
         octave = packed & 255
         octave = np.where(octave >= 128, octave - 256, octave)
-        return (octave + 1) * self._settings.octave_layers + ((packed >> 8) & 255) - 1
+        return (octave + 1) * OCTAVE_LAYERS + ((packed >> 8) & 255) - 1

@@ -6,6 +6,8 @@ estimate that a true return shows stays the same from frame to frame, and is no 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -17,7 +19,6 @@ from fgslam.core.measurements import LoopClosure
 from fgslam.frontend.features.matching import choose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.sightings import SightingMemory
-from fgslam.frontend.settings import LoopSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem
 from fgslam.frontend.tracking.resection import Resection
 
@@ -29,12 +30,37 @@ _DRIFT_DEG_PER_M = 0.25  # of heading, by wheels without a gyro
 _FUSED_M = 0.10  # after a closure, landmarks that look alike and lie this near become one
 
 
+@dataclass(frozen=True, slots=True)
+class LoopGates:
+    """When a return is looked for, and what it takes to be a closure.
+
+    Attributes:
+        every: frames between searches; after a place was recognised, every frame.
+        forgotten_after: frames unseen until a landmark counts as old.
+        confirm: frames in a row that find the same offset.
+        max_drift_share: largest drift as a share of the path since; poor wheels drift by 0.05.
+        min_matches: old landmarks that must agree on the closure in the end.
+        max_sigma_m: largest standard deviation of a closure's position.
+        max_sigma_deg: and of its heading.
+        rest: frames after a closure in which no other is looked for.
+    """
+
+    every: int = 4
+    forgotten_after: int = 60
+    confirm: int = 3
+    max_drift_share: float = 0.08
+    min_matches: int = 12
+    max_sigma_m: float = 0.10
+    max_sigma_deg: float = 1.0
+    rest: int = 15
+
+
 class Confirmation:
     """Counts frames in a row that find the same offset."""
 
-    def __init__(self, settings: LoopSettings) -> None:
+    def __init__(self, gates: LoopGates) -> None:
         """Has seen nothing yet."""
-        self._settings = settings
+        self._gates = gates
         self.count = 0
         self.offset: FloatArray = np.eye(4)
 
@@ -55,7 +81,7 @@ class Confirmation:
         else:
             self.count = 1
         self.offset = recognised @ inverse(estimated)
-        return self.count >= self._settings.confirm
+        return self.count >= self._gates.confirm
 
     def forget(self) -> None:
         """Begins anew: a look that found nothing, or a closure."""
@@ -78,13 +104,13 @@ def difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
 
 
 def drift_allows(
-    recognised: FloatArray, estimated: FloatArray, way_m: float, settings: LoopSettings
+    recognised: FloatArray, estimated: FloatArray, way_m: float, gates: LoopGates
 ) -> bool:
     """True if the offset is worth a correction, and a drift that ``way_m`` metres allow."""
     metres, degrees = difference(estimated, recognised)
     worth = metres > _WORTH[0] or degrees > _WORTH[1]
     return worth and (
-        metres <= _DRIFT_M + settings.max_drift_share * way_m
+        metres <= _DRIFT_M + gates.max_drift_share * way_m
         and degrees <= _DRIFT_DEG + _DRIFT_DEG_PER_M * way_m
     )
 
@@ -132,13 +158,13 @@ def close_loop(
     )
 
 
-def is_sharp(closure: LoopClosure, settings: LoopSettings) -> bool:
+def is_sharp(closure: LoopClosure, gates: LoopGates) -> bool:
     """Whether a closure rests on enough landmarks, and says where the frame is."""
     sigma = np.sqrt(np.diagonal(closure.covariance))
     return bool(
-        len(closure.observations) >= settings.min_matches
-        and sigma[3:].max() <= settings.max_sigma_m
-        and np.rad2deg(sigma[:3].max()) <= settings.max_sigma_deg
+        len(closure.observations) >= gates.min_matches
+        and sigma[3:].max() <= gates.max_sigma_m
+        and np.rad2deg(sigma[:3].max()) <= gates.max_sigma_deg
     )
 
 

@@ -20,6 +20,7 @@ from fgslam.core.measurements import Increment, LoopClosure
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.closures import (
     Confirmation,
+    LoopGates,
     close_loop,
     difference,
     drift_allows,
@@ -27,7 +28,6 @@ from fgslam.frontend.places.closures import (
     is_sharp,
 )
 from fgslam.frontend.places.sightings import SightingMemory
-from fgslam.frontend.settings import LoopSettings, LostSettings
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 
 _STREAM = 11  # of random numbers, beside those of the recording
@@ -39,7 +39,7 @@ _WORDS_EVERY = 16
 first look after a long time would find them all at once."""
 _Looks: TypeAlias = tuple[int, IntArray, LandmarkAppearances | None]
 """State of the database's views, landmarks (n,), and their appearances then."""
-_JOINT = LoopSettings()  # how sharp a closure between parts of the map must be
+_JOINT = LoopGates()  # how sharp a closure between parts of the map must be
 _NOBODY: IntArray = np.empty(0, np.int64)
 _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
@@ -56,6 +56,14 @@ class Locator(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class LostRules:
+    """Unlocated frames in a row until the whole map is searched, and until mapping goes on."""
+
+    after: int = 2
+    give_up_after: int = 10
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RecognitionParts:
     """What place recognition works with; loops or lost None where it is not wanted.
@@ -64,8 +72,8 @@ class RecognitionParts:
     """
 
     joins: bool
-    loops: LoopSettings | None
-    lost: LostSettings | None
+    loops: LoopGates | None
+    lost: LostRules | None
     appearance: AppearanceSettings
     relocaliser: Locator
     seed: int
@@ -355,14 +363,14 @@ class PlaceRecognition:
         outside = self._tracker.keeps_map and self._parts.lost is None
         return self._lost > 0 and not outside
 
-    def _time_to_look(self, loops: LoopSettings, confirmation: Confirmation) -> bool:
+    def _time_to_look(self, loops: LoopGates, confirmation: Confirmation) -> bool:
         frame = len(self.memory)
         if self._astray or (self._offered >= 0 and frame - self._offered <= loops.rest):
             return False
         return confirmation.begun or frame % loops.every == 0
 
     def _old_place(
-        self, loops: LoopSettings, landmarks: LandmarkMap, features: StereoFeatures
+        self, loops: LoopGates, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Relocalisation | None:
         """The frame located by landmarks not seen for long, or never; None where it is not."""
         trusted = self._trusted()
@@ -379,7 +387,7 @@ class PlaceRecognition:
         return database.ids[database.valid]
 
     def _plausible(
-        self, found: Relocalisation, wTc: FloatArray, landmarks: LandmarkMap, loops: LoopSettings
+        self, found: Relocalisation, wTc: FloatArray, landmarks: LandmarkMap, loops: LoopGates
     ) -> bool:
         earlier = self.memory.best_view_of(found.ids, landmarks)
         if earlier < 0:

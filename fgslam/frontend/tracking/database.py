@@ -26,6 +26,7 @@ from fgslam.frontend.tracking.map_matching import (
 )
 from fgslam.frontend.tracking.views import Views
 
+MAX_VIEWS = 8  # of a landmark; a further one replaces that matched longest ago
 _VIEW_ANGLE_DEG = 20.0
 """A direction farther than this from every view becomes a view of its own: SIFT descriptors match
 up to about this angle (docs/concepts/maps.md)."""
@@ -48,12 +49,10 @@ class LandmarkDatabase(LandmarkTable):
 
         Landmarks that are carried need ``patch_pixels`` for their own patch.
         """
-        viewpoints = settings.viewpoints
-        if viewpoints is None:
-            super().__init__(1, 0.0, patch_pixels)
+        if settings.viewpoints:
+            super().__init__(MAX_VIEWS, float(np.deg2rad(_VIEW_ANGLE_DEG)), patch_pixels)
         else:
-            angle = float(np.deg2rad(_VIEW_ANGLE_DEG))
-            super().__init__(viewpoints.max_views, angle, patch_pixels)
+            super().__init__(1, 0.0, patch_pixels)
         self._settings = settings
         self._rig = rig
         self._field_of_view = FieldOfView(rig, settings, max_disparity_px)

@@ -28,6 +28,7 @@ Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 """(k,) landmarks, features, and distances of their descriptors."""
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their distances by which sizes shrink: which to consider at all."""
+BORDER_PX = 8.0  # nearer to an image's edge a landmark is not missed
 CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
 _NEAREST_M = 0.1
 _SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
@@ -84,7 +85,6 @@ class FieldOfView:
     def __init__(self, rig: CameraRig, settings: DatabaseSettings, max_disparity_px: float) -> None:
         """Points of more than ``max_disparity_px`` are outside."""
         self._rig = rig
-        self._border = settings.border_px
         self._cone = settings.field_of_view == "cone"
         self._tangent = np.tan(np.deg2rad(CONE_DEG))
         self._max_disparity = max_disparity_px
@@ -111,8 +111,8 @@ class FieldOfView:
         if self._cone:
             possible = certain = self._in_cone(points)
         else:
-            possible = self._in_images(measurement, -self._border)
-            certain = self._in_images(measurement, self._border)
+            possible = self._in_images(measurement, -BORDER_PX)
+            certain = self._in_images(measurement, BORDER_PX)
         keep = possible & (measurement[:, 2] <= self._max_disparity)
         return InView(rows, points, measurement, certain).select(keep)
 
@@ -122,7 +122,7 @@ class FieldOfView:
         The reference image with its border, widened by a hair, as planes through the camera.
         """
         rows = np.flatnonzero(points[:, 2] > _NEAREST_M)
-        rig, reach = self._rig, self._border + _SLACK_PX
+        rig, reach = self._rig, BORDER_PX + _SLACK_PX
         if self._cone:
             return rows
         for axis, (focal, centre, size) in enumerate(

@@ -280,7 +280,7 @@ def submap_features(
         looks; those outside its image, too. And the covariance (6, 6) of that camera in the
         submap, which whoever is located by the submap has beside the map's.
     """
-    plain = dataclasses.replace(frontend, tracking="sift", loops=None, lost=None)
+    plain = dataclasses.replace(frontend, tracking="sift", loops=False, lost=False)
     pipeline = make_pipeline(sequence.rig, plain, odometry, LandmarkKalmanSettings())
     for k, one in enumerate(found):
         timestamp = float(sequence.timestamps[one.i])

@@ -131,7 +131,7 @@ class RunOutputs:
     def _looks_for_places(self) -> bool:
         """Whether the configuration asks for place recognition, or it joined parts of the map."""
         frontend = self.config.frontend
-        return frontend.loops is not None or frontend.lost is not None or bool(self._taken)
+        return frontend.loops or frontend.lost or bool(self._taken)
 
     def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
         closures = closure_counts(self._taken)

@@ -46,14 +46,13 @@ MAPPED = ROUND // 2  # frames of the drive that makes the map
 BEGIN = 22  # of it, where the second drive begins
 PATH = [on_ring(k) for k in range(BEGIN, ROUND + 14)]
 DARK = range(26, 38)  # outside the map
-WITHOUT_LOST = dataclasses.replace(SETTINGS, lost=None)
 
 
 @cache
 def half_a_ring() -> SavedMap:
     """The map of the first half, by the paper's filter."""
     poses = [on_ring(k) for k in range(MAPPED)]
-    pipeline = pipeline_of(poses, 0.1, WITHOUT_LOST)
+    pipeline = pipeline_of(poses, 0.1, lost=None)
     drive(pipeline, seen(poses))
     database, estimate = pipeline.tracker.database, pipeline.estimator.estimate()
     rows = database.rows(estimate.landmarks.ids)
@@ -82,9 +81,7 @@ def drift_deg(extends: bool) -> float:
 
 
 def in_map(extends: bool) -> SlamPipeline:
-    return pipeline_of(
-        PATH, drift_deg(extends), WITHOUT_LOST, LandmarkKalmanSettings(), arrival(extends)
-    )
+    return pipeline_of(PATH, drift_deg(extends), arrival=arrival(extends), lost=None)
 
 
 States = tuple[StateArrays, ...]
@@ -147,7 +144,7 @@ def test_where_it_is_not_lost_no_loop_is_closed() -> None:
     path = [on_ring(k) for k in range(6, MAPPED + 8)]
     prior = Prediction(path[0], arrival(True).prior.covariance)
     start = dataclasses.replace(arrival(True), prior=prior)
-    pipeline = pipeline_of(path, 0.1, WITHOUT_LOST, arrival=start)
+    pipeline = pipeline_of(path, 0.1, arrival=start, lost=None)
     reports = drive(pipeline, seen(path))
     assert not closings(reports)
     assert error_m(reports[-1], path[-1]) < 0.1

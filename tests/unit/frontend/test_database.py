@@ -18,8 +18,7 @@ from fgslam.frontend.settings import DatabaseSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.map_matching import predicted_covariance
 
-NO_BORDER = DatabaseSettings(border_px=0.0)
-BORDER = DatabaseSettings(border_px=8.0)
+SETTINGS = DatabaseSettings()
 CONE = DatabaseSettings(field_of_view="cone")
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
 
@@ -43,7 +42,7 @@ def stereo_features(points: FloatArray, scale: float = 3.0) -> StereoFeatures:
 
 
 def database_of(
-    points: FloatArray, settings: DatabaseSettings = NO_BORDER, rig: CameraRig = RIG
+    points: FloatArray, settings: DatabaseSettings = SETTINGS, rig: CameraRig = RIG
 ) -> LandmarkDatabase:
     database = LandmarkDatabase(rig, settings, 40.0)
     count = len(points)
@@ -91,10 +90,10 @@ def test_the_cone_expects_what_the_image_cannot_show() -> None:
     point = np.array([[0.0, 3.0 * np.tan(np.deg2rad(27.0)), 3.0]])
     assert g.project(RIG, point)[0, 1] > RIG.height
     assert expected_ids(point, CONE) == [0]
-    assert expected_ids(point, NO_BORDER) == []
+    assert expected_ids(point, SETTINGS) == []
 
 
-@pytest.mark.parametrize("settings", [NO_BORDER, CONE])
+@pytest.mark.parametrize("settings", [SETTINGS, CONE])
 def test_nothing_behind_the_camera_is_expected(settings: DatabaseSettings) -> None:
     points = np.array([[0.1, 0.0, -3.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-9], [0.1, 0.0, 3.0]])
     database = database_of(np.tile([0.0, 0.0, 3.0], (4, 1)), settings)
@@ -120,26 +119,26 @@ POSSIBLE = {
 
 @pytest.mark.parametrize("edge", BOUNDS)
 def test_the_images_bounds(edge: str) -> None:
-    assert expected_ids(at_pixels(list(BOUNDS[edge])), BORDER) == [0]
+    assert expected_ids(at_pixels(list(BOUNDS[edge])), SETTINGS) == [0]
 
 
 @pytest.mark.parametrize("edge", POSSIBLE)
 def test_at_the_border_a_landmark_may_be_matched_but_is_not_missed(edge: str) -> None:
     points = at_pixels(list(POSSIBLE[edge]))
-    expected = database_of(points, BORDER).expected(landmark_map(points), np.eye(4))
+    expected = database_of(points, SETTINGS).expected(landmark_map(points), np.eye(4))
     assert expected.ids.tolist() == [0]
     assert expected.certain.tolist() == [False]
 
 
 def test_without_a_top_camera_the_lower_edge_is_the_images_own() -> None:
     points = at_pixels([(100, 230.99, 10), (100, 231.01, 10)])
-    assert expected_ids(points, BORDER, TWO_CAMERAS) == [0]
+    assert expected_ids(points, SETTINGS, TWO_CAMERAS) == [0]
 
 
 def test_unequal_baselines_move_the_lower_edge() -> None:
     rig = dataclasses.replace(RIG, vertical_baseline=0.3)
     points = at_pixels([(100, 239 - 8 - 30.01, 10), (100, 239 - 8 - 29.99, 10)])
-    assert expected_ids(points, BORDER, rig) == [0]
+    assert expected_ids(points, SETTINGS, rig) == [0]
 
 
 # --------------------------------------------------------------------------------------------
@@ -181,7 +180,7 @@ def test_expected_landmarks_carry_their_own_appearance() -> None:
 
 def test_landmark_ids_may_differ_from_row_numbers() -> None:
     points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20), (200, 100, 5)])
-    database = database_of(points, DatabaseSettings(prune_after_misses=1, border_px=0.0))
+    database = database_of(points, DatabaseSettings(prune_after_misses=1))
     database.record_misses(np.array([1]))
     assert database.prune().tolist() == [1]
     kept = np.array([0, 2, 3])
@@ -295,7 +294,7 @@ def test_predicted_covariance_matches_monte_carlo() -> None:
 def test_new_landmarks_count_one_hit_and_get_ascending_ids() -> None:
     """Every feature of the first frame becomes a track."""
     points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20)])
-    database = LandmarkDatabase(RIG, NO_BORDER, 40.0)
+    database = LandmarkDatabase(RIG, SETTINGS, 40.0)
     features = stereo_features(points)
     assert database.state()["next_id"] == 0
     first = database.add(features, np.array([0, 2]), np.array([7, 9], np.uint8))
@@ -419,7 +418,7 @@ def test_a_restored_database_continues_exactly() -> None:
 
 
 def test_an_empty_database_expects_nothing() -> None:
-    database = LandmarkDatabase(RIG, NO_BORDER, 40.0)
+    database = LandmarkDatabase(RIG, SETTINGS, 40.0)
     assert len(database) == 0
     assert len(database.expected(landmark_map(np.empty((0, 3))), np.eye(4))) == 0
     assert len(database.prune()) == 0

@@ -18,15 +18,20 @@ from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.settings import (
     DatabaseSettings,
     PermanenceSettings,
-    ViewpointSettings,
 )
+from fgslam.frontend.tracking import database as database_module
 from fgslam.frontend.tracking.database import LandmarkDatabase
 
 PLACES = at_pixels([(80, 60, 8), (100, 110, 12), (120, 90, 10), (150, 100, 9)])
 LASTING = DatabaseSettings(
     prune_after_misses=3, permanence=PermanenceSettings(ratio=0.5, hits=3, contradicted_after=4)
 )
-VIEWS = DatabaseSettings(viewpoints=ViewpointSettings(max_views=3))
+VIEWS = DatabaseSettings(viewpoints=True)
+
+
+@pytest.fixture(autouse=True)
+def _few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database_module, "MAX_VIEWS", 3)
 
 
 def hit(database: LandmarkDatabase, *ids: int, directions: FloatArray | None = None) -> None:

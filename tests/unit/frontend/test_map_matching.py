@@ -15,7 +15,7 @@ from fgslam.frontend.tracking import map_matching
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatcher, MapMatches
 
 PAPER = AppearanceSettings(mode="paper")
-DESCRIPTOR = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.85)
+DESCRIPTOR = AppearanceSettings(mode="descriptor")
 FIXED = MapMatchingSettings(widen_sigmas=0.0, refine=False, rescue=False)
 AT = (100.0, 80.0, 10.0)
 

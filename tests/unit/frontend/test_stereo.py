@@ -15,6 +15,7 @@ from fgslam.core.planar import wrap
 from fgslam.core.rig_correction import RigCorrection, term_names
 from fgslam.core.sensors import SHIFT_SHARE, CameraRig
 from fgslam.core.settings import RigPlaces
+from fgslam.frontend.features import matching
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher, measurement_map
@@ -123,11 +124,13 @@ def test_unequal_baselines_scale_the_agreement() -> None:
     assert len(match(right, left, features((100.0, 102.1)), rig=rig)) == 0
 
 
-def test_descriptors_gate_by_distance_and_ratio() -> None:
+def test_descriptors_gate_by_distance_and_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matching, "MAX_DISTANCE", 250.0)
+    monkeypatch.setattr(matching, "RATIO", 0.8)
     near, far = np.zeros((1, 128), np.uint8), np.zeros((1, 128), np.uint8)
     far[0, 0] = 251
     right = features(RIGHT, descriptors=near)
-    appearance = AppearanceSettings(mode="descriptor", max_distance=250.0, ratio=0.8)
+    appearance = AppearanceSettings(mode="descriptor")
     two = dataclasses.replace(TWO_CAMERAS)
     assert (
         len(match(right, features((110, 80), descriptors=far), rig=two, appearance=appearance)) == 0

@@ -33,7 +33,7 @@ SETTINGS = FrontendSettings(
     stereo=StereoSettings(),
     appearance=AppearanceSettings(mode="descriptor"),
     matching=MapMatchingSettings(widen_sigmas=0.0, refine=False, rescue=False),
-    database=DatabaseSettings(prune_after_misses=3, field_of_view="image", border_px=8.0),
+    database=DatabaseSettings(prune_after_misses=3, field_of_view="image"),
     ego_motion=EgoMotionSettings(min_matches=6),
 )
 

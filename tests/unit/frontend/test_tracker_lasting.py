@@ -16,7 +16,6 @@ from fgslam.frontend.settings import (
     DatabaseSettings,
     FrontendSettings,
     PermanenceSettings,
-    ViewpointSettings,
 )
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.database import LandmarkDatabase
@@ -106,7 +105,7 @@ BRANCHES = {
 def test_the_four_branches(branch: str) -> None:
     """The procedure of 6.3, and 6.3's last sentence: a match measures the position either way."""
     angle, matched, views, misses = BRANCHES[branch]
-    things = Things(cloud(), settings(viewpoints=ViewpointSettings()))
+    things = Things(cloud(), settings(viewpoints=True))
     things.step(from_angle(HERE))
     landmark = things.id_of(7)
     before = things.database.appearances(np.array([landmark]))
@@ -157,7 +156,7 @@ def test_an_orbit_around_a_pillar(several: bool) -> None:
     At the end of what is seen of it a landmark is still near to its last view for five frames.
     """
     pillar = Pillar()
-    viewpoints = ViewpointSettings(max_views=8) if several else None
+    viewpoints = several
     things = Things(pillar.points, settings(prune_after=20, viewpoints=viewpoints))
     born: set[int] = set()
     lost = 0

@@ -13,14 +13,13 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.settings import DatabaseSettings
-from fgslam.frontend.tracking.map_matching import CONE_DEG, FieldOfView, directions_to
+from fgslam.frontend.tracking.map_matching import BORDER_PX, CONE_DEG, FieldOfView, directions_to
 
 MAX_DISPARITY = 40.0
 TWO_CAMERAS = dataclasses.replace(RIG, vertical_baseline=None)
 LOOKS = 90 * np.eye(3, 128, dtype=np.uint8)
 SETTINGS = {
-    "image": DatabaseSettings(border_px=8.0),
-    "no border": DatabaseSettings(border_px=0.0),
+    "image": DatabaseSettings(),
     "cone": DatabaseSettings(field_of_view="cone"),
 }
 
@@ -41,7 +40,7 @@ def full_scan(
             tangent = np.tan(np.deg2rad(CONE_DEG))
             possible[k] = certain[k] = bool((np.abs(point[:2]) < tangent * point[2]).all())
             continue
-        for out, border in ((possible, -settings.border_px), (certain, settings.border_px)):
+        for out, border in ((possible, -BORDER_PX), (certain, BORDER_PX)):
             out[k] = (
                 column >= border
                 and column + disparity <= rig.width - 1 - border

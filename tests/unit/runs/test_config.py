@@ -10,7 +10,6 @@ import yaml
 
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import ConstantVelocitySettings, ImageFolderSettings
-from fgslam.frontend.settings import LoopSettings
 from fgslam.runs.config import ExperimentConfig, load_config, make_config, make_experiment
 from fgslam.runs.config_reading import read_mapping
 from fgslam.worlds.settings import RenderedLabSettings
@@ -54,7 +53,7 @@ def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
         (MINIMAL, "dataset.pth", "path"),
         (MINIMAL, "dataset.use_tops", "use_top"),
         (MINIMAL, "frontend.shift", "sift"),
-        (MINIMAL, "frontend.sift.octave_layer", "octave_layers"),
+        (MINIMAL, "frontend.sift.max_feature", "max_features"),
         (MINIMAL, "frontend.ego_motion.min_match", "min_matches"),
         (MINIMAL, "odometry.max_speed", "max_speed_mps"),
         (MINIMAL, "estimator.updates", "update"),
@@ -126,10 +125,10 @@ def test_kinds_are_listed(tmp_path: Path) -> None:
         ("dataset.stride", 0),
         ("dataset.lever_arm_m", 1.0),
         ("frontend", None),
-        ("frontend.sift.octave_layers", 0),
+        ("frontend.sift.max_features", -1),
         ("frontend.sift.contrast_threshold", float("nan")),
         ("frontend.sift.contrast_threshold", float("inf")),
-        ("frontend.appearance.ratio", 1.01),
+        ("frontend.sift.base_sigma_px", 3.01),
         ("frontend.appearance.mode", "colour"),
         ("frontend.ego_motion.dof", 4),
         ("frontend.matching.refine", "perhaps"),
@@ -213,7 +212,7 @@ def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
     config = load(
         tmp_path,
         "seed=3",
-        "frontend.sift.octave_layers=4",
+        "frontend.sift.max_features=4",
         "dataset.lever_arm_m=[1, -2.5, 1e-1]",
         "dataset.stop=null",
         "dataset.use_top=false",
@@ -222,7 +221,7 @@ def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
         "frontend.matching={refine: true}",
     )
     assert config.seed == 3
-    assert config.frontend.sift.octave_layers == 4
+    assert config.frontend.sift.max_features == 4
     assert isinstance(config.dataset, ImageFolderSettings)
     assert config.dataset.lever_arm_m == (1.0, -2.5, 0.1)
     assert config.dataset.stop is None
@@ -304,8 +303,8 @@ def test_overrides_that_cannot_be_applied(tmp_path: Path) -> None:
     assert "not valid YAML; quote it" in message_of(MINIMAL, tmp_path, "seed=[1")
     message = message_of(MINIMAL, tmp_path, "name.first=1")
     assert "--set name.first=1: name holds a value, not a group" in message
-    message = message_of(MINIMAL, tmp_path, "frontend.sift.octave_layrs=3")
-    assert "unknown key frontend.sift.octave_layrs; did you mean octave_layers?" in message
+    message = message_of(MINIMAL, tmp_path, "frontend.sift.max_featurs=3")
+    assert "unknown key frontend.sift.max_featurs; did you mean max_features?" in message
 
 
 def test_another_kind_drops_the_keys_of_the_old_one_but_no_misspelling(tmp_path: Path) -> None:
@@ -453,7 +452,7 @@ def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) ->
 
 
 def test_a_map_that_is_not_extended_allows_loops() -> None:
-    values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": {}}}
+    values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": True}}
     config = make_config(values, "test")
     assert not config.map.extend
-    assert config.frontend.loops == LoopSettings()
+    assert config.frontend.loops

@@ -9,7 +9,7 @@ import pytest
 from fgslam.runs.tasks.localisation import settings_that_differ
 
 NOW = {
-    "sift": {"octave_layers": 3},
+    "sift": {"max_features": 3},
     "appearance": {"mode": "descriptor"},
     "stereo": {"pixel_sigma": 0.3, "others": "auto"},
 }
@@ -22,7 +22,7 @@ NOW = {
         (NOW | {"stereo": {"pixel_sigma": 0.3}}, []),
         (NOW | {"stereo": {"pixel_sigma": 0.3, "retired": 1}}, []),
         (NOW | {"stereo": {"pixel_sigma": 0.2}}, ["stereo"]),
-        (NOW | {"sift": {"octave_layers": 5}}, ["sift"]),
+        (NOW | {"sift": {"max_features": 5}}, ["sift"]),
         ({"sift": None}, []),
     ],
 )

@@ -259,7 +259,7 @@ def test_the_pose_that_is_used_says_whether_it_was_found_anew(
     views: Views, monkeypatch: pytest.MonkeyPatch, anew: bool
 ) -> None:
     """Recent landmarks may place a frame again: with them the prediction, or without it."""
-    slam = session(views, frontend={"tracking": "sift", "loops": {}})
+    slam = session(views, frontend={"tracking": "sift", "loops": True})
     push(slam, views, range(3))
     status = EgoMotionStatus.RELOCALISED if anew else EgoMotionStatus.OK
 

@@ -8,6 +8,7 @@ from functools import cache, lru_cache
 import numpy as np
 import pytest
 from rings import (
+    LOOPS,
     ROUND,
     SETTINGS,
     RingMotion,
@@ -31,9 +32,8 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.features.descriptor_index import AppearanceIndex
 from fgslam.frontend.places.closures import difference
-from fgslam.frontend.places.recognition import PlaceRecognition
+from fgslam.frontend.places.recognition import LostRules, PlaceRecognition
 from fgslam.frontend.places.relocalisation import known_map
-from fgslam.frontend.settings import LostSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.landmark_table import LandmarkTable
 from fgslam.slam.factory import make_estimator
@@ -48,7 +48,7 @@ DARK = range(30, 42)  # in the dark the heading drifts by what no search window 
 
 
 def round_the_ring(path: list[FloatArray] = RING) -> SlamPipeline:
-    return pipeline_of(path, 0.9, dataclasses.replace(SETTINGS, lost=None))
+    return pipeline_of(path, 0.9, lost=None)
 
 
 def refuse_closures(patch: pytest.MonkeyPatch) -> None:
@@ -122,12 +122,12 @@ def test_frame_with_two_hypotheses_is_placed_by_recent_landmarks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Back near the start, 0.24 m off: old landmarks and new ones, found in the same frames."""
-    late = dataclasses.replace(SETTINGS.loops, confirm=18)  # long after old landmarks are found
+    late = dataclasses.replace(LOOPS, confirm=18)  # long after old landmarks are found
     once = dataclasses.replace(SETTINGS.matching, refine=False)  # a second matching helps as well
-    settings = dataclasses.replace(SETTINGS, lost=None, loops=late, matching=once)
+    settings = dataclasses.replace(SETTINGS, matching=once)
 
     def driven() -> tuple[list[int], list[int]]:
-        reports = drive(pipeline_of(RING, 0.2, settings), seen(RING, DARK))
+        reports = drive(pipeline_of(RING, 0.2, settings, loops=late, lost=None), seen(RING, DARK))
         apart = [k for k, report in enumerate(reports) if not report.tracking.coherent]
         return apart, closings(reports)
 
@@ -193,9 +193,9 @@ def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:
     assert offered[0] == closings(ring()[1])[0]
     assert all(reports[k].stats.closed == (False,) for k in offered)
     assert pipeline.places.taken == (False,) * len(offered)
-    rest = SETTINGS.loops.rest
+    rest = LOOPS.rest
     assert (np.diff(offered) > rest).all()
-    without = pipeline_of(RING, 0.9, dataclasses.replace(SETTINGS, lost=None, loops=None))
+    without = pipeline_of(RING, 0.9, loops=None, lost=None)
     for report, expected in zip(reports, drive(without, seen(RING, DARK)), strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_bits(report.increment.observations, expected.increment.observations)
@@ -206,7 +206,7 @@ def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:
 def test_a_refused_closure_is_offered_again_after_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     """The place was not seen, as far as the map is concerned; so it can be recognised again."""
     first = closings(ring(refusing=True)[1])[0]
-    longer = [on_ring(k) for k in range(ROUND + 16 + SETTINGS.loops.rest)]
+    longer = [on_ring(k) for k in range(ROUND + 16 + LOOPS.rest)]
     again = gone_on(True, first, longer)
     refuse_closures(monkeypatch)
     offered = closings(drive(again, list(seen(longer, DARK))[first:]))
@@ -316,17 +316,15 @@ def test_who_is_lost_indexes_the_same_looks_once_with_the_same_answers(
 ) -> None:
     """Frames in unmapped surroundings: each looks at the whole map, and none changes its looks."""
     poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 46)]
-    settings = dataclasses.replace(
-        SETTINGS, lost=LostSettings(after=1, give_up_after=20), loops=None
-    )
+    lost = LostRules(after=1, give_up_after=20)
     made = []
     monkeypatch.setattr(
         known_map, "AppearanceIndex", lambda *held: (made.append(1), AppearanceIndex(*held))[1]
     )
-    once = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    once = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
     first = len(made)
     monkeypatch.setattr(LandmarkTable, "changes", property(lambda self: len(made)))
-    every = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    every = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
     assert first < len(made) - first == len(poses) - 12 + 1
     for one, other in zip(once, every, strict=True):
         assert_same_increments(one.increment, other.increment)
@@ -335,8 +333,7 @@ def test_who_is_lost_indexes_the_same_looks_once_with_the_same_answers(
 
 def test_kidnapped_robot_stays_lost_without_relocalisation() -> None:
     poses = carried()
-    settings = dataclasses.replace(SETTINGS, lost=None, loops=None)
-    reports = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    reports = drive(pipeline_of(poses, 0.1, loops=None, lost=None), seen(poses))
     assert error_m(reports[-1], poses[-1]) > 1.0
 
 
@@ -351,10 +348,8 @@ def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
 
 def test_robot_lost_in_unmapped_surroundings_gives_up_and_maps_on() -> None:
     poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 64)]
-    settings = dataclasses.replace(
-        SETTINGS, lost=LostSettings(after=2, give_up_after=6), loops=None
-    )
-    reports = drive(pipeline_of(poses, 0.1, settings), seen(poses))
+    lost = LostRules(after=2, give_up_after=6)
+    reports = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
     new = [int(r.increment.observations.is_new.sum()) for r in reports]
     assert sum(new[14:17]) == 0
     assert sum(new[17:]) > 50

@@ -17,17 +17,18 @@ from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.closures import (
     Confirmation,
+    LoopGates,
     close_loop,
     difference,
     drift_allows,
     duplicates,
 )
 from fgslam.frontend.places.sightings import SightingMemory
-from fgslam.frontend.settings import EgoMotionSettings, LoopSettings
+from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.resection import Resection
 
-LOOPS = LoopSettings()
+LOOPS = LoopGates()
 DOWN = np.array([0.0, 1.0, 0.0])
 NOBODY = np.empty(0, np.int64)
 NOISE = 0.2**2 * np.eye(3)
