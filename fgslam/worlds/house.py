@@ -97,7 +97,7 @@ def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
     Raises:
         CalibrationError: the mirror cannot show what is asked for.
     """
-    if settings.kind == "equirectangular":
+    if settings.model == "equirectangular":
         width = settings.width or 1024
         return Equirectangular(width, width // 2)
     bottom, top = np.deg2rad(MIRROR_ELEVATIONS_DEG)
@@ -122,7 +122,7 @@ def miscalibrated(
         return camera
     if not isinstance(camera, HyperbolicMirror):
         raise CalibrationError(
-            "dataset.calibration: errors of a mirror, but dataset.camera.kind is equirectangular; "
+            "dataset.calibration: errors of a mirror, but dataset.camera.model is equirectangular; "
             "take mirror, or leave them out"
         )
     signs, side = rng.choice([-1.0, 1.0], 2), rng.uniform(0.0, 2.0 * np.pi)

@@ -161,7 +161,7 @@ class RenderedLabSettings(LabSettings, FrameSelection):
 class HouseCameraSettings:
     """The camera above the wheelchair."""
 
-    kind: Literal["mirror", "equirectangular"] = Field(
+    model: Literal["mirror", "equirectangular"] = Field(
         default="mirror",
         description="`mirror`: hyperbolic, above an upward camera; or an ideal panorama",
     )
