@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp
 

@@ -16,10 +16,9 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.formats.own import raw_values
-from fgslam.cameras.formats.writing import write_calibration
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
+from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.cameras.write_formats import raw_values, write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FrameError
 from fgslam.core.estimates import Trajectory

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from fgslam.cameras.board_projection import INTRINSICS, PARAMETERS, TURN, projected
 from fgslam.cameras.board_start import board_pose, camera_of, first_guess
 from fgslam.cameras.boards import Board, Corners
-from fgslam.cameras.raw_cameras import RawCamera, checked_camera
+from fgslam.cameras.lenses import RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import (

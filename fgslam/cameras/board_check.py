@@ -18,7 +18,7 @@ from fgslam.cameras.board_calibration import (
 from fgslam.cameras.board_projection import TURN, projected
 from fgslam.cameras.board_start import board_pose
 from fgslam.cameras.boards import Board, Corners
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError
 

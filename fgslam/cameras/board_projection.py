@@ -12,7 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from fgslam.cameras.formats.trees import intrinsic_matrix
+from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
 
 PARAMETERS = {

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from fgslam.cameras.board_projection import PARAMETERS
-from fgslam.cameras.formats.trees import intrinsic_matrix
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose, so3_exp

@@ -7,13 +7,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from fgslam.cameras.assembly import at_size, in_metres
-from fgslam.cameras.calibration import level_mounting
-from fgslam.cameras.raw_cameras import Calibration
-from fgslam.cameras.rectification import Rectifier
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+import numpy as np
+
+from fgslam.cameras.lenses import Calibration
+from fgslam.cameras.rectify import Rectifier
+from fgslam.cameras.rig import StereoRig, at_size, in_metres, load_rig, rig_of
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
 from fgslam.core.sensors import CameraRig, body_is_camera
 from fgslam.datasets.odometry_files import is_of_gyroscope
 from fgslam.datasets.settings import CalibratedSettings
@@ -108,7 +108,9 @@ def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:
     if settings.camera_yaw_deg is None and settings.lever_arm_m is None:
         return rig
     lever_arm = settings.lever_arm_m or (0.0, 0.0, 0.0)
-    return replace(rig, bTc=level_mounting(settings.camera_yaw_deg or 0.0, lever_arm))
+    heading = so3_exp(np.array([0.0, 0.0, np.radians(settings.camera_yaw_deg or 0.0)]))
+    level = heading @ BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
+    return replace(rig, bTc=pose(level, np.array(lever_arm, np.float64)))
 
 
 def on_wheels(

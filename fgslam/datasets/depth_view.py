@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.raw_cameras import RawCamera
-from fgslam.cameras.rectification import MapArray, View, pixel_grid, sampling_maps
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.rectify import MapArray, View, pixel_grid, sampling_maps
 from fgslam.core.arrays import Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.sensors import CameraRig

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats.kalibr import read_asl_mounting
+from fgslam.cameras.formats import read_asl_mounting
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError

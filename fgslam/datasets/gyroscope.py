@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats.kalibr import read_asl_mounting
-from fgslam.cameras.formats.trees import Values, read_tree
+from fgslam.cameras.formats import read_asl_mounting
+from fgslam.cameras.trees import Values, read_tree
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
 from fgslam.core.geometry import rotation_angle

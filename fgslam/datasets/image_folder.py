@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.calibration import read_json_object
+from fgslam.cameras.formats import read_json_object
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError

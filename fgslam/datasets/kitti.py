@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats.kitti import pair_beside, right_of_camera_0
 from fgslam.cameras.rig import load_rig
+from fgslam.cameras.stereo_formats import pair_beside, right_of_camera_0
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory

@@ -7,8 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats import kitti
 from fgslam.cameras.rig import StereoRig
+from fgslam.cameras.stereo_formats import (
+    KITTI_RAW,
+    KITTI_RAW_COLOUR,
+    left_on_inertial_unit,
+    read_kitti,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
@@ -108,7 +113,7 @@ def _rig(
     root = drive.resolve().parent
     places = (drive / CALIBRATION, root / CALIBRATION, root / _OF_360, root.parent / _OF_360)
     path = next((p for p in places if p.is_file()), None)
-    keys = kitti.RAW if names == _PAIRS[0] else kitti.RAW_COLOUR
+    keys = KITTI_RAW if names == _PAIRS[0] else KITTI_RAW_COLOUR
     if settings.camera_file is not None:
         rig = loaded_rig(settings, Path(settings.camera_file), size=size)
     elif path is None:
@@ -117,8 +122,8 @@ def _rig(
             "or give one by --camera FILE"
         )
     else:
-        rig = read_rig(settings, kitti.read_kitti(path, size, keys), size)
-    iTl = None if path is None else kitti.left_on_inertial_unit(path, keys)
+        rig = read_rig(settings, read_kitti(path, size, keys), size)
+    iTl = None if path is None else left_on_inertial_unit(path, keys)
     if iTl is None:
         return mounted(rig, settings), None
     iTc = iTl @ pose(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.rectification import Rectifier
+from fgslam.cameras.rectify import Rectifier
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.formats.published import rgbd_part
-from fgslam.cameras.formats.trees import read_tree
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.formats import rgbd_part
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.rig import at_size, read_calibration_file
+from fgslam.cameras.trees import read_tree
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError

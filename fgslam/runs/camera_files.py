@@ -8,16 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.assembly import assembled, at_size, in_metres
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.formats.writing import write_calibration
-from fgslam.cameras.raw_cameras import Calibration, RawCamera, StatedView
+from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
 from fgslam.cameras.rig import (
     StereoRig,
+    assembled,
+    at_size,
     chosen_cameras,
+    in_metres,
+    read_calibration_file,
     require_options,
     rig_of,
 )
+from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, ConfigError
 from fgslam.core.sensors import CAMERA_NAMES

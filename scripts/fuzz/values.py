@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 import fgslam as fg
-from fgslam.cameras.raw_cameras import Calibration
+from fgslam.cameras.lenses import Calibration
 from fgslam.runs.camera_files import Asked, convert_calibration
 from fgslam.runs.config import load_experiment
 from fgslam.runs.named_experiments import experiment_names, experiments_folder

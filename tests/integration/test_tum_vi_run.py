@@ -13,7 +13,7 @@ from running import Capture, Patch, main, metrics_of
 from scipy.spatial.transform import Rotation
 
 import fgslam as fg
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse, pose, se3_exp, se3_log

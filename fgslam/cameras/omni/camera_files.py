@@ -10,10 +10,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.formats.kalibr import is_camchain
-from fgslam.cameras.formats.slam_settings import is_camodocal
-from fgslam.cameras.formats.trees import read_tree
+from fgslam.cameras.formats import is_camchain, is_camodocal
+from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.omni.camera import OmniCamera
 from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import (
@@ -34,7 +32,8 @@ from fgslam.cameras.omni.settings import (
     OCamCalibSettings,
     RadialPolynomialSettings,
 )
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.rig import read_calibration_file
+from fgslam.cameras.trees import read_tree
 from fgslam.core.errors import CalibrationError, shortened
 from fgslam.core.files import as_path, read_lines
 from fgslam.core.settings import make_settings

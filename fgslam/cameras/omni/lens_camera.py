@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fgslam.cameras.lenses import RawCamera, checked_camera
 from fgslam.cameras.omni.camera import inside, unit_rays
 from fgslam.cameras.omni.mirrors import AHEAD_IS_UP
-from fgslam.cameras.raw_cameras import RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 

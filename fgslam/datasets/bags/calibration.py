@@ -9,11 +9,16 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.assembly import at_size, implausible, in_metres, is_stereo_pair
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.formats.ros import read_camera_info, read_camera_info_pair
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
-from fgslam.cameras.rig import StereoRig
+from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.rig import (
+    StereoRig,
+    at_size,
+    implausible,
+    in_metres,
+    is_stereo_pair,
+    read_calibration_file,
+)
+from fgslam.cameras.stereo_formats import read_camera_info, read_camera_info_pair
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
 from fgslam.core.sensors import body_is_camera

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.backend.filters.self_calibration import SelfCalibration
-from fgslam.cameras.corrected import write_corrected
-from fgslam.cameras.rectification import Rectifier
+from fgslam.cameras.rectify import Rectifier
+from fgslam.cameras.rig import write_corrected
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.files import read_text, write_text
 from fgslam.core.rig_correction import IMPLAUSIBLE_PX, RigCorrection, term_names

@@ -11,7 +11,7 @@ import pytest
 from fgslam.cameras.board_calibration import BoardCalibration, View, calibrate
 from fgslam.cameras.board_check import coverage, held_out, judged
 from fgslam.cameras.boards import Board, Corners, find_corners, sizes_that_fit
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import inverse, se3_exp, so3_exp

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.raw_cameras import Calibration
+from fgslam.cameras.lenses import Calibration
+from fgslam.cameras.rig import read_calibration_file
 from fgslam.core.arrays import FloatArray
 from fgslam.runs.camera_files import Asked, show_calibration
 

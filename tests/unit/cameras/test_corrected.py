@@ -11,12 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.corrected import rectifier_of, write_corrected
-from fgslam.cameras.formats.own import raw_values
-from fgslam.cameras.formats.writing import write_calibration
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
-from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.rig import (
+    StereoRig,
+    load_rig,
+    read_calibration_file,
+    rectifier_of,
+    write_corrected,
+)
+from fgslam.cameras.write_formats import raw_values, write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp

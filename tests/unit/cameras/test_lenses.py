@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.lenses import LENSES
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import LENSES, RawCamera
 from fgslam.core.arrays import FloatArray
 
 SIZE = (640, 400)

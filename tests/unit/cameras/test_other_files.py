@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.rig import load_rig
+from fgslam.cameras.rig import load_rig, read_calibration_file
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose, so3_exp

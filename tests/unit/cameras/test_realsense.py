@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.rig import read_calibration_file
 from fgslam.core.errors import CalibrationError
 
 K = [[600.0, 0.0, 320.0], [0.0, 601.0, 240.0], [0.0, 0.0, 1.0]]

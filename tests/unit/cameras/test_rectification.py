@@ -11,10 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.assembly import at_size
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
-from fgslam.cameras.rig import StereoRig, load_rig, rig_of
+from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.rig import StereoRig, at_size, load_rig, read_calibration_file, rig_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import pose, project, so3_exp, transform_to_camera, triangulate

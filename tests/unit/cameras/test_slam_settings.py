@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.raw_cameras import Calibration
+from fgslam.cameras.lenses import Calibration
+from fgslam.cameras.rig import read_calibration_file
 from fgslam.core.errors import CalibrationError
 
 HEAD = """%YAML:1.0

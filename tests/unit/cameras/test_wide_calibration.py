@@ -14,8 +14,8 @@ from fgslam.cameras.board_check import coverage_of_circle, farthest_from_axis, h
 from fgslam.cameras.board_projection import PARAMETERS, projected
 from fgslam.cameras.board_start import board_pose
 from fgslam.cameras.boards import Board, Corners, find_corners
-from fgslam.cameras.formats.trees import intrinsic_matrix
-from fgslam.cameras.raw_cameras import RawCamera
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import so3_exp

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.formats.writing import write_calibration
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
+from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.rig import read_calibration_file
+from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.runs.camera_files import Asked, convert_calibration, show_calibration

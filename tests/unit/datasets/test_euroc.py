@@ -18,10 +18,9 @@ from dataset_builders import (
     write_euroc_truth,
 )
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.raw_cameras import RawCamera
-from fgslam.cameras.rectification import Rectifier
-from fgslam.cameras.rig import load_rig
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.rectify import Rectifier
+from fgslam.cameras.rig import load_rig, read_calibration_file
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera

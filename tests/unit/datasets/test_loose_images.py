@@ -25,8 +25,8 @@ from dataset_builders import (
     write_tum,
 )
 
-from fgslam.cameras.calibration_files import read_calibration_file
-from fgslam.cameras.formats.writing import write_calibration as write_file
+from fgslam.cameras.rig import read_calibration_file
+from fgslam.cameras.write_formats import write_calibration as write_file
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose
 from fgslam.core.sensors import body_is_camera

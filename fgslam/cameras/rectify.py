@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.raw_cameras import Calibration, RawCamera
+from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.core.arrays import Brief, FloatArray, Image
 from fgslam.core.geometry import pose
 from fgslam.core.rig_correction import camera_displacements

@@ -1,33 +1,85 @@
-"""Calibration files as keys and values: YAML, JSON and XML, with OpenCV's matrices as arrays."""
+"""Calibration files as keys and values, and the tables that say which key holds which number.
+
+A :class:`Row` of a format's table says where a camera's size, intrinsics and lens are;
+:func:`camera_of` reads them. Files are YAML, JSON, XML, with OpenCV's matrices as arrays, and
+NumPy's archives.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
 import yaml
 
+from fgslam.cameras.lenses import RawCamera, checked_camera
 from fgslam.core.array_files import UNREADABLE, require_plain
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text, require_file
-from fgslam.core.geometry import is_rigid, pose, rotation_from_quaternion
+from fgslam.core.geometry import is_rigid
 from fgslam.core.yaml_text import PlainLoader
 
+Size: TypeAlias = tuple[int, int]
 Tree: TypeAlias = Mapping[str, Any]
 """Keys and values of a file; OpenCV's matrices are arrays."""
 
-_MATRICES = ("opencv-matrix", "opencv-nd-matrix")
+FOCAL = ("fx", "fy", "cx", "cy")
+BROWN = ("k1", "k2", "p1", "p2")
+KANNALA = ("k1", "k2", "k3", "k4")
+ORIGIN = np.eye(4)
+
+
+class Row(NamedTuple):
+    """Where a camera's numbers are: key paths, whose parts are joined by dots.
+
+    Attributes:
+        size: of width and height, or one of both.
+        lenses: by the texts under ``kind``: our model, and the keys of its parameters: one of all,
+            or one of each; without keys there are none. A key that ends in `?` may be missing: 0.
+        kind: of the texts that name the lens; none: the only one.
+        focal: of fx, fy, cx, cy, or one of all four.
+        matrix: of the intrinsic matrix, where that is stated instead.
+    """
+
+    size: tuple[str, ...]
+    lenses: Mapping[str, tuple[str, tuple[str, ...]]]
+    kind: tuple[str, ...] = ()
+    focal: tuple[str, ...] = FOCAL
+    matrix: str = ""
+
+
+def camera_of(part: Values, row: Row, bTc: FloatArray = ORIGIN, name: str = "") -> RawCamera:
+    """The camera that a part of a file holds by a row. Raises CalibrationError."""
+    model, keys = row.lenses[kind_of(part, row.kind, row.lenses)]
+    parameters = part.values(keys) if keys else np.zeros(4)
+    size = part.size(*row.size)
+    matrix = part.matrix(row.matrix, 3, 3) if row.matrix else part.intrinsics(row.focal)
+    return checked_camera(RawCamera(*size, matrix, parameters, bTc, name or part.name, model))
+
+
+def kind_of(part: Values, keys: Sequence[str], known: Iterable[str]) -> str:
+    """The texts under some keys, joined by `-`. Raises CalibrationError: they are not known."""
+    found = "-".join(part.text(key, "none") for key in keys)
+    if found not in known:
+        stated = " with ".join(f"{key} {part.text(key, 'none')}" for key in keys)
+        raise part.refuse(f"{stated} is not known; known: {', '.join(known)}")
+    return found
+
+
+# --------------------------------------------------------------------------------------------
+# Keys and values: YAML, JSON and XML, with OpenCV's matrices as arrays, and NumPy's archives
+
+
 _TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])")
 _CAMERA_INFO = re.compile(r"^distortion_model:", re.MULTILINE)
 _MESSAGE_END = re.compile(r"^---[ \t]*$", re.MULTILINE)
-_ARCHIVE = ".npz"
 _LARGEST_ARCHIVE = 100_000_000  # bytes; points of a board may be in it
 _DEEPEST = 20  # levels of nesting: no calibration has ten
 
@@ -38,12 +90,12 @@ class _Loader(PlainLoader):
     most_values = 1_000_000
 
 
-def _plain(loader: yaml.SafeLoader, node: Any) -> Any:
+def _mapping(loader: yaml.SafeLoader, node: Any) -> Any:
     return loader.construct_mapping(node, deep=True)
 
 
-for _tag in _MATRICES:
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _plain)
+for _tag in ("opencv-matrix", "opencv-nd-matrix"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_tag}", _mapping)
 
 
 def read_tree(path: Path) -> Tree | None:
@@ -52,14 +104,16 @@ def read_tree(path: Path) -> Tree | None:
     Raises:
         CalibrationError: it cannot be read, or is meant to be one of them and is malformed.
     """
-    if path.suffix.lower() == _ARCHIVE:
+    if path.suffix.lower() == ".npz":
         return _of_archive(path)
     text = read_text(path, CalibrationError).lstrip("\ufeff \t\r\n")
-    if text.startswith("{"):
-        return _of_json(path, text)
     if text.startswith("<"):
-        return _of_xml(path)
-    return _of_yaml(path, text)
+        values = _of_xml(path)
+    else:
+        values = read_json(path, text) if text.startswith("{") else _of_yaml(path, text)
+    if not isinstance(values, dict):
+        return None
+    return {str(key): _arrays(path, str(key), value, 0) for key, value in values.items()}
 
 
 def _of_archive(path: Path) -> Tree:
@@ -85,22 +139,23 @@ def _loaded(archive: Any, key: str) -> Any:
     return float(value) if value.ndim == 0 else np.asarray(value, np.float64)
 
 
-def _of_json(path: Path, text: str) -> Tree:
+def read_json(path: Path, text: str) -> Any:
+    """The values of a JSON text. Raises CalibrationError: it is none."""
     try:
-        return _with_arrays(path, json.loads(text))
+        return json.loads(text)
     except RecursionError:
         raise CalibrationError(f"{path} is nested too deeply; correct the file") from None
     except ValueError as cause:
         raise CalibrationError(f"{path} is not JSON: {cause}; correct the file") from None
 
 
-def _of_yaml(path: Path, text: str) -> Tree | None:
+def _of_yaml(path: Path, text: str) -> Any:
     lines = _first_message(text).splitlines()
     if text.startswith("%YAML"):
         # OpenCV writes a directive that is no YAML, and reads "key:value" without a space.
         lines = [_TIGHT.sub(r"\1: ", line) for line in lines if not line.startswith("%YAML")]
     try:
-        values = _Loader("\n".join(lines)).get_single_data()
+        return _Loader("\n".join(lines)).get_single_data()
     except RecursionError:
         raise CalibrationError(f"{path} is nested too deeply; correct the file") from None
     except (yaml.YAMLError, ValueError) as cause:
@@ -108,7 +163,6 @@ def _of_yaml(path: Path, text: str) -> Tree | None:
             return None
         reason = " ".join(str(cause).split())
         raise CalibrationError(f"{path} is not YAML: {reason}; correct the file") from None
-    return _with_arrays(path, values) if isinstance(values, dict) else None
 
 
 def is_camera_text(text: str) -> bool:
@@ -123,16 +177,15 @@ def _first_message(text: str) -> str:
     return _MESSAGE_END.split(text.removeprefix("---\n"), maxsplit=1)[0]
 
 
-def _of_xml(path: Path) -> Tree:
+def _of_xml(path: Path) -> Any:
     try:
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        root = storage.root()
-        values = {name: _of_node(root.getNode(name), 0) for name in root.keys()}  # noqa: SIM118
+        values = _of_node(storage.root(), 0)
         storage.release()
     except (cv2.error, SystemError) as error:  # its constructor wraps the one in the other
         cause = " ".join(str(error.__cause__ or error).split())
         raise CalibrationError(f"{path} is malformed: {cause}; write the file again") from None
-    return _with_arrays(path, values)
+    return values
 
 
 def _of_node(node: cv2.FileNode, depth: int) -> Any:
@@ -148,12 +201,8 @@ def _of_node(node: cv2.FileNode, depth: int) -> Any:
     return node.real() if node.isReal() or node.isInt() else None
 
 
-def _with_arrays(path: Path, values: Mapping[Any, Any]) -> Tree:
-    """The same with what has rows, columns and data as arrays; keys are texts."""
-    return {str(key): _arrays(path, str(key), value, 0) for key, value in values.items()}
-
-
 def _arrays(path: Path, key: str, value: Any, depth: int) -> Any:
+    """The value with what has rows, columns and data as arrays; keys are texts."""
     if depth > _DEEPEST:
         raise CalibrationError(f"{path} is nested too deeply; correct the file")
     if isinstance(value, list):
@@ -189,10 +238,6 @@ def _array_of_sizes(path: Path, key: str, block: Mapping[str, Any]) -> FloatArra
     return data.reshape(tuple(np.rint(sizes).astype(int)))
 
 
-# --------------------------------------------------------------------------------------------
-# Numbers in them
-
-
 def flat_numbers(value: Any, depth: int = 0) -> FloatArray | None:
     """All numbers of lists in lists, or of an array, in order; None where one is no number."""
     if isinstance(value, np.ndarray):
@@ -207,20 +252,15 @@ def flat_numbers(value: Any, depth: int = 0) -> FloatArray | None:
                 return None
             found.extend(inner.tolist())
             continue
-        number = _number(one)
-        if number is None:
+        if isinstance(one, str):  # YAML 1.1 takes 1e-05 for a text
+            try:
+                one = float(one)
+            except ValueError:
+                return None
+        if not is_finite_number(one):
             return None
-        found.append(number)
+        found.append(float(one))
     return np.array(found, np.float64)
-
-
-def _number(value: Any) -> float | None:
-    if isinstance(value, str):  # YAML 1.1 takes 1e-05 for a text
-        try:
-            value = float(value)
-        except ValueError:
-            return None
-    return float(value) if is_finite_number(value) else None
 
 
 class Values:
@@ -231,8 +271,20 @@ class Values:
         self.path, self.where = path, where
         self.tree: Tree = tree if isinstance(tree, Mapping) else {}
 
+    @property
+    def name(self) -> str:
+        """Of the file and the part."""
+        part = self.where.rstrip(" .:")
+        return f"{self.path.name}: {part}" if part else self.path.name
+
+    def _at(self, key: str) -> Any:
+        if key in self.tree or "." not in key:
+            return self.tree.get(key)
+        first, _, rest = key.partition(".")
+        return self.inside(first)._at(rest)
+
     def __contains__(self, key: str) -> bool:
-        return self.tree.get(key) is not None
+        return self._at(key) is not None
 
     def inside(self, key: str) -> Values:
         """The part under a key, empty where there is none."""
@@ -251,14 +303,15 @@ class Values:
 
     def numbers(self, key: str, count: int | None = None) -> FloatArray:
         """(count,) finite numbers, or as many as there are. Raises CalibrationError otherwise."""
-        given = self.tree.get(key)
+        given = self._at(key)
         if isinstance(given, dict) and "data" in given:  # a matrix without its shape
             key, given = f"{key}.data", given["data"]
         found = None if given is None else flat_numbers(given)
         if found is None or count not in (None, len(found)):
             many = "" if count is None else f"{count} "
+            text = " ".join(repr(given).split())
             raise self.refuse(
-                f"{key} is {_short(given)}, expected {many}finite "
+                f"{key} is {text if len(text) <= 60 else text[:57] + '...'}, expected {many}finite "
                 f"number{'' if count == 1 else 's'}; correct the file"
             )
         return found
@@ -269,13 +322,22 @@ class Values:
             return default
         return float(self.numbers(key, 1)[0])
 
-    def named(self, keys: Iterable[str], default: float | None = None) -> FloatArray:
-        """One number for each key."""
-        return np.array([self.number(key, default) for key in keys])
+    def values(self, keys: Sequence[str]) -> FloatArray:
+        """One number for each key, 0 for a missing one that ends in `?`; of one key alone all."""
+        if len(keys) == 1:
+            return self.numbers(keys[0])
+        optional = [0.0 if key.endswith("?") else None for key in keys]
+        named = [key.removesuffix("?") for key in keys]
+        return np.array([self.number(*pair) for pair in zip(named, optional, strict=True)])
 
     def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
         """(rows, columns) numbers."""
         return self.numbers(key, rows * columns).reshape(rows, columns)
+
+    def intrinsics(self, keys: Sequence[str]) -> FloatArray:
+        """(3, 3) of fx, fy, cx, cy by their keys, or by one key of all four."""
+        four = self.numbers(keys[0], 4) if len(keys) == 1 else self.values(keys)
+        return intrinsic_matrix(*four)
 
     def motion(self, key: str) -> FloatArray:
         """(4, 4) rigid motion, of 16 or of 12 numbers."""
@@ -288,26 +350,16 @@ class Values:
             raise self.refuse(f"{key} is not a rigid motion; correct the file")
         return motion
 
-    def size(self, width: str, height: str) -> tuple[int, int]:
-        """Width and height, by two keys, or by one that holds both where these are equal."""
-        found = self.numbers(width, 2) if width == height else self.named((width, height))
-        return round(found[0]), round(found[1])
+    def size(self, *keys: str) -> Size:
+        """Width and height, by two keys, or by one that holds both."""
+        width, height = self.numbers(keys[0], 2) if len(keys) == 1 else self.values(keys)
+        return round(width), round(height)
 
     def refuse(self, text: str) -> CalibrationError:
         """An error that names file and part."""
         return CalibrationError(f"{self.path}: {self.where}{text}")
 
 
-def _short(value: Any) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else text[:57] + "..."
-
-
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
     """(3, 3) of focal lengths and principal point."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def motion_of(position: FloatArray, quaternion: FloatArray) -> FloatArray:
-    """(4, 4) of a position and a quaternion (x, y, z, w) of any length but 0."""
-    return pose(rotation_from_quaternion(quaternion / np.linalg.norm(quaternion)), position)

@@ -1,1 +1,0 @@
-"""Calibration files of other tools: one module for each family, each gives a Calibration."""
