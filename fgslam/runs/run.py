@@ -98,11 +98,11 @@ def opener_of(  # noqa: PLR0911 - one a task
 
             return open_localisation
         case HomingPairsConfig():
-            from fgslam.runs.tasks.homing_pairs import open_pairs
+            from fgslam.runs.tasks.homing_views import open_pairs
 
             return open_pairs
         case TopologicalMapConfig():
-            from fgslam.runs.tasks.homing_map import open_topological_map
+            from fgslam.runs.tasks.homing_views import open_topological_map
 
             return open_topological_map
         case OmniVideoConfig():

@@ -11,6 +11,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.files import make_subfolder
+from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker, TrackedImage, VideoState
@@ -28,7 +29,6 @@ from fgslam.runs.engine import (
     write_document,
     write_page,
 )
-from fgslam.runs.tasks.homing_views import open_checked
 
 FRAMES_FILE = "frames.csv"
 TRACKS_FILE = "tracks.csv"

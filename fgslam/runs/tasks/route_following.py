@@ -14,6 +14,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.planar import wrap
+from fgslam.datasets.omni_checks import camera_notes
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.datasets.opening import open_omni
 from fgslam.evaluation.metrics import JsonValue
@@ -36,7 +37,6 @@ from fgslam.runs.engine import (
     write_document,
     write_page,
 )
-from fgslam.runs.tasks.homing_views import camera_notes
 
 FOLLOW_FILE = "follow.csv"
 COLUMNS = (

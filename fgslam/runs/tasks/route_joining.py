@@ -18,8 +18,7 @@ from fgslam.homing.route_map import FEATURES, VECTOR, Answered, Asker, RouteMap,
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.config_models import JoinConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, write_document, write_page
-from fgslam.runs.tasks.homing_map_links import map_figure, write_links
-from fgslam.runs.tasks.homing_views import PairSearch, answer_pairs
+from fgslam.runs.tasks.homing_views import PairSearch, answer_pairs, map_figure, write_links
 
 MAP_FILE = "routes.fgmap"
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from fgslam.core.errors import FrameError
 from fgslam.core.files import make_subfolder
+from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.settings import DRIVING
@@ -33,7 +34,6 @@ from fgslam.runs.engine import (
     write_document,
     write_page,
 )
-from fgslam.runs.tasks.homing_views import open_checked
 from fgslam.runs.tasks.route_poses import MetricDrive
 
 ROUTE_FILE = "route.fgpath"

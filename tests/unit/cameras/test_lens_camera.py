@@ -16,8 +16,8 @@ from fgslam.cameras.omni.camera_values import camera_of, camera_values
 from fgslam.cameras.omni.lens_camera import LensCamera
 from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
 from fgslam.core.errors import CalibrationError
+from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.omni_settings import OmniPathSettings
-from fgslam.runs.tasks.homing_views import open_checked
 
 MEI = """%YAML:1.0
 ---

@@ -18,9 +18,9 @@ from fgslam.cameras.omni.settings import (
     OCamCalibSettings,
 )
 from fgslam.core.arrays import Image
+from fgslam.datasets.omni_checks import camera_notes, open_checked
 from fgslam.datasets.omni_settings import OmniPathSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
-from fgslam.runs.tasks.homing_views import camera_notes, open_checked
 from tests import textured_room
 
 SIZE = (320, 240)

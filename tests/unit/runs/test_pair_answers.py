@@ -11,7 +11,8 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import compose, wrap
-from fgslam.runs.tasks.homing_pairs import (
+from fgslam.runs.tasks.homing_views import (
+    PairAnswer,
     answer_numbers,
     error_numbers,
     error_tables,
@@ -19,7 +20,6 @@ from fgslam.runs.tasks.homing_pairs import (
     true_pair,
     write_pairs,
 )
-from fgslam.runs.tasks.homing_views import PairAnswer
 
 SIGMA = np.deg2rad(1.0)
 
