@@ -29,7 +29,7 @@ from fgslam.core.geometry import (
     pose,
     rotation_from_quaternion,
 )
-from fgslam.datasets.bags.messages import calibration_of, grey_of, motion_of
+from fgslam.datasets.bag_messages import calibration_of, grey_of, motion_of
 from fgslam.report.ros_bag import pose_message
 
 SIDES = ("left", "right")

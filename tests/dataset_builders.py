@@ -13,7 +13,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.datasets.loose_images import open_loose_images
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import LooseImagesSettings, RecordedOdometrySettings
 
@@ -59,7 +59,7 @@ def loose(
 
 
 def opened_loose(root: Path, **settings: Any) -> Recording:
-    return open_loose_images(
+    return open_recording(
         LooseImagesSettings(path=str(root), **settings), RecordedOdometrySettings()
     )
 

@@ -1,9 +1,10 @@
-"""Image files: listing a folder, reading one image completely or not at all, frames of a rig."""
+"""Image files: read completely or not at all, in 8 bits; the files of all frames of a rig."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,38 +13,18 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.rig import StereoRig
-from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import require_file
 from fgslam.core.sensors import CAMERA_NAMES
-from fgslam.datasets.image_bytes import fault_of_bytes
-from fgslam.datasets.loose_files import IMAGE_SUFFIXES
+from fgslam.datasets.layouts import IMAGE_SUFFIXES
 
-
-def list_numbered_images(folder: Path) -> dict[int, Path]:
-    """Images of a folder by the number that is their name (``000012.png`` is 12).
-
-    Raises:
-        DatasetError: two images carry the same number.
-    """
-    numbered: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in IMAGE_SUFFIXES or not path.stem.isdecimal():
-            continue
-        number = int(path.stem)
-        if number in numbered:
-            raise DatasetError(
-                f"{folder} has two images of frame {number}: {numbered[number].name} and "
-                f"{path.name}; remove one"
-            )
-        numbered[number] = path
-    return numbered
+# --------------------------------------------------------------------------------------------
+# One image
 
 
 def read_grey_image(path: Path, bits: int = 16) -> Image:
-    """The image (height, width) in grey, uint8; ``bits`` are those that 16 of a pixel hold.
-
-    A truncated or damaged file is refused, never returned half grey.
+    """Grey image (height, width), uint8; ``bits`` are those that 16 of a pixel hold.
 
     Raises:
         FrameError: the file is absent, incomplete or no image.
@@ -51,41 +32,20 @@ def read_grey_image(path: Path, bits: int = 16) -> Image:
     return decode_grey(_bytes_of(path), str(path), bits)
 
 
-def read_sized_image(path: Path, width: int, height: int, bits: int = 16) -> Image:
-    """The image in grey, as :func:`read_grey_image`. Raises FrameError if of another size, too."""
-    return sized(read_grey_image(path, bits), f"image {path}", width, height)
-
-
-def sized(image: Image, name: str, width: int, height: int) -> Image:
-    """The image itself. Raises FrameError where it has another size than calibrated."""
-    if image.shape[:2] != (height, width):
-        raise FrameError(
-            f"{name} is {size(image)} but the calibration says {width}x{height}; restore the "
-            "right file"
-        )
-    return image
-
-
 def read_colour_image(path: Path, bits: int = 16) -> Image:
-    """The image (height, width, 3) in red, green, blue, uint8; else as :func:`read_grey_image`."""
+    """Image (height, width, 3) in red, green, blue, uint8; else as :func:`read_grey_image`."""
     return decode_colour(_bytes_of(path), str(path), bits)
 
 
-def encoded_png(image: Image) -> bytes:
-    """A grey image, or one in red, green, blue, as a PNG file."""
-    shown = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".png", shown)[1])
-
-
 def read_depth_image(path: Path) -> npt.NDArray[Any]:
-    """A depth image (height, width), uint16 or float, as it is stored; 0 where unknown.
+    """Depth image (height, width), uint16 or float, as it is stored; 0 where unknown.
 
     The largest integer is no depth: 7-Scenes and saturated sensors mark with it what is unknown.
 
     Raises:
         FrameError: absent, incomplete, no image, or of colours or 8 bits.
     """
-    image = _decoded(_bytes_of(path), str(path), cv2.IMREAD_UNCHANGED)
+    image = decode_stored(_bytes_of(path), str(path))
     if image.ndim != 2 or image.dtype == np.uint8:
         raise FrameError(
             f"image {path} is no depth image: {image.dtype} of {image.ndim} dimensions; 16 bits or "
@@ -102,7 +62,7 @@ def without_unknown(depth: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def decode_grey(data: bytes, name: str, bits: int = 16) -> Image:
-    """The image (height, width) in grey, uint8, of an encoded image's bytes.
+    """Grey image (height, width), uint8, of an encoded image's bytes.
 
     Of more than 8 bits the upper 8 are kept (:func:`of_8_bits`).
 
@@ -118,7 +78,7 @@ def decode_grey(data: bytes, name: str, bits: int = 16) -> Image:
 
 
 def decode_colour(data: bytes, name: str, bits: int = 16) -> Image:
-    """The image (height, width, 3) in red, green, blue, uint8; else as :func:`decode_grey`."""
+    """Image (height, width, 3) in red, green, blue, uint8; else as :func:`decode_grey`."""
     image = of_8_bits(_decoded(data, name, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH), name, bits)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
@@ -128,14 +88,109 @@ def decode_stored(data: bytes, name: str) -> npt.NDArray[Any]:
     return _decoded(data, name, cv2.IMREAD_UNCHANGED)
 
 
+def encoded_png(image: Image) -> bytes:
+    """A grey image, or one in red, green, blue, as a PNG file."""
+    shown = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".png", shown)[1])
+
+
+def require_size(image: Image, name: str, width: int, height: int) -> Image:
+    """The image itself. Raises FrameError where it has another size than calibrated."""
+    if image.shape[:2] != (height, width):
+        raise FrameError(
+            f"{name} is {image.shape[1]}x{image.shape[0]} but the calibration says "
+            f"{width}x{height}; restore the right file"
+        )
+    return image
+
+
+def _bytes_of(path: Path) -> bytes:
+    remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
+    if path.exists() and not path.is_file():
+        require_file(path, FrameError, remedy)  # who reads a pipe waits, a device may have no end
+    try:
+        return path.read_bytes()
+    except OSError as cause:
+        raise FrameError(f"image {path} cannot be read: {cause.strerror}; {remedy}") from cause
+
+
+def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
+    if fault := _fault_of_bytes(data):
+        remedy = "" if ";" in fault else "; copy the file again from its source"
+        raise FrameError(f"image {name} {fault}{remedy}")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
+    except cv2.error:  # absurd sizes in a damaged header
+        image = None
+    if image is None:
+        raise FrameError(f"image {name} is not an image that can be decoded; restore the file")
+    return image
+
+
 # --------------------------------------------------------------------------------------------
-# More than eight bits
+# What is wrong with the bytes of a file, before a decoder would fill in grey
+
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_TAIL = 64  # some writers pad a JPEG after its end marker
+# The largest cameras have that many; SIFT would need 30 GB for one such image.
+_MOST_PIXELS = 100_000_000
+
+_WEB_PAGE = "is a web page, as a download that failed leaves it; download it again"
+_NO_IMAGES = {
+    b"version https://git-lfs": "is a pointer of Git LFS; get the image itself: git lfs pull",
+    b"<!doctype html": _WEB_PAGE,
+    b"<html": _WEB_PAGE,
+}
+"""Beginnings of files that stand in the place of an image, in small letters."""
+
+
+def _fault_of_bytes(data: bytes) -> str | None:
+    if not data:
+        return "is empty"
+    if data.startswith(_PNG_SIGNATURE):
+        return _png_fault(data)
+    if data.startswith(_JPEG_START):
+        return None if _JPEG_END in data[-_JPEG_TAIL:] else "is truncated (no end marker)"
+    start = data[:64].lstrip().lower()
+    return next((fault for begin, fault in _NO_IMAGES.items() if start.startswith(begin)), None)
+
+
+def _png_fault(data: bytes) -> str | None:
+    """What is wrong with the chunks of a PNG file."""
+    at = len(_PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        kind, end = data[at + 4 : at + 8], at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return f"is damaged (checksum of its {kind.decode('latin-1')} chunk)"
+        if kind == b"IHDR":  # a few bytes of header may stand for gigabytes
+            width, height = (int.from_bytes(data[k : k + 4], "big") for k in (at + 8, at + 12))
+            if not 0 < width * height <= _MOST_PIXELS:
+                most = f"{_MOST_PIXELS / 1e6:.0f} megapixels"
+                return f"claims to be {width}x{height}, at most {most} are read"
+        if kind == b"acTL":
+            return "is animated; give one file an image"
+        if kind == b"IEND":
+            return None
+        at = end + 4
+    return f"is truncated at {len(data)} bytes"
+
+
+# --------------------------------------------------------------------------------------------
+# More than eight bits; mosaics of colours
 
 
 _BITS = (8, 10, 12, 14, 16)
 """Of the sensors whose pixels are stored in 16."""
 
-_LOOKED_AT = 9  # frames from first to last, by which it is decided how many bits are used
+_SAMPLED_FRAMES = 9  # from first to last, by which it is decided how many bits are used
+_MOSAIC = 1.2
+"""Neighbours' difference over that of the next but one: 0.50 to 0.87 in 97 grey pictures, 1.00 in
+noise alone, 1.5 to 13 in mosaics of colourful ones."""
 
 
 def of_8_bits(image: npt.NDArray[Any], name: str, bits: int = 16) -> Image:
@@ -164,7 +219,7 @@ def bits_held(count: int, stored: Callable[[int], npt.NDArray[Any]]) -> tuple[in
         stored: the pixels of a frame as they are stored; raises FrameError.
     """
     largest = 0
-    for frame in np.unique(np.linspace(0, count - 1, _LOOKED_AT).astype(int)).tolist():
+    for frame in np.unique(np.linspace(0, count - 1, _SAMPLED_FRAMES).astype(int)).tolist():
         try:
             pixels = stored(frame)
         except FrameError:
@@ -176,8 +231,8 @@ def bits_held(count: int, stored: Callable[[int], npt.NDArray[Any]]) -> tuple[in
     if bits == 16:
         return bits, ()
     return bits, (
-        f"pixels of 16 bits hold {bits}: none of {min(count, _LOOKED_AT)} frames looked at has one "
-        f"above {largest}; {(1 << bits) - 1} is taken as white",
+        f"pixels of 16 bits hold {bits}: none of {min(count, _SAMPLED_FRAMES)} frames looked at "
+        f"has one above {largest}; {(1 << bits) - 1} is taken as white",
     )
 
 
@@ -186,17 +241,8 @@ def bits_of(paths: Sequence[Path]) -> tuple[int, tuple[str, ...]]:
     return bits_held(len(paths), lambda k: decode_stored(_bytes_of(paths[k]), str(paths[k])))
 
 
-# --------------------------------------------------------------------------------------------
-# Mosaics of colours
-
-
-_MOSAIC = 1.2
-"""Neighbours' difference over that of the next but one: 0.50 to 0.87 in 97 grey pictures, 1.00 in
-noise alone, 1.5 to 13 in mosaics of colourful ones."""
-
-
 def mosaic_note(count: int, grey: Callable[[int], Image]) -> tuple[str, ...]:
-    """What to tell where images are mosaics of a colour filter (Bayer's) and not of grey pixels.
+    """A note where images are mosaics of a colour filter (Bayer's) and not of grey pixels.
 
     In one, pixels next to each other differ more than those two apart, which have one colour; in a
     grey image they differ less, and as much only in noise.
@@ -208,7 +254,7 @@ def mosaic_note(count: int, grey: Callable[[int], Image]) -> tuple[str, ...]:
     found = []
     for frame in sorted({0, count // 2, count - 1}):
         try:
-            found.append(_neighbours(grey(frame)))
+            found.append(_neighbour_ratio(grey(frame)))
         except FrameError:
             continue
     if not found or np.median(found) < _MOSAIC:
@@ -220,7 +266,7 @@ def mosaic_note(count: int, grey: Callable[[int], Image]) -> tuple[str, ...]:
     )
 
 
-def _neighbours(image: Image) -> float:
+def _neighbour_ratio(image: Image) -> float:
     """Mean difference of neighbours over that of the next but one; of both axes the smaller."""
     if min(image.shape) < 3:
         return 0.0
@@ -232,95 +278,28 @@ def _neighbours(image: Image) -> float:
     return min(ratios)
 
 
-def _bytes_of(path: Path) -> bytes:
-    remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
-    if path.exists() and not path.is_file():
-        require_file(path, FrameError, remedy)  # who reads a pipe waits, a device may have no end
-    try:
-        return path.read_bytes()
-    except OSError as cause:
-        raise FrameError(f"image {path} cannot be read: {cause.strerror}; {remedy}") from cause
-
-
-def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
-    fault = fault_of_bytes(data)
-    if fault is not None:
-        raise FrameError(f"image {name} {fault}")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), mode) if data else None
-    except cv2.error:  # absurd sizes in a damaged header
-        image = None
-    if image is None:
-        raise FrameError(f"image {name} is not an image that can be decoded; restore the file")
-    return image
-
-
 # --------------------------------------------------------------------------------------------
-# Frames of several cameras
+# Files of frames
 
 
-_NAMED_IN_NOTES = 5
+def list_numbered_images(folder: Path) -> dict[int, Path]:
+    """Images of a folder by the number that is their name (``000012.png`` is 12).
 
-
-@dataclass(frozen=True, eq=False)
-class StereoFiles:
-    """Where the images of every frame are; readable by index.
-
-    Attributes:
-        paths: per frame the files of right, left[, top] camera; they need not exist.
-        width, height: the calibrated size in pixels.
-        bits: that pixels of 16 bits hold.
+    Raises:
+        DatasetError: two images carry the same number.
     """
-
-    paths: tuple[tuple[Path, ...], ...]
-    width: int
-    height: int
-    bits: int = 16
-
-    def load(self, index: int) -> tuple[Image, ...]:
-        """Images of a frame. Raises FrameError when one is missing, damaged or of another size."""
-        return tuple(
-            read_sized_image(path, self.width, self.height, self.bits) for path in self.paths[index]
-        )
-
-    def load_colour(self, index: int) -> tuple[Image, ...]:
-        """The same in red, green, blue."""
-        return tuple(
-            sized(read_colour_image(path, self.bits), f"image {path}", self.width, self.height)
-            for path in self.paths[index]
-        )
-
-    def with_bits(self) -> tuple[StereoFiles, tuple[str, ...]]:
-        """The same, with as many bits as the right images hold, and what to tell of them."""
-        right = [paths[0] for paths in self.paths]
-        bits, notes = bits_of(right)
-        seen = mosaic_note(len(right), lambda frame: read_grey_image(right[frame], bits))
-        return replace(self, bits=bits), (*notes, *seen)
-
-    def first_images(self) -> tuple[Image, ...] | None:
-        """Images of the first frame that can be read, whatever their size; None without any."""
-        for paths in self.paths:
-            try:
-                return tuple(read_grey_image(path) for path in paths)
-            except FrameError:
-                continue
-        return None
-
-
-@dataclass(frozen=True, eq=False)
-class RawImages:
-    """Raw images of a rig, rectified when read."""
-
-    files: StereoFiles
-    rig: StereoRig
-
-    def load(self, index: int) -> tuple[Image, ...]:
-        """Rectified (right, left[, top]) images. Raises FrameError as StereoFiles does."""
-        return self.rig.rectified(self.files.load(index))
-
-    def load_colour(self, index: int) -> tuple[Image, ...]:
-        """The same in red, green, blue."""
-        return self.rig.rectified(self.files.load_colour(index))
+    numbered: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in IMAGE_SUFFIXES or not path.stem.isdecimal():
+            continue
+        number = int(path.stem)
+        if number in numbered:
+            raise DatasetError(
+                f"{folder} has two images of frame {number}: {numbered[number].name} and "
+                f"{path.name}; remove one"
+            )
+        numbered[number] = path
+    return numbered
 
 
 def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
@@ -334,66 +313,6 @@ def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
     return None
 
 
-def size(image: Image) -> str:
-    """Width and height in words."""
-    return f"{image.shape[1]}x{image.shape[0]}"
-
-
-def check_sizes(files: StereoFiles, where: Path) -> None:
-    """Compare the first readable frame with the calibration; later frames are checked when read.
-
-    Raises:
-        DatasetError: no frame can be read, or the cameras' images differ in size.
-        CalibrationError: their size is not the calibrated one.
-    """
-    images = files.first_images()
-    if images is None:
-        raise DatasetError(
-            f"{where}: not one of {len(files.paths)} frames has a readable image from each of "
-            f"{len(files.paths[0])} cameras; {_why_unreadable(files.paths[0])}"
-        )
-    sizes = [size(image) for image in images]
-    if len(set(sizes)) > 1:
-        named = ", ".join(f"{n} {s}" for n, s in zip(CAMERA_NAMES, sizes, strict=False))
-        raise DatasetError(
-            f"{where}: the cameras' images differ in size ({named}); all must be rectified to one "
-            "size: resize the larger ones, and calibrate them so"
-        )
-    if sizes[0] != f"{files.width}x{files.height}":
-        raise CalibrationError(
-            f"{where}: images are {sizes[0]} but the calibration says {files.width}x{files.height}"
-            "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
-        )
-
-
-def _why_unreadable(paths: Sequence[Path]) -> str:
-    """What is wrong with the images of the first frame."""
-    if not all(path.exists() for path in paths):
-        return "check that the file names fit the list of times"
-    try:
-        for path in paths:
-            read_grey_image(path)
-    except FrameError as error:
-        return f"of the first: {error}"
-    return "restore the files"
-
-
-def missing_notes(files: StereoFiles, stamps: FloatArray) -> tuple[str, ...]:
-    """In words, which frames lack an image (existence only: damage shows when reading)."""
-    missing = [
-        (k, CAMERA_NAMES[c])
-        for k, paths in enumerate(files.paths)
-        for c, path in enumerate(paths)
-        if not path.is_file()
-    ]
-    frames = sorted({k for k, _ in missing})
-    if not frames:
-        return ()
-    first = ", ".join(f"{k} ({camera})" for k, camera in missing[:_NAMED_IN_NOTES])
-    more = ", ..." if len(missing) > _NAMED_IN_NOTES else ""
-    return (f"{len(frames)} of {len(stamps)} frames lack an image: {first}{more}",)
-
-
 def require_folder(path: Path, what: str) -> None:
     """Raises DatasetError unless the folder exists."""
     if not path.is_dir():
@@ -401,3 +320,98 @@ def require_folder(path: Path, what: str) -> None:
             f"{what} {path} does not exist; check dataset.path and the layout, or say where the "
             "recording is: --set dataset.path=FOLDER"
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFiles:
+    """Images of every frame in files, rectified when read.
+
+    Attributes:
+        paths: per frame the files of right, left[, top] camera; they need not exist.
+        rig: of the cameras.
+        bits: that pixels of 16 bits hold.
+    """
+
+    paths: tuple[tuple[Path, ...], ...]
+    rig: StereoRig
+    bits: int = 16
+
+    def load(self, index: int, colour: bool = False) -> tuple[Image, ...]:
+        """Rectified images. Raises FrameError: one is missing, damaged or of another size."""
+        read = read_colour_image if colour else read_grey_image
+        size = self.rig.image_size
+        return self.rig.rectified(
+            tuple(
+                require_size(read(path, self.bits), f"image {path}", *size)
+                for path in self.paths[index]
+            )
+        )
+
+
+def open_frames(
+    paths: Sequence[tuple[Path, ...]], rig: StereoRig, where: Path
+) -> tuple[FrameFiles, tuple[str, ...]]:
+    """Files of frames, of which the first readable one is checked, and what was noticed.
+
+    Raises:
+        DatasetError: no frame can be read, or the cameras' images differ in size.
+        CalibrationError: their size is not the calibrated one.
+    """
+    if not paths:  # refused where frames are selected
+        return FrameFiles((), rig), ()
+    _check_sizes(paths, rig.image_size, where)
+    right = [frame[0] for frame in paths]
+    bits, held = bits_of(right)
+    mosaic = mosaic_note(len(right), lambda k: read_grey_image(right[k], bits))
+    return FrameFiles(tuple(paths), rig, bits), (*held, *mosaic, *_missing_note(paths))
+
+
+def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where: Path) -> None:
+    images, fault = None, None
+    for frame in paths:
+        try:
+            images = [read_grey_image(path) for path in frame]
+        except FrameError as error:
+            fault = fault or error
+            continue
+        break
+    if images is None:
+        there = all(path.exists() for path in paths[0])
+        why = (
+            f"of the first: {fault}" if there else "check that the file names fit the list of times"
+        )
+        raise DatasetError(
+            f"{where}: not one of {len(paths)} frames has a readable image from each of "
+            f"{len(paths[0])} cameras; {why}"
+        )
+    sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
+    if len(set(sizes)) > 1:
+        named = ", ".join(f"{n} {s}" for n, s in zip(CAMERA_NAMES, sizes, strict=False))
+        raise DatasetError(
+            f"{where}: the cameras' images differ in size ({named}); all must be rectified to one "
+            "size: resize the larger ones, and calibrate them so"
+        )
+    if sizes[0] != f"{size[0]}x{size[1]}":
+        raise CalibrationError(
+            f"{where}: images are {sizes[0]} but the calibration says {size[0]}x{size[1]}"
+            "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
+        )
+
+
+_NAMED_IN_NOTES = 5
+
+
+def _missing_note(paths: Sequence[tuple[Path, ...]]) -> tuple[str, ...]:
+    """Which frames lack an image (existence only: damage shows when reading)."""
+    missing = [
+        (k, CAMERA_NAMES[c])
+        for k, frame in enumerate(paths)
+        for c, path in enumerate(frame)
+        if not path.is_file()
+    ]
+    if not missing:
+        return ()
+    first = ", ".join(f"{k} ({camera})" for k, camera in missing[:_NAMED_IN_NOTES])
+    more = ", ..." if len(missing) > _NAMED_IN_NOTES else ""
+    count = len({k for k, _ in missing})
+    return (f"{count} of {len(paths)} frames lack an image: {first}{more}",)

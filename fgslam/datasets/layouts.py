@@ -1,25 +1,27 @@
-"""The layout of a recording: of a folder by the files in it, of files by their endings."""
+"""Layouts of recordings: of a folder by the files in it, of files by their endings.
+
+Needs no image library and no arrays: commands recognise layouts before these are loaded.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import shown_in
-from fgslam.core.sides import camera_pairs, camera_trio, is_view
-from fgslam.datasets.loose_files import (
-    IMAGE_SUFFIXES,
-    find_cameras,
-    images_in,
-    natural,
-    one_camera,
-)
+from fgslam.core.sides import camera_pairs, camera_trio, differ_in_number, is_view
 
-_DRIVE = ("image_0", "image_1", "calib.txt", "times.txt")
-_RUN_CONFIG = "config.yaml"
+IMAGE_SUFFIXES = (
+    *(".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".tif", ".tiff", ".webp"),
+)
+VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv")
+_PLAIN_BAGS = (".bag", ".db3", ".mcap")
+_PACKED_BAG = ".zstd"
+_INSIDE = "data"  # where EuRoC and KITTI keep a camera's images
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class Layout:
 
     name: str
     lacking: Callable[[Path], tuple[str, ...]]
-    begun: Callable[[Path], bool]
+    begun: Callable[[Path], bool] = lambda folder: False
     endings: tuple[str, ...] = ()
     last: bool = False
 
@@ -58,11 +60,13 @@ def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
     fitting = fitting_layouts(folder)
     if kind not in LAYOUTS:
         if len(fitting) > 1:
-            raise DatasetError(_ambiguous(folder, fitting))
+            names = "; ".join(_with_lacking(folder, LAYOUTS[kind]) for kind in fitting)
+            raise DatasetError(
+                f"{folder} fits several layouts equally well: {names}; say which, e.g. --set "
+                f"dataset.kind={fitting[0]}"
+            )
         kind = fitting[0]
-    if kind == "kitti":
-        return _kitti_keys(folder)
-    return {"kind": kind, "path": str(folder)}
+    return _kitti_keys(folder) if kind == "kitti" else {"kind": kind, "path": str(folder)}
 
 
 def fitting_layouts(given: Path) -> tuple[str, ...]:
@@ -100,51 +104,6 @@ def files_of(given: Path) -> list[Path]:
     return sorted((path for path in found if not path.name.startswith(".")), key=natural)
 
 
-def _fitting_files(given: Path) -> tuple[str, ...]:
-    files = files_of(given)
-    if not files or not all(file.exists() for file in files):
-        raise DatasetError(
-            f"{given}: no such folder or experiment file; give the folder of a recording, its "
-            "file, or an experiment's .yaml"
-        )
-    fitting = tuple(kind for kind, layout in LAYOUTS.items() if _all_end(files, layout))
-    if not fitting and (remedy := _REMEDIES.get(files[0].suffix.lower())):
-        raise DatasetError(f"{given} is not read: {remedy}")
-    if not fitting:
-        known = "; ".join(
-            f"{layout.name}: {', '.join(layout.endings)}"
-            for layout in LAYOUTS.values()
-            if layout.endings
-        )
-        raise DatasetError(
-            f"{given} is neither a folder nor an experiment's .yaml nor a file of a known kind "
-            f"({known}); give the recording's folder"
-        )
-    return fitting
-
-
-_UNPACK = "unpack it, and give the folder"
-_REMEDIES = {
-    **dict.fromkeys((".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz"), _UNPACK),
-    **dict.fromkeys(
-        (".svo", ".svo2"),
-        "only the maker's program can; export it as a film of both views side by side (ZED's SVO "
-        "export), with the calibration SN*.conf by --camera",
-    ),
-    **dict.fromkeys(
-        (".oni", ".klg", ".sens", ".h5", ".hdf5"),
-        "export its images to folders, as rgb/ and depth/, or left/ and right/",
-    ),
-}
-"""What to do with files of recordings that others' programs alone can read."""
-
-
-def _all_end(files: list[Path], layout: Layout) -> bool:
-    if layout.last and len(files) < 2:
-        return False
-    return all(file.is_file() and file.suffix.lower() in layout.endings for file in files)
-
-
 def layout_hint(folder: Path, kind: str) -> str:
     """What to set where the folder has another layout than that of ``kind``; else empty."""
     try:
@@ -159,58 +118,69 @@ def layout_hint(folder: Path, kind: str) -> str:
     return f"this is {'an' if name[0] in 'aeiouE' else 'a'} {name} folder: {keys}"
 
 
-def kitti_drives(root: Path) -> tuple[str, ...]:
-    """Names of the drives (two digits) in a KITTI odometry folder, ascending; perhaps none."""
-    parent = root / "sequences"
-    if not parent.is_dir():
-        return ()
-    return tuple(
-        sorted(
-            path.name
-            for path in parent.iterdir()
-            if path.is_dir() and len(path.name) == 2 and path.name.isdecimal()
+def _fitting_files(given: Path) -> tuple[str, ...]:
+    files = files_of(given)
+    if not files or not all(file.exists() for file in files):
+        raise DatasetError(
+            f"{given}: no such folder or experiment file; give the folder of a recording, its "
+            "file, or an experiment's .yaml"
         )
-    )
-
-
-def _kitti_keys(folder: Path) -> dict[str, str]:
-    """A drive's own folder is ROOT/sequences/NN; of a root the first drive is taken."""
-    if kitti_drives(folder):
-        return {"kind": "kitti", "path": str(folder), "sequence": kitti_drives(folder)[0]}
-    if _is_drive(folder):
-        here = folder.resolve()
-        return {"kind": "kitti", "path": str(here.parent.parent), "sequence": here.name}
+    fitting = tuple(kind for kind, layout in LAYOUTS.items() if _all_end(files, layout))
+    if fitting:
+        return fitting
+    if remedy := _REMEDIES.get(files[0].suffix.lower()):
+        raise DatasetError(f"{given} is not read: {remedy}")
+    known = [f"{kind.name}: {', '.join(kind.endings)}" for kind in LAYOUTS.values() if kind.endings]
     raise DatasetError(
-        f"{folder} looks like one KITTI drive, but it is not in a folder sequences/ under two "
-        "digits; move it to ROOT/sequences/00 (its poses to ROOT/poses/00.txt) and give ROOT"
+        f"{given} is neither a folder nor an experiment's .yaml nor a file of a known kind "
+        f"({'; '.join(known)}); give the recording's folder"
     )
 
 
-def _ambiguous(folder: Path, fitting: tuple[str, ...]) -> str:
-    names = "; ".join(_with_lacking(folder, LAYOUTS[kind]) for kind in fitting)
-    return (
-        f"{folder} fits several layouts equally well: {names}; say which, e.g. --set "
-        f"dataset.kind={fitting[0]}"
-    )
+def _all_end(files: list[Path], layout: Layout) -> bool:
+    if layout.last and len(files) < 2:
+        return False
+    return all(file.is_file() and file.suffix.lower() in layout.endings for file in files)
+
+
+_REMEDIES = {
+    **dict.fromkeys(
+        (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz"),
+        "unpack it, and give the folder",
+    ),
+    **dict.fromkeys(
+        (".svo", ".svo2"),
+        "only the maker's program can; export it as a film of both views side by side (ZED's SVO "
+        "export), with the calibration SN*.conf by --camera",
+    ),
+    **dict.fromkeys(
+        (".oni", ".klg", ".sens", ".h5", ".hdf5"),
+        "export its images to folders, as rgb/ and depth/, or left/ and right/",
+    ),
+}
+"""What to do with files of recordings that others' programs alone can read."""
 
 
 def _unknown(folder: Path) -> str:
     """What was looked for in each layout, and what of it is missing."""
-    if (folder / _RUN_CONFIG).is_file():
+    if (folder / "config.yaml").is_file():
         return (
             f"{folder} is a run folder, not a recording; give what it was made from: "
-            f"{folder / _RUN_CONFIG}"
+            f"{folder / 'config.yaml'}"
         )
     if not shown_in(folder):
         return f"{folder} is empty; give the folder of a recording, docs/datasets/ has the layouts"
     if inside := _recordings_in(folder):
         return f"{folder} has none of the known layouts; in it has {inside}: give that folder"
-    if (alone := one_camera(folder)) is not None:
+    places = [path for path in shown_in(folder) if path.is_dir()]
+    places = [folder, *places, *(path / _INSIDE for path in places)]
+    with_images = [path for path in places if path.is_dir() and images_in(path)]
+    if len(with_images) == 1:
         return (
-            f"{alone} holds images of one camera only; a stereo pair is the least, beside a "
-            "gyroscope, too: images of a left and a right camera by the names of folders or files "
-            "(of a mirror or panoramas: fgslam teach; where each shows both views side by side, "
-            "cut them into left/ and right/, or make a film of them, which is read as it is)"
+            f"{with_images[0]} holds images of one camera only; a stereo pair is the least, beside "
+            "a gyroscope, too: images of a left and a right camera by the names of folders or "
+            "files (of a mirror or panoramas: fgslam teach; where each shows both views side by "
+            "side, cut them into left/ and right/, or make a film of them, which is read as it is)"
         )
     for path in shown_in(folder):
         if path.is_file() and (remedy := _REMEDIES.get(path.suffix.lower())):
@@ -219,7 +189,7 @@ def _unknown(folder: Path) -> str:
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
 
 
-_LOOKED_INTO = 50  # folders of one level
+_SEARCHED = 50  # folders of one level
 
 
 def _recordings_in(folder: Path) -> str:
@@ -227,17 +197,16 @@ def _recordings_in(folder: Path) -> str:
     level = [folder]
     for _ in range(2):
         inside = [path for above in level for path in shown_in(above)]
-        level = [path for path in inside if path.is_dir() and is_view(path.name)]
-        level = level[:_LOOKED_INTO]
-        found = [str(path) for path in level if _has_layout(path)]
+        level = [path for path in inside if path.is_dir() and is_view(path.name)][:_SEARCHED]
+        found = [
+            str(path)
+            for path in level
+            if any(not layout.lacking(path) for layout in LAYOUTS.values())
+        ]
         if found:
             more = f" or {len(found) - 3} more" if len(found) > 3 else ""
             return " or ".join(found[:3]) + more
     return ""
-
-
-def _has_layout(folder: Path) -> bool:
-    return any(not layout.lacking(folder) for layout in LAYOUTS.values())
 
 
 def _with_lacking(folder: Path, layout: Layout) -> str:
@@ -245,50 +214,72 @@ def _with_lacking(folder: Path, layout: Layout) -> str:
     return f"{layout.name} (lacks {', '.join(lacking)})" if lacking else layout.name
 
 
-# --------------------------------------------------------------------------------------------
-# What each layout needs, and what tells it from the others
-
-
-def _absent(folder: Path, parts: tuple[str, ...]) -> tuple[str, ...]:
+def _absent(folder: Path, *parts: str) -> tuple[str, ...]:
     return tuple(part for part in parts if not (folder / part).exists())
 
 
-def _lacking_of_euroc(folder: Path) -> tuple[str, ...]:
-    inside = folder / "mav0" if (folder / "mav0").is_dir() else folder
-    cameras = _absent(inside, ("cam0", "cam1"))
-    lists = () if cameras else _absent(inside, ("cam0/data.csv", "cam1/data.csv"))
-    return tuple(f"mav0/{part}" for part in (*cameras, *lists))
+# --------------------------------------------------------------------------------------------
+# KITTI, EuRoC
 
 
-def _euroc_begun(folder: Path) -> bool:
-    return (folder / "mav0").is_dir() or (folder / "cam0" / "sensor.yaml").is_file()
+def kitti_drives(root: Path) -> tuple[str, ...]:
+    """Names of the drives (two digits) in a KITTI odometry folder, ascending; perhaps none."""
+    names = sorted(path.name for path in root.glob("sequences/??") if path.is_dir())
+    return tuple(name for name in names if name.isdecimal())
 
 
-def _lacking_of_kitti(folder: Path) -> tuple[str, ...]:
-    if kitti_drives(folder) or _is_drive(folder):
-        return ()
-    drive = ", ".join(_absent(folder, _DRIVE)) or "its place in ROOT/sequences/NN"
-    return ("sequences/NN", f"or of one drive {drive}")
+def _kitti_keys(folder: Path) -> dict[str, str]:
+    """A drive's own folder is ROOT/sequences/NN; of a root the first drive is taken."""
+    if drives := kitti_drives(folder):
+        return {"kind": "kitti", "path": str(folder), "sequence": drives[0]}
+    if _is_kitti_drive(folder):
+        here = folder.resolve()
+        return {"kind": "kitti", "path": str(here.parent.parent), "sequence": here.name}
+    raise DatasetError(
+        f"{folder} looks like one KITTI drive, but it is not in a folder sequences/ under two "
+        "digits; move it to ROOT/sequences/00 (its poses to ROOT/poses/00.txt) and give ROOT"
+    )
 
 
-def _kitti_begun(folder: Path) -> bool:
-    return (folder / "image_0").is_dir() or (folder / "image_1").is_dir()
-
-
-def _is_drive(folder: Path) -> bool:
+def _is_kitti_drive(folder: Path) -> bool:
     """Whether this is one KITTI drive in its place, ROOT/sequences/NN."""
     here = folder.resolve()
     return here.parent.name == "sequences" and here.name in kitti_drives(here.parent.parent)
 
 
-def _image_folder_begun(folder: Path) -> bool:
-    pair = (folder / "left").is_dir() or (folder / "right").is_dir()
-    return pair or not _absent(folder, ("calib.json", "times.txt"))
+def _lacking_of_kitti(folder: Path) -> tuple[str, ...]:
+    if kitti_drives(folder) or _is_kitti_drive(folder):
+        return ()
+    drive = _absent(folder, "image_0", "image_1", "calib.txt", "times.txt")
+    return (
+        "sequences/NN",
+        f"or of one drive {', '.join(drive) or 'its place in ROOT/sequences/NN'}",
+    )
 
 
-_PLAIN_BAGS = (".bag", ".db3", ".mcap")
-_PACKED = ".zstd"
-BAG_ENDINGS = (*_PLAIN_BAGS, _PACKED)
+def kitti_raw_drive(folder: Path) -> Path | None:
+    """The folder of a KITTI raw drive: this one, or the only one in the folder of a date."""
+    if any((folder / name / "timestamps.txt").is_file() for name in ("image_00", "image_02")):
+        return folder
+    places = (folder, folder / "data_2d_raw")  # KITTI-360 has it in there
+    inside = [p for place in places for p in place.glob("*_drive_*") if p.is_dir()]
+    return kitti_raw_drive(inside[0]) if len(inside) == 1 else None
+
+
+def _lacking_of_kitti_raw(folder: Path) -> tuple[str, ...]:
+    if kitti_raw_drive(folder) is not None:
+        return ()
+    return "image_00/data and image_01/data, or image_02 and image_03", "timestamps.txt"
+
+
+def _lacking_of_euroc(folder: Path) -> tuple[str, ...]:
+    inside = folder / "mav0" if (folder / "mav0").is_dir() else folder
+    absent = _absent(inside, "cam0", "cam1") or _absent(inside, "cam0/data.csv", "cam1/data.csv")
+    return tuple(f"mav0/{part}" for part in absent)
+
+
+# --------------------------------------------------------------------------------------------
+# Files: bags, films
 
 
 def is_bag(file: Path) -> bool:
@@ -298,58 +289,29 @@ def is_bag(file: Path) -> bool:
 
 def is_packed_bag(file: Path) -> bool:
     """Whether it is one of ROS 2 that is compressed as a whole (compression mode file)."""
-    return file.suffix == _PACKED and Path(file.stem).suffix in BAG_ENDINGS
-
-
-def _lacking_of_bag(folder: Path) -> tuple[str, ...]:
-    found = any(map(is_bag, shown_in(folder)))
-    return () if found else ("a file *.bag, *.db3 or *.mcap",)
-
-
-def _lacking_of_kitti_raw(folder: Path) -> tuple[str, ...]:
-    drive = kitti_raw_drive(folder)
-    if drive is None:
-        return ("image_00/data and image_01/data, or image_02 and image_03", "timestamps.txt")
-    return ()
-
-
-def kitti_raw_drive(folder: Path) -> Path | None:
-    """The folder of a KITTI raw drive: this one, or the only one in the folder of a date."""
-    if (folder / "image_00" / "timestamps.txt").is_file() or (
-        folder / "image_02" / "timestamps.txt"
-    ).is_file():
-        return folder
-    places = (folder, folder / "data_2d_raw")  # KITTI-360 has it in there
-    inside = [p for place in places for p in place.glob("*_drive_*") if p.is_dir()]
-    return kitti_raw_drive(inside[0]) if len(inside) == 1 else None
-
-
-VIDEO_ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg", ".wmv")
+    return file.suffix == _PACKED_BAG and Path(file.stem).suffix in (*_PLAIN_BAGS, _PACKED_BAG)
 
 
 def films_in(given: Path) -> list[Path]:
     """The film, or the left, right[, third] one, of a file, folder or pattern; none if unclear."""
     within = sorted(shown_in(given), key=natural) if given.is_dir() else files_of(given)
     films = {p.name: p for p in within if p.suffix.lower() in VIDEO_ENDINGS and p.is_file()}
-    pairs = camera_pairs(films)
     if len(films) == 1:
         return list(films.values())
     if len(films) == 3:
         return [films[name] for name in camera_trio(films)]
+    pairs = camera_pairs(films)
     return [films[name] for name in pairs[0]] if len(pairs) == 1 and len(films) == 2 else []
 
 
-def _lacking_of_video(folder: Path) -> tuple[str, ...]:
-    lacking = "one film, or one of a left and one of a right camera (and one of a top one)"
-    return () if films_in(folder) else (lacking,)
+# --------------------------------------------------------------------------------------------
+# Colour and depth
 
 
 _COLOUR_FOLDERS = (
     *("rgb", "color", "colour", "image", "images"),
     *("rgbs", "colors", "rgb_images", "color_images"),
 )
-
-
 _DEPTH_FOLDERS = (
     *("aligned_depth", "aligned_depth_to_color", "depth_aligned", "depth"),
     *("depths", "depth_images", "depth_image"),
@@ -366,6 +328,11 @@ def colour_and_depth(folder: Path) -> tuple[Path, Path] | None:
     return None if colour is None or depth is None else (colour, depth)
 
 
+def numbers_in(stem: str) -> list[int]:
+    """All numbers of a name."""
+    return [int(n) for n in re.findall(r"\d+", stem)]
+
+
 def colour_and_depth_files(folder: Path) -> tuple[list[Path], list[Path]] | None:
     """Colour and depth images of a folder that holds both; None where it does not.
 
@@ -375,8 +342,10 @@ def colour_and_depth_files(folder: Path) -> tuple[list[Path], list[Path]] | None
     found = images_in(folder)
     depths = [path for path in found if "depth" in path.stem.lower()]
     colours = [path for path in found if "depth" not in path.stem.lower()]
-    numbers = [[re.findall(r"\d+", path.stem) for path in files] for files in (colours, depths)]
-    return (colours, depths) if depths and numbers[0] == numbers[1] else None
+    alike = [numbers_in(path.stem) for path in colours] == [
+        numbers_in(path.stem) for path in depths
+    ]
+    return (colours, depths) if depths and alike else None
 
 
 def _lacking_of_rgbd(folder: Path) -> tuple[str, ...]:
@@ -384,33 +353,214 @@ def _lacking_of_rgbd(folder: Path) -> tuple[str, ...]:
     if folders or colour_and_depth_files(folder):
         deeper = [path.name for path in folders or () if not images_in(path) and shown_in(path)]
         return tuple(f"images right in {name}" for name in deeper)
-    return _absent(folder, ("depth",)) or ("rgb, or color",)
+    return _absent(folder, "depth") or ("rgb, or color",)
 
 
-def _lacking_of_loose_images(folder: Path) -> tuple[str, ...]:
-    found = find_cameras(folder)
-    return () if found else ("images of a left and a right camera, by their names",)
+# --------------------------------------------------------------------------------------------
+# Images of two cameras in folders with any names: which files they are
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFiles:
+    """Image files of both cameras, each in natural order.
+
+    Attributes:
+        left, right: the files.
+        folder: that of all.
+        interleaved: both cameras' files lie in one folder, and their names say which is which.
+        others: further pairs of folders, which are not taken.
+    """
+
+    left: tuple[Path, ...]
+    right: tuple[Path, ...]
+    folder: Path
+    interleaved: bool
+    others: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def numbered(self) -> bool:
+        """Whether numbers tell the cameras, as in a calibration's file, and not sides."""
+        left, right = (str(files[0].relative_to(self.folder)) for files in (self.left, self.right))
+        if not self.interleaved:
+            left, right = (name.partition("/")[0] for name in (left, right))
+        return differ_in_number(left, right)
+
+
+def natural(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sorts names with numbers by their values, so that 10 comes after 9; words as they are."""
+    words = re.split(r"(\d+)", path.name)
+    return tuple((int(w), "") if w.isdecimal() else (-1, w) for w in words)
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Image files of a folder, in natural order; by time where all names are times."""
+    files = (p for p in shown_in(folder) if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
+    found = sorted(files, key=natural)
+    times = time_parts([path.stem for path in found])
+    if times is None:
+        return found
+    # Digits behind the point sort as text: .98 comes after .1234567.
+    return [path for _, _, path in sorted(zip(*times, found, strict=True))]
+
+
+# Names of files that are times are numbers of ten digits or more, or a whole name of seconds to the
+# microsecond (ETH3D). Ten digits with zeros before them count images, as in KITTI's drives.
+_NAME = re.compile(r"^([1-9]\d{9,18}|\d{1,9}(?=\.\d{6,9}$))(?:\.(\d+)|[_-](\d{3,9}))?$")
+_AMID = re.compile(r"(?<!\d)([1-9]\d{9,18})(?:\.(\d+)|[_-](\d{3,9})(?!\d))?(?!\d)")
+
+
+def time_parts(names: Sequence[str]) -> tuple[list[int], list[str]] | None:
+    """Whole numbers, and digits of the fractions, of names that are times; None where they are not.
+
+    So are names that are the same but for one time, ``camera_1225719876.123_left``.
+    What follows a dash or an underscore is a fraction, with zeros before it where its width
+    varies, unless it counts by one.
+    """
+    found = [match for name in names if (match := _NAME.match(name))]
+    if len(found) < len(names):
+        found = _times_amid(names)
+    if not found:
+        return None
+    width = max(len(match[3] or "") for match in found)
+    parts = [match[2] or (match[3] or "").zfill(width) or "0" for match in found]
+    whole = [int(match[1]) for match in found]
+    if not counts_by_one([int(match[3]) for match in found if match[3]]):
+        return whole, parts
+    return (whole, ["0"] * len(whole)) if len(set(whole)) == len(whole) else None
+
+
+def _times_amid(names: Sequence[str]) -> list[re.Match[str]]:
+    """The one number in which names differ, where it may be a time and is no counter; else none."""
+    for found in zip(*(_AMID.finditer(name) for name in names), strict=False):
+        around = {
+            match.string[: match.start()] + "\0" + match.string[match.end() :] for match in found
+        }
+        if len(around) == 1 and not counts_by_one([int(match[1]) for match in found]):
+            return list(found)
+    return []
+
+
+def counts_by_one(numbers: Sequence[int]) -> bool:
+    """Whether most of the numbers are one more than that before."""
+    steps = [b - a for a, b in pairwise(numbers)]
+    return len(steps) > 0 and 2 * steps.count(1) > len(steps)
+
+
+def find_cameras(root: Path, files: Sequence[Path] | None = None) -> CameraFiles | None:
+    """The files of a left and a right camera; None where there is no such pair.
+
+    Two folders side by side (left and right, image_0 and image_1, cam0 and cam1), or one folder in
+    which names differ in the side alone, or end in the camera's number (12_0 and 12_1), or have it
+    behind the word image (image_0_12 and image_1_12).
+
+    Args:
+        root: the folder.
+        files: of it, only these; None for all.
+    """
+    if files is None:
+        if (found := _two_folders(root)) is not None:
+            return found
+        files = [path for path in images_in(root) if is_view(path.stem)]
+    named = {path.name: path for path in files}
+    pairs = camera_pairs(named, any_number=False)
+    if not pairs:
+        return next(filter(None, (_by_number(files, root, split) for split in NUMBERED)), None)
+    left, right = (tuple(sorted({named[p[k]] for p in pairs}, key=natural)) for k in (0, 1))
+    return CameraFiles(left, right, root, interleaved=True)
+
+
+def _two_folders(root: Path) -> CameraFiles | None:
+    """Two folders of images whose names differ in the side, and further pairs of them."""
+    with_images: dict[str, tuple[Path, ...]] = {}
+    for folder in (path for path in shown_in(root) if path.is_dir() and is_view(path.name)):
+        places = [place for place in (folder, folder / _INSIDE) if place.is_dir()]
+        images = next(filter(None, map(images_in, places)), [])
+        inside = camera_pairs([path.name for path in images], any_number=False)
+        both = 2 * len({name for pair in inside for name in pair}) > len(images)
+        if images and not both:  # else it holds the images of both cameras
+            with_images[folder.name] = tuple(images)
+    # Of a first and a second camera the first one may have no number: rgb and rgb2.
+    second = [(name, f"{name}2") for name in sorted(with_images) if f"{name}2" in with_images]
+    pairs = camera_pairs(with_images) or second
+    if not pairs:
+        return None
+    words = [pair for pair in pairs if not re.search(r"\d", pair[0])]
+    left, right = (words or list(pairs))[0]
+    others = tuple(pair for pair in pairs if not {left, right} & set(pair))
+    return CameraFiles(with_images[left], with_images[right], root, False, others)
+
+
+NUMBERED = (
+    re.compile(r"(.*\d)[_-](\d+)()$"),
+    re.compile(r"(.*?(?:image|img)[_-]?)(\d+)([_-].*\d.*)$", re.IGNORECASE),
+)
+"""A name with the camera's number at its end, or in it: what is before and behind."""
+
+_FEWEST_NUMBERED = 4  # files: of two pairs
+
+
+def _by_number(files: Sequence[Path], root: Path, split: re.Pattern[str]) -> CameraFiles | None:
+    """Both cameras by a number in the names, where that is one of two for all of them."""
+    ends = {path: int(match[2]) for path in files if (match := split.match(path.stem))}
+    numbers = sorted(set(ends.values()))
+    if len(ends) < len(files) or len(files) < _FEWEST_NUMBERED or numbers not in ([0, 1], [1, 2]):
+        return None
+    left, right = (tuple(path for path in files if ends[path] == n) for n in numbers)
+    moments = [{split.sub(r"\1\3", path.stem) for path in paths} for paths in (left, right)]
+    if len(moments[0] & moments[1]) * 2 < len(left):
+        return None
+    return CameraFiles(left, right, root, interleaved=True)
+
+
+# --------------------------------------------------------------------------------------------
+# The layouts
 
 
 LAYOUTS = {
     "image_folder": Layout(
         "image folder",
-        lambda folder: _absent(folder, ("left", "right", "calib.json", "times.txt")),
-        _image_folder_begun,
+        lambda folder: _absent(folder, "left", "right", "calib.json", "times.txt"),
+        lambda folder: (
+            len(_absent(folder, "left", "right")) < 2
+            or not _absent(folder, "calib.json", "times.txt")
+        ),
     ),
-    "kitti": Layout("KITTI odometry", _lacking_of_kitti, _kitti_begun),
-    "euroc": Layout("EuRoC native", _lacking_of_euroc, _euroc_begun),
-    "kitti_raw": Layout("KITTI raw", _lacking_of_kitti_raw, lambda folder: False),
-    "bag": Layout("ROS bag", _lacking_of_bag, lambda folder: False, BAG_ENDINGS),
-    "video": Layout("film", _lacking_of_video, lambda folder: False, VIDEO_ENDINGS),
+    "kitti": Layout(
+        "KITTI odometry",
+        _lacking_of_kitti,
+        lambda folder: len(_absent(folder, "image_0", "image_1")) < 2,
+    ),
+    "euroc": Layout(
+        "EuRoC native",
+        _lacking_of_euroc,
+        lambda folder: len(_absent(folder, "mav0", "cam0/sensor.yaml")) < 2,
+    ),
+    "kitti_raw": Layout("KITTI raw", _lacking_of_kitti_raw),
+    "bag": Layout(
+        "ROS bag",
+        lambda folder: (
+            () if any(map(is_bag, shown_in(folder))) else ("a file *.bag, *.db3 or *.mcap",)
+        ),
+        endings=(*_PLAIN_BAGS, _PACKED_BAG),
+    ),
+    "video": Layout(
+        "film",
+        lambda folder: (
+            ()
+            if films_in(folder)
+            else ("one film, or one of a left and one of a right camera (and one of a top one)",)
+        ),
+        endings=VIDEO_ENDINGS,
+    ),
     "rgbd": Layout(
-        "colour and depth", _lacking_of_rgbd, lambda folder: (folder / "depth.txt").is_file()
+        "colour and depth", _lacking_of_rgbd, lambda folder: not _absent(folder, "depth.txt")
     ),
     "loose_images": Layout(
         "folder of images",
-        _lacking_of_loose_images,
-        lambda folder: False,
-        IMAGE_SUFFIXES,
+        lambda folder: (
+            () if find_cameras(folder) else ("images of a left and a right camera, by their names",)
+        ),
+        endings=IMAGE_SUFFIXES,
         last=True,
     ),
 }

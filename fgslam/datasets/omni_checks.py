@@ -15,7 +15,7 @@ from fgslam.cameras.omni.panoramas import Equirectangular
 from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
-from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_settings import OmniDatasetSettings
 from fgslam.datasets.opening import open_omni
 

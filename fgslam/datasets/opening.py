@@ -5,31 +5,41 @@ A reader is imported when its kind is opened: what one needs takes others a seco
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
+import cv2
+import numpy as np
+
+from fgslam.core.arrays import Image
+from fgslam.core.errors import DatasetError
 from fgslam.core.recordings import MeasurementRecording
+from fgslam.datasets.fit import fit_notes
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
-    BagSettings,
-    EurocSettings,
     FileRecordingSettings,
-    ImageFolderSettings,
-    KittiRawSettings,
-    LooseImagesSettings,
     MeasurementDatasetSettings,
-    MeasurementFilesSettings,
     OdometrySettings,
     RecordedOdometrySettings,
-    RgbdSettings,
-    SimulatedMeasurementsSettings,
-    StereoTracksSettings,
-    VideoSettings,
 )
 
 if TYPE_CHECKING:
-    from fgslam.datasets.omni_recording import OmniRecording
+    from fgslam.datasets.omni import OmniRecording
     from fgslam.datasets.omni_settings import OmniDatasetSettings
+
+READERS: Mapping[str, Callable[[], Any]] = {
+    "image_folder": lambda: import_module("fgslam.datasets.folders").open_image_folder,
+    "loose_images": lambda: import_module("fgslam.datasets.folders").open_loose_images,
+    "video": lambda: import_module("fgslam.datasets.video").open_video,
+    "rgbd": lambda: import_module("fgslam.datasets.depth").open_rgbd,
+    "bag": lambda: import_module("fgslam.datasets.bags").open_bag,
+    "kitti": lambda: import_module("fgslam.datasets.published").open_kitti,
+    "kitti_raw": lambda: import_module("fgslam.datasets.published").open_kitti_raw,
+    "euroc": lambda: import_module("fgslam.datasets.published").open_euroc,
+}
+"""By kind of the settings what reads a recording: ``(settings, odometry) -> Recording``."""
 
 
 def open_recording(
@@ -45,73 +55,62 @@ def open_recording(
         DatasetError: the recording is missing, malformed or empty.
         CalibrationError: its calibration is missing or impossible.
     """
-    found = _opened(settings, odometry or RecordedOdometrySettings())
-    found = _judged(found) if found.unrectified else found
-    if settings.scale == 1.0:
-        return found
-    from fgslam.datasets.smaller import smaller
-
-    return smaller(found, settings.scale)
+    found: Recording = READERS[settings.kind]()(settings, odometry or RecordedOdometrySettings())
+    if found.unrectified:
+        misfit = fit_notes(lambda i: found.frame(i).images, len(found))
+        found = replace(found, notes=(*misfit, *found.notes))
+    return found if settings.scale == 1.0 else smaller(found, settings.scale)
 
 
-def _judged(recording: Recording) -> Recording:
-    """With a note where its calibration does not fit its images."""
-    from fgslam.datasets.checks.fit import fit_notes
-
-    notes = fit_notes(lambda i: recording.frame(i).images, len(recording))
-    return replace(recording, notes=(*notes, *recording.notes))
+_SMALLEST_PX = 8  # SIFT finds nothing in less
 
 
-def _opened(settings: FileRecordingSettings, odometry: RecordedOdometrySettings) -> Recording:
-    if isinstance(settings, _WithOdometry):
-        return _open_with_odometry(settings, odometry)
-    if isinstance(settings, _FilmOrDepth):
-        return _open_film_or_depth(settings, odometry)
-    from fgslam.datasets.kitti import open_kitti
+def smaller(recording: Recording, scale: float) -> Recording:
+    """The recording with rectified images smaller by a factor ``scale``, the calibration with them.
 
-    return open_kitti(settings)
+    Pixels are averaged over what they cover. Noise that the recording states is in pixels of the
+    images it gives.
 
+    Raises:
+        DatasetError: nothing would be left of the images.
+    """
+    rig = recording.rig
+    size = (max(round(scale * rig.width), 1), max(round(scale * rig.height), 1))
+    if min(size) < _SMALLEST_PX:
+        raise DatasetError(
+            f"dataset.scale {scale:g} makes images of {size[0]}x{size[1]} pixels of "
+            f"{rig.width}x{rig.height}; choose a larger one"
+        )
+    x, y = size[0] / rig.width, size[1] / rig.height
+    margins = () if recording.rectifier is None else recording.rectifier.margins
 
-_FilmOrDepth: TypeAlias = VideoSettings | RgbdSettings
+    def load(index: int, colour: bool) -> tuple[Image, ...]:
+        return tuple(
+            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            for image in recording.load_images(index, colour)
+        )
 
-
-def _open_film_or_depth(settings: _FilmOrDepth, odometry: RecordedOdometrySettings) -> Recording:
-    if isinstance(settings, VideoSettings):
-        from fgslam.datasets.stereo_video import open_video
-
-        return open_video(settings)
-    from fgslam.datasets.rgbd import open_rgbd
-
-    return open_rgbd(settings, odometry)
-
-
-_WithOdometry: TypeAlias = (
-    ImageFolderSettings | LooseImagesSettings | EurocSettings | KittiRawSettings | BagSettings
-)
-
-
-def _open_with_odometry(settings: _WithOdometry, odometry: RecordedOdometrySettings) -> Recording:
-    match settings:
-        case ImageFolderSettings():
-            from fgslam.datasets.image_folder import open_image_folder
-
-            return open_image_folder(settings, odometry)
-        case LooseImagesSettings():
-            from fgslam.datasets.loose_images import open_loose_images
-
-            return open_loose_images(settings, odometry)
-        case EurocSettings():
-            from fgslam.datasets.euroc import open_euroc
-
-            return open_euroc(settings, odometry)
-        case KittiRawSettings():
-            from fgslam.datasets.kitti_raw import open_kitti_raw
-
-            return open_kitti_raw(settings, odometry)
-        case BagSettings():
-            from fgslam.datasets.bags.reader import open_bag
-
-            return open_bag(settings, odometry)
+    return replace(
+        recording,
+        rig=replace(
+            rig,
+            width=size[0],
+            height=size[1],
+            fx=x * rig.fx,
+            fy=y * rig.fy,
+            # Whole pixels are at their centres: the image reaches from -0.5.
+            cx=x * (rig.cx + 0.5) - 0.5,
+            cy=y * (rig.cy + 0.5) - 0.5,
+        ),
+        margins=tuple(
+            scale * cv2.resize(m, size, interpolation=cv2.INTER_NEAREST) for m in margins
+        ),
+        load_images=load,
+        notes=(
+            f"images of {rig.width}x{rig.height} are made {size[0]}x{size[1]}",
+            *recording.notes,
+        ),
+    )
 
 
 def open_measurements(
@@ -130,19 +129,17 @@ def open_measurements(
         ConfigError: a simulated drive cannot be driven, or synthetic odometry is asked for.
     """
     odometry = odometry or RecordedOdometrySettings()
-    match settings:
-        case SimulatedMeasurementsSettings():
-            from fgslam.datasets.simulated_measurements import open_simulated_measurements
+    if settings.kind == "stereo_tracks":
+        from fgslam.datasets.stereo_tracks import open_stereo_tracks
 
-            return open_simulated_measurements(settings, seed, odometry)
-        case StereoTracksSettings():
-            from fgslam.datasets.stereo_tracks import open_stereo_tracks
+        return open_stereo_tracks(settings, odometry)
+    if settings.kind == "measurements":
+        from fgslam.datasets.measurement_files import open_measurement_files
 
-            return open_stereo_tracks(settings, odometry)
-        case MeasurementFilesSettings():
-            from fgslam.datasets.measurement_files import open_measurement_files
+        return open_measurement_files(settings, odometry)
+    from fgslam.datasets.simulated_measurements import open_simulated_measurements
 
-            return open_measurement_files(settings, odometry)
+    return open_simulated_measurements(settings, seed, odometry)
 
 
 def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
@@ -152,10 +149,10 @@ def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
         DatasetError: it is missing, malformed or empty; of these CalibrationError, where the
             camera is concerned, and FrameError, where the first picture cannot be read.
     """
+    from fgslam.datasets import omni
+
     if settings.kind == "panoramas":
-        from fgslam.datasets.panoramas import open_panoramas
-
-        return open_panoramas(settings)
-    from fgslam.datasets.mirror_images import open_omni_path, open_omni_video
-
-    return open_omni_path(settings) if settings.kind == "omni_path" else open_omni_video(settings)
+        return omni.open_panoramas(settings)
+    if settings.kind == "omni_path":
+        return omni.open_omni_path(settings)
+    return omni.open_omni_video(settings)

@@ -1,35 +1,36 @@
-"""The one implementation of the Sequence protocol that all readers of files return.
-
-Which frames are used: ``start``, ``stop``, ``stride``, as a Python slice.
-"""
+"""A recording of images: its rig, which of its frames are used, and what all its readers return."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.lenses import Calibration
 from fgslam.cameras.rectify import Rectifier
+from fgslam.cameras.rig import StereoRig, at_size, in_metres, load_rig, rig_of
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
-from fgslam.core.errors import DatasetError
+from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.estimates import Trajectory
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, body_is_camera
 from fgslam.core.settings import FrameSelection
-from fgslam.datasets.settings import RecordingSettings
+from fgslam.datasets.odometry import OdometrySource, is_of_gyroscope
+from fgslam.datasets.settings import CalibratedSettings, RecordingSettings
 
-ImageLoader: TypeAlias = Callable[[int], tuple[Image, ...]]
-"""Images (right, left[, top]) of one of the recording's own frames; raises FrameError."""
+Rig = TypeVar("Rig", bound=CameraRig)
 
-OdometrySource: TypeAlias = Callable[[FloatArray], tuple[Odometry | None, ...]]
-"""Body motions between consecutive stamps (n,): n - 1 of them, None where nothing was recorded."""
+ImageLoader: TypeAlias = Callable[[int, bool], tuple[Image, ...]]
+"""Images (right, left[, top]) of one of the recording's own frames, grey or, where the flag is set,
+in red, green, blue if it has colour; raises FrameError."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,29 +42,27 @@ class Recording(Brief):
         rig: the rectified cameras.
         timestamps: (n,) seconds of the selected frames, strictly increasing.
         identity: hexadecimal digest of the recording.
-        ground_truth: true poses of the reference camera at the selected frames, or None.
         notes: what was tolerated when opening.
         indices: (n,) the recording's own numbers of the selected frames.
         load_images: reads the images of one of the recording's own frames.
-        load_colour: reads them in red, green, blue; None where they are grey anyway.
-        disparity_sigma_px: noise of the disparity where a depth camera gives it, or None.
+        ground_truth: true poses of the reference camera at the selected frames, or None.
         odometry_source: where the body's motions come from, or None. Asked once, when first
             needed, so that a bad odometry file hurts only who uses it.
         rectifier: what makes the images its own that the cameras gave; None where they are stored
             rectified.
         margins: of frames, in place of the rectifier's.
+        disparity_sigma_px: noise of the disparity where a depth camera gives it, or None.
     """
 
     name: str
     rig: CameraRig
     timestamps: FloatArray
     identity: str
-    ground_truth: Trajectory | None
     notes: tuple[str, ...]
     indices: IntArray
     load_images: ImageLoader
+    ground_truth: Trajectory | None = None
     odometry_source: OdometrySource | None = None
-    load_colour: ImageLoader | None = None
     rectifier: Rectifier | None = None
     margins: tuple[npt.NDArray[np.float32], ...] = ()
     disparity_sigma_px: float | None = None
@@ -83,12 +82,12 @@ class Recording(Brief):
         margins = self.margins
         if self.rectifier is not None:
             margins = margins or self.rectifier.margins
-        return Frame(index, float(self.timestamps[i]), self.load_images(index), margins)
+        return Frame(index, float(self.timestamps[i]), self.load_images(index, False), margins)
 
     def colour(self, i: int) -> tuple[Image, ...]:
         """Images of frame ``i`` in red, green, blue, or grey where the recording is. FrameError."""
         self._check_index(i, 0)
-        return (self.load_colour or self.load_images)(int(self.indices[i]))
+        return self.load_images(int(self.indices[i]), True)
 
     def odometry(self, i: int) -> Odometry | None:
         """Body motion from frame ``i - 1`` to ``i``, 1 <= i < len; None where none was recorded.
@@ -109,6 +108,38 @@ class Recording(Brief):
             raise IndexError(f"frame {i} of {self.name}: expected {least} to {len(self) - 1}")
 
 
+def image_recording(
+    settings: RecordingSettings,
+    name: str,
+    rig: CameraRig,
+    stamps: FloatArray,
+    load_images: ImageLoader,
+    identity: str,
+    notes: tuple[str, ...],
+) -> Recording:
+    """Recording of those frames that the settings select; what all readers of images end in.
+
+    Args:
+        settings: which frames are used.
+        name: short name for titles.
+        rig: of the cameras, on the body that odometry moves.
+        stamps: (n,) seconds of all frames, increasing.
+        load_images: reads the images of a frame by its number among all.
+        identity: as :func:`recording_identity` makes it.
+        notes: what was tolerated; the rig's own remarks are put before them.
+
+    Raises:
+        DatasetError: no frame is selected.
+    """
+    indices = select_frames(len(stamps), settings)
+    plain, rectifier = rig, None
+    if isinstance(rig, StereoRig):
+        plain, rectifier, notes = rig.plain(), rig.rectifier, (*rig.remarks, *notes)
+    return Recording(
+        name, plain, stamps[indices], identity, notes, indices, load_images, rectifier=rectifier
+    )
+
+
 def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
     """SHA-256 over the bytes of ``contents`` and the names and sizes of ``listed`` files."""
     digest = hashlib.sha256()
@@ -118,10 +149,6 @@ def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
     for path in sorted(listed):
         digest.update(f"{path.parent.name}/{path.name}\0{path.stat().st_size}\0".encode())
     return digest.hexdigest()
-
-
-# --------------------------------------------------------------------------------------------
-# Which frames are used
 
 
 def select_frames(count: int, settings: RecordingSettings) -> IntArray:
@@ -154,3 +181,117 @@ def select_of(count: int, settings: FrameSelection, name: str) -> IntArray:
         )
     stop = count if settings.stop is None else min(settings.stop, count)
     return np.arange(settings.start, stop, settings.stride, dtype=np.int64)
+
+
+# --------------------------------------------------------------------------------------------
+# The rig: the recording's own calibration or the one that is given in its place, mounted
+
+
+def calibrated_rig(
+    settings: CalibratedSettings, own: Path, size: tuple[int, int] | None, pair: bool = True
+) -> StereoRig:
+    """The rig by the file that the settings name, else by the recording's own file or folder.
+
+    Args:
+        settings: of the recording.
+        own: the recording's file or folder of calibration.
+        size: width and height of the images, for formats that do not state it.
+        pair: whether they are of two cameras; else of three.
+
+    Raises:
+        CalibrationError: there is no calibration, or it cannot be used.
+    """
+    file = own if settings.camera_file is None else Path(settings.camera_file)
+    try:
+        return mounted(loaded_rig(settings, file, size=size, pair=pair), settings)
+    except CalibrationError as fault:
+        # Of a file in the folder the message is enough: that is there, and at fault.
+        if settings.camera_file is not None or not str(fault).startswith(f"{own}:"):
+            raise
+        raise CalibrationError(
+            f"{fault}; give a calibration: {own / 'calib.json'}, or another one by --camera FILE"
+        ) from None
+
+
+def loaded_rig(
+    settings: CalibratedSettings,
+    *files: Path,
+    size: tuple[int, int] | None,
+    cameras: Sequence[int] | None = None,
+    pair: bool = True,
+) -> StereoRig:
+    """:func:`fgslam.load_rig` of one file or two, in the unit, scaled, as wide as is asked for.
+
+    Where the images are of a ``pair`` and the file has three cameras, those of its first two.
+    """
+
+    def load(cameras: Sequence[int] | None) -> StereoRig:
+        return load_rig(
+            *files,
+            size=size,
+            scale=settings.resized,
+            unit_m=settings.unit_m,
+            fov_deg=settings.fov_deg,
+            cameras=cameras,
+        )
+
+    rig = load(cameras)
+    if not pair or max(rig.sources) < 2:
+        return rig
+    text = f"{files[0]} holds three cameras, the images are of two: the first two are taken"
+    two = load((0, 1))
+    return replace(two, remarks=(text, *two.remarks))
+
+
+def read_rig(
+    settings: CalibratedSettings, calibration: Calibration, size: tuple[int, int] | None
+) -> StereoRig:
+    """The same of a calibration that is read."""
+    found = in_metres(calibration, settings.unit_m)
+    return rig_of(at_size(found, size, settings.resized), settings.fov_deg)
+
+
+def numbered(rig: StereoRig) -> StereoRig:
+    """The rig of images that are given as those of a file's second and first camera.
+
+    So do names with numbers, cam1 and cam0, whichever of them is the right one.
+    """
+    if rig.sources[:2] != (0, 1):
+        return rig
+    kept = rig.rectifier or Rectifier(rig.plain(), ())
+    text = "the camera of the lower number is the right one by its calibration, and is taken so"
+    return replace(rig, rectifier=replace(kept, order=(1, 0)), remarks=(*rig.remarks, text))
+
+
+def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:
+    """The rig where the settings put it; as it is, where they name no place."""
+    if settings.camera_yaw_deg is None and settings.lever_arm_m is None:
+        return rig
+    lever_arm = settings.lever_arm_m or (0.0, 0.0, 0.0)
+    heading = so3_exp(np.array([0.0, 0.0, np.radians(settings.camera_yaw_deg or 0.0)]))
+    level = heading @ BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
+    return replace(rig, bTc=pose(level, np.array(lever_arm, np.float64)))
+
+
+def on_wheels(
+    rig: Rig, settings: CalibratedSettings, odometry_file: Path | None
+) -> tuple[Rig, tuple[str, ...]]:
+    """The rig on the body that a file's odometry moves, and what is assumed of its place there.
+
+    Where the calibration is of the cameras alone, they look straight ahead from its origin.
+    """
+    stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
+    # A gyroscope is in the camera's own box, wheels turn about another axis.
+    if stated or odometry_file is None or is_of_gyroscope(odometry_file):
+        return rig, ()
+    if not body_is_camera(rig.bTc):
+        return rig, ()
+    text = f"nothing says where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
+    return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (text,)
+
+
+LOOKS_AHEAD = (
+    "it is taken to look straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say "
+    "otherwise)"
+)
+"""What is assumed of a camera where nothing says how it sits on the body that odometry moves."""

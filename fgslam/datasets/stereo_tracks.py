@@ -30,7 +30,7 @@ from fgslam.datasets.measurement_files import (
 )
 from fgslam.datasets.recording import select_of
 from fgslam.datasets.settings import OdometrySettings, StereoTracksSettings
-from fgslam.datasets.tables import Table, read_table
+from fgslam.datasets.times import Table, read_table
 
 _INSIDE = {"00s": "00s", "00": "00", "large": "_large"}
 _PREFIX = "VO_stereo_factors"

@@ -23,7 +23,8 @@ from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.files import write_text
 from fgslam.datasets.images import bits_of, read_grey_image
-from fgslam.datasets.loose_files import find_cameras, images_in, pair_files
+from fgslam.datasets.layouts import find_cameras, images_in
+from fgslam.datasets.times import pair_files
 from fgslam.runs.calibration_report import (
     Files,
     draw_coverage,

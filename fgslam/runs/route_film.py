@@ -12,7 +12,7 @@ import numpy as np
 from fgslam.cameras.omni.camera import OmniCamera, unit_rays
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, StoredMapError
-from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.opening import open_omni
 from fgslam.homing.path_memory import PathMemory
 from fgslam.report.pictures.route_film import PathPicture, RouteCanvas, RouteMoment

@@ -34,7 +34,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines, write_bytes, write_text
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
-from fgslam.datasets.images import encoded_png, read_sized_image
+from fgslam.datasets.images import encoded_png, read_grey_image, require_size
 from scripts.convert import run, write_poses
 
 ROW = 8
@@ -61,7 +61,8 @@ class Grid:
 
     def image(self, view: tuple[int, int]) -> Image:
         """One view. Raises FrameError when it is missing, damaged or of another size."""
-        return read_sized_image(self.files[view], self.width, self.height)
+        path = self.files[view]
+        return require_size(read_grey_image(path), f"image {path}", self.width, self.height)
 
 
 def convert(root: Path, folder: Path) -> None:

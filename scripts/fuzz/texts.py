@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.polynomial import polynomial
 
-from fgslam.datasets.odometry_files import file_odometry
+from fgslam.datasets.odometry import file_odometry
 from fgslam.datasets.settings import RecordedOdometrySettings
 from fgslam.runs.camera_files import Asked, convert_calibration
 from fgslam.runs.named_experiments import experiment_names, experiments_folder

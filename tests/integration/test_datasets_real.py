@@ -13,8 +13,6 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.datasets.checks.matches import check_epipolar
 from fgslam.datasets.checks.recording import Level
-from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.kitti import open_kitti
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -57,7 +55,7 @@ def folder(root: Path, name: str, **settings: object) -> ImageFolderSettings:
 def test_stereo_recordings(
     shared_data: Path, name: str, frames: int, size: tuple[int, int], baseline: float, length: float
 ) -> None:
-    recording = open_image_folder(folder(shared_data, name))
+    recording = open_recording(folder(shared_data, name))
     assert len(recording) == frames
     assert (recording.rig.width, recording.rig.height) == size
     assert recording.rig.baseline == pytest.approx(baseline, abs=1e-3)
@@ -90,7 +88,7 @@ def step_errors(recording: Recording) -> FloatArray:
 def test_dead_reckoning_of_real_odometry(shared_data: Path) -> None:
     """Measured: ATE 0.31 m after SE3 alignment over 300 m; truth itself is good to 0.27 m."""
     settings = folder(shared_data, "kitti_raw_0926_5hz", lever_arm_m=KITTI_LEVER_ARM)
-    recording = open_image_folder(settings, RecordedOdometrySettings(time_offset_s=-0.06))
+    recording = open_recording(settings, RecordedOdometrySettings(time_offset_s=-0.06))
     truth = recording.ground_truth
     assert truth is not None
     pose, positions = np.eye(4), [np.zeros(3)]
@@ -112,8 +110,8 @@ def test_time_offset_and_lever_arm_explain_the_odometry(shared_data: Path) -> No
     plain = folder(shared_data, "kitti_raw_0926_5hz")
     mounted = folder(shared_data, "kitti_raw_0926_5hz", lever_arm_m=KITTI_LEVER_ARM)
     shifted = RecordedOdometrySettings(time_offset_s=-0.06)
-    before = np.median(np.abs(step_errors(open_image_folder(plain))), axis=0)
-    after = np.median(np.abs(step_errors(open_image_folder(mounted, shifted))), axis=0)
+    before = np.median(np.abs(step_errors(open_recording(plain))), axis=0)
+    after = np.median(np.abs(step_errors(open_recording(mounted, shifted))), axis=0)
     assert after[2] < 0.5 * before[2]
     assert after[3] < 0.6 * before[3]
 
@@ -121,7 +119,7 @@ def test_time_offset_and_lever_arm_explain_the_odometry(shared_data: Path) -> No
 def test_default_noise_covers_the_real_errors(shared_data: Path) -> None:
     """Per axis the errors are within the stated noise, and not far below it (roll to vertical)."""
     settings = folder(shared_data, "kitti_raw_0926_5hz", lever_arm_m=KITTI_LEVER_ARM)
-    recording = open_image_folder(settings, RecordedOdometrySettings(time_offset_s=-0.06))
+    recording = open_recording(settings, RecordedOdometrySettings(time_offset_s=-0.06))
     sigmas = []
     for i in range(1, len(recording)):
         step = recording.odometry(i)
@@ -135,7 +133,7 @@ def test_default_noise_covers_the_real_errors(shared_data: Path) -> None:
 
 
 def test_synthetic_odometry_of_the_indoor_flight(shared_data: Path) -> None:
-    recording = open_image_folder(folder(shared_data, "euroc_v101_kf100"))
+    recording = open_recording(folder(shared_data, "euroc_v101_kf100"))
     synthetic = SyntheticOdometry(recording, SyntheticOdometrySettings(), 7)
     steps = [synthetic.odometry(i) for i in range(1, 100)]
     assert all(step is not None for step in steps)
@@ -143,7 +141,7 @@ def test_synthetic_odometry_of_the_indoor_flight(shared_data: Path) -> None:
 
 def test_native_kitti_layout_equals_the_image_folder(shared_data: Path, tmp_path: Path) -> None:
     """The same drive laid out as KITTI does it (by links) reads the same."""
-    simple = open_image_folder(folder(shared_data, "kitti06"))
+    simple = open_recording(folder(shared_data, "kitti06"))
     source = shared_data / "kitti06"
     target = tmp_path / "sequences" / "06"
     target.mkdir(parents=True)
@@ -155,7 +153,7 @@ def test_native_kitti_layout_equals_the_image_folder(shared_data: Path, tmp_path
     text = "".join(f"P{k}: {row.format(shifts[k])}\n" for k, row in enumerate(rows))
     (target / "calib.txt").write_text(text, encoding="utf-8")
     np.savetxt(target / "times.txt", simple.timestamps, fmt="%.6f")
-    native = open_kitti(KittiSettings(path=str(tmp_path), sequence="06"))
+    native = open_recording(KittiSettings(path=str(tmp_path), sequence="06"))
     assert native.rig.baseline == pytest.approx(rig.baseline)
     np.testing.assert_array_equal(native.timestamps, simple.timestamps)
     for i in (0, 30):
@@ -179,7 +177,7 @@ def matched(a: np.ndarray, b: np.ndarray) -> tuple[FloatArray, FloatArray, list[
 
 @pytest.mark.parametrize("name", ["euroc_v101_kf100", "kitti06", "kitti_raw_0926_5hz"])
 def test_matches_tell_sound_swapped_and_shifted_cameras(shared_data: Path, name: str) -> None:
-    frame = open_image_folder(folder(shared_data, name)).frame(10)
+    frame = open_recording(folder(shared_data, name)).frame(10)
     on_right, on_left, _ = matched(*frame.images)
     rows, disparities = on_left[:, 1] - on_right[:, 1], on_left[:, 0] - on_right[:, 0]
     sound = check_epipolar(rows, disparities)
@@ -196,7 +194,7 @@ def test_light_field_is_a_trinocular_rig(shared_data: Path, tmp_path: Path) -> N
     if not path.is_dir():
         pytest.skip(f"no light field in {shared_data}: this test needs it")
     convert(path, tmp_path)
-    recording = open_image_folder(ImageFolderSettings(path=str(tmp_path)))
+    recording = open_recording(ImageFolderSettings(path=str(tmp_path)))
     assert len(recording) == 13
     assert recording.rig.baseline == pytest.approx(0.0208, abs=2e-4)
     right, left, top = recording.frame(6).images

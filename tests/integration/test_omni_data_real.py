@@ -17,7 +17,7 @@ from fgslam.cameras.omni.ring_calibration import find_mirror_circle, mirror_offs
 from fgslam.cameras.omni.settings import OCamCalibSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni_recording import OmniRecording
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
 

@@ -36,7 +36,7 @@ from fgslam.core.errors import (
     OutputError,
 )
 from fgslam.core.measurements import Odometry
-from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.runs.config import make_config
@@ -216,7 +216,7 @@ def test_a_recording_that_fails_loses_nothing(
     recording: Path, finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As a reader would that decodes its odometry on the way: frames so far are kept."""
-    probe = open_image_folder(ImageFolderSettings(path=str(recording)))
+    probe = open_recording(ImageFolderSettings(path=str(recording)))
     intact = type(probe).odometry
 
     def broken(self: Recording, i: int) -> Odometry | None:

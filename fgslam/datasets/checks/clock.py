@@ -14,7 +14,8 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import FrameError, OdometryError
 from fgslam.core.geometry import so3_log, triangulate
 from fgslam.core.measurements import Odometry
-from fgslam.datasets.recording import OdometrySource, Recording
+from fgslam.datasets.odometry import OdometrySource
+from fgslam.datasets.recording import Recording
 
 _STEPS = 60  # those in which the turn changes most: a steady one says nothing of the clock
 _FEWEST_STEPS = 15

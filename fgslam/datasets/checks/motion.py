@@ -12,8 +12,9 @@ from fgslam.core.geometry import inverse, se3_log, so3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.checks.recording import Finding, Level, listed, share
-from fgslam.datasets.recording import OdometrySource, Recording
-from fgslam.datasets.tables import rows_at
+from fgslam.datasets.odometry import OdometrySource
+from fgslam.datasets.recording import Recording
+from fgslam.datasets.times import rows_at
 
 _STAMP_TOLERANCE_S = 1e-3
 _NONE = 1e-9  # metres, and of a rotation: rounding

@@ -11,8 +11,8 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.files import make_subfolder
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable

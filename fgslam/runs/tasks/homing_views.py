@@ -31,8 +31,8 @@ from fgslam.core.homing import (
 )
 from fgslam.core.planar import wrap
 from fgslam.core.quantiles import chi_square_quantile
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.datasets.omni_settings import OmniDatasetSettings
 from fgslam.datasets.opening import open_omni
 from fgslam.evaluation.metrics import JsonValue

@@ -14,8 +14,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.planar import wrap
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import camera_notes
-from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.datasets.opening import open_omni
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.api import PathFollower

@@ -10,8 +10,8 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.trajectories import Trajectory, read_covariances
-from fgslam.datasets.omni_recording import OmniRecording
-from fgslam.datasets.tables import covered, interpolate_poses, nearest_rows
+from fgslam.datasets.omni import OmniRecording
+from fgslam.datasets.times import covered, interpolate_poses, nearest_rows
 from fgslam.homing.path_memory import MetricPoses
 
 COVARIANCES = "covariance.csv"

@@ -15,8 +15,8 @@ import numpy as np
 
 from fgslam.core.errors import FrameError
 from fgslam.core.files import make_subfolder
+from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.datasets.omni_recording import OmniRecording
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.settings import DRIVING
 from fgslam.homing.teaching import FULL, GAP, Taught, TaughtImage, Teacher

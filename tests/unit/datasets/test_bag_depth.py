@@ -25,8 +25,8 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import pose
-from fgslam.datasets.bags.reader import open_bag
-from fgslam.datasets.depth_view import BASELINE_M
+from fgslam.datasets.depth import BASELINE_M
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.runs.bare_recording import bare_experiment
@@ -82,7 +82,7 @@ def walk(encode: Any = in_millimetres, names: tuple[str, str] = (COLOUR, DEPTH))
 
 
 def opened(path: Path, **settings: Any) -> Recording:
-    return open_bag(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
+    return open_recording(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
 
 
 FORMS = {

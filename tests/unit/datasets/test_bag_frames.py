@@ -30,9 +30,8 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA as AHEAD
 from fgslam.core.geometry import inverse, pose, so3_exp
-from fgslam.datasets.bags.frames import FrameTree
-from fgslam.datasets.bags.messages import colour_of
-from fgslam.datasets.bags.reader import open_bag
+from fgslam.datasets.bag_messages import FrameTree, colour_of
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 
@@ -65,7 +64,7 @@ def moving() -> list[Written]:
 
 
 def opened(path: Path, **settings: Any) -> Recording:
-    return open_bag(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
+    return open_recording(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
 
 
 def mosaic_of(image: Image, pattern: str) -> Image:

@@ -28,9 +28,9 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibrat
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.datasets.bags.reader import open_bag
 from fgslam.datasets.checks.motion import check_odometry
 from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.runs.bare_recording import bare_experiment
@@ -40,7 +40,7 @@ KINDS = (".bag", ".db3", ".mcap")
 
 
 def opened(path: Path, **settings: Any) -> Recording:
-    return open_bag(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
+    return open_recording(BagSettings(path=str(path), **settings), RecordedOdometrySettings())
 
 
 def codes(recording: Recording, i: int) -> tuple[int, ...]:

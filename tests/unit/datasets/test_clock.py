@@ -22,9 +22,8 @@ from fgslam.datasets.checks.clock import (
     judged,
     judged_turns,
 )
-from fgslam.datasets.gyroscope import GyroscopeLog, integrated
-from fgslam.datasets.image_folder import open_image_folder
-from fgslam.datasets.odometry import recorded_motions
+from fgslam.datasets.odometry import GyroscopeLog, integrated, recorded_motions
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 
 BIAS = np.radians([0.3, -1.2, 4.3])
@@ -127,5 +126,5 @@ def test_turns_are_seen() -> None:
 def test_the_clock_of_a_real_car_is_found_without_its_truth(shared_data: Path) -> None:
     """By the truth its odometry agrees best at -0.06 s (docs/datasets/image_folder.md)."""
     folder = ImageFolderSettings(path=str(shared_data / "kitti_raw_0926_5hz"))
-    shifted = open_image_folder(folder, RecordedOdometrySettings(time_offset_s=0.09))
+    shifted = open_recording(folder, RecordedOdometrySettings(time_offset_s=0.09))
     assert judged_turns(shifted).time_offset_s == pytest.approx(-0.15, abs=0.015)

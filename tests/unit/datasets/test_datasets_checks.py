@@ -22,8 +22,8 @@ from fgslam.datasets.checks.recording import (
     check_images,
     check_timing,
 )
-from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry import SyntheticOdometry
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
     ImageFolderSettings,
@@ -34,7 +34,7 @@ from fgslam.runs.inspection import check_sequence, facts_of
 
 
 def opened(root: Path, **settings: object) -> Recording:
-    return open_image_folder(ImageFolderSettings(path=str(root), **settings))  # type: ignore[arg-type]
+    return open_recording(ImageFolderSettings(path=str(root), **settings))  # type: ignore[arg-type]
 
 
 def texts(findings: tuple[Finding, ...], least: Level = Level.WARNING) -> str:
@@ -101,9 +101,9 @@ def test_sampling_reads_no_more_than_asked(tmp_path: Path) -> None:
     read: list[int] = []
     recording = opened(image_folder(tmp_path, 40))
 
-    def counted(index: int) -> tuple[np.ndarray, ...]:
+    def counted(index: int, colour: bool) -> tuple[np.ndarray, ...]:
         read.append(index)
-        return recording.load_images(index)
+        return recording.load_images(index, colour)
 
     assert check_images(replace(recording, load_images=counted), 5) == ()
     assert read == [0, 9, 19, 29, 39]
@@ -168,7 +168,7 @@ def test_gap_in_the_odometry(tmp_path: Path) -> None:
     root = image_folder(tmp_path, 10)
     (root / "odom.csv").write_text("".join(f"{t},1,0\n" for t in (0, 0.1, 0.2, 0.7, 0.8, 0.9)))
     noise = RecordedOdometrySettings(max_gap_s=0.3)
-    recording = open_image_folder(ImageFolderSettings(path=str(root)), noise)
+    recording = open_recording(ImageFolderSettings(path=str(root)), noise)
     found = check_odometry(recording)
     assert "covers 4 of 9 (44.4 %) steps" in texts(found, Level.INFO)
     assert "none before frames 3, 4, 5, 6, 7; constant velocity" in texts(found)

@@ -13,14 +13,13 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.geometry import inverse
 from fgslam.core.measurements import Odometry
-from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry import (
     SpeedLog,
+    file_odometry,
     motions_from_speed,
-    read_pose_log,
-    read_speed_log,
     steps_covered,
 )
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 
@@ -144,7 +143,7 @@ def with_speeds(root: Path, frames: int = 6, row: str = "{t:.2f},5.0,0.1,9.9\n")
 
 
 def opened(root: Path, odometry: RecordedOdometrySettings = DEFAULT, **s: object) -> Recording:
-    return open_image_folder(ImageFolderSettings(path=str(root), **s), odometry)  # type: ignore[arg-type]
+    return open_recording(ImageFolderSettings(path=str(root), **s), odometry)  # type: ignore[arg-type]
 
 
 def test_folder_with_speed_and_yaw_rate(tmp_path: Path) -> None:
@@ -190,16 +189,22 @@ def test_poses_are_not_held_beyond_their_ends(tmp_path: Path) -> None:
 
 
 BAD_LOGS = [
-    ("0.1,nan,0\n0.2,1,0\n", ["line 2", "forward speed is nan", "not finite"]),
+    ("0.1,1,0\n0.2,nan,0\n", ["line 3", "forward speed is nan", "not finite"]),
     ("0.1,1,0\n0.2,1,inf\n", ["line 3", "yaw rate is inf", "not finite"]),
     ("0.1,1,0\n0.2,400,0\n", ["line 3", "400 m/s is absurd", "limit 60"]),
     ("0.1,1,0\n0.2,1,-99\n", ["line 3", "yaw rate", "absurd", "limit 720"]),
     ("0.1,1,0\n0.3,1,0\n0.2,1,0\n", ["line 4", "0.200000", "time order"]),
     ("0.1,1,0\n0.1,1,0\n", ["line 3", "duplicates"]),
     ("0.1,1\n", ["line 2", "2 columns, expected 3"]),
-    ("0.1,fast,0\n", ["line 2", "'fast'", "not a number"]),
+    ("0.1,1,0\n0.2,fast,0\n", ["line 3", "'fast'", "not a number"]),
     ("", ["0 samples", "at least 2", "constant_velocity"]),
 ]
+
+
+def read(path: Path) -> None:
+    source = file_odometry(path, DEFAULT)
+    assert source is not None
+    source(np.array([0.0, 0.1]))
 
 
 @pytest.mark.parametrize(("rows", "words"), BAD_LOGS)
@@ -207,7 +212,7 @@ def test_bad_speed_log_names_the_line(tmp_path: Path, rows: str, words: list[str
     path = tmp_path / "odom.csv"
     path.write_text("# t, v, w\n" + rows, encoding="utf-8")
     with pytest.raises(OdometryError) as error:
-        read_speed_log(path, DEFAULT)
+        read(path)
     assert "\n" not in str(error.value)
     for part in [str(path), *words]:
         assert part in str(error.value)
@@ -227,12 +232,12 @@ def test_absurd_pose_names_the_line(tmp_path: Path) -> None:
     poses[3, :3, 3] += 100.0
     write_tum(tmp_path / "odometry.txt", 0.1 * np.arange(5), poses)
     with pytest.raises(OdometryError, match=r"odometry\.txt, line 5: speed of 17.* absurd"):
-        read_pose_log(tmp_path / "odometry.txt", DEFAULT)
+        read(tmp_path / "odometry.txt")
     turning = curve(5)
     turning[2, :3, :3] = turning[2, :3, :3] @ np.diag([-1.0, -1.0, 1.0])
     write_tum(tmp_path / "odometry.txt", 0.1 * np.arange(5), turning)
     with pytest.raises(OdometryError, match=r"odometry\.txt, line 4: turn of 1\d{3} degrees/s"):
-        read_pose_log(tmp_path / "odometry.txt", DEFAULT)
+        read(tmp_path / "odometry.txt")
 
 
 def test_log_of_another_clock(tmp_path: Path) -> None:

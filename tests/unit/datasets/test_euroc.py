@@ -25,7 +25,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.euroc import open_euroc
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import EurocSettings
 
@@ -36,7 +36,7 @@ RIGHT = pose(so3_exp(np.array([-0.01, 0.02, 0.035])) @ AHEAD, np.array([0.103, -
 
 
 def opened(root: Path, **settings: object) -> Recording:
-    return open_euroc(EurocSettings(path=str(root), **settings))  # type: ignore[arg-type]
+    return open_recording(EurocSettings(path=str(root), **settings))  # type: ignore[arg-type]
 
 
 def seen_raw(camera: RawCamera, points: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ import pytest
 from fgslam.cameras.rig import load_rig
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
-from fgslam.datasets.checks.fit import fit_notes
+from fgslam.datasets.fit import fit_notes
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import EurocSettings
 

@@ -14,9 +14,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, OdometryError
 from fgslam.core.geometry import rotation_angle, so3_exp, so3_log
 from fgslam.core.measurements import Odometry
-from fgslam.datasets.bags.reader import open_bag
-from fgslam.datasets.euroc import open_euroc
-from fgslam.datasets.gyroscope import (
+from fgslam.datasets.odometry import (
     GyroscopeLog,
     GyroscopeNoise,
     checked_rates,
@@ -25,7 +23,7 @@ from fgslam.datasets.gyroscope import (
     read_gyroscope_noise,
     read_rates,
 )
-from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import (
     BagSettings,
     EurocSettings,
@@ -173,12 +171,12 @@ def euroc_with_gyroscope(root: Path) -> Path:
 
 def test_euroc_turns_as_its_gyroscope_says(tmp_path: Path) -> None:
     root = euroc_with_gyroscope(tmp_path)
-    steps = open_euroc(EurocSettings(path=str(root))).odometry(1)
+    steps = open_recording(EurocSettings(path=str(root))).odometry(1)
     np.testing.assert_allclose(only_step((steps,)), 1e-9 * PERIOD_NS * RATE, rtol=0.0, atol=1e-6)
     quarter = "[0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"  # the sensor's x is the body's y
     text = f"T_BS:\n  data: {quarter}\ngyroscope_noise_density: 0.5\n"
     (root / "mav0" / "imu0" / "sensor.yaml").write_text(text)
-    turned = open_euroc(EurocSettings(path=str(root))).odometry(1)
+    turned = open_recording(EurocSettings(path=str(root))).odometry(1)
     assert turned is not None
     body = np.array([-RATE[1], RATE[0], RATE[2]])
     np.testing.assert_allclose(only_step((turned,)), 1e-9 * PERIOD_NS * body, rtol=0.0, atol=1e-6)
@@ -207,13 +205,13 @@ def test_a_folder_has_its_gyroscope_beside_its_images(
     rows = [f"{round(1e9 * t)},{x:.9g},{y:.9g},{z:.9g},0" for t, (x, y, z) in
             zip(stamps, rates / unit, strict=True)]  # fmt: skip
     (root / "imu.csv").write_text("\n".join([*([head] if head else []), *rows]))
-    step = open_image_folder(ImageFolderSettings(path=str(root))).odometry(1)
+    step = open_recording(ImageFolderSettings(path=str(root))).odometry(1)
     np.testing.assert_allclose(only_step((step,)), 0.1 * RATE, rtol=0.0, atol=1e-6)
 
 
 def test_a_bag_turns_by_its_imu(tmp_path: Path) -> None:
     stamps = START_NS + 5_000_000 * np.arange(-20, 100)
     bag = write_bag(tmp_path / "walk.bag", stereo(4) + gyroscope(stamps.tolist(), RATE))
-    recording = open_bag(BagSettings(path=str(bag)), LIMITS)
+    recording = open_recording(BagSettings(path=str(bag)), LIMITS)
     np.testing.assert_allclose(only_step((recording.odometry(1),)), 0.1 * RATE, atol=1e-6)
     assert "; a gyroscope, no odometry" in bare_experiment(bag).said

@@ -22,14 +22,14 @@ from fgslam.cameras.write_formats import raw_values
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, right_from_left_camera
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.images import read_grey_image
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
 
 
 def opened(root: Path, **settings: object) -> Recording:
-    return open_image_folder(ImageFolderSettings(path=str(root), **settings))  # type: ignore[arg-type]
+    return open_recording(ImageFolderSettings(path=str(root), **settings))  # type: ignore[arg-type]
 
 
 def corners(recording: Recording, i: int) -> list[int]:

@@ -25,8 +25,8 @@ from fgslam.datasets.checks.matches import (
 )
 from fgslam.datasets.checks.motion import check_clock
 from fgslam.datasets.checks.recording import Finding, Level
-from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.layouts import kitti_drives, recognise_layout
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.runs.inspection import inspect_recording, render_report
@@ -81,7 +81,7 @@ def test_a_kitti_drive_without_its_root_is_a_folder_of_images(tmp_path: Path) ->
 
 def test_half_an_image_folder_gets_its_readers_message(tmp_path: Path) -> None:
     save(tmp_path / "left" / "000000.png", picture(1))
-    with pytest.raises(DatasetError, match="has no folder right: a recording of one camera"):
+    with pytest.raises(DatasetError, match="has no folder right; a recording of one camera"):
         inspect_recording(tmp_path)
 
 
@@ -95,11 +95,11 @@ def test_image_folder_reader_names_the_layout_that_it_finds_instead(tmp_path: Pa
         driving: r"this is a KITTI odometry folder: --set dataset\.kind=kitti "
         r"--set dataset\.sequence=06$",
         driving / "sequences" / "06": r"--set dataset\.kind=kitti --set dataset\.path=.*/car",
-        tmp_path / "nothing": "no folder left: a recording of one camera cannot be used",
+        tmp_path / "nothing": "no folder left; a recording of one camera cannot be used",
     }
     for folder, words in expected.items():
         with pytest.raises(DatasetError, match=words):
-            open_image_folder(ImageFolderSettings(path=str(folder)))
+            open_recording(ImageFolderSettings(path=str(folder)))
 
 
 @pytest.mark.parametrize("inside", [".", "images", "cam0/data"])
@@ -308,7 +308,7 @@ def winding_drive(root: Path, late: float, turning: float = 1.0) -> Path:
 
 def clock(root: Path, offset: float = 0.0) -> str:
     odometry = RecordedOdometrySettings(time_offset_s=offset)
-    recording = open_image_folder(ImageFolderSettings(path=str(root)), odometry)
+    recording = open_recording(ImageFolderSettings(path=str(root)), odometry)
     return reported(check_clock(recording), Level.WARNING)
 
 

@@ -8,13 +8,13 @@ from dataset_builders import kitti, picture, save
 
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.kitti import open_kitti
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiSettings
 
 
 def opened(root: Path, **settings: object) -> Recording:
-    return open_kitti(KittiSettings(path=str(root), **{"sequence": "06", **settings}))  # type: ignore[arg-type]
+    return open_recording(KittiSettings(path=str(root), **{"sequence": "06", **settings}))  # type: ignore[arg-type]
 
 
 def test_native_layout(tmp_path: Path) -> None:

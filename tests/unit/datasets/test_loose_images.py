@@ -31,13 +31,12 @@ from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose
 from fgslam.core.sensors import body_is_camera
 from fgslam.core.sides import camera_pairs, is_view
-from fgslam.datasets.kitti_raw import open_kitti_raw
-from fgslam.datasets.layouts import recognise_layout
-from fgslam.datasets.loose_files import find_cameras, pair_files
+from fgslam.datasets.layouts import find_cameras, recognise_layout
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import (
     KittiRawSettings,
 )
-from fgslam.datasets.stamps import written_stamps
+from fgslam.datasets.times import pair_files, written_stamps
 from fgslam.runs.bare_recording import bare_experiment
 
 STAMP = 1_403_715_273_262_142_976
@@ -408,7 +407,7 @@ def test_a_drive_of_kitti_raw(tmp_path: Path, cameras: tuple[str, str]) -> None:
     drive = kitti_raw(tmp_path, cameras)
     for given in (drive, drive.parent):
         assert recognise_layout(given) == {"kind": "kitti_raw", "path": str(given)}
-        recording = open_kitti_raw(KittiRawSettings(path=str(given)))
+        recording = open_recording(KittiRawSettings(path=str(given)))
         assert recording.rig.baseline == pytest.approx(0.4, abs=1e-12)
         assert codes(recording) == [(10, 60), (11, 61), (12, 62)]
         assert np.allclose(np.diff(recording.timestamps), 0.1, rtol=0.0, atol=1e-6)
@@ -418,7 +417,7 @@ def test_a_drive_of_kitti_raw(tmp_path: Path, cameras: tuple[str, str]) -> None:
 def test_kitti_raw_that_lacks_a_left_image(tmp_path: Path) -> None:
     drive = kitti_raw(tmp_path)
     next((drive / "image_00" / "data").glob("*1.png")).unlink()
-    recording = open_kitti_raw(KittiRawSettings(path=str(drive)))
+    recording = open_recording(KittiRawSettings(path=str(drive)))
     assert np.allclose(np.diff(recording.timestamps), 0.2, rtol=0.0, atol=1e-6)
 
 
@@ -426,10 +425,10 @@ def test_kitti_raw_that_lacks_a_part(tmp_path: Path) -> None:
     drive = kitti_raw(tmp_path)
     (drive.parent / "calib_cam_to_cam.txt").rename(drive.parent / "elsewhere.txt")
     with pytest.raises(CalibrationError, match=r"no calib_cam_to_cam\.txt in it or beside it"):
-        open_kitti_raw(KittiRawSettings(path=str(drive)))
+        open_recording(KittiRawSettings(path=str(drive)))
     (drive / "image_01").rename(drive / "image_07")
     with pytest.raises(DatasetError, match="has no two cameras' images"):
-        open_kitti_raw(KittiRawSettings(path=str(drive)))
+        open_recording(KittiRawSettings(path=str(drive)))
 
 
 def test_one_folder_may_number_the_cameras_last(tmp_path: Path) -> None:

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from PIL import Image as PictureFile
 
+import fgslam as fg
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.datasets.images import (
-    StereoFiles,
-    check_sizes,
     decode_grey,
     mosaic_note,
+    open_frames,
     read_grey_image,
 )
 
@@ -120,14 +120,15 @@ def test_a_file_in_the_place_of_an_image_is_said_to_be_what_it_is(data: bytes, w
 
 
 def test_a_recording_without_a_readable_image_says_what_the_first_one_is(tmp_path: Path) -> None:
+    rig = fg.StereoRig(80, 60, 50.0, 50.0, 40.0, 30.0, baseline=0.1)
     paths = tuple((tmp_path / f"right_{k}.png", tmp_path / f"left_{k}.png") for k in range(2))
     with pytest.raises(DatasetError, match="check that the file names fit the list of times"):
-        check_sizes(StereoFiles(paths, 80, 60), tmp_path)
+        open_frames(paths, rig, tmp_path)
     for right, left in paths:
         right.write_bytes(encoded(PictureFile.fromarray(GREY)))
         left.write_bytes(LFS)
     with pytest.raises(DatasetError, match=r"of the first: image .*left_0.png is a pointer of Git"):
-        check_sizes(StereoFiles(paths, 80, 60), tmp_path)
+        open_frames(paths, rig, tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["a pipe", "a device", "a folder", "a loop", "nothing"])

@@ -10,7 +10,7 @@ import pytest
 
 from fgslam.core.errors import OdometryError
 from fgslam.core.measurements import Odometry
-from fgslam.datasets.odometry_files import file_odometry
+from fgslam.datasets.odometry import file_odometry
 from fgslam.datasets.settings import RecordedOdometrySettings
 
 TIMES = 0.1 * np.arange(11)

@@ -23,11 +23,10 @@ from fgslam.cameras.omni.settings import (
 )
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
-from fgslam.datasets.omni_recording import OmniRecording, ids_of
+from fgslam.datasets.omni import OmniRecording, PanoramaReduction, ids_of
 from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
-from fgslam.datasets.panoramas import PanoramaReduction
-from fgslam.datasets.video_frames import VideoFrames
+from fgslam.datasets.video import VideoFrames
 
 HEADER = "id,file,x_m,y_m,heading_deg,room\n"
 ROWS = "3,b.png,1.5,-2,270,kitchen\n12,a.png,0,0.25,-90.5,hall\n"
@@ -152,7 +151,7 @@ def test_reduced_panoramas(home: Path) -> None:
         ("", "line 1: no column id, file"),
         ("id,file,x_m,y_m\n1,a.png,0,0\n", "no column heading_deg"),
         (HEADER, "lists no panorama"),
-        (HEADER + "3,b.png,nan,0,0,\n", "line 2: x_m is 'nan', not a finite number"),
+        (HEADER + "3,b.png,nan,0,0,\n", "line 2: x_m is nan, not finite"),
         (HEADER + "3,b.png,1,zwei,0,\n", "line 2: y_m is 'zwei'"),
         (HEADER + "3,b.png,1\n", "line 2: y_m is empty"),
         (HEADER + "x,b.png,1,2,3,\n", "line 2: id is 'x'"),

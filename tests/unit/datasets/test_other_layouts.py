@@ -21,10 +21,8 @@ from dataset_builders import (
 )
 
 from fgslam.core.errors import DatasetError
-from fgslam.datasets.bags.reader import open_bag
-from fgslam.datasets.kitti_raw import open_kitti_raw
 from fgslam.datasets.layouts import colour_and_depth, recognise_layout
-from fgslam.datasets.rgbd import open_rgbd
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import (
     BagSettings,
     KittiRawSettings,
@@ -148,7 +146,7 @@ def test_colour_and_depth_in_one_folder(tmp_path: Path, names: tuple[str, str]) 
     lens = {"width": WIDTH, "height": HEIGHT, "fx": 30, "fy": 30, "ppx": 15.5, "ppy": 11.5}
     (tmp_path / "camera.json").write_text(json.dumps(lens), encoding="utf-8")
     assert recognise_layout(tmp_path)["kind"] == "rgbd"
-    recording = open_rgbd(RgbdSettings(path=str(tmp_path), depth_scale=1000.0))
+    recording = open_recording(RgbdSettings(path=str(tmp_path), depth_scale=1000.0))
     right, left = recording.frame(1).images
     assert abs(int(right[0, 0]) - 10) <= 1
     assert np.array_equal(left[:, 18:], right[:, 8:-10])
@@ -184,7 +182,7 @@ def test_kitti_360(tmp_path: Path) -> None:
     (tmp_path / "calibration" / "perspective.txt").write_text("\n".join(lines), encoding="utf-8")
     for given in (tmp_path, drive.parent, drive):
         assert recognise_layout(given)["kind"] == "kitti_raw"
-        recording = open_kitti_raw(KittiRawSettings(path=str(given)))
+        recording = open_recording(KittiRawSettings(path=str(given)))
         assert recording.rig.baseline == pytest.approx(0.4, abs=1e-12)
         assert codes(recording) == [(10, 60), (11, 61), (12, 62)]
 
@@ -194,8 +192,8 @@ def test_a_bag_that_is_compressed_as_a_whole(tmp_path: Path) -> None:
     assert file.name == "packed.db3.zstd"
     for given in (file, file.parent):
         assert recognise_layout(given)["kind"] == "bag"
-        again = open_bag(BagSettings(path=str(given)), RecordedOdometrySettings())
+        again = open_recording(BagSettings(path=str(given)), RecordedOdometrySettings())
         assert codes(again) == [(10, 60), (11, 61), (12, 62)]
     (file.parent / "metadata.yaml").unlink()
     with pytest.raises(DatasetError, match=r"compressed as a whole.* zstd -d packed\.db3\.zstd"):
-        open_bag(BagSettings(path=str(file)), RecordedOdometrySettings())
+        open_recording(BagSettings(path=str(file)), RecordedOdometrySettings())

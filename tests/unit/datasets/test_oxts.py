@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError
 from fgslam.core.geometry import inverse, pose, so3_exp
-from fgslam.datasets.kitti_raw import open_kitti_raw
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiRawSettings
 from fgslam.runs.bare_recording import bare_experiment
@@ -90,7 +90,7 @@ def drive(root: Path) -> Path:
 
 
 def opened(path: Path) -> Recording:
-    return open_kitti_raw(KittiRawSettings(path=str(path)))
+    return open_recording(KittiRawSettings(path=str(path)))
 
 
 def test_oxts_are_odometry_and_truth_of_the_camera(tmp_path: Path) -> None:

@@ -13,11 +13,11 @@ from dataset_builders import HEIGHT, WIDTH, picture, save
 
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.sensors import CameraRig
+from fgslam.datasets.depth import BASELINE_M, seen_from_the_left
 from fgslam.datasets.layouts import recognise_layout
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.rgbd import BASELINE_M, open_rgbd
 from fgslam.datasets.settings import RgbdSettings
-from fgslam.datasets.virtual_view import seen_from_the_left
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
@@ -28,7 +28,7 @@ DEPTH_M = 2.0
 
 
 def opened(root: Path, **settings: Any) -> Recording:
-    return open_rgbd(RgbdSettings(path=str(root), **settings))
+    return open_recording(RgbdSettings(path=str(root), **settings))
 
 
 def camera(root: Path, **changes: Any) -> None:

@@ -23,11 +23,10 @@ from fgslam.core.geometry import pose
 from fgslam.core.sides import camera_pairs, camera_trio
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.omni_settings import OmniVideoSettings
-from fgslam.datasets.opening import open_omni
+from fgslam.datasets.opening import open_omni, open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import VideoSettings
-from fgslam.datasets.stereo_video import open_video
-from fgslam.datasets.video_frames import VideoFrames
+from fgslam.datasets.video import VideoFrames
 from fgslam.runs.bare_recording import bare_experiment
 from tests import textured_wall
 
@@ -71,7 +70,7 @@ def calibrated(root: Path) -> None:
 
 
 def opened(path: Path, **settings: Any) -> Recording:
-    return open_video(VideoSettings(path=str(path), **settings))
+    return open_recording(VideoSettings(path=str(path), **settings))
 
 
 def levels(recording: Recording, i: int) -> np.ndarray:

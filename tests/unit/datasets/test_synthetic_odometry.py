@@ -13,8 +13,8 @@ from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
 from fgslam.datasets import odometry as odometry_module
-from fgslam.datasets.image_folder import open_image_folder
 from fgslam.datasets.odometry import SyntheticOdometry
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings, SyntheticOdometrySettings
 
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def opened(root: Path, **settings: object) -> Recording:
     mounting = {"lever_arm_m": (0.5, -0.2, 1.0), "camera_yaw_deg": 10.0}
-    return open_image_folder(ImageFolderSettings(path=str(root), **mounting, **settings))  # type: ignore[arg-type]
+    return open_recording(ImageFolderSettings(path=str(root), **mounting, **settings))  # type: ignore[arg-type]
 
 
 def step(sequence: SyntheticOdometry, i: int) -> Odometry:

@@ -195,7 +195,7 @@ def test_one_camera_only(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     for path in (*(root / "left").iterdir(), root / "left"):
         path.unlink() if path.is_file() else path.rmdir()
-    assert "has no folder left: a recording of one camera cannot be used" in refused(root)
+    assert "has no folder left; a recording of one camera cannot be used" in refused(root)
 
 
 def test_a_missing_calibration(tmp_path: Path) -> None:

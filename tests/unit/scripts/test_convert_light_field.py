@@ -12,7 +12,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.image_folder import open_image_folder
+from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
 from scripts.convert.light_field import convert, shift_image
@@ -57,7 +57,7 @@ def grid(tmp_path: Path) -> Path:
 def converted(root: Path) -> Recording:
     """The grid as an image folder, opened."""
     convert(root, root / "converted")
-    return open_image_folder(ImageFolderSettings(path=str(root / "converted")))
+    return open_recording(ImageFolderSettings(path=str(root / "converted")))
 
 
 def centre(image: Image, near: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
-"""What the messages of a bag mean: images in grey and colour, calibrations, motions, frames."""
+"""What the messages of a bag mean: images, depth, calibrations, motions, transforms of frames."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias
 
 import cv2
@@ -10,7 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import FrameError
+from fgslam.core.errors import CalibrationError, FrameError
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    inverse,
+    is_rigid,
+    pose,
+    rotation_from_quaternion,
+)
 from fgslam.datasets.images import (
     decode_colour,
     decode_grey,
@@ -28,8 +35,11 @@ TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU = "sensor_msgs/msg/Imu"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
-_Code: TypeAlias = int | None  # of cv2.cvtColor; None: the pixels as they are
+# --------------------------------------------------------------------------------------------
+# Images
 
+
+_Code: TypeAlias = int | None  # of cv2.cvtColor; None: the pixels as they are
 
 _GREY = {"mono8", "8UC1", "mono16", "16UC1"}
 
@@ -37,18 +47,12 @@ _PLANES: Mapping[str, int] = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_
 """Encodings of a plane of grey, and one of two colours and half its height below it."""
 
 _COLOURS: Mapping[str, tuple[int, _Code, _Code]] = {
-    "bgr8": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
-    "8UC3": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
-    "rgb8": (3, cv2.COLOR_RGB2GRAY, None),
-    "bgra8": (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
-    "8UC4": (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
+    **dict.fromkeys(("bgr8", "8UC3", "bgr16"), (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB)),
+    **dict.fromkeys(("rgb8", "rgb16"), (3, cv2.COLOR_RGB2GRAY, None)),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB)),
     "rgba8": (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
-    "bgr16": (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
-    "rgb16": (3, cv2.COLOR_RGB2GRAY, None),
-    "yuv422": (2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV),
-    "yuyv": (2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV),
+    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV)),
 }
 """Encodings of colour: channels, and how they become grey, and red, green, blue."""
 
@@ -62,7 +66,7 @@ _MOSAICS = {
 
 
 def grey_of(message: Any, where: str, bits: int = 16) -> Image:
-    """The image of an Image or CompressedImage message in grey, (height, width) uint8.
+    """Grey image (height, width), uint8, of an Image or CompressedImage message.
 
     Args:
         message: the message.
@@ -166,8 +170,7 @@ def _pixels(
 # Depth
 
 
-_PACKED_DEPTH = "compressedDepth"
-_HEADER = 12  # bytes before the image: a kind, and two numbers by which floats are coded
+_HEADER = 12  # bytes before a compressed depth: a kind, and two numbers by which floats are coded
 
 
 def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
@@ -180,15 +183,14 @@ def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
         FrameError: it is no depth, or its data are incomplete.
     """
     if hasattr(message, "encoding"):
-        floats = message.encoding == "32FC1"
-        if not floats and message.encoding not in ("16UC1", "mono16"):
+        if message.encoding not in ("32FC1", "16UC1", "mono16"):
             raise FrameError(
                 f"{where}: encoding {message.encoding!r} is no depth: 16UC1 or 32FC1 is"
             )
         pixels = _pixels(message, message.encoding, 1, where)
-        return pixels if floats else _of_millimetres(pixels)
+        return pixels if message.encoding == "32FC1" else _of_millimetres(pixels)
     data = bytes(memoryview(message.data))
-    packed = _PACKED_DEPTH in message.format
+    packed = "compressedDepth" in message.format
     if "rvl" in message.format.lower():
         raise FrameError(f"{where}: depth in the format RVL is not read; record it as PNG, or raw")
     stored = decode_stored(data[_HEADER:] if packed else data, where)
@@ -206,7 +208,7 @@ def _of_millimetres(pixels: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
 
 
 # --------------------------------------------------------------------------------------------
-# Calibration
+# Calibration, motion
 
 
 def calibration_of(message: Any) -> dict[str, Any]:
@@ -214,25 +216,49 @@ def calibration_of(message: Any) -> dict[str, Any]:
 
     ``binning`` and ``roi`` (columns and rows) say which part of the calibrated image is sent.
     """
-    d, k, r, p = (_letters(message, letter) for letter in "dkrp")
+
+    def numbers(letter: str) -> dict[str, list[float]]:  # capital in ROS 1, small in ROS 2
+        values = getattr(message, letter, None)
+        values = getattr(message, letter.upper()) if values is None else values
+        return {"data": [float(v) for v in values]}
+
     roi = message.roi
     return {
         "image_width": int(message.width),
         "image_height": int(message.height),
         "distortion_model": message.distortion_model,
-        "camera_matrix": {"data": k},
-        "distortion_coefficients": {"data": d},
-        "rectification_matrix": {"data": r},
-        "projection_matrix": {"data": p},
+        "distortion_coefficients": numbers("d"),
+        "camera_matrix": numbers("k"),
+        "rectification_matrix": numbers("r"),
+        "projection_matrix": numbers("p"),
         "binning": (max(int(message.binning_x), 1), max(int(message.binning_y), 1)),
         "roi": tuple(int(v) for v in (roi.x_offset, roi.y_offset, roi.width, roi.height)),
     }
 
 
-def _letters(message: Any, letter: str) -> list[float]:
-    # Capital in ROS 1, small in ROS 2.
-    values = getattr(message, letter, None)
-    return [float(v) for v in (getattr(message, letter.upper()) if values is None else values)]
+def motion_of(message: Any) -> FloatArray:
+    """The numbers of a message by its type.
+
+    Of an Odometry (7,) position and quaternion x, y, z, w; of a twist (2,) m/s and rad/s; of an Imu
+    (3,) rad/s about its axes.
+    """
+    if hasattr(message, "angular_velocity"):
+        rate = message.angular_velocity
+        return np.array([rate.x, rate.y, rate.z])
+    if hasattr(message, "pose"):
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+    twist = getattr(message.twist, "twist", message.twist)
+    return np.array([twist.linear.x, twist.angular.z])
+
+
+# --------------------------------------------------------------------------------------------
+# Where frames sit on the robot
+
+
+_NAMED = 8  # frames that a message lists
+_STILL = 1e-5  # metres, and of a quaternion; less is rounding
+_UPWARD = 0.7071  # cosine of 45 degrees
 
 
 def frame_of(message: Any) -> str:
@@ -251,21 +277,112 @@ def transforms_of(message: Any) -> list[tuple[str, str, FloatArray]]:
     return found
 
 
-# --------------------------------------------------------------------------------------------
-# Motion
+class FrameTree:
+    """Transforms between frames that do not move against each other."""
+
+    def __init__(self, transforms: Iterable[tuple[str, str, FloatArray]] = ()) -> None:
+        """Takes what :meth:`add` takes."""
+        self._parents: dict[str, tuple[str, FloatArray]] = {}
+        self._moving: set[str] = set()
+        self._other: dict[str, str] = {}
+        self.add(transforms, static=True)
+
+    def add(self, transforms: Iterable[tuple[str, str, FloatArray]], static: bool) -> None:
+        """Takes parent, child, and (7,) position and quaternion x, y, z, w of the child in it.
+
+        Of several transforms of one child the last counts, as in tf. Those that are not from
+        tf_static count as long as they stay the same.
+        """
+        for parent, child, numbers in transforms:
+            if child in self._moving:
+                continue
+            before = self._parents.get(child)
+            if before is not None and before[0] != parent:
+                text = f"{child} has two parents, {before[0]} and {parent}; the latter counts"
+                self._other[child] = f"tf_static: {text}"
+            elif before is not None and not static and np.abs(before[1] - numbers).max() > _STILL:
+                self._moving.add(child)
+                del self._parents[child]
+                continue
+            self._parents[child] = parent, numbers
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is not as it should be, a line each."""
+        return tuple(self._other.values())
+
+    def __bool__(self) -> bool:
+        return bool(self._parents)
+
+    @property
+    def frames(self) -> set[str]:
+        """Names of all frames."""
+        return {*self._parents, *(parent for parent, _ in self._parents.values())}
+
+    def pose(self, frame: str, base: str) -> FloatArray:
+        """Pose (4, 4) of a frame in the axes of another.
+
+        Raises:
+            CalibrationError: the tree does not connect them, runs in a circle, or has a number that
+                is none.
+        """
+        names = sorted(self.frames)
+        for name in (frame, base):
+            if name not in names:
+                more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+                raise CalibrationError(
+                    f"tf_static has no frame {name or 'without a name'}; it has "
+                    f"{', '.join(names[:_NAMED]) + more or 'none'}"
+                )
+        ups = [self._up(name) for name in (frame, base)]
+        common = next((name for name in ups[0] if name in ups[1]), None)
+        if common is None:
+            raise CalibrationError(f"tf_static does not connect {frame} with {base}")
+        return np.asarray(inverse(ups[1][common]) @ ups[0][common])
+
+    def _up(self, frame: str) -> dict[str, FloatArray]:
+        """Poses of a frame in itself and in all that are above it, nearest first."""
+        found = {frame: np.eye(4)}
+        while frame in self._parents:
+            parent, numbers = self._parents[frame]
+            if parent in found:
+                circle = " under ".join([*list(found)[list(found).index(parent) :], parent])
+                raise CalibrationError(f"tf_static runs in a circle: {circle}")
+            found[parent] = _rigid_pose(frame, numbers) @ found[frame]
+            frame = parent
+        return found
 
 
-def motion_of(message: Any) -> FloatArray:
-    """The numbers of a message by its type.
+def _rigid_pose(child: str, numbers: FloatArray) -> FloatArray:
+    quaternion = numbers[3:]
+    if np.isfinite(numbers).all() and np.linalg.norm(quaternion) > 0.5:
+        found = pose(rotation_from_quaternion(quaternion), numbers[:3])
+        if is_rigid(found):
+            return found
+    raise CalibrationError(
+        f"tf_static: the transform of {child} is none: {', '.join(f'{v:g}' for v in numbers)}"
+    )
 
-    Of an Odometry (7,) position and quaternion x, y, z, w; of a twist (2,) m/s and rad/s; of an Imu
-    (3,) rad/s about its axes.
+
+def view_axes(tree: FrameTree, left: str, right: str, body: str) -> tuple[FloatArray, str]:
+    """Pose (4, 4) of a camera in its frame, and what was assumed.
+
+    Images are given in axes x right, y down, z ahead, and their frame's name says "optical"
+    (REP 103). Some give a frame with the axes of a robot, x ahead and z up: there the cameras sit
+    beside each other along y, or would look upwards.
     """
-    if hasattr(message, "angular_velocity"):
-        rate = message.angular_velocity
-        return np.array([rate.x, rate.y, rate.z])
-    if hasattr(message, "pose"):
-        p, q = message.pose.pose.position, message.pose.pose.orientation
-        return np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
-    twist = getattr(message.twist, "twist", message.twist)
-    return np.array([twist.linear.x, twist.angular.z])
+    robot = False
+    if "optical" not in left + right:
+        try:
+            apart = tree.pose(left, right)[:3, 3]
+            robot = abs(apart[1]) > 2.0 * abs(apart[0])
+            if not apart.any():
+                robot = tree.pose(right, body)[2, 2] > _UPWARD
+        except CalibrationError:
+            robot = False
+    if not robot:
+        return np.eye(4), ""
+    return BODY_FORWARD_LEFT_UP_FROM_CAMERA, (
+        f"frame {right} of the camera has the axes of a robot, z up: the camera is taken to look "
+        "along its x axis"
+    )

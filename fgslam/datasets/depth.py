@@ -1,0 +1,427 @@
+"""Colour and depth as a stereo pair, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md).
+
+Depth is measured as disparity: what a second camera beside the colour camera would see is made from
+the depth image, and found again by the front-end as in any stereo pair.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.cameras.formats import rgbd_part
+from fgslam.cameras.lenses import RawCamera
+from fgslam.cameras.rectify import View, pixel_grid, sampling_maps
+from fgslam.cameras.rig import StereoRig, at_size, read_calibration_file
+from fgslam.cameras.trees import read_tree
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.checks import is_finite_number
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.files import read_lines, shown_in
+from fgslam.core.sensors import CameraRig
+from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, require_size
+from fgslam.datasets.layouts import (
+    CameraFiles,
+    colour_and_depth,
+    colour_and_depth_files,
+    images_in,
+)
+from fgslam.datasets.odometry import file_odometry, find_odometry
+from fgslam.datasets.recording import (
+    ImageLoader,
+    Recording,
+    image_recording,
+    mounted,
+    on_wheels,
+    recording_identity,
+)
+from fgslam.datasets.settings import CalibratedSettings, RecordedOdometrySettings, RgbdSettings
+from fgslam.datasets.times import (
+    NANOSECONDS,
+    pair_files,
+    pair_stamps,
+    read_tum,
+    stamps_of,
+    trajectory_at_frames,
+)
+
+Depth: TypeAlias = npt.NDArray[np.float32]
+"""Depths (height, width) in metres; 0, infinite or NaN where unknown."""
+
+ReadPair: TypeAlias = Callable[[int], tuple[Image, Depth, str]]
+"""Of a frame its image, the depth of each pixel in metres, and the name of the depth image."""
+
+BASELINE_M = 0.08
+"""Of the camera that is made up: about that of depth cameras, so that both see much the same."""
+
+_FOUND_AGAIN_PX = 0.15  # by which SIFT finds a point again in a view made of the same image
+
+# --------------------------------------------------------------------------------------------
+# The camera that is made up
+
+
+def depth_rig(camera: RawCamera) -> StereoRig:
+    """The colour camera without distortion on the right, and the one that is made up."""
+    (fx, _, cx), (_, fy, cy) = camera.matrix[:2].tolist()
+    return StereoRig(camera.width, camera.height, fx, fy, cx, cy, BASELINE_M)
+
+
+def depth_sigma_px(focal_px: float, sigma_m: float) -> float:
+    """Noise of the disparity, pixels, where a depth of 1 m has ``sigma_m``, growing with Z^2."""
+    return round(float(np.hypot(focal_px * BASELINE_M * sigma_m, _FOUND_AGAIN_PX)), 3)
+
+
+def depth_images(read: ReadPair, rig: CameraRig, camera: RawCamera) -> ImageLoader:
+    """Frames as a stereo pair: the colour camera on the right, the view made by depth left.
+
+    Args:
+        read: what gives image and depth.
+        rig: of both cameras.
+        camera: the colour camera, whose distortion is taken away.
+    """
+    maps = None
+    if camera.model != "radtan" or np.any(camera.distortion):
+        view = View(camera.matrix, (camera.width, camera.height))
+        maps = sampling_maps(camera, np.eye(3), view, pixel_grid(view.size))
+
+    def load(index: int, colour: bool) -> tuple[Image, ...]:
+        image, metres, name = read(index)
+        if metres.shape != image.shape[:2]:
+            raise FrameError(
+                f"image {name} is {metres.shape[1]}x{metres.shape[0]}, its colour image "
+                f"{image.shape[1]}x{image.shape[0]}; depth must be registered to colour"
+            )
+        if maps is not None:
+            image = np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
+            # Between two surfaces there is no depth: of each pixel the nearest.
+            metres = np.asarray(cv2.remap(metres, *maps, cv2.INTER_NEAREST), np.float32)
+        known = np.isfinite(metres) & (metres > 0.0)
+        shift = rig.fx * rig.baseline / np.where(known, metres, np.inf)
+        pair = (image, seen_from_the_left(image, shift.astype(np.float32), known))
+        if colour or image.ndim == 2:
+            return pair
+        return tuple(np.asarray(cv2.cvtColor(i, cv2.COLOR_RGB2GRAY), np.uint8) for i in pair)
+
+    return load
+
+
+_CRACK_PX = 3.0  # between two neighbours on one surface, in the original image
+_LEAST_WEIGHT = 1e-3
+_SMOOTH = (41, 41)  # what fills the parts that nothing is known of has no texture of this size
+
+
+def seen_from_the_left(image: Image, shift: npt.NDArray[np.float32], known: BoolArray) -> Image:
+    """The image (h, w, ...) with each known pixel further right by its ``shift`` (h, w).
+
+    Nearer surfaces hide farther ones. What is seen by neither is filled without texture.
+    """
+    height, width = shift.shape
+    # The column of the original at which each pixel of the view looks.
+    rows, columns = np.nonzero(known)
+    order = np.argsort(shift[rows, columns], kind="stable")  # the nearest last, which stays
+    rows, columns = rows[order], columns[order]
+    there = columns + shift[rows, columns]
+    pixel = np.rint(there).astype(np.int64)
+    inside = (pixel >= 0) & (pixel < width)
+    source = np.full((height, width), np.nan, np.float32)
+    source[rows[inside], pixel[inside]] = (columns + pixel - there)[inside]
+    # A surface that is stretched leaves cracks of a pixel.
+    before, after = source[:, :-2], source[:, 2:]
+    crack = np.isnan(source[:, 1:-1]) & (np.abs(after - before) <= _CRACK_PX)
+    source[:, 1:-1][crack] = 0.5 * (before + after)[crack]
+
+    seen = np.isfinite(source)
+    at_rows = np.repeat(np.arange(height, dtype=np.float32)[:, None], width, axis=1)
+    at_columns = np.where(seen, source, -1.0).astype(np.float32)
+    moved = np.asarray(cv2.remap(image, at_columns, at_rows, cv2.INTER_LINEAR))
+    shown = seen if image.ndim == 2 else seen[:, :, None]
+    weight = cv2.blur(seen.astype(np.float32), _SMOOTH)
+    around = cv2.blur(np.where(shown, moved, 0).astype(np.float32), _SMOOTH)
+    weight = np.maximum(weight, _LEAST_WEIGHT).reshape(*weight.shape, *(1,) * (image.ndim - 2))
+    return np.asarray(np.where(shown, moved, around / weight), np.uint8)
+
+
+# --------------------------------------------------------------------------------------------
+# Files of colour and depth
+
+
+def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Recording:
+    """Open colour and depth images; the colour camera is the reference.
+
+    Args:
+        settings: where they are, and of which camera.
+        odometry: noise and limits of a file of odometry beside them.
+
+    Raises:
+        DatasetError: images are missing or do not pair, or depths are in another unit.
+        CalibrationError: nothing says the colour camera's focal length.
+    """
+    root = Path(settings.path)
+    pairs, stamps, notes, lists = _pairs(root, settings)
+    size = first_size(colour for colour, _ in pairs)
+    if size is None:
+        raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
+    require_one_camera(settings)
+    camera, known = _camera(root, settings, size)
+    odometry_file = find_odometry(root, settings.odometry_file)
+    rig, mounting = on_wheels(mounted(depth_rig(camera), settings), settings, odometry_file)
+    scale, said = _scale(root, pairs, settings, size)
+
+    def read(index: int) -> tuple[Image, Depth, str]:
+        colour_file, depth_file = pairs[index]
+        colour = require_size(read_colour_image(colour_file), f"image {colour_file}", *size)
+        depth = read_depth_image(depth_file)
+        return colour, depth.astype(np.float32) / np.float32(scale), str(depth_file)
+
+    identity = recording_identity(
+        [*lists, *filter(None, [odometry_file])], (path for pair in pairs for path in pair)
+    )
+    images = depth_images(read, rig, camera)
+    notes = (*notes, *known, *said, *mounting)
+    name, truth = root.resolve().name, root / "groundtruth.txt"
+    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
+    return replace(
+        recording,
+        ground_truth=trajectory_at_frames(read_tum(truth), recording.timestamps)
+        if truth.is_file()
+        else None,
+        odometry_source=file_odometry(odometry_file, odometry),
+        disparity_sigma_px=depth_sigma_px(settings.scale * rig.fx, settings.depth_sigma_m),
+    )
+
+
+def require_one_camera(settings: CalibratedSettings) -> None:
+    """Raises DatasetError where something is asked for that two cameras alone have."""
+    for name, usual in (("fov_deg", None), ("unit_m", 1.0)):
+        if getattr(settings, name) != usual:
+            raise DatasetError(f"{settings.path}: dataset.{name} is for two cameras; leave it out")
+
+
+def colour_and_depth_notes(notes: tuple[str, ...]) -> tuple[str, ...]:
+    """Notes on the pairs of two cameras in the words of colour and depth."""
+    words = (
+        ("left and right images", "colour and depth"),
+        ("right images", "colour images"),
+        ("left images", "depth images"),
+    )
+    for of_cameras, of_depth in words:
+        notes = tuple(note.replace(of_cameras, of_depth) for note in notes)
+    return notes
+
+
+def _pairs(
+    root: Path, settings: RgbdSettings
+) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...], tuple[Path, ...]]:
+    """Colour and depth of each frame, their stamps (n,) in seconds, notes and lists."""
+    lists = (root / "rgb.txt", root / "depth.txt")
+    if all(path.is_file() for path in lists):
+        (colour_at, colours), (depth_at, depths) = (_listed(path) for path in lists)
+        tolerance = 1e-3 * settings.pairing_tolerance_ms
+        names = (str(lists[0]), str(lists[1]))
+        (rows, partners), notes = pair_stamps(colour_at, depth_at, tolerance, names)
+        numbers = zip(rows.tolist(), partners.tolist(), strict=True)
+        pairs = tuple((colours[i], depths[j]) for i, j in numbers)
+        stamps = NANOSECONDS * colour_at[rows].astype(np.float64)
+        return pairs, stamps, colour_and_depth_notes(notes), lists
+    folders, mixed = colour_and_depth(root), None
+    if folders is None:
+        mixed = colour_and_depth_files(root)
+        if mixed is None:
+            raise DatasetError(f"{root} has no folders of colour and depth images (rgb/, depth/)")
+    else:
+        mixed = images_in(folders[0]), images_in(folders[1])
+        for folder, images in zip(folders, mixed, strict=True):
+            if not images:
+                raise DatasetError(f"{folder} holds no image; restore it")
+    colour_files, depth_files = map(tuple, mixed)
+    cameras = CameraFiles(depth_files, colour_files, root, interleaved=False)
+    pairs, notes = pair_files(cameras, settings.pairing_tolerance_ms)
+    used = [colour for colour, _ in pairs]
+    stamps, assumed, found = stamps_of(used, (used[0].parent, root), None, colour_files)
+    return pairs, stamps, (*colour_and_depth_notes(notes), *assumed), found
+
+
+def _listed(path: Path) -> tuple[IntArray, list[Path]]:
+    """Stamps (n,) in nanoseconds and files of a list ``seconds file``."""
+    stamps, files = [], []
+    for number, text in read_lines(path):
+        words = text.split()
+        if len(words) < 2 or re.fullmatch(r"\d+(\.\d+)?", words[0]) is None:
+            raise DatasetError(f"{path}, line {number}: expected seconds and a file; correct it")
+        whole, _, part = words[0].partition(".")
+        stamps.append(int(whole) * 10**9 + int(part[:9].ljust(9, "0") or 0))
+        files.append(path.parent / words[1])
+    if not stamps or np.any(np.diff(stamps) <= 0):
+        raise DatasetError(f"{path}: lists no image, or times do not increase; restore the file")
+    return np.array(stamps, np.int64), files
+
+
+# --------------------------------------------------------------------------------------------
+# The unit of depth
+
+
+_TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
+_NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
+# Where 16 bits are only assumed to be millimetres: farther than RealSense, Kinect and Orbbec see.
+_FARTHEST_GUESSED_M = 10.0
+_NEAREST_OF_TUM_M = 0.4  # nearer than Kinect sees in its near mode, of which TUM's layout is
+_ENDS = (1.0, 99.0)  # percentiles of depth that are its nearest and farthest: few pixels are wrong
+_SAMPLES = 5  # depth images, over the whole recording
+_SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor", "png_depth_scale", "scale")
+
+
+def _scale(
+    root: Path,
+    pairs: tuple[tuple[Path, Path], ...],
+    settings: RgbdSettings,
+    size: tuple[int, int],
+) -> tuple[float, tuple[str, ...]]:
+    """Units a metre, and the depth that follows from it in words. Raises DatasetError."""
+    seen, of_integers = _some_depths(root, pairs, size)
+    stated = settings.depth_scale or _stated_scale(root, settings)
+    guessed = stated is None and of_integers
+    scale, doubt = _assumed_scale(root, seen) if guessed else (stated or 1.0, ())
+    median = float(np.median(seen)) / scale
+    if not _NEAREST_M < median < (_FARTHEST_GUESSED_M if guessed else _FARTHEST_M):
+        raise DatasetError(
+            f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
+            "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, "
+            "10000 for tenths of them, 5000 as in TUM's, 1 for metres"
+        )
+    assumed = ", which nothing states" if guessed else ""
+    said = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
+    return scale, (*doubt, said)
+
+
+def _assumed_scale(root: Path, seen: FloatArray) -> tuple[float, tuple[str, ...]]:
+    """TUM's units a metre or millimetres, whichever a depth camera can have seen; doubt in words.
+
+    No motion tells: all that is seen is the same in a world of another size. Where both or neither
+    can be, it is the layout's own.
+
+    Args:
+        root: the recording, in TUM's layout or another.
+        seen: (n,) depths in units.
+    """
+    near, far = np.percentile(seen, _ENDS)
+    own, other = _MILLIMETRES, _TUM_SCALE
+    if (root / "depth.txt").is_file():
+        own, other = other, own
+    nearest = {_TUM_SCALE: _NEAREST_OF_TUM_M, _MILLIMETRES: _NEAREST_M}
+    possible = {
+        scale: near > nearest[scale] * scale and far < _FARTHEST_GUESSED_M * scale
+        for scale in (own, other)
+    }
+    if possible[own] and not possible[other]:
+        return own, ()
+    refused = float(np.median(seen)) >= _FARTHEST_GUESSED_M * own  # it may be a third unit
+    if possible[other] and not possible[own] and not refused:
+        own, other = other, own
+    return own, (
+        f"nothing states the unit of depth, and the size of the map depends on it: at {own:g} "
+        f"units a metre it is {near / own:.2g} to {far / own:.2g} m, at {other:g} "
+        f"{near / other:.2g} to {far / other:.2g} m; say which: "
+        f"--set dataset.depth_scale={other:g} or {own:g}",
+    )
+
+
+def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
+    """Units a metre by the calibration's file; RealSense's tools state metres a unit there."""
+    named = settings.camera_file
+    files = _own_files(root) if named is None else [Path(named)]
+    tree = read_tree(files[0]) if len(files) == 1 and files[0].is_file() else None
+    for key in _SCALES:
+        inner = rgbd_part(tree or {}).get(key)
+        given = (tree or {}).get(key) if inner is None and key != "scale" else inner
+        value = float(given) if is_finite_number(given) else 0.0  # type: ignore[arg-type]
+        if value > 0.0:
+            return 1.0 / value if value < 1.0 else value
+    return None
+
+
+def _some_depths(
+    root: Path, pairs: tuple[tuple[Path, Path], ...], size: tuple[int, int]
+) -> tuple[FloatArray, bool]:
+    """Known depths (n,) of some images, in their own units, and whether these are integers."""
+    images = []
+    for row in np.unique(np.linspace(0, len(pairs) - 1, _SAMPLES).astype(int)).tolist():
+        try:
+            images.append(read_depth_image(pairs[row][1]))
+        except FrameError:
+            continue
+    if not images:
+        raise DatasetError(f"{root}: not one depth image can be read; restore them")
+    if all(depth.shape != size[::-1] for depth in images):  # a few may be damaged
+        own = f"{images[0].shape[1]}x{images[0].shape[0]}"
+        raise DatasetError(
+            f"{root}: depth images are {own} pixels, colour images {size[0]}x{size[1]}; depth must "
+            f"be registered to colour. Where it is, as in ScanNet, resize the colour images to "
+            f"{own}, and say --set dataset.resized=true"
+        )
+    known = [depth[np.isfinite(depth) & (depth > 0)] for depth in images]
+    seen = np.concatenate(known).astype(np.float64)
+    if len(seen) == 0:
+        raise DatasetError(f"{pairs[0][1]} holds no depth at all; check the depth images")
+    return seen, bool(images[0].dtype == np.uint16)
+
+
+# --------------------------------------------------------------------------------------------
+# The colour camera
+
+
+_TUM_CAMERAS = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+}
+"""fx, fy, cx, cy of the colour cameras, as TUM publishes them; their distortion is left out."""
+
+
+def camera_of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:
+    """The first camera of a calibration file, for images of this size."""
+    found = read_calibration_file(path, size=size)
+    alone = replace(found, cameras=found.cameras[:1], view=None)
+    return at_size(alone, size, resized).cameras[0]
+
+
+def _camera(
+    root: Path, settings: RgbdSettings, size: tuple[int, int]
+) -> tuple[RawCamera, tuple[str, ...]]:
+    """The colour camera by the given file, the folder's own, or as TUM publishes it."""
+    if settings.camera_file is not None:
+        return camera_of_file(Path(settings.camera_file), size, settings.resized), ()
+    own = _own_files(root)
+    if len(own) == 1:
+        return camera_of_file(own[0], size, settings.resized), ()
+    known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
+    if known is None or size != (640, 480):
+        raise CalibrationError(
+            f"{root}: nothing says the colour camera's focal length; give its calibration by "
+            "--camera FILE"
+        )
+    fx, fy, cx, cy = _TUM_CAMERAS[known[1]]
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    camera = RawCamera(*size, matrix, np.zeros(4), np.eye(4), f"freiburg{known[1]}")
+    return camera, (f"the camera is taken as TUM's freiburg{known[1]}, without distortion",)
+
+
+def _own_files(root: Path) -> list[Path]:
+    """The folder's files that may be a camera; of several those that are one."""
+    suffixes = (".json", ".yaml", ".yml", ".xml")
+    found = [p for p in shown_in(root) if p.suffix in suffixes or p.name == "camera_info.txt"]
+    if len(found) < 2:
+        return found
+    cameras = []
+    for path in found:
+        try:
+            cameras += [path] if read_calibration_file(path).cameras else []
+        except CalibrationError:
+            continue
+    return cameras

@@ -1,0 +1,241 @@
+"""Folders of images: our own layout, and any two folders, or one with the side in the names.
+
+docs/datasets/image_folder.md, docs/datasets/loose_images.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.cameras.formats import read_json_object
+from fgslam.cameras.rig import StereoRig
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.geometry import right_from_left_camera
+from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
+from fgslam.datasets.layouts import files_of, find_cameras, layout_hint
+from fgslam.datasets.odometry import file_odometry, find_odometry
+from fgslam.datasets.recording import (
+    Recording,
+    calibrated_rig,
+    image_recording,
+    loaded_rig,
+    mounted,
+    numbered,
+    on_wheels,
+    recording_identity,
+)
+from fgslam.datasets.settings import (
+    ImageFolderSettings,
+    LooseImagesSettings,
+    RecordedOdometrySettings,
+)
+from fgslam.datasets.times import (
+    pair_files,
+    read_table,
+    read_tum,
+    require_increasing,
+    stamps_of,
+    trajectory_at_frames,
+)
+
+# --------------------------------------------------------------------------------------------
+# Any two cameras
+
+
+def open_loose_images(
+    settings: LooseImagesSettings, odometry: RecordedOdometrySettings
+) -> Recording:
+    """Open images of two cameras that lie in two folders, or in one with the side in their names.
+
+    Raises:
+        DatasetError: there are no two cameras, their images do not pair, or times are malformed.
+        CalibrationError: there is no calibration, or it is none of these images.
+    """
+    given = Path(settings.path)
+    folder, files = (given, None) if given.is_dir() else (given.parent, files_of(given))
+    cameras = find_cameras(folder, files)
+    if cameras is None:
+        raise DatasetError(
+            f"{given}: no images of a left and a right camera: two folders such as left/ and "
+            "right/, or names such as *_left.png and *_right.png; one camera alone is not enough"
+        )
+    root = cameras.folder
+    pairs, unpaired = pair_files(cameras, settings.pairing_tolerance_ms)
+    right = [pair[0] for pair in pairs]
+    own = right[0].parent
+    stamps, assumed, lists = stamps_of(right, (own, own.parent, root), settings.fps, cameras.right)
+    rig = calibrated_rig(settings, root, first_size(right))
+    rig = numbered(rig) if cameras.numbered else rig
+    images, noticed = open_frames(pairs, rig, root)
+    odometry_file = find_odometry(root, settings.odometry_file)
+    rig, mounting = on_wheels(rig, settings, odometry_file)
+    also = ", ".join(" with ".join(pair) for pair in cameras.others)
+    others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
+    defining = [*lists, *filter(None, [odometry_file])]
+    identity = recording_identity(defining, (path for pair in pairs for path in pair))
+    notes = (*mounting, *noticed, *others, *unpaired, *assumed)
+    name = root.resolve().name
+    recording = image_recording(settings, name, rig, stamps, images.load, identity, notes)
+    return replace(recording, odometry_source=file_odometry(odometry_file, odometry))
+
+
+# --------------------------------------------------------------------------------------------
+# Our own layout: left/, right/[, top/], calib.json, times.txt
+
+
+TRUTH_LEFT = "gt_left_cam.txt"
+TRUTH_RIGHT = "gt_right_cam.txt"
+_LAST_NUMBER = 2.0**53  # beyond it a float is no single whole number
+
+
+def open_image_folder(
+    settings: ImageFolderSettings, odometry: RecordedOdometrySettings
+) -> Recording:
+    """Open a recording in the image-folder layout.
+
+    Args:
+        settings: where it is and which frames are used.
+        odometry: noise and limits of recorded odometry; read only when a motion is asked for.
+
+    Raises:
+        DatasetError: a folder or file is missing or malformed, or no frame is left.
+        CalibrationError: calib.json is missing, not finite or impossible.
+    """
+    root = Path(settings.path)
+    require_folder(root, "the recording")
+    cameras = _numbered_images(root, settings.use_top)
+    calibration = root / "calib.json"
+    if settings.camera_file is not None:
+        calibration = Path(settings.camera_file)
+    rig = _folder_rig(root, settings, calibration, cameras)
+    numbers, stamps = _read_times(root / "times.txt")
+    images, noticed = open_frames(_frames(cameras, numbers), rig, root)
+    odometry_file = find_odometry(root, settings.odometry_file)
+    rig, mounting = on_wheels(rig, settings, odometry_file)
+    known = set(numbers.tolist())
+    unlisted = {folder.name: len(found.keys() - known) for folder, found in cameras.items()}
+    notes = [
+        f"{n} images of {k}/ are not in times.txt and unused" for k, n in unlisted.items() if n
+    ]
+    without_top = settings.camera_file is None and settings.use_top and len(cameras) == 2
+    if without_top and "vertical_baseline_m" in read_json_object(calibration):
+        notes.append(
+            "calib.json states a vertical baseline but there is no top/: read as two cameras"
+        )
+    present = [path for path in (calibration,) if path.is_file()]
+    defining = [*present, root / "times.txt", *filter(None, [odometry_file])]
+    identity = recording_identity(
+        defining, (path for found in cameras.values() for path in found.values())
+    )
+    recording = image_recording(
+        settings,
+        root.resolve().name,
+        rig,
+        stamps,
+        images.load,
+        identity,
+        (*mounting, *noticed, *notes),
+    )
+    truth = _read_truth(root, rig.baseline)
+    return replace(
+        recording,
+        ground_truth=None if truth is None else trajectory_at_frames(truth, recording.timestamps),
+        odometry_source=file_odometry(odometry_file, odometry),
+    )
+
+
+def _numbered_images(root: Path, use_top: bool) -> dict[Path, dict[int, Path]]:
+    """Images by number of the cameras' folders, right first. Raises DatasetError without any."""
+    folders = [root / "right", root / "left"]
+    absent = [folder.name for folder in folders if not folder.is_dir()]
+    if absent:
+        other = layout_hint(root, "image_folder") or (
+            "a recording of one camera cannot be used, a stereo pair (left/ and right/) is the "
+            "least; check dataset.path"
+        )
+        raise DatasetError(f"{root} has no folder {' and no folder '.join(absent)}; {other}")
+    if use_top and (root / "top").is_dir():
+        folders.append(root / "top")
+    cameras = {folder: list_numbered_images(folder) for folder in folders}
+    for folder, images in cameras.items():
+        if not images:
+            raise DatasetError(
+                f"{folder} holds no image named by its number (000000.png ...): the whole camera "
+                "is missing; restore it"
+            )
+    return cameras
+
+
+def _folder_rig(
+    root: Path,
+    settings: ImageFolderSettings,
+    calibration: Path,
+    cameras: dict[Path, dict[int, Path]],
+) -> StereoRig:
+    """The rectified rig, with what rectifies the images where they are raw."""
+    three = len(cameras) == 3
+    chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
+    size = first_size(cameras[root / "right"].values())
+    rig = loaded_rig(settings, calibration, size=size, cameras=chosen, pair=not three)
+    # Two of three cameras in a line may be the outer ones, where the file tells the images' sides.
+    known = None if rig.rectifier is None else rig.rectifier.calibration
+    outer_two = known is not None and known.sided and len(known.cameras) == 3
+    if three and rig.vertical_baseline is None and not outer_two:
+        raise CalibrationError(
+            f"{calibration} knows two cameras, but {root} has a third one, top/; give a "
+            "calibration of all three, or leave it out: --set dataset.use_top=false"
+        )
+    return mounted(rig if three else replace(rig, vertical_baseline=None), settings)
+
+
+def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
+    """Image numbers (n,) and stamps (n,) in seconds."""
+    table = read_table(path, ("image number", "time"))
+    stated = table.column(0)
+    wrong = np.flatnonzero((stated != np.floor(stated)) | (stated < 0) | (stated > _LAST_NUMBER))
+    if len(wrong):
+        line = table.lines[wrong[0]]
+        raise DatasetError(
+            f"{path}, line {line}: the image number {stated[wrong[0]]:g} is not a whole "
+            "number from 0; the line must be: number, seconds"
+        )
+    numbers = stated.astype(np.int64)
+    _, first = np.unique(numbers, return_index=True)
+    repeated = np.setdiff1d(np.arange(len(numbers)), first)
+    if len(repeated):
+        k = int(repeated[0])
+        raise DatasetError(
+            f"{path}, line {table.lines[k]}: image number {numbers[k]} is listed twice; "
+            "remove one of the lines"
+        )
+    require_increasing(table, table.column(1))
+    return numbers, table.column(1)
+
+
+def _frames(
+    cameras: dict[Path, dict[int, Path]], numbers: IntArray
+) -> tuple[tuple[Path, ...], ...]:
+    """Files of all frames; an absent one gets the name that it should have."""
+    suffixes = {folder: next(iter(images.values())).suffix for folder, images in cameras.items()}
+    return tuple(
+        tuple(
+            images.get(number, folder / f"{number:06d}{suffixes[folder]}")
+            for folder, images in cameras.items()
+        )
+        for number in numbers.tolist()
+    )
+
+
+def _read_truth(root: Path, baseline: float) -> Trajectory | None:
+    """True poses of the reference (right) camera at their own stamps, or None."""
+    if (root / TRUTH_RIGHT).is_file():
+        return read_tum(root / TRUTH_RIGHT)
+    if (root / TRUTH_LEFT).is_file():
+        left = read_tum(root / TRUTH_LEFT)
+        return Trajectory(left.timestamps, right_from_left_camera(left.poses, baseline))
+    return None

@@ -1,0 +1,385 @@
+"""Pictures of an omnidirectional camera: folders, panoramas with surveyed poses, videos.
+
+docs/datasets/mirror_images.md, docs/datasets/panoramas.md.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni.camera_files import make_camera
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.files import read_text, shown_in
+from fgslam.core.planar import wrap
+from fgslam.datasets.images import read_colour_image, require_folder
+from fgslam.datasets.layouts import IMAGE_SUFFIXES, natural
+from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
+from fgslam.datasets.recording import recording_identity, select_frames
+from fgslam.datasets.times import finite_number, written_stamps
+from fgslam.datasets.video import VideoFrames, moments_of
+
+if TYPE_CHECKING:
+    from scipy import sparse
+
+ColourLoader: TypeAlias = Callable[[int], Image]
+"""Picture (height, width, 3) in R, G, B by place in the recording; raises FrameError."""
+
+
+@dataclass(frozen=True, eq=False)
+class OmniRecording:
+    """Pictures of one omnidirectional camera; read when asked for.
+
+    Attributes:
+        name: short name for titles.
+        identity: hexadecimal digest of the recording.
+        camera: of all pictures.
+        ids: (n,) the recording's own numbers, all different.
+        names: (n,) of the pictures, as people know them: file names, or frames of a video.
+        timestamps: (n,) seconds, strictly increasing; NaN where times are unknown.
+        load_image: reads a picture by its place.
+        poses: (n, 3) planar poses x, y in metres and heading of the camera (of the centre column
+            of a panorama) in radians, in the recording's world; None where there is no truth.
+        rooms: (n,) name of the room of each picture, or None.
+        notes: what was tolerated when opening.
+    """
+
+    name: str
+    identity: str
+    camera: OmniCamera
+    ids: IntArray
+    names: tuple[str, ...]
+    timestamps: FloatArray
+    load_image: ColourLoader
+    poses: FloatArray | None = None
+    rooms: tuple[str, ...] | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def image(self, i: int) -> Image:
+        """Picture ``i`` (camera.height, camera.width, 3) in R, G, B, 0 <= i < len.
+
+        Raises:
+            FrameError: it is missing or damaged, or has another size than the camera.
+        """
+        if not 0 <= i < len(self):
+            raise IndexError(f"picture {i} of {self.name}: expected 0 to {len(self) - 1}")
+        image = self.load_image(i)
+        if image.shape[:2] != (self.camera.height, self.camera.width):
+            raise FrameError(
+                f"{self.name}: picture {self.names[i]} has {image.shape[1]}x{image.shape[0]} "
+                f"pixels, but the camera is calibrated for {self.camera.width}x"
+                f"{self.camera.height}; all pictures must have that size"
+            )
+        return image
+
+    def select(self, chosen: IntArray) -> OmniRecording:
+        """Those pictures alone, in that order."""
+        places = [int(i) for i in chosen]
+        load = self.load_image
+        return replace(
+            self,
+            ids=self.ids[chosen],
+            names=tuple(self.names[i] for i in places),
+            timestamps=self.timestamps[chosen],
+            poses=None if self.poses is None else self.poses[chosen],
+            rooms=None if self.rooms is None else tuple(self.rooms[i] for i in places),
+            load_image=lambda i: load(places[i]),
+        )
+
+
+# --------------------------------------------------------------------------------------------
+# Pictures of a mirror: a folder along a path, a video
+
+
+def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
+    """Open a folder of mirror images, in the order of the numbers in their names.
+
+    Raises:
+        DatasetError: the folder is absent or holds no such picture.
+        CalibrationError: the camera is impossible, or calibrated for another size.
+        FrameError: the first picture cannot be read.
+    """
+    root = Path(settings.path)
+    paths = pictures_in(root, settings.pattern)
+    chosen = select_frames(len(paths), settings)
+    first = read_colour_image(paths[int(chosen[0])])
+    recording = OmniRecording(
+        name=root.resolve().name,
+        identity=recording_identity([], paths),
+        camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), root),
+        ids=ids_of([path.stem for path in paths]),
+        names=tuple(path.name for path in paths),
+        timestamps=times_of(paths, root),
+        load_image=lambda i: read_colour_image(paths[i]),
+    )
+    return recording.select(chosen)
+
+
+def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
+    """Open a video file; times come from its rate or its frames, the first of which is at 0 s.
+
+    Raises:
+        DatasetError: the file is absent, no video, or without a frame rate.
+        CalibrationError: the camera is impossible, or calibrated for another size.
+        FrameError: the first frame cannot be decoded.
+    """
+    path = Path(settings.path)
+    frames = VideoFrames(path)
+    rate = settings.frame_rate_hz or frames.rate
+    if not 0.0 < rate < np.inf:
+        raise DatasetError(f"{path} states no frame rate; give dataset.frame_rate_hz")
+    chosen = select_frames(frames.count, settings)
+    first = frames.load(int(chosen[0]))
+    moments = moments_of([frames], rate, settings.frame_rate_hz is not None)
+    recording = OmniRecording(
+        name=path.stem,
+        identity=recording_identity([path], []),
+        camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), path.parent),
+        ids=moments.numbers[:, 0],
+        names=tuple(f"frame {k}" for k in range(frames.count)),
+        timestamps=moments.times,
+        notes=(*frames.notes, *moments.notes),
+        load_image=frames.load,
+    )
+    return recording.select(chosen)
+
+
+def pictures_in(folder: Path, pattern: str = "*") -> list[Path]:
+    """Picture files of a folder in the order of the numbers in their names.
+
+    Raises:
+        DatasetError: the folder is absent or holds no such picture.
+    """
+    require_folder(folder, "the folder of pictures")
+    found = [
+        path
+        for path in shown_in(folder)
+        if fnmatchcase(path.name, pattern)
+        and path.suffix.lower() in IMAGE_SUFFIXES
+        and path.is_file()
+    ]
+    if not found:
+        # Folders in this one may hold pictures, as of a stereo recording.
+        inside = {p.parent for p in folder.glob("*/*") if p.suffix.lower() in IMAGE_SUFFIXES}
+        shown = ", ".join(path.name for path in sorted(inside, key=natural)[:3])
+        raise DatasetError(
+            f"{folder} holds no picture named {pattern} ({', '.join(IMAGE_SUFFIXES)}); "
+            + (
+                f"folders in it do ({shown}): give that of the one camera"
+                if inside
+                else "check dataset.path"
+            )
+        )
+    return sorted(found, key=natural)
+
+
+def ids_of(names: Sequence[str]) -> IntArray:
+    """(n,) last number in each name where all have one and all differ; else 0 to n - 1."""
+    numbers = [re.findall(r"\d+", name) for name in names]
+    last = [int(n[-1]) if n and len(n[-1]) < 18 else -1 for n in numbers]
+    if -1 in last or max(Counter(last).values()) > 1:
+        return np.arange(len(names), dtype=np.int64)
+    return np.array(last, dtype=np.int64)
+
+
+def times_of(images: Sequence[Path], folder: Path) -> FloatArray:
+    """Time stamps (n,) of a folder's images, by a list beside them or their names; NaN without.
+
+    Raises:
+        DatasetError: the list is malformed, or lacks an image.
+    """
+    written = written_stamps(images, [folder])
+    return np.full(len(images), np.nan) if written is None else written[0]
+
+
+# --------------------------------------------------------------------------------------------
+# A folder of panoramas, with or without surveyed poses
+
+
+POSES_FILE = "poses.csv"
+_PICTURES = "panos"
+_NUMBERS = ("x_m", "y_m", "heading_deg")
+_COLUMNS = ("id", "file", *_NUMBERS)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A row of poses.csv."""
+
+    line: int
+    id: int
+    file: str
+    pose: tuple[float, float, float]
+    room: str
+
+
+def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
+    """Open a folder of panoramas: those in ``poses.csv`` in its order, else all by their numbers.
+
+    Raises:
+        DatasetError: the folder, a picture or a row is missing, malformed or listed twice.
+        CalibrationError: the panorama's elevations are impossible.
+        FrameError: the first picture cannot be read.
+    """
+    root = Path(settings.path)
+    require_folder(root, "the folder of panoramas")
+    table, pictures = root / POSES_FILE, root / _PICTURES
+    places = _read_places(table) if table.is_file() else []
+    if places:
+        paths = [_listed_picture(root, place) for place in places]
+    else:
+        paths = pictures_in(pictures if pictures.is_dir() else root)
+    chosen = select_frames(len(paths), settings)
+    first = read_colour_image(paths[int(chosen[0])])
+    size = reduced = (first.shape[1], first.shape[0])
+    if settings.width is not None and settings.width != size[0]:
+        if settings.width > size[0]:
+            raise DatasetError(
+                f"dataset.width is {settings.width} but the panoramas of {root} have only "
+                f"{size[0]} columns; give a smaller width, or null"
+            )
+        reduced = (settings.width, max(2, round(settings.width * size[1] / size[0])))
+    reduction = None if reduced == size else PanoramaReduction(size, reduced)
+
+    def load(i: int) -> Image:
+        image = read_colour_image(paths[i])
+        if (image.shape[1], image.shape[0]) != size:
+            raise FrameError(
+                f"panorama {paths[i]} has {image.shape[1]}x{image.shape[0]} pixels, the first one "
+                f"{size[0]}x{size[1]}; all must have one size"
+            )
+        return image if reduction is None else reduction(image)
+
+    recording = OmniRecording(
+        name=root.resolve().name,
+        identity=recording_identity([table] if places else [], paths),
+        camera=make_camera(settings.camera, reduced, root),
+        ids=ids_of([path.stem for path in paths]),
+        names=tuple(path.name for path in paths),
+        timestamps=times_of(paths, root),
+        load_image=load,
+    )
+    if places:
+        # Beside poses.csv lie plans, too; pictures that no row names are looked for in panos/.
+        inside = pictures.iterdir() if pictures.is_dir() else ()
+        extra = [p for p in inside if p.suffix.lower() in IMAGE_SUFFIXES and p not in paths]
+        note = f"{len(extra)} pictures of {_PICTURES}/ are not in {POSES_FILE}"
+        recording = replace(
+            recording,
+            ids=np.array([place.id for place in places], dtype=np.int64),
+            poses=np.array([place.pose for place in places], dtype=np.float64),
+            rooms=tuple(p.room for p in places) if any(p.room for p in places) else None,
+            notes=(note,) if extra else (),
+        )
+    return recording.select(chosen)
+
+
+def _read_places(path: Path) -> list[_Place]:
+    reader = csv.DictReader(read_text(path).splitlines(), strict=True)
+    try:
+        absent = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
+        if absent:
+            raise DatasetError(
+                f"{path}, line 1: no column {', '.join(absent)}; the header must name "
+                f"{', '.join(_COLUMNS)}"
+            )
+        places = [_place(f"{path}, line {reader.line_num}", reader.line_num, row) for row in reader]
+    except csv.Error as cause:
+        raise DatasetError(
+            f"{path}, line {reader.reader.line_num}: {cause}; correct the line"
+        ) from cause
+    if not places:
+        raise DatasetError(f"{path} lists no panorama; add rows, or remove the file")
+    seen: dict[int | str, int] = {}
+    for place in places:
+        for key, what in ((place.id, "id"), (place.file, "file")):
+            if key in seen:
+                raise DatasetError(
+                    f"{path}, line {place.line}: {what} {key} is in line {seen[key]} already; "
+                    "remove one of the rows"
+                )
+            seen[key] = place.line
+    return places
+
+
+def _place(where: str, line: int, row: dict[str, str | None]) -> _Place:
+    words = {name: (row.get(name) or "").strip() for name in (*_COLUMNS, "room")}
+    if empty := next((name for name in _COLUMNS if not words[name]), None):
+        raise DatasetError(f"{where}: {empty} is empty; complete the row")
+    x, y, heading = (finite_number(words[name], f"{where}: {name}") for name in _NUMBERS)
+    if not words["id"].isdecimal():
+        raise DatasetError(f"{where}: id is {words['id']!r}, not a whole number from 0")
+    angle = float(wrap(np.array(math.radians(heading))))
+    return _Place(line, int(words["id"]), words["file"], (x, y, angle), words["room"])
+
+
+def _listed_picture(root: Path, place: _Place) -> Path:
+    """The file of a row, in the folder itself or in panos/."""
+    for path in (root / place.file, root / _PICTURES / place.file):
+        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
+            return path
+    raise DatasetError(
+        f"{root / POSES_FILE}, line {place.line}: there is no picture {place.file} in "
+        f"{root} or its {_PICTURES}/; restore it, or remove the row"
+    )
+
+
+class PanoramaReduction:
+    """Averages pictures (height, width, 3) of one size to a smaller one, around the seam.
+
+    Plain resizing keeps the picture's *borders* in place; a panorama's first and last columns (and
+    rows) must keep their *centres*, or bearings would be off by half a pixel at the seam.
+    """
+
+    def __init__(self, before: tuple[int, int], after: tuple[int, int]) -> None:
+        """Sizes are (width, height); ``after`` must not be larger."""
+        self._across = _averaging(before[0], after[0], periodic=True)
+        self._down = _averaging(before[1], after[1], periodic=False)
+
+    def __call__(self, image: Image) -> Image:
+        """The smaller picture, rounded."""
+        height, width, bands = image.shape
+        rows = self._down @ image.reshape(height, -1).astype(np.float32)
+        columns = rows.reshape(-1, width, bands).transpose(1, 0, 2).reshape(width, -1)
+        out = (self._across @ columns).reshape(-1, rows.shape[0], bands).transpose(1, 0, 2)
+        return np.ascontiguousarray(out + np.float32(0.5)).astype(np.uint8)
+
+
+def _averaging(before: int, after: int, periodic: bool) -> sparse.csr_array:
+    """(after, before) weights: each new pixel is the mean over the old ones that it covers."""
+    from scipy import sparse  # of pictures that are not made smaller nothing needs it
+
+    step = (before - 1) / (after - 1)
+    centres = np.arange(after) * step
+    reach = int(np.ceil(0.5 * step + 0.5))
+    old = np.rint(centres).astype(np.int64)[:, None] + np.arange(-reach, reach + 1)
+    weights: FloatArray = np.clip(
+        np.minimum(centres[:, None] + 0.5 * step, old + 0.5)
+        - np.maximum(centres[:, None] - 0.5 * step, old - 0.5),
+        0.0,
+        None,
+    )
+    if periodic:
+        # The first and the last column look the same way.
+        old = np.mod(old, before - 1)
+    else:
+        weights = np.where((old >= 0) & (old < before), weights, 0.0)
+        old = np.clip(old, 0, before - 1)
+    weights /= weights.sum(axis=1, keepdims=True)
+    new = np.repeat(np.arange(after), old.shape[1])
+    entries = (weights.ravel().astype(np.float32), (new, old.ravel()))
+    return sparse.csr_array(entries, shape=(after, before))

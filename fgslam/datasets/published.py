@@ -1,0 +1,443 @@
+"""Published data sets in their native layouts: EuRoC, KITTI odometry, KITTI raw.
+
+docs/datasets/euroc.md, docs/datasets/md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from fgslam.cameras.formats import read_asl_mounting
+from fgslam.cameras.rig import StereoRig, load_rig
+from fgslam.cameras.stereo_formats import (
+    KITTI_RAW,
+    KITTI_RAW_COLOUR,
+    left_on_inertial_unit,
+    pair_beside,
+    read_kitti,
+    right_of_camera_0,
+)
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import CalibrationError, DatasetError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.files import read_lines, read_text, shown_in
+from fgslam.core.geometry import inverse, pose, right_from_left_camera
+from fgslam.core.sensors import CameraRig, body_is_camera
+from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
+from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
+from fgslam.datasets.odometry import (
+    OdometrySource,
+    checked_speeds,
+    recorded_gyroscope,
+    recorded_motions,
+)
+from fgslam.datasets.recording import (
+    Recording,
+    image_recording,
+    loaded_rig,
+    mounted,
+    read_rig,
+    recording_identity,
+)
+from fgslam.datasets.settings import (
+    EurocSettings,
+    KittiRawSettings,
+    KittiSettings,
+    RecordedOdometrySettings,
+)
+from fgslam.datasets.times import (
+    NANOSECONDS,
+    Table,
+    pair_files,
+    pair_stamps,
+    poses_of,
+    read_table,
+    require_increasing,
+    stamps_of,
+    trajectory_at_frames,
+    written_stamps,
+)
+
+# --------------------------------------------------------------------------------------------
+# EuRoC MAV (ASL layout), rectified on reading
+
+
+_CAMERAS = ("cam0", "cam1")
+_TRUTH_COLUMNS = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
+_FASTEST_NS = 1_000_000  # a thousand frames a second; in microseconds it is one
+
+
+def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> Recording:
+    """Open a recording; ``settings.path`` is the folder mav0 or the one that holds it.
+
+    Raises:
+        DatasetError: a folder or file is missing or malformed, or no frame is left.
+        CalibrationError: a sensor.yaml is missing, not finite or impossible.
+    """
+    root = Path(settings.path)
+    root = root / "mav0" if (root / "mav0").is_dir() else root
+    folders = [root / name for name in _CAMERAS]
+    for folder in folders:
+        require_folder(folder, "a stereo pair needs two cameras, but the folder")
+    cameras = [read_camera_frames(folder) for folder in folders]
+    rig = _euroc_rig(settings, root, first_size(cameras[0].paths))
+    right, left = (cameras[k] for k in rig.sources[:2])
+    names = (str(right.paths[0].parent), str(left.paths[0].parent))
+    tolerance = 1e-3 * settings.pairing_tolerance_ms
+    (rows, partners), paired = pair_stamps(right.stamps, left.stamps, tolerance, names)
+    paths = [(right.paths[i], left.paths[j]) for i, j in zip(rows, partners, strict=True)]
+    images, noticed = open_frames(paths, rig, root)
+    sensors = [*folders, root / "imu0"]
+    defining = [folder / name for folder in sensors for name in ("sensor.yaml", "data.csv")]
+    identity = recording_identity(
+        [path for path in defining if path.is_file()],
+        [path for pair in paths for path in pair if path.is_file()],
+    )
+    recording = image_recording(
+        settings,
+        root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
+        rig,
+        right.stamps[rows].astype(np.float64) * NANOSECONDS,
+        images.load,
+        identity,
+        (*noticed, *paired),
+    )
+    return replace(
+        recording,
+        ground_truth=_euroc_truth(root, rig, recording.timestamps),
+        odometry_source=_euroc_gyroscope(root, odometry),
+    )
+
+
+def _euroc_rig(settings: EurocSettings, root: Path, size: tuple[int, int] | None) -> StereoRig:
+    """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain beside mav0."""
+    given: tuple[Path, ...] = tuple(root / name / "sensor.yaml" for name in _CAMERAS)
+    chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
+    if settings.camera_file is not None:
+        given = (Path(settings.camera_file),)
+    elif not any(path.is_file() for path in given):
+        given = next(((chain,) for chain in chains if chain.is_file()), ())
+    if not given:
+        raise CalibrationError(
+            f"{root}: neither {_CAMERAS[0]}/sensor.yaml nor, as in TUM-VI, {chains[0]} is "
+            "there; restore one, or give a calibration by --camera FILE"
+        )
+    return mounted(loaded_rig(settings, *given, size=size), settings)
+
+
+def _euroc_gyroscope(root: Path, settings: RecordedOdometrySettings) -> OdometrySource | None:
+    """Turns by imu0, read when they are first needed; None where there is none."""
+    path, own = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
+    if not path.is_file():
+        return None
+    noise = next((p for p in (own, root.parent / "dso" / "imu_config.yaml") if p.is_file()), None)
+    mounting = own if own.is_file() else None
+    read = partial(recorded_gyroscope, path, mounting, noise, settings)
+    return recorded_motions(str(path), read, settings)
+
+
+def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
+    """True poses of the rectified right camera, interpolated at the frames' stamps (n,)."""
+    body = read_body_truth(root / "state_groundtruth_estimate0")
+    if body is None and not body_is_camera(rig.bTc):  # TUM-VI tracks the gyroscope
+        body = read_body_truth(root / "mocap0")
+    if body is None:
+        return None
+    at_frames = trajectory_at_frames(body, frames)
+    return Trajectory(at_frames.timestamps, at_frames.poses @ rig.bTc)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraFrames:
+    """Images listed in a camera's data.csv: stamps (n,) in nanoseconds, increasing, and files."""
+
+    stamps: IntArray
+    paths: tuple[Path, ...]
+
+
+def read_camera_frames(folder: Path) -> CameraFrames:
+    """Images that a camera's data.csv lists (``stamp in ns, file name``), under data/.
+
+    Raises:
+        DatasetError: the file is missing, empty or malformed, or stamps do not increase.
+    """
+    path = folder / "data.csv"
+    stamps: list[int] = []
+    paths: list[Path] = []
+    for number, (line, text) in enumerate(read_lines(path)):
+        words = [word.strip() for word in text.split(",")]
+        if number == 0 and not any(digit in words[0] for digit in "0123456789"):
+            continue  # names of columns
+        if len(words) < 2 or not words[0].isdecimal() or not words[1]:
+            raise DatasetError(
+                f"{path}, line {line}: expected a stamp in whole nanoseconds and a file name; "
+                "correct the line, or all stamps (seconds: times 1e9)"
+            )
+        if stamps and int(words[0]) <= stamps[-1]:
+            raise DatasetError(
+                f"{path}, line {line}: stamp {words[0]} does not come after {stamps[-1]}; put the "
+                "lines in time order and remove duplicates"
+            )
+        stamps.append(int(words[0]))
+        paths.append(folder / "data" / words[1])
+    if not stamps:
+        raise DatasetError(f"{path} lists no image; restore the file")
+    found = np.array(stamps, np.int64)
+    step = float(np.median(np.diff(found))) if len(found) > 1 else np.inf
+    if step < _FASTEST_NS:
+        raise DatasetError(
+            f"{path}: as nanoseconds its stamps are {step:.0f} ns apart (median); are they micro- "
+            "or milliseconds? multiply them, and those of all data.csv, by 1e3 or 1e6"
+        )
+    return CameraFrames(found, tuple(paths))
+
+
+def read_body_truth(folder: Path) -> Trajectory | None:
+    """Poses of the body by data.csv, those of the sensor and sensor.yaml; None where absent.
+
+    Without sensor.yaml the sensor is the body.
+
+    Raises:
+        DatasetError: the file is malformed, or its stamps do not increase.
+        CalibrationError: its sensor.yaml is malformed.
+    """
+    path = folder / "data.csv"
+    if not path.is_file():
+        return None
+    table = read_table(path, _TRUTH_COLUMNS, ",")
+    require_increasing(table, table.column(0))
+    poses = poses_of(table, table.values[:, 1:4], table.values[:, [5, 6, 7, 4]])
+    if (folder / "sensor.yaml").is_file():
+        poses = poses @ inverse(read_asl_mounting(folder / "sensor.yaml"))
+    return Trajectory(table.column(0) * NANOSECONDS, poses)
+
+
+# --------------------------------------------------------------------------------------------
+# KITTI odometry: sequences/NN/{image_0,image_1,calib.txt,times.txt}, poses/NN.txt of camera 0, the
+# left one; or the colour pair image_2 and image_3
+
+
+_POSE_COLUMNS = tuple(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3, 4))
+
+
+def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recording:
+    """Open one drive; ``settings.path`` is the folder that holds sequences/ and poses/.
+
+    Raises:
+        DatasetError: a folder or file is missing or malformed, or no frame is left.
+        CalibrationError: calib.txt is missing, malformed or impossible.
+    """
+    folder = Path(settings.path) / "sequences" / settings.sequence
+    require_folder(folder, "the KITTI sequence")
+    calibration, times = folder / "calib.txt", folder / "times.txt"
+    pair = pair_beside(calibration)
+    if pair is None:
+        lacking = next(name for name in ("image_1", "image_0") if not (folder / name).is_dir())
+        raise DatasetError(
+            f"{folder} has no {lacking}/: both grey cameras are needed (image_0 left, image_1 "
+            "right), or both colour cameras (image_2 left, image_3 right); unpack the odometry "
+            "data set there"
+        )
+    cameras = {
+        name: list_numbered_images(folder / name)
+        for name in (f"image_{pair[1]}", f"image_{pair[0]}")
+    }
+    table = read_table(times, ("time",))
+    stamps = table.column(0)
+    require_increasing(table, stamps)
+    paths = [
+        tuple(found.get(k, folder / name / f"{k:06d}.png") for name, found in cameras.items())
+        for k in range(len(stamps))
+    ]
+    size = first_size(frame[0] for frame in paths)  # which calib.txt does not state
+    if size is None:
+        raise DatasetError(
+            f"{folder}: not one frame of times.txt has a readable image of both cameras; "
+            "check the unpacked files"
+        )
+    rig = load_rig(calibration, size=size)
+    images, noticed = open_frames(paths, rig, folder)
+    listed = [path for found in cameras.values() for path in found.values()]
+    identity = recording_identity([calibration, times], listed)
+    name = f"KITTI {settings.sequence}"
+    recording = image_recording(settings, name, rig, stamps, images.load, identity, noticed)
+    poses = _kitti_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
+    if poses is None:
+        return recording
+    poses = right_from_left_camera(poses[recording.indices], right_of_camera_0(calibration))
+    return replace(recording, ground_truth=Trajectory(recording.timestamps, poses))
+
+
+def _kitti_poses(path: Path, frames: int) -> FloatArray | None:
+    """Left-camera poses (n, 4, 4) of poses/NN.txt, or None where there is no such file."""
+    if not path.is_file():
+        return None
+    table = read_table(path, _POSE_COLUMNS)
+    if len(table) != frames:
+        raise DatasetError(
+            f"{path} has {len(table)} poses but times.txt has {frames} frames; restore the file "
+            "that belongs to this sequence"
+        )
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :] = table.values.reshape(-1, 3, 4)
+    skewed = np.abs(np.linalg.det(poses[:, :3, :3]) - 1.0) > 1e-2
+    if skewed.any():
+        line = table.lines[int(np.argmax(skewed))]
+        raise DatasetError(f"{path}, line {line}: not a rotation and translation; restore the file")
+    return poses
+
+
+# --------------------------------------------------------------------------------------------
+# KITTI raw: a synchronised and rectified drive
+
+
+CALIBRATION = "calib_cam_to_cam.txt"
+_OF_360 = Path("calibration", "perspective.txt")  # of KITTI-360
+_INSIDE = ("data", "data_rect")
+_PAIRS = (("image_00", "image_01"), ("image_02", "image_03"))
+"""Folders of the left and the right camera: grey, else colour."""
+
+_MAX_TRUTH_GAP_S = 0.25  # synchronised drives have a row a frame, every 0.1 s
+
+
+def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySettings) -> Recording:
+    """Open a drive; ``settings.path`` is its folder, or that of a date with one drive in it.
+
+    Raises:
+        DatasetError: a folder or list of times is missing or malformed, or no frame is left.
+        CalibrationError: calib_cam_to_cam.txt is missing or of other images.
+    """
+    drive = kitti_raw_drive(Path(settings.path))
+    if drive is None:
+        raise DatasetError(f"{settings.path} holds no drive of KITTI raw; check dataset.path")
+    names = next((pair for pair in _PAIRS if all(_raw_images(drive / n) for n in pair)), None)
+    if names is None:
+        raise DatasetError(
+            f"{drive} has no two cameras' images (image_00 and image_01, or image_02 and image_03, "
+            "each with data/ or data_rect/); unpack the drive's synced and rectified data"
+        )
+    left, right = (_raw_images(drive / name) for name in names)
+    pairs, unpaired = pair_files(CameraFiles(left, right, drive, interleaved=False))
+    stamps, assumed, lists = stamps_of(
+        [path for path, _ in pairs], (drive / names[1],), None, right
+    )
+    rig, iTc = _raw_rig(settings, drive, names, first_size(right))
+    oxts = read_oxts(drive)
+    untrue = (
+        "oxts is used as odometry of a camera that looks ahead, and not as truth: beside "
+        f"{CALIBRATION} there are no calib_imu_to_velo.txt and calib_velo_to_cam.txt"
+    )
+    images, noticed = open_frames(pairs, rig, drive)
+    notes = (*noticed, *unpaired, *assumed, *([untrue] if oxts and iTc is None else []))
+    identity = recording_identity(lists, (path for pair in pairs for path in pair))
+    name = drive.resolve().name
+    recording = image_recording(settings, name, rig, stamps, images.load, identity, notes)
+    if oxts is None:
+        return recording
+    recording = replace(recording, odometry_source=oxts.odometry(odometry))
+    if iTc is None:
+        return recording
+    unit = trajectory_at_frames(oxts.poses(), recording.timestamps, _MAX_TRUTH_GAP_S)
+    return replace(recording, ground_truth=Trajectory(unit.timestamps, unit.poses @ iTc))
+
+
+def _raw_images(camera: Path) -> tuple[Path, ...]:
+    inside = next((camera / name for name in _INSIDE if (camera / name).is_dir()), None)
+    return () if inside is None else tuple(images_in(inside))
+
+
+def _raw_rig(
+    settings: KittiRawSettings, drive: Path, names: tuple[str, str], size: tuple[int, int] | None
+) -> tuple[StereoRig, FloatArray | None]:
+    """The rig, and the pose (4, 4) of the right camera on the inertial unit where it is known."""
+    root = drive.resolve().parent
+    places = (drive / CALIBRATION, root / CALIBRATION, root / _OF_360, root.parent / _OF_360)
+    path = next((p for p in places if p.is_file()), None)
+    keys = KITTI_RAW if names == _PAIRS[0] else KITTI_RAW_COLOUR
+    if settings.camera_file is not None:
+        rig = loaded_rig(settings, Path(settings.camera_file), size=size)
+    elif path is None:
+        raise CalibrationError(
+            f"{drive}: no {CALIBRATION} in it or beside it; unpack the calibration of that date, "
+            "or give one by --camera FILE"
+        )
+    else:
+        rig = read_rig(settings, read_kitti(path, size, keys), size)
+    iTl = None if path is None else left_on_inertial_unit(path, keys)
+    if iTl is None:
+        return mounted(rig, settings), None
+    iTc = iTl @ pose(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
+    return mounted(replace(rig, bTc=iTc), settings), iTc
+
+
+# GPS and inertial data, oxts/: odometry and true poses of the inertial unit (Geiger et al. 2013,
+# "Vision meets robotics", and its development kit)
+
+
+_LATITUDE, _LONGITUDE, _ALTITUDE, _ROLL, _PITCH, _YAW = range(6)
+_FORWARD_SPEED, _YAW_RATE = 8, 22
+_COLUMNS = 23  # of those that are used; a file has 30
+_EARTH_RADIUS_M = 6_378_137.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Oxts:
+    """Rows (n, k) of the files' numbers at stamps (n,) in seconds."""
+
+    folder: Path
+    stamps: FloatArray
+    rows: FloatArray
+
+    def odometry(self, settings: RecordedOdometrySettings) -> OdometrySource:
+        """Motions of the unit by its forward speed and yaw rate."""
+        values = np.column_stack([self.stamps, self.rows[:, [_FORWARD_SPEED, _YAW_RATE]]])
+        table = Table(self.folder, values, np.arange(1, len(values) + 1))
+        return recorded_motions(
+            str(self.folder), partial(checked_speeds, table, settings), settings
+        )
+
+    def poses(self) -> Trajectory:
+        """Poses of the unit (x ahead, y left, z up) in a world with x east, z up."""
+        from scipy.spatial.transform import Rotation
+
+        latitude, longitude = np.radians(self.rows[:, [_LATITUDE, _LONGITUDE]]).T
+        scale = np.cos(latitude[0]) * _EARTH_RADIUS_M  # of the Mercator projection
+        poses = np.tile(np.eye(4), (len(self.rows), 1, 1))
+        north = np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+        where = np.column_stack([scale * longitude, scale * north, self.rows[:, _ALTITUDE]])
+        poses[:, :3, 3] = where - where[0]
+        angles = self.rows[:, [_YAW, _PITCH, _ROLL]]
+        poses[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
+        return Trajectory(self.stamps, poses)
+
+
+def read_oxts(drive: Path) -> Oxts | None:
+    """The inertial data of a drive; None where it has none.
+
+    Raises:
+        DatasetError: a file or the list of times is malformed.
+    """
+    folder = drive / "oxts"
+    if not (folder / "data").is_dir():
+        return None
+    files = sorted((p for p in shown_in(folder / "data") if p.suffix == ".txt"), key=natural)
+    if not files:
+        return None
+    found = written_stamps(files, (folder,)) if (folder / "timestamps.txt").is_file() else None
+    if found is None:
+        raise DatasetError(f"{folder} has no timestamps.txt; restore it, or remove the folder")
+    return Oxts(folder, found[0], np.array([_oxts_row(path) for path in files]))
+
+
+def _oxts_row(path: Path) -> list[float]:
+    try:
+        values = [float(word) for word in read_text(path, DatasetError).split()[:_COLUMNS]]
+    except ValueError:
+        values = []
+    if len(values) < _COLUMNS or not np.isfinite(values).all():
+        raise DatasetError(f"{path}: expected 30 numbers; restore the file")
+    return values

@@ -1,0 +1,643 @@
+"""What files say of time: tables of numbers, time stamps of images, poses and pairs by time.
+
+Errors name the file, the line and the remedy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.errors import DatasetError
+from fgslam.core.estimates import Trajectory
+from fgslam.core.files import read_lines
+from fgslam.core.sides import without_side
+from fgslam.datasets.layouts import (
+    NUMBERED,
+    CameraFiles,
+    counts_by_one,
+    natural,
+    numbers_in,
+    time_parts,
+)
+
+NANOSECONDS = 1e-9
+
+# --------------------------------------------------------------------------------------------
+# Tables of numbers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Numbers of a text file: values (n, columns) and the line (n,) each row came from, from 1."""
+
+    path: Path
+    values: FloatArray
+    lines: IntArray
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def column(self, k: int) -> FloatArray:
+        """Column ``k`` (n,)."""
+        return np.asarray(self.values[:, k])
+
+
+def read_table(
+    path: Path,
+    columns: tuple[str, ...],
+    delimiter: str | None = None,
+    error: type[DatasetError] = DatasetError,
+) -> Table:
+    """The first ``len(columns)`` numbers of every line; further columns are ignored.
+
+    Args:
+        path: the file.
+        columns: names of the columns, for the messages.
+        delimiter: what separates them; None for white space.
+        error: class of the errors to raise.
+
+    Raises:
+        DatasetError: (or ``error``) the file is unreadable, or a line has too few columns, a word
+            that is no number, or a number that is not finite.
+    """
+    rows = read_lines(path, error)
+    values = np.empty((len(rows), len(columns)))
+    for k, (line, text) in enumerate(rows):
+        words = text.split(delimiter)
+        if len(words) < len(columns):
+            raise error(
+                f"{path}, line {line}: {len(words)} columns, expected {len(columns)} "
+                f"({', '.join(columns)}); complete or remove the line"
+            )
+        for j, name in enumerate(columns):
+            values[k, j] = finite_number(words[j], f"{path}, line {line}: {name}", error)
+    return Table(path, values, np.array([line for line, _ in rows], np.int64))
+
+
+def finite_number(word: str, where: str, error: type[DatasetError] = DatasetError) -> float:
+    """The number that a word is. Raises ``error``: it is none, or not finite."""
+    try:
+        value = float(word)
+    except ValueError:
+        raise error(f"{where} is {word.strip()!r}, not a number; correct the line") from None
+    if not np.isfinite(value):
+        raise error(f"{where} is {word.strip()}, not finite; correct or remove the line")
+    return value
+
+
+def require_increasing(
+    table: Table, stamps: FloatArray, error: type[DatasetError] = DatasetError
+) -> None:
+    """Raises ``error``, naming the line, unless the time stamps (n,) increase strictly."""
+    bad = np.flatnonzero(np.diff(stamps) <= 0.0)
+    if len(bad):
+        k = int(bad[0])
+        raise error(
+            f"{table.path}, line {table.lines[k + 1]}: time {stamps[k + 1]:.6f} s does not come "
+            f"after {stamps[k]:.6f} s of line {table.lines[k]}; put the lines in time order and "
+            "remove duplicates"
+        )
+
+
+# --------------------------------------------------------------------------------------------
+# Trajectories
+
+
+TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
+_QUATERNION_TOLERANCE = 0.01
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Poses of a TUM file (``t x y z qx qy qz qw``); raises as :func:`trajectory_of`."""
+    return trajectory_of(read_table(path, TUM_COLUMNS))
+
+
+def trajectory_of(table: Table, error: type[DatasetError] = DatasetError) -> Trajectory:
+    """The poses of a table with the columns of a TUM file.
+
+    Raises:
+        DatasetError: (or ``error``) times do not increase, a quaternion is not of unit length.
+    """
+    require_increasing(table, table.column(0), error)
+    poses = poses_of(table, table.values[:, 1:4], table.values[:, 4:8], error)
+    return Trajectory(table.column(0), poses)
+
+
+def poses_of(
+    table: Table,
+    positions: FloatArray,
+    quaternions: FloatArray,
+    error: type[DatasetError] = DatasetError,
+) -> FloatArray:
+    """Poses (n, 4, 4) of positions (n, 3) and unit quaternions (n, 4) (x, y, z, w) of a table."""
+    norms = np.linalg.norm(quaternions, axis=1)
+    bad = np.flatnonzero(np.abs(norms - 1.0) > _QUATERNION_TOLERANCE)
+    if len(bad):
+        k = int(bad[0])
+        raise error(
+            f"{table.path}, line {table.lines[k]}: the quaternion has length {norms[k]:.3f}, not 1"
+            f"; check the order of the columns ({' '.join(TUM_COLUMNS)})"
+        )
+    from scipy.spatial.transform import Rotation  # slow to load, and few recordings have poses
+
+    poses = np.tile(np.eye(4), (len(positions), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(quaternions).as_matrix()
+    poses[:, :3, 3] = positions
+    return poses
+
+
+def rows_at(stamps: FloatArray, at: FloatArray, tolerance: float) -> IntArray:
+    """Row of the stamps (n,) within ``tolerance`` seconds of each of ``at`` (m,), or -1."""
+    nearest = nearest_rows(stamps, at)
+    return np.asarray(np.where(np.abs(stamps[nearest] - at) <= tolerance, nearest, -1))
+
+
+def covered(stamps: FloatArray, at: FloatArray, max_gap: float, tolerance: float) -> BoolArray:
+    """Which times ``at`` (m,) the increasing stamps (n,) cover.
+
+    A time is covered when it lies between two stamps at most ``max_gap`` seconds apart, or within
+    ``tolerance`` seconds of one stamp.
+    """
+    if len(stamps) == 0:
+        return np.zeros(len(at), np.bool_)
+    after = np.clip(np.searchsorted(stamps, at), 1, max(len(stamps) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(stamps) - 1)
+    inside = (stamps[before] <= at) & (at <= stamps[after])
+    bridged = inside & (stamps[after] - stamps[before] <= max_gap)
+    nearest = np.minimum(np.abs(at - stamps[before]), np.abs(at - stamps[after]))
+    return np.asarray(bridged | (nearest <= tolerance))
+
+
+def interpolate_poses(trajectory: Trajectory, at: FloatArray) -> FloatArray:
+    """Poses (m, 4, 4) at times (m,): positions linearly, rotations on the shortest arc.
+
+    Times outside the trajectory get its first or last pose.
+    """
+    stamps = trajectory.timestamps
+    if len(at) == 0:
+        return np.empty((0, 4, 4))
+    if len(stamps) == 1:
+        return np.repeat(trajectory.poses, len(at), axis=0)
+    from scipy.spatial.transform import Rotation, Slerp
+
+    clipped = np.clip(at, stamps[0], stamps[-1])
+    out = np.tile(np.eye(4), (len(at), 1, 1))
+    rotations = Rotation.from_matrix(trajectory.poses[:, :3, :3])
+    out[:, :3, :3] = Slerp(stamps, rotations)(clipped).as_matrix()
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(clipped, stamps, trajectory.poses[:, axis, 3])
+    return out
+
+
+def trajectory_at_frames(
+    trajectory: Trajectory, frames: FloatArray, max_gap: float = 0.1, tolerance: float = 1e-3
+) -> Trajectory:
+    """The trajectory at those of the frames' stamps (n,) that it covers (see :func:`covered`)."""
+    known = covered(trajectory.timestamps, frames, max_gap, tolerance)
+    return Trajectory(frames[known], interpolate_poses(trajectory, frames[known]))
+
+
+# --------------------------------------------------------------------------------------------
+# Pairs of images by time
+
+
+AnyStamps = TypeVar("AnyStamps", FloatArray, IntArray)
+"""Stamps in seconds, or in whole nanoseconds, which are compared without rounding."""
+
+_NAMED_SKEW_S = 1e-3  # what synchronised cameras differ by at most
+
+
+def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:
+    """Row of the increasing stamps (n,), n >= 1, nearest to each of ``at`` (m,)."""
+    after = np.clip(np.searchsorted(stamps, at), 0, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = np.abs(stamps[before] - at) <= np.abs(stamps[after] - at)
+    return np.asarray(np.where(closer, before, after), np.int64)
+
+
+def pair_stamps(
+    right: IntArray, left: IntArray, tolerance: float, names: tuple[str, str], side: str = "left"
+) -> tuple[tuple[IntArray, IntArray], tuple[str, ...]]:
+    """Rows of the right and the left images that are each other's nearest in time.
+
+    Args:
+        right: (n,) stamps of the right camera in nanoseconds, increasing.
+        left: (m,) stamps of the left one.
+        tolerance: largest difference in seconds.
+        names: of the right and the left camera, in messages.
+        side: of the camera in place of the left one, in notes.
+
+    Returns:
+        The paired rows, and notes on images left without a partner and on how far pairs differ.
+
+    Raises:
+        DatasetError: no pair is left.
+    """
+    partner = nearest_rows(left, right)
+    rows = np.arange(len(right))
+    mutual = nearest_rows(right, left)[partner] == rows
+    skew = NANOSECONDS * np.abs(left[partner] - right).astype(np.float64)
+    close = skew <= tolerance + 0.5 * NANOSECONDS
+    kept = rows[mutual & close]
+    if len(kept) == 0:
+        spans = [f"{NANOSECONDS * s[0]:.3f} to {NANOSECONDS * s[-1]:.3f} s" for s in (right, left)]
+        raise DatasetError(
+            f"no image of {names[0]} ({spans[0]}) has a partner in {names[1]} ({spans[1]}) "
+            f"within {1e3 * tolerance:g} ms, the nearest differ by {1e3 * skew.min():.4g} ms; "
+            "raise dataset.pairing_tolerance_ms or restore the stamps"
+        )
+    notes = [
+        f"{n} {camera} images have no partner within {1e3 * tolerance:g} ms and are left out"
+        for camera, n in (("right", len(rows) - len(kept)), (side, len(left) - len(kept)))
+        if n
+    ]
+    if (worst := float(skew[kept].max())) > _NAMED_SKEW_S:
+        median = float(np.median(skew[kept]))
+        notes.append(
+            f"the images of a pair differ in time by {1e3 * median:.3g} ms in the median and "
+            f"{1e3 * worst:.3g} ms at most: cameras that are not synchronised measure wrong depths "
+            "while they turn"
+        )
+    return (kept, partner[kept]), tuple(notes)
+
+
+def pair_all(
+    reference: IntArray,
+    others: Sequence[tuple[str, str, IntArray]],
+    tolerance: float,
+    name: str,
+) -> tuple[IntArray, tuple[str, ...]]:
+    """Rows (n, 1 + others) of images of one time, those of the reference first, and notes.
+
+    Args:
+        reference: (n,) stamps of the right camera in nanoseconds, increasing.
+        others: side, name and stamps of each other camera.
+        tolerance: largest difference in seconds from the reference.
+        name: of the right camera, in messages.
+
+    Raises:
+        DatasetError: no image is left that has a partner of each camera.
+    """
+    rows = np.arange(len(reference))[:, None]
+    notes: tuple[str, ...] = ()
+    for side, other, stamps in others:
+        (kept, partners), said = pair_stamps(
+            reference[rows[:, 0]], stamps, tolerance, (name, other), side
+        )
+        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *said)
+    return rows, notes
+
+
+# --------------------------------------------------------------------------------------------
+# Time stamps of images: a list beside them, or their own names, in whatever unit of time
+
+
+LISTS = (
+    *("times.txt", "timestamps.txt", "times.csv", "timestamps.csv", "data.csv"),
+    "right_images.txt",
+)
+"""Names of lists of times, the first that is there counts."""
+
+_ASSUMED_FPS = 10.0
+_UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
+_SLOWEST_S = 10.0  # between two images: what makes a unit plausible
+SLOWEST_MOTION_S = 1.0
+"""The same between two samples of odometry."""
+
+
+def stamps_of(
+    images: Sequence[Path],
+    folders: Sequence[Path],
+    fps: float | None,
+    every: Sequence[Path] | None = None,
+) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]]:
+    """Seconds (n,) of images in their order, notes, and the list they were read from, if any.
+
+    Taken from a list of times in one of the folders, from names that are times, or by the rate.
+
+    Args:
+        images: one file a frame.
+        folders: where a list may be.
+        fps: the rate at which they were taken; None where it is unknown: 10 is assumed.
+        every: all images of that camera, which lists without names and rates count; None: these.
+
+    Raises:
+        DatasetError: the list is malformed, or lacks an image.
+    """
+    written = written_stamps(images, folders, every) if fps is None else None
+    if written is not None:
+        return written
+    rate = fps or _ASSUMED_FPS
+    note = f"no list of times: taken as {rate:g} frames a second (--fps says otherwise)"
+    return np.array(_places(images, every)) / rate, () if fps else (note,), ()
+
+
+def written_stamps(
+    images: Sequence[Path], folders: Sequence[Path], every: Sequence[Path] | None = None
+) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]] | None:
+    """As :func:`stamps_of`, from a list or from names; None where neither says anything."""
+    for folder in folders:
+        for path in (folder / name for name in LISTS):
+            if path.is_file():
+                return (*_in_seconds(_listed(path, images, every), str(path)), (path,))
+    names = [image.stem for image in images]
+    by_date = _dates(names)
+    if by_date is not None:
+        return by_date, ("times are the dates in the names of the images",), ()
+    parts = time_parts(names) if len(names) > 1 else None
+    if parts is not None:
+        texts = [f"{whole}.{part}" for whole, part in zip(*parts, strict=True)]
+        mend = "two names of a folder are one time: remove one"
+        return (*_in_seconds(_numbers(texts), "names of the images", mend), ())
+    return None
+
+
+def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, float]:
+    """The largest unit in which the times (n,) follow each other as a sensor's do, in seconds.
+
+    ``slowest_s`` is the longest time that is plausible between two of them.
+    """
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    known = _UNITS.items()
+    return next(
+        ((name, unit) for name, unit in known if step * unit <= slowest_s), ("seconds", 1.0)
+    )
+
+
+def _places(images: Sequence[Path], every: Sequence[Path] | None) -> list[int]:
+    """Of each image its place among all of the camera."""
+    known = {path: k for k, path in enumerate(every or images)}
+    return [known[path] for path in images]
+
+
+def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:
+    """The numbers less the first's whole part, which doubles could not hold, and that part."""
+    if any("e" in text.lower() for text in texts):
+        return np.array([float(text) for text in texts]), 0.0
+    whole = [int(text.partition(".")[0]) for text in texts]
+    parts = [float(f"0.{text.partition('.')[2] or 0}") for text in texts]
+    return np.array([w - whole[0] for w in whole], np.float64) + parts, float(whole[0])
+
+
+def _in_seconds(
+    numbers: tuple[FloatArray, float],
+    where: str,
+    mend: str = "put the lines in time order and remove duplicates",
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Times in seconds by the unit that makes the rate of a camera, and a note where not seconds.
+
+    Raises:
+        DatasetError: times do not increase.
+    """
+    values, first = numbers
+    steps = np.diff(values)
+    if len(steps) and steps.min() <= 0.0:
+        k = int(np.argmax(steps <= 0.0))
+        raise DatasetError(
+            f"{where}: the time of image {k + 2} does not come after that of image {k + 1}; {mend}"
+        )
+    name, unit = time_unit(values)
+    note = () if name == "seconds" else (f"times of {where} are taken as {name}",)
+    return unit * (first + values), note
+
+
+# Lists
+
+
+_DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
+
+
+def _listed(
+    path: Path, images: Sequence[Path], every: Sequence[Path] | None
+) -> tuple[FloatArray, float]:
+    """Times of the images by a list: a time a line, or name or number and time in either order."""
+    lines = read_lines(path)
+    if lines and _DATE.match(lines[0][1]):
+        rows = [[_seconds_of_date(path, number, text)] for number, text in lines]
+    else:
+        rows = [[w for w in re.split(r"[,;\s]+", text) if w] for _, text in lines]
+        if rows and not any(_is_number(word) for word in rows[0]):
+            rows, lines = rows[1:], lines[1:]  # names of columns
+    if rows and all(len(row) >= 2 for row in rows):
+        return _listed_by_name(path, rows, images)
+    count = len(every or images)
+    if len(rows) < count:
+        raise DatasetError(
+            f"{path} has {len(rows)} times for {count} images; restore the list, or leave it "
+            "out and say --fps"
+        )
+    for row, (number, _) in zip(rows, lines, strict=True):
+        if not _is_number(row[0]):
+            raise DatasetError(f"{path}, line {number}: {row[0]!r} is no time; correct the line")
+    return _numbers([rows[k][0] for k in _places(images, every)])
+
+
+def _listed_by_name(
+    path: Path, rows: Sequence[Sequence[str]], images: Sequence[Path]
+) -> tuple[FloatArray, float]:
+    """By the column that names the images, one of the first three; another one is the time."""
+    columns = range(min(3, *(len(row) for row in rows)))
+    for names in columns:
+        known = {_stem(row[names]): row for row in rows}
+        keys = [image.stem if image.stem in known else _stem(image.stem) for image in images]
+        if not all(key in known for key in keys):
+            continue
+        others = ([known[key][k] for key in keys] for k in columns if k != names)
+        times = [texts for texts in others if all(map(_is_number, texts))]
+        if times:  # one that counts the images is their number
+            return _numbers(next((texts for texts in times if not _counts(texts)), times[0]))
+    raise DatasetError(
+        f"{path}: neither column names all images ({images[0].name} to {images[-1].name}); each "
+        "line must be: name or number of the image, seconds"
+    )
+
+
+def _counts(texts: Sequence[str]) -> bool:
+    return all(text.isdecimal() for text in texts) and counts_by_one([int(t) for t in texts])
+
+
+def _stem(word: str) -> str:
+    """A file's name without folder and ending; of a number its value."""
+    name = re.sub(r"\.(png|jpe?g|p[gnp]m|bmp|tiff?|webp)$", "", word.rpartition("/")[2], flags=re.I)
+    return str(int(name)) if name.isdecimal() else name
+
+
+def _is_number(word: str) -> bool:
+    return re.fullmatch(r"\d+(\.\d*)?([eE][-+]?\d+)?", word) is not None
+
+
+def _seconds_of_date(path: Path, line: int, text: str) -> str:
+    """``2011-09-26 13:02:25.964389445`` in seconds since 1970, as text with all its digits."""
+    whole, _, part = text.strip().partition(".")
+    try:
+        moment = datetime.fromisoformat(whole.strip()).replace(tzinfo=UTC)
+    except ValueError:
+        raise DatasetError(f"{path}, line {line}: {text!r} is no time; correct it") from None
+    return f"{int(moment.timestamp())}.{part or 0}"
+
+
+# Names of files that are dates
+
+
+_FASTEST_S = 2e-3
+_DATE_IN_NAME = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)[-_.]?(\d\d)[-_.]?(\d\d)[-_.T ]?"
+    r"(\d\d)[-_.:h]?(\d\d)[-_.:m]?(\d\d)(?:([-_.,]?)(\d{1,9}))?(?!\d)"
+)
+_COUNTED = 10_000  # six digits below: the first hour after midnight, or a counter
+
+
+def _dates(names: Sequence[str]) -> FloatArray | None:
+    """Seconds (n,) since 1970 by dates in names, UTC; None where they are no camera's times.
+
+    What follows the seconds is their fraction, unless it counts the images: by one, or with fewer
+    than three digits and no point. Neither are six digits from 000000 on that count by one.
+    """
+    found = _dates_in(names)
+    if len(names) < 2 or len(found) < len(names):
+        return None
+    try:
+        dates = (datetime(*map(int, match.groups()[:6])) for match in found)  # type: ignore[arg-type]
+        whole = [date.replace(tzinfo=UTC).timestamp() for date in dates]
+    except ValueError:  # no date
+        return None
+    parts = _fractions(found)
+    clock = [match[4] + match[5] + match[6] for match in found]
+    joined = all(digits in match[0] for digits, match in zip(clock, found, strict=True))
+    counted = joined and not any(parts) and int(clock[-1]) < _COUNTED
+    if counted and counts_by_one([int(digits) for digits in clock]):
+        return None
+    stamps = np.array(whole) + parts
+    steps = np.diff(stamps)
+    return stamps if steps.min() > 0.0 and np.median(steps) >= _FASTEST_S else None
+
+
+def _dates_in(names: Sequence[str]) -> list[re.Match[str]]:
+    """The first date in each name; the second where that is the drive's, the same in all."""
+    found = [match for name in names if (match := _DATE_IN_NAME.search(name))]
+    if len({match.groups()[:6] for match in found}) > 1:
+        return found
+    after = [_DATE_IN_NAME.search(match.string, match.end(6)) for match in found]
+    second = [match for match in after if match]
+    return second if len(second) == len(names) else found
+
+
+def _fractions(found: Sequence[re.Match[str]]) -> list[float]:
+    """Of a second, by what follows it in each name; 0 where that counts the images."""
+    if counts_by_one([int(match[8]) for match in found if match[8]]):
+        return [0.0] * len(found)
+    written = [
+        match[8] if match[8] and (match[7] in (".", ",") or len(match[8]) > 2) else ""
+        for match in found
+    ]
+    return [float(f"0.{digits or 0}") for digits in written]
+
+
+# --------------------------------------------------------------------------------------------
+# Pairs of image files by their names, by time, by order
+
+
+Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]
+"""Files (right, left) of each moment, and notes on what is left out."""
+
+TOLERANCE_MS = 20.0
+
+
+def pair_files(found: CameraFiles, tolerance_ms: float | None = TOLERANCE_MS) -> Pairs:
+    """Pairs (right, left) in natural order, and notes on what is left out.
+
+    Files are paired by their names without the side; where those do not match, by the times that
+    the names are, at most ``tolerance_ms`` apart; else by their order. None as tolerance: images
+    that were not taken at once, as of a board that stands still; times say nothing then.
+
+    Raises:
+        DatasetError: names do not match, and the cameras have different numbers of images, or names
+            are times and no two are near.
+    """
+    named = _by_names(found, _KEYS)
+    if named is not None:
+        return named
+    times = None if found.interleaved else _times(found)
+    if times is None:
+        named = _by_names(found, _MOMENTS)
+    elif tolerance_ms is not None:
+        named = _by_time(found, times, tolerance_ms)
+    return _by_order(found) if named is None else named
+
+
+_Key: TypeAlias = Callable[[str], object]
+
+_MOMENTS: tuple[_Key, ...] = (
+    *(lambda stem, split=split: natural(Path(split.sub(r"\1\3", stem))) for split in NUMBERED),
+)
+_KEYS: tuple[_Key, ...] = (
+    lambda stem: natural(Path(stem)),
+    lambda stem: natural(Path(without_side(stem))),
+    lambda stem: natural(Path(without_side(stem, camera_number=True))),
+)
+"""What two names of a pair have in common; the first that most of them have counts."""
+
+
+def _by_names(found: CameraFiles, keys: Iterable[_Key]) -> Pairs | None:
+    """By the first of the keys that most names have in common; None where none is."""
+    for key in keys:
+        right, left = ({key(path.stem): path for path in f} for f in (found.right, found.left))
+        common = [name for name in right if name in left]
+        unique = len(right) == len(found.right) and len(left) == len(found.left)
+        if unique and len(common) >= max(1, min(len(right), len(left)) // 2):
+            alone = (("right", len(right) - len(common)), ("left", len(left) - len(common)))
+            notes = tuple(
+                f"{n} {camera} images have no partner of their name and are left out"
+                for camera, n in alone
+                if n
+            )
+            return tuple((right[name], left[name]) for name in common), notes
+    return None
+
+
+def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pairs:
+    if len(found.right) != len(found.left):
+        raise DatasetError(
+            f"{found.folder}: {len(found.left)} images of the left camera and {len(found.right)} "
+            f"of the right one, and their names ({found.left[0].name}, {found.right[0].name}) do "
+            "not match: which belong together cannot be told; name both of a pair alike"
+        )
+    pairs = tuple(zip(found.right, found.left, strict=True))
+    if all(numbers_in(right.stem) == numbers_in(left.stem) != [] for right, left in pairs):
+        return pairs, ()  # frame000012 and depth000012 are of one moment
+    return pairs, (f"left and right images are paired by their order: {why}",)
+
+
+def _times(found: CameraFiles) -> tuple[IntArray, IntArray] | None:
+    """Nanoseconds (n,), (m,) of right and left files whose names are times; None otherwise."""
+    right, left = (written_stamps(files, ()) for files in (found.right, found.left))
+    if right is None or left is None:
+        return None
+    first, second = (np.rint(each[0] / NANOSECONDS).astype(np.int64) for each in (right, left))
+    return first, second
+
+
+def _by_time(found: CameraFiles, times: tuple[IntArray, IntArray], tolerance_ms: float) -> Pairs:
+    """The nearest in time; by order where each camera has a clock of its own that goes alike."""
+    right, left = times
+    names = (f"{found.folder}, right", f"{found.folder}, left")
+    try:
+        (rows, partners), notes = pair_stamps(right, left, 1e-3 * tolerance_ms, names)
+    except DatasetError:
+        apart = NANOSECONDS * (left - right) if len(left) == len(right) else np.array([np.inf])
+        if not np.ptp(apart) <= 1e-3 * tolerance_ms:
+            raise
+        away = abs(float(np.median(apart)))
+        return _by_order(found, f"the times that their names are lie {away:.6g} s apart throughout")
+    chosen = zip(rows.tolist(), partners.tolist(), strict=True)
+    note = "left and right images are paired by the times that their names are"
+    return tuple((found.right[i], found.left[j]) for i, j in chosen), (note, *notes)

@@ -1,0 +1,432 @@
+"""Stereo films: one of both views, or one a camera (docs/datasets/video.md).
+
+Frames are decoded by number, those of several films are paired by number or by time.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from fgslam.cameras.rig import StereoRig
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
+from fgslam.core.sides import differ_in_number
+from fgslam.datasets.images import require_size
+from fgslam.datasets.layouts import films_in
+from fgslam.datasets.recording import (
+    Recording,
+    calibrated_rig,
+    image_recording,
+    numbered,
+    recording_identity,
+)
+from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
+from fgslam.datasets.times import NANOSECONDS, pair_all
+
+_VIEWS = {"side_by_side": (2, 1), "over_under": (1, 2)}
+"""Views beside each other and above each other."""
+
+_USUAL_SHAPE = 1.5  # width over height of a camera's image
+
+Views: TypeAlias = Callable[..., tuple[Image, ...]]
+"""Right, left[, top] view (height, width, 3) in R, G, B, by numbers in the films; or FrameError."""
+
+
+def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recording:
+    """Open a film of both views, or the films of a left and a right camera, and of a third one.
+
+    Raises:
+        DatasetError: there is no film, it holds no frame, or is of one camera.
+        CalibrationError: there is no calibration, or it is of images of another size.
+        FrameError: the first frame cannot be decoded.
+    """
+    given = Path(settings.path)
+    paths = films_in(given)
+    if not paths:
+        raise DatasetError(
+            f"{given}: neither one film nor one of a left and one of a right camera, by their "
+            "names (left.mp4 and right.mp4, with a third camera top.mp4); check dataset.path"
+        )
+    films = [VideoFrames(path) for path in paths]
+    rate = settings.fps or films[0].rate
+    if not 0.0 < rate < np.inf:
+        raise DatasetError(f"{paths[0]} states no frame rate; say it: --fps RATE")
+    views, rig, assumed = _views(settings, films, paths[0].parent)
+    tolerance = 1e-3 * settings.pairing_tolerance_ms
+    moments = moments_of(films, rate, settings.fps is not None, tolerance)
+    size = rig.image_size
+
+    def load(index: int, colour: bool) -> tuple[Image, ...]:
+        images = views(*moments.numbers[index].tolist())
+        if not colour:
+            images = tuple(
+                np.asarray(cv2.cvtColor(np.ascontiguousarray(i), cv2.COLOR_RGB2GRAY), np.uint8)
+                for i in images
+            )
+        whole = [_with_last(image, size) for image in images]
+        return rig.rectified(tuple(require_size(i, f"frame {index}", *size) for i in whole))
+
+    notes = (*(note for film in films for note in film.notes), *assumed, *moments.notes)
+    name = given.stem if len(films) == 1 else given.resolve().name.replace("*", "")
+    identity = recording_identity([], paths)
+    return image_recording(settings, name, rig, moments.times, load, identity, notes)
+
+
+def _with_last(image: Image, size: tuple[int, int]) -> Image:
+    """The image with the last column and row again that its encoder has left out."""
+    columns, rows = size[0] - image.shape[1], size[1] - image.shape[0]
+    if (columns, rows) not in ((1, 0), (0, 1), (1, 1)):
+        return image
+    return np.asarray(cv2.copyMakeBorder(image, 0, rows, 0, columns, cv2.BORDER_REPLICATE))
+
+
+# --------------------------------------------------------------------------------------------
+# Where the views of a frame are, and the rig that they fit
+
+
+def _views(
+    settings: VideoSettings, films: list[VideoFrames], folder: Path
+) -> tuple[Views, StereoRig, tuple[str, ...]]:
+    """What gives the views of a frame, the rig that they fit, and what was assumed."""
+    height, width = films[0].load(0).shape[:2]
+    if len(films) > 1:
+        rig, assumed = _rig(settings, folder, (width, height), (1, 1), pair=len(films) == 2)
+        rig, order = _films_of_cameras(rig, films, folder)
+        return lambda *numbers: tuple(films[k].load(numbers[k]) for k in order), rig, assumed
+    film = films[0]
+    # Both arrangements, first that which gives the views a usual shape.
+    shape = {name: width * rows / (height * columns) for name, (columns, rows) in _VIEWS.items()}
+    by_shape = sorted(_VIEWS, key=lambda name: abs(math.log(shape[name] / _USUAL_SHAPE)))
+    fault: CalibrationError | None = None
+    for name in [settings.views] if settings.views else by_shape:
+        columns, rows = _VIEWS[name]
+        size = (width // columns, height // rows)
+        try:
+            rig, assumed = _rig(settings, folder, size, (columns, rows))
+        except CalibrationError as error:
+            fault = fault or error
+            continue
+        said = () if settings.views else (f"the film is taken as {name.replace('_', ' ')}",)
+        return partial(_halves, film, size), rig, (*assumed, *said)
+    with suppress(CalibrationError):
+        calibrated_rig(settings, folder, (width, height))
+        raise DatasetError(
+            f"{film.name} is {width}x{height}, as large as the calibrated image of one camera: a "
+            "film of one camera alone cannot be used; one that shows both squeezed must be "
+            "stretched back to twice the width (side by side) or height"
+        )
+    raise fault or DatasetError(f"{folder}: no film")
+
+
+def _halves(film: VideoFrames, size: tuple[int, int], number: int) -> tuple[Image, Image]:
+    """Right and left view of a frame that shows both."""
+    image = film.load(number)
+    return image[-size[1] :, -size[0] :], image[: size[1], : size[0]]
+
+
+def _films_of_cameras(
+    rig: StereoRig, films: list[VideoFrames], where: Path
+) -> tuple[StereoRig, tuple[int, ...]]:
+    """The rig, and which film is that of its right, left[, top] camera.
+
+    Films with numbers are those of the file's cameras in its order, and so are all of a file that
+    calls its cameras left and right. Else the names say what the geometry must agree with.
+
+    Raises:
+        CalibrationError: it is of two cameras, and the films are of three.
+    """
+    by_number = differ_in_number(films[0].name, films[1].name)
+    if len(films) == 2:
+        return numbered(rig) if by_number else rig, (1, 0)
+    known = None if rig.rectifier is None else rig.rectifier.calibration
+    in_line = rig.cameras == 2 and known is not None and len(known.cameras) == 3
+    by_file = by_number or (known is not None and known.sided)
+    if rig.cameras == 2 and not (in_line and by_file):
+        raise CalibrationError(
+            f"{where} has films of three cameras, but the calibration knows two; give one of all "
+            "three, --camera FILE, or move the third film elsewhere"
+        )
+    if rig.rectifier is not None:
+        kept = tuple(range(rig.cameras))
+        rig = replace(rig, rectifier=replace(rig.rectifier, order=kept))
+    return rig, rig.sources if by_file else (1, 0, 2)
+
+
+def _rig(
+    settings: VideoSettings,
+    folder: Path,
+    size: tuple[int, int],
+    views: tuple[int, int],
+    pair: bool = True,
+) -> tuple[StereoRig, tuple[str, ...]]:
+    """The rig of views of a size, or of a column or row more, and what was assumed then.
+
+    Most encoders take even sizes only, and leave out the last of an odd number; ``views`` are those
+    beside and above each other: of two the film's size is even.
+    """
+    try:
+        return calibrated_rig(settings, folder, size, pair), ()
+    except CalibrationError:
+        columns, rows = (
+            (one, one + 1) if count == 1 and one % 2 == 0 else (one,)
+            for one, count in zip(size, views, strict=True)
+        )
+        for whole in list(product(columns, rows))[1:]:
+            with suppress(CalibrationError):
+                rig = calibrated_rig(settings, folder, whole, pair)
+                return rig, (
+                    f"the film's views are {size[0]}x{size[1]}, calibrated for "
+                    f"{whole[0]}x{whole[1]}: its encoder is taken to have left out the last column "
+                    "or row of an odd number",
+                )
+        raise
+
+
+# --------------------------------------------------------------------------------------------
+# When frames of films are shown, and which belong together
+
+
+_UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
+
+_SIDES = ("right", "third")  # of the films after the first one
+
+_LASTING = 15  # frames over which films part, not only jitter: at most half of the film
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """What is shown when.
+
+    Attributes:
+        numbers: (n, films) of the frames of each film.
+        times: (n,) seconds, from the first film's beginning on.
+        notes: how that was found, and what was left out.
+    """
+
+    numbers: IntArray
+    times: FloatArray
+    notes: tuple[str, ...]
+
+
+def moments_of(
+    films: list[VideoFrames], rate: float, stated: bool, tolerance: float = 0.0
+) -> Moments:
+    """Frames of one film, or of several those of one number, or of one time where that is another.
+
+    Args:
+        films: one, or those of the left and of the right camera, and of a third one.
+        rate: frames a second of the first.
+        stated: that rate is the user's, in place of each film's own times.
+        tolerance: largest time between frames of two films, seconds.
+
+    Raises:
+        DatasetError: no two frames are shown at one time.
+    """
+    own = [None if stated else film.stamps() for film in films]
+    if len(films) == 1:
+        return _by_number(films, own, rate)
+    either = (film.even() if its is None else its for film, its in zip(films, own, strict=True))
+    known = [times for times in either if times is not None]
+    if stated or len(known) < len(films) or not any(_part(known[0], its) for its in known[1:]):
+        how, moments = "number", _by_number(films, own, rate)
+    else:
+        how, moments = "time", _by_time(films, known, tolerance)
+    count, all_ = ("two", "both") if len(films) == 2 else ("three", "all")
+    how = f"frames of the {count} films are paired by their {how}: {all_} must begin at one time"
+    differ = (note for film, side in zip(films[1:], _SIDES, strict=False)
+              for note in _differences(films[0], film, side))  # fmt: skip
+    return replace(moments, notes=(how, *differ, *moments.notes))
+
+
+def _part(left: FloatArray, right: FloatArray) -> bool:
+    """Whether frames of one number come to lie nearer to frames of another one, and stay there.
+
+    Single frames may be late: by the time alone they would lose their partners.
+    """
+    count = min(len(left), len(right))
+    if count < 2:
+        return False
+    apart = sliding_window_view(left[:count] - right[:count], min(_LASTING, count // 2))
+    step = min(times[-1] / (len(times) - 1) for times in (left, right))
+    return bool(np.abs(np.median(apart, axis=1)).max() > 0.5 * step)
+
+
+def _differences(left: VideoFrames, right: VideoFrames, side: str) -> tuple[str, ...]:
+    """What two films that should run together differ in."""
+    notes = []
+    if left.count != right.count:
+        notes.append(f"the left film has {left.count} frames, the {side} one {right.count}")
+    if abs(left.rate - right.rate) > 1e-3 * left.rate:
+        notes.append(f"the left film has {left.rate:g} frames a second, the {side} {right.rate:g}")
+    return tuple(notes)
+
+
+def _by_time(films: list[VideoFrames], known: list[FloatArray], tolerance: float) -> Moments:
+    """Frames of the films that are each other's nearest."""
+    left, right, *third = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
+    sides = zip(("left", "third"), (films[0], *films[2:]), (left, *third), strict=False)
+    others = [(side, film.name, stamps) for side, film, stamps in sides]
+    rows, notes = pair_all(right, others, tolerance, films[1].name)
+    numbers = rows[:, [1, 0, *range(2, len(films))]]
+    return Moments(numbers, known[0][numbers[:, 0]], notes)
+
+
+def _by_number(films: list[VideoFrames], own: list[FloatArray | None], rate: float) -> Moments:
+    """Frames at the rate, or each at its time in the first film where these are uneven."""
+    count = min(film.count for film in films)
+    even = np.arange(count, dtype=np.int64) / rate
+    numbers = np.repeat(np.arange(count, dtype=np.int64)[:, None], len(films), axis=1)
+    shown = [times[:count] for times in own if times is not None]
+    if count < 2 or len(shown) < len(films):
+        return Moments(numbers, even, ())
+    notes: tuple[str, ...] = ()
+    apart = max((float(np.abs(shown[0] - its).max()) for its in shown[1:]), default=0.0)
+    if apart > _UNEVEN / rate:
+        notes = (f"frames of one number differ in time by up to {1e3 * apart:.0f} ms in the films",)
+    if np.abs(shown[0] - even).max() <= _UNEVEN / rate:
+        return Moments(numbers, even, notes)
+    steps = 1e3 * np.diff(shown[0])
+    note = f"frames are {steps.min():.0f} to {steps.max():.0f} ms apart: each has its own time"
+    return Moments(numbers, shown[0], (note, *notes))
+
+
+# --------------------------------------------------------------------------------------------
+# Frames of a film by number
+
+
+_AS_STORED = -1  # packets of the file instead of decoded frames
+_KEPT = 10  # decoded frames: threads ask for neighbours out of order
+
+
+class VideoFrames:
+    """Frames of a video by number, exactly: decoded from the start, never by seeking.
+
+    A decoder's seeking may land on a neighbour. Going backward by more than the last few frames
+    therefore starts over; going forward costs what is skipped. No frame is decoded twice on the
+    way. Safe to be asked by several threads.
+
+    Attributes:
+        name: of the file.
+        count: frames that can be read.
+        rate: frames a second, as the file states it.
+        notes: what was cut off; how the frames are turned.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Opens the file. Raises DatasetError where it is absent, no video, or without a frame."""
+        self._path, self.name = path, path.name
+        self._lock = threading.Lock()
+        self._capture = self._open()
+        stated = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.rate = float(self._capture.get(cv2.CAP_PROP_FPS))
+        self.count = stated if stated > 0 and self._reaches(stated) else self._counted()
+        if self.count < 1:
+            raise DatasetError(f"{path} holds no frame; give a video file")
+        self.notes: tuple[str, ...] = tuple(self._noticed(stated))
+        self._next = 0
+        self._kept: OrderedDict[int, Image] = OrderedDict()
+
+    def load(self, index: int) -> Image:
+        """Frame (height, width, 3) in R, G, B. Raises FrameError where it cannot be decoded."""
+        with self._lock:
+            if index not in self._kept:
+                self._go_to(index)
+            return self._kept[index].copy()
+
+    def stamps(self) -> FloatArray | None:
+        """Seconds (count,) from the first frame on, each as the file states it; None without.
+
+        Nothing is decoded. Frames are stored in another order than they are shown.
+        """
+        capture, found = self._open(), []
+        if capture.set(cv2.CAP_PROP_FORMAT, _AS_STORED):
+            while capture.grab():
+                found.append(1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC))
+        capture.release()
+        times = np.sort(np.array(found, np.float64))[: self.count]
+        if len(times) < self.count or np.any(np.diff(times) <= 0.0):
+            return None
+        return np.asarray(times - times[0])
+
+    def even(self) -> FloatArray | None:
+        """Seconds (count,) from the first frame on by the stated rate; None without a rate."""
+        return np.arange(self.count) / self.rate if 0.0 < self.rate < np.inf else None
+
+    def _go_to(self, index: int) -> None:
+        if index < self._next:
+            self._capture.release()
+            self._capture, self._next = self._open(), 0
+        while self._next <= index:
+            if not self._capture.grab():
+                raise FrameError(
+                    f"video {self._path} ends after {self._next} frames, frame {index} of "
+                    f"{self.count} is missing: it is truncated; restore it, or set dataset.stop"
+                )
+            self._next += 1
+            if index - self._next < _KEPT:
+                self._keep(self._next - 1, index)
+
+    def _keep(self, number: int, wanted: int) -> None:
+        decoded, frame = self._capture.retrieve()
+        if decoded and frame is not None:
+            self._kept[number] = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+            while len(self._kept) > _KEPT:
+                self._kept.popitem(last=False)
+        elif number == wanted:
+            raise FrameError(
+                f"video {self._path}: frame {number} cannot be decoded; leave it out with "
+                "dataset.start, stop or stride"
+            )
+
+    def _noticed(self, stated: int) -> Iterator[str]:
+        if self.count < stated:
+            yield f"{self.name} is cut off: {self.count} of {stated} frames can be read"
+        if turn := round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)):
+            yield (
+                f"{self.name} states that it is to be turned by {turn} degrees, and is read so: "
+                "the calibration must be of images turned so"
+            )
+
+    def _reaches(self, stated: int) -> bool:
+        """Whether the last frame that the file states is there."""
+        capture = self._open()
+        try:
+            capture.set(cv2.CAP_PROP_POS_FRAMES, stated - 1)
+            return bool(capture.grab())
+        finally:
+            capture.release()
+
+    def _counted(self) -> int:
+        """How many frames can be read, by reading them."""
+        capture, count = self._open(), 0
+        while capture.grab():
+            count += 1
+        capture.release()
+        return count
+
+    def _open(self) -> cv2.VideoCapture:
+        if not self._path.is_file():
+            raise DatasetError(
+                f"video {self._path} does not exist; check dataset.path, or say where it is: "
+                "--set dataset.path=FILE"
+            )
+        capture = cv2.VideoCapture(str(self._path))
+        if not capture.isOpened():
+            raise DatasetError(
+                f"{self._path} cannot be opened as a video: it is damaged, holds no frame or is of "
+                "an unknown format; restore or convert it"
+            )
+        return capture
