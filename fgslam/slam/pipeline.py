@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -55,23 +57,41 @@ class Stopwatch:
     """Milliseconds by stage, within one frame."""
 
     def __init__(self) -> None:
-        """Starts now."""
+        """No stage yet."""
         self.ms: dict[str, float] = {}
-        self._last = time.perf_counter()
 
-    def lap(self, stage: str) -> None:
-        """Adds the time since the last lap to ``stage``."""
-        now = time.perf_counter()
-        self.ms[stage] = self.ms.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
-
-
-_Before: TypeAlias = "list[tuple[Resumable, StateArrays]]"
-"""Parts, and what they were like before a frame."""
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the time that the block takes to a stage."""
+        start = time.perf_counter()
+        yield
+        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (time.perf_counter() - start)
 
 
-def _nobody() -> IntArray:
+def no_ids() -> IntArray:
+    """No landmark's identity."""
     return np.empty(0, np.int64)
+
+
+Step = TypeVar("Step", bound=Callable[..., Any])
+
+
+def timed(stage: str) -> Callable[[Step], Step]:
+    """Decorator of a step of the loop, whose time it adds to a stage of the frame."""
+
+    def decorate(step: Step) -> Step:
+        @functools.wraps(step)
+        def run(self: SlamPipeline, *arguments: Any) -> Any:
+            with self.watch_of_frame.stage(stage):
+                return step(self, *arguments)
+
+        return cast("Step", run)
+
+    return decorate
+
+
+Snapshot: TypeAlias = "list[tuple[Resumable, StateArrays]]"
+"""Parts, and their states before a frame, for the rollback where its features cannot be found."""
 
 
 @dataclass(slots=True, eq=False)
@@ -84,13 +104,14 @@ class SlamPipeline:
         key_frames: tracking between key frames; None where every frame is one.
         watch: says which frames' images cannot be used; None uses all.
         describe: finds the features of a frame that came without: of all images, or of the
-            reference image where patches tell the rest (`frontend.stereo.others`).
-        describe_reference: of the first frame, and of one that carried landmarks have placed,
+            reference image where patches measure the rest (`frontend.stereo.others`).
+        describe_reference: of the first frame, and of one that tracked patches have located,
             those of its reference image alone.
         located: pose of the first frame, found in a saved map without a prior; None where it was
             not.
-        rewound: the last frame's features could not be found, and it left no trace; but what a
+        rewound: the last frame's features could not be found, and it was rolled back; but what a
             closure before it ended has ended.
+        watch_of_frame: time of the last frame, by stage.
     """
 
     stereo: RigStereo
@@ -105,70 +126,60 @@ class SlamPipeline:
     describe: Callable[[FeatureFrame], FeatureFrame] | None = None
     describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
     rewound: bool = False
-    _ended: IntArray = field(default_factory=_nobody, init=False)
+    watch_of_frame: Stopwatch = field(default_factory=Stopwatch, init=False)
+    _ended: IntArray = field(default_factory=no_ids, init=False)
     _tried: tuple[FeatureFrame, StereoFeatures] | None = field(default=None, init=False)
 
     def process(
-        self, found: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
+        self, frame: FeatureFrame, index: int, timestamp: float, body: Odometry | None = None
     ) -> FrameReport:
         """Processes one frame: Sections 2 to 4 of the paper in order, then loops (its section 7).
 
         Args:
-            found: the frame with its features.
+            frame: its images, with or without their features.
             index: its number in the recording, for the log.
             timestamp: seconds.
             body: the robot's motion since the last frame; None where none was measured.
         """
-        watch = Stopwatch()
-        before = self._before(found)
-        found = self._watched(found, index)
-        watch.lap("watch")
-        correction = self._correction()
-        recalibrated(self.estimator, None if correction is None else correction.values)
-        odometry = self.motion.between(timestamp, body)
-        prediction = predicted(self.estimator, odometry)
-        watch.lap("predict")
-        landmarks = self._fused()
-        carried = self._carried(prediction, found, landmarks)
-        watch.lap("track")
-        if self.key_frames is not None and carried is not None and self._goes_on(carried):
-            stereo, described = carried.carried.features, None
-            seen = _Seen(carried.tracked.ego_motion, self.key_frames.book(carried))
+        self.watch_of_frame = Stopwatch()
+        snapshot = self._snapshot(frame)
+        frame = self._check_cameras(frame, index)  # late, frozen, swapped images are not used
+        odometry, prediction = self._predict(timestamp, body)  # 3.1
+        landmarks = self._current_map()
+        carried = self._track_patches(prediction, frame, landmarks)  # between key frames
+        if self.key_frames and carried and self._needs_no_features(carried):
+            stereo, features = carried.carried.features, None
+            matched = Matched(carried.tracked.ego_motion, self.key_frames.book(carried))
         else:
-            found = self._described(found, carried, before)
-            watch.lap("sift")
-            every = self._match_stereo(found)
-            watch.lap("stereo")
-            guessed = odometry is not None and not odometry.measured
-            every, seen = self._track(prediction, found, every, landmarks, carried, guessed)
-            stereo = described = every.whole
-            watch.lap("track")
-            seen = self._recognise(seen, stereo, landmarks)
-        watch.lap("places")
-        seen, self._ended = seen.without(self._ended), _nobody()
-        increment = self._increment(index, timestamp, odometry, seen)
-        stats = updated(self.estimator, increment, seen.tracking)
-        noise = noise_in_use(self.motion, odometry, self.tracker.noise, self.estimator)
-        observe(self.motion, increment, seen.tracking, stats)
-        self.tracker.noise.learn(seen.tracking)
-        self._remember(increment, seen, stats)
-        watch.lap("update")
-        if described is not None and self.watch is not None:
-            self._look_for_other_motion(index, described, seen, stats)
-        watch.lap("watch")  # not the estimator's time
-        if self.calibration is not None:
-            self.calibration.observe(increment, stats.wTc)
-        watch.lap("calibrate")
-        return FrameReport(found, stereo, increment, seen.tracking, stats, watch.ms, noise)
+            frame = self._find_features(frame, carried, snapshot)  # 2.1
+            every = self._match_stereo(frame)  # 2.2
+            measured = odometry is None or odometry.measured
+            every, matched = self._track(prediction, frame, every, landmarks, carried, measured)
+            stereo = features = every.whole
+            matched = self._recognise_places(matched, stereo, landmarks)
+        matched = self._end_landmarks(matched)
+        increment = self._increment(index, timestamp, odometry, matched)  # what the log holds
+        stats, noise = self._update(increment, matched.ego_motion)  # 6.4
+        if features is not None:
+            self._look_for_other_motion(index, features, matched, stats)
+        self._calibrate(increment, stats)
+        times = self.watch_of_frame.ms
+        return FrameReport(frame, stereo, increment, matched.ego_motion, stats, times, noise)
 
-    def founds(self, found: FeatureFrame, least: int) -> bool:
+    def can_initialise(self, frame: FeatureFrame, least: int) -> bool:
         """Whether a map could begin with the frame: it has ``least`` stereo matches, or more.
 
         Not with images that the watch refuses: what they match is chance, or of two moments.
         """
-        if found.frame is None or self._refused(found):
+        if frame.frame is None:
             return False
-        first = self._described(dataclasses.replace(found, i=0), None, [])
+        if self.watch is not None:
+            before = self.watch.state()
+            refused = self._check_cameras(frame, frame.i).refused
+            self.watch.restore(before)  # the frame comes again
+            if refused:
+                return False
+        first = self._find_features(dataclasses.replace(frame, i=0), None, [])
         self._tried = first, self._match_stereo(first)
         return len(self._tried[1].whole) >= least
 
@@ -193,94 +204,38 @@ class SlamPipeline:
         self.tracker.noise.restore(state)
         self.tracker.other_motion.restore(state)
 
-    def _before(self, found: FeatureFrame) -> _Before:
-        """What a frame changes until its features are found, where it came without."""
+    # -- the steps, in their order -------------------------------------------------------------
+
+    def _snapshot(self, frame: FeatureFrame) -> Snapshot:
+        """What a frame that comes without features changes before these are found."""
         self.rewound = False
-        if self.describe is None or found.frame is None or found.features:
+        if self.describe is None or frame.frame is None or frame.features:
             return []
         parts = self.watch, self.motion, self.key_frames
         return [(part, part.state()) for part in parts if isinstance(part, Resumable)]
 
-    def _watched(self, found: FeatureFrame, index: int) -> FeatureFrame:
+    @timed("watch")
+    def _check_cameras(self, frame: FeatureFrame, index: int) -> FeatureFrame:
         """The frame, without its images where these are not of one moment and this one."""
-        if self.watch is None or found.frame is None:
-            return found
-        fault = self.watch.look(found.frame.images, index)
+        if self.watch is None or frame.frame is None:
+            return frame
+        fault = self.watch.look(frame.frame.images, index)
         if not fault:
-            return found
-        return dataclasses.replace(found, frame=None, features=(), problem=fault, refused=True)
+            return frame
+        return dataclasses.replace(frame, frame=None, features=(), problem=fault, refused=True)
 
-    def _refused(self, found: FeatureFrame) -> bool:
-        """Whether the watch refuses the frame, which it does not take in here."""
-        if self.watch is None:
-            return False
-        before = self.watch.state()
-        refused = self._watched(found, found.i).refused
-        self.watch.restore(before)
-        return refused
+    @timed("predict")
+    def _predict(
+        self, timestamp: float, body: Odometry | None
+    ) -> tuple[Odometry | None, Prediction]:
+        """The camera's motion, and the pose after it, on the map that the calibration has moved."""
+        correction = self._correction()
+        recalibrated(self.estimator, None if correction is None else correction.values)
+        odometry = self.motion.between(timestamp, body)
+        return odometry, predicted(self.estimator, odometry)
 
-    def _carried(
-        self, prediction: Prediction, found: FeatureFrame, landmarks: LandmarkMap
-    ) -> CarriedFrame | None:
-        """The frame by the landmarks carried into it; None where there are none."""
-        if self.key_frames is None or found.frame is None:
-            return None
-        return self.key_frames.carry(prediction, landmarks, found.frame.images, self._correction())
-
-    def _goes_on(self, carried: CarriedFrame) -> bool:
-        """Whether the frame needs no features: enough is carried, and no place is looked for."""
-        return carried.suffices and (self.places is None or not self.places.wants_features)
-
-    def _described(
-        self, found: FeatureFrame, carried: CarriedFrame | None, before: _Before
-    ) -> FeatureFrame:
-        """The frame with features; of its reference image where carried landmarks place it.
-
-        Whatever an extractor of the user's raises, the loop is then as it was before the frame.
-        """
-        first = self.key_frames is not None and found.i == 0
-        patches = first or (carried is not None and carried.placed)
-        find = self.describe_reference if patches else self.describe
-        if find is None:
-            return found
-        try:
-            return find(found)
-        except BaseException:
-            for part, state in before:
-                part.restore(state)
-            self.rewound = True
-            raise
-
-    def _match_stereo(self, found: FeatureFrame) -> StereoFeatures:
-        if found.frame is None:
-            return StereoFeatures.empty()
-        tried, self._tried = self._tried, None
-        if tried and tried[0].frame is found.frame and tried[0].features is found.features:
-            return tried[1]
-        return self.stereo.match(found.frame, found.features, self._correction())
-
-    def _correction(self) -> RigCorrection | None:
-        return None if self.calibration is None else self.calibration.found.applied
-
-    def _increment(
-        self, index: int, timestamp: float, odometry: Odometry | None, seen: _Seen
-    ) -> Increment:
-        association, calibration = seen.association, self.calibration
-        return Increment(
-            index=index,
-            timestamp=timestamp,
-            odometry=odometry,
-            observations=association.observations,
-            rejected=association.rejected,
-            missed_ids=association.missed_ids,
-            pruned_ids=association.pruned_ids,
-            loops=seen.loops,
-            relocalised=seen.relocalised,
-            rig_correction=None if calibration is None else calibration.found.applied.values,
-            settled_rig=None if calibration is None else calibration.settled,
-        )
-
-    def _fused(self) -> LandmarkMap:
+    @timed("track")
+    def _current_map(self) -> LandmarkMap:
         """The map to track on, without the landmarks that a loop closed in the last frame ends.
 
         The estimator drops these with this frame's measurements, as the log records it.
@@ -290,82 +245,172 @@ class SlamPipeline:
             self._ended = np.union1d(self._ended, self.places.fuse(landmarks))
         return landmarks.without(self._ended) if len(self._ended) else landmarks
 
+    @timed("track")
+    def _track_patches(
+        self, prediction: Prediction, frame: FeatureFrame, landmarks: LandmarkMap
+    ) -> CarriedFrame | None:
+        """The frame by the landmarks whose patches are tracked into it; None where none are."""
+        if self.key_frames is None or frame.frame is None:
+            return None
+        return self.key_frames.carry(prediction, landmarks, frame.frame.images, self._correction())
+
+    def _needs_no_features(self, carried: CarriedFrame) -> bool:
+        """Whether enough patches are tracked, and no place is looked for."""
+        return carried.suffices and (self.places is None or not self.places.wants_features)
+
+    @timed("sift")
+    def _find_features(
+        self, frame: FeatureFrame, carried: CarriedFrame | None, snapshot: Snapshot
+    ) -> FeatureFrame:
+        """The frame with features; of its reference image where tracked patches locate it.
+
+        Whatever an extractor of the user's raises, the loop is then as it was before the frame.
+        """
+        first = self.key_frames is not None and frame.i == 0
+        patches = first or (carried is not None and carried.placed)
+        find = self.describe_reference if patches else self.describe
+        if find is None:
+            return frame
+        try:
+            return find(frame)
+        except BaseException:
+            for part, state in snapshot:
+                part.restore(state)
+            self.rewound = True
+            raise
+
+    @timed("stereo")
+    def _match_stereo(self, frame: FeatureFrame) -> StereoFeatures:
+        if frame.frame is None:
+            return StereoFeatures.empty()
+        tried, self._tried = self._tried, None
+        if tried and tried[0].frame is frame.frame and tried[0].features is frame.features:
+            return tried[1]
+        return self.stereo.match(frame.frame, frame.features, self._correction())
+
+    @timed("track")
     def _track(
         self,
         prediction: Prediction,
-        found: FeatureFrame,
+        frame: FeatureFrame,
         stereo: StereoFeatures,
         landmarks: LandmarkMap,
         carried: CarriedFrame | None,
-        guessed: bool,
-    ) -> tuple[StereoFeatures, _Seen]:
-        """A key frame by all its features, those carried among them."""
-        if found.frame is None:
-            status = EgoMotionStatus.CAMERA_FAULT if found.refused else EgoMotionStatus.NO_IMAGE
+        measured: bool,
+    ) -> tuple[StereoFeatures, Matched]:
+        """A key frame by all its features, those of tracked patches among them (3.1 to 4.3).
+
+        ``measured``: its prediction is by odometry.
+        """
+        if frame.frame is None:
+            status = EgoMotionStatus.CAMERA_FAULT if frame.refused else EgoMotionStatus.NO_IMAGE
             blind = self.tracker.track_blind(prediction, status)
-            return stereo, _Seen(blind, Association.nothing())
+            return stereo, Matched(blind, Association.nothing())
         if self.key_frames is None:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:
             tracked, stereo = self.key_frames.beside(carried, prediction, landmarks, stereo)
-        located, maps_on = False, True
-        if found.i == 0 and self.located is not None:
-            anew = self.tracker.track_anew(self.located, landmarks, stereo)
-            located = anew.ego_motion.status.measured
-            tracked = anew if located else tracked
-        elif self.places is not None and found.i > 0:
+        located, initialises = False, True
+        if frame.i == 0 and self.located is not None:
+            again = self.tracker.track_anew(self.located, landmarks, stereo)
+            located = again.ego_motion.status.measured
+            tracked = again if located else tracked
+        elif self.places is not None and frame.i > 0:  # where the prediction failed
             tracked = self.places.placed_by_recent(tracked, prediction, landmarks, stereo)
-            tracked, located = self.places.recover(tracked, landmarks, stereo.whole, guessed)
-            maps_on = self.places.maps_on
+            tracked, located = self.places.recover(tracked, landmarks, stereo.whole, not measured)
+            initialises = self.places.maps_on
         relocalised = located or tracked.ego_motion.status is EgoMotionStatus.RELOCALISED
-        if self.key_frames is not None:
+        image = frame.frame.images[0]
+        if self.key_frames is None:
+            association = self.tracker.associate(tracked, stereo, image, initialises)
+        else:
             tracked = spread(tracked, stereo)
-        image = found.frame.images[0]
-        association = self.tracker.associate(tracked, stereo, image, maps_on)
-        if self.key_frames is not None:
+            association = self.tracker.associate(tracked, stereo, image, initialises)
             self.key_frames.begin(image, stereo, association)
-        if found.i == 0 and not len(landmarks):
-            return stereo, _Seen(unmeasured(prediction, EgoMotionStatus.FIRST), association)
-        return stereo, _Seen(tracked.ego_motion, association, relocalised=relocalised)
+        if frame.i == 0 and not len(landmarks):
+            return stereo, Matched(unmeasured(prediction, EgoMotionStatus.FIRST), association)
+        return stereo, Matched(tracked.ego_motion, association, relocalised=relocalised)
 
-    def _recognise(self, seen: _Seen, stereo: StereoFeatures, landmarks: LandmarkMap) -> _Seen:
+    @timed("places")
+    def _recognise_places(
+        self, matched: Matched, stereo: StereoFeatures, landmarks: LandmarkMap
+    ) -> Matched:
         """The frame with the loops that it may close."""
         if self.places is None:
-            return seen
-        loops = self.places.look(seen.tracking.wTc, landmarks, stereo, seen.association)
-        return dataclasses.replace(seen, loops=loops)
+            return matched
+        wTc, association = matched.ego_motion.wTc, matched.association
+        loops = self.places.look(wTc, landmarks, stereo, association)
+        return dataclasses.replace(matched, loops=loops)
 
-    def _look_for_other_motion(
-        self, index: int, stereo: StereoFeatures, seen: _Seen, stats: UpdateStats
-    ) -> None:
-        """Whether the features that the map does not explain move rigidly, too."""
-        association = seen.association
-        known = association.partners(len(stereo)), association.known
-        self.tracker.other_motion.look(index, stereo, known, seen.tracking, stats.wTc)
+    def _end_landmarks(self, matched: Matched) -> Matched:
+        """Landmarks that ended before the frame go with it."""
+        ended, self._ended = self._ended, no_ids()
+        if not len(ended):
+            return matched
+        pruned = np.union1d(matched.association.pruned_ids, ended)
+        association = dataclasses.replace(matched.association, pruned_ids=pruned)
+        return dataclasses.replace(matched, association=association)
 
-    def _remember(self, increment: Increment, seen: _Seen, stats: UpdateStats) -> None:
+    def _increment(
+        self, index: int, timestamp: float, odometry: Odometry | None, matched: Matched
+    ) -> Increment:
+        association, calibration = matched.association, self.calibration
+        return Increment(
+            index=index,
+            timestamp=timestamp,
+            odometry=odometry,
+            observations=association.observations,
+            rejected=association.rejected,
+            missed_ids=association.missed_ids,
+            pruned_ids=association.pruned_ids,
+            loops=matched.loops,
+            relocalised=matched.relocalised,
+            rig_correction=None if calibration is None else calibration.found.applied.values,
+            settled_rig=None if calibration is None else calibration.settled,
+        )
+
+    @timed("update")
+    def _update(
+        self, increment: Increment, ego_motion: EgoMotion
+    ) -> tuple[UpdateStats, FrameNoise]:
+        """The estimator takes the frame in; motion model, noise and places learn from it."""
+        stats = updated(self.estimator, increment, ego_motion)
+        noise = noise_in_use(self.motion, increment.odometry, self.tracker.noise, self.estimator)
+        observe(self.motion, increment, ego_motion, stats)
+        self.tracker.noise.learn(ego_motion)
         self.tracker.parts.book(increment, stats.closed)
         if self.places is not None:
-            self.places.remember(increment, seen.tracking.wTc, stats)
+            self.places.remember(increment, ego_motion.wTc, stats)
+        return stats, noise
+
+    @timed("watch")  # not the estimator's time
+    def _look_for_other_motion(
+        self, index: int, features: StereoFeatures, matched: Matched, stats: UpdateStats
+    ) -> None:
+        """Whether the features that the map does not explain move rigidly, too."""
+        if self.watch is None:
+            return
+        association = matched.association
+        known = association.partners(len(features)), association.known
+        self.tracker.other_motion.look(index, features, known, matched.ego_motion, stats.wTc)
+
+    @timed("calibrate")
+    def _calibrate(self, increment: Increment, stats: UpdateStats) -> None:
+        if self.calibration is not None:
+            self.calibration.observe(increment, stats.wTc)
+
+    def _correction(self) -> RigCorrection | None:
+        return None if self.calibration is None else self.calibration.found.applied
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
+class Matched:
     """One frame matched: its pose, what its landmarks are, and which places it recognised."""
 
-    tracking: EgoMotion
+    ego_motion: EgoMotion
     association: Association
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
-
-    def without(self, ended: IntArray) -> _Seen:
-        """Landmarks that ended before the frame go with it."""
-        if not len(ended):
-            return self
-        pruned = np.union1d(self.association.pruned_ids, ended)
-        return dataclasses.replace(
-            self, association=dataclasses.replace(self.association, pruned_ids=pruned)
-        )
 
 
 def observe(

@@ -164,25 +164,25 @@ def replay_frame(
 ) -> ReplayedFrame:
     """Gives frame ``k`` of a log to an estimator: the live loop without its matching."""
     watch = Stopwatch()
-    if increment.odometry is None or increment.odometry.turned:
-        stand_in = motion.between(increment.timestamp, increment.odometry)
-        increment = dataclasses.replace(increment, odometry=stand_in)
-    recalibrated(estimator, increment.rig_correction)
-    prediction = predicted(estimator, increment.odometry)
-    watch.lap("predict")
-    matched = increment.observations.select(~increment.observations.is_new)
-    if k == 0 and not len(estimator.landmarks()):
-        tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
-    elif increment.relocalised:
-        tracking = _relocated(estimator, ego_motion, prediction, matched)
-    else:
-        tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
-    watch.lap("track")
-    stats = updated(estimator, increment, tracking)
-    noise = noise_in_use(motion, increment.odometry, ego_motion.noise, estimator)
-    observe(motion, increment, tracking, stats)
-    ego_motion.noise.learn(tracking)
-    watch.lap("update")
+    with watch.stage("predict"):
+        if increment.odometry is None or increment.odometry.turned:
+            stand_in = motion.between(increment.timestamp, increment.odometry)
+            increment = dataclasses.replace(increment, odometry=stand_in)
+        recalibrated(estimator, increment.rig_correction)
+        prediction = predicted(estimator, increment.odometry)
+    with watch.stage("track"):
+        matched = increment.observations.select(~increment.observations.is_new)
+        if k == 0 and not len(estimator.landmarks()):
+            tracking = unmeasured(prediction, EgoMotionStatus.FIRST)
+        elif increment.relocalised:
+            tracking = _relocated(estimator, ego_motion, prediction, matched)
+        else:
+            tracking = _solve(estimator, partial(ego_motion.solve, prediction), matched)
+    with watch.stage("update"):
+        stats = updated(estimator, increment, tracking)
+        noise = noise_in_use(motion, increment.odometry, ego_motion.noise, estimator)
+        observe(motion, increment, tracking, stats)
+        ego_motion.noise.learn(tracking)
     return ReplayedFrame(tracking, stats, watch.ms, noise)
 
 

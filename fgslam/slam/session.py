@@ -240,7 +240,7 @@ class Session:
             return False
         if self.recorder.most_stereo >= least:
             return False
-        return self.pipeline.founds(found, least)
+        return self.pipeline.can_initialise(found, least)
 
     def _begin_anew(self, timestamp: float) -> None:
         """Leaves out all frames so far: the next one is the first."""
