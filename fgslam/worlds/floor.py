@@ -285,8 +285,7 @@ class PathPlanner:
             DatasetError: no such path is found.
         """
         for _ in range(_STARTS):
-            tour = self._tour(rng, within)
-            points = self._searched(tour, spacing, legs, rng, within)
+            points = self.walk(self._tour(rng, within), spacing, legs, rng, within)
             if points is not None:
                 return _with_headings(points)
         where = "the house" if within is None else f"the {within}"
@@ -296,49 +295,40 @@ class PathPlanner:
         )
 
     def crossing_routes(
-        self, spacing: float, rng: np.random.Generator, crossing: str = "corridor"
+        self, spacing: float, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """Poses (n, 3) and (m, 3) of two routes, each from one room to another, that meet between.
+        """Poses (n, 3) and (m, 3) of two routes, each from one room to another by the corridor.
 
-        Args:
-            spacing: between poses, metres; the last ones lie about as far from the routes' ends.
-            rng: chooses rooms and places.
-            crossing: name of the room that they meet in: both lead by one place of it.
+        Both lead by one place of it. The last poses lie about ``spacing`` metres from the routes'
+        ends.
 
         Raises:
             DatasetError: no such routes are found.
         """
-        rooms = [room.name for room in ROOMS if room.name != crossing]
+        rooms = [room.name for room in ROOMS if room.name != "corridor"]
         for _ in range(_STARTS):
             a, b, c, d = (self._spot(_room(str(name)), rng) for name in rng.permutation(rooms)[:4])
-            middle = self._spot(_room(crossing), rng)
-            one, other = (
-                self._searched(tour, spacing, None, rng, None)
-                for tour in ((a, middle, b), (c, middle, d))
-            )
+            middle = self._spot(_room("corridor"), rng)
+            one = self.walk((a, middle, b), spacing, None, rng)
+            other = self.walk((c, middle, d), spacing, None, rng)
             if one is not None and other is not None:
                 return _with_headings(one), _with_headings(other)
         raise DatasetError(
-            f"no two routes of legs of {spacing} m meet in the {crossing}; lower path.spacing_m"
+            f"no two routes of legs of {spacing} m meet in the corridor; lower path.spacing_m"
         )
 
     def walk(
-        self, places: Sequence[FloatArray], spacing: float, steps: int, rng: np.random.Generator
-    ) -> FloatArray | None:
-        """(steps + 1, 2) places of a walk from the first of some free places (2,) by the others.
-
-        None where no such walk is found; whether it gets to the last place depends on ``steps``.
-        """
-        return self._searched(places, spacing, steps, rng, None)
-
-    def _searched(
         self,
         tour: Sequence[FloatArray],
         spacing: float,
         legs: int | None,
         rng: np.random.Generator,
-        within: str | None,
+        within: str | None = None,
     ) -> FloatArray | None:
+        """(legs + 1, 2) places of a walk from the first of some free places (2,) by the others.
+
+        None where no such walk is found. Without ``legs`` it ends a leg before the last place.
+        """
         search = _Search(self._space, self._grid, tour, spacing, self._clearance)
         return search.run(legs, rng, None if within is None else _room(within))
 

@@ -33,7 +33,9 @@ class LabRigSettings:
 
     width: int = Field(default=320, ge=16, le=4096, description="image width, pixels")
     height: int = Field(default=240, ge=16, le=4096, description="image height, pixels")
-    baseline_m: float = Field(default=0.10, gt=0.0, le=2.0, description="right to left, metres")
+    baseline_m: float = Field(
+        default=0.10, gt=0.0, le=2.0, description="right to left camera, metres"
+    )
     vertical_baseline_m: Annotated[float, Field(gt=0.0, le=2.0)] | None = Field(
         default=0.10, description="right to top camera, metres; null for a two-camera rig"
     )
