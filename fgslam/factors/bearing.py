@@ -1,9 +1,9 @@
 """Factors of homing: bearings, elevations, the leg, its measured direction, and motion.
 
 Variables: planar poses of the start, of every image on the way and of the target (``Pose2``),
-velocities in the robot's axes, landmarks in the plane, and their heights where elevations are
-used. GTSAM's own factors serve wherever there is one; residuals are specified in
-:mod:`fgslam.factors.bearing_residuals`. Derivation: docs/derivations/homing_graph.md.
+velocities in the robot's axes, and landmarks in the plane. GTSAM's own factors serve wherever there
+is one; residuals are specified in :mod:`fgslam.factors.bearing_residuals`. Derivation:
+docs/derivations/homing_graph.md.
 """
 
 from __future__ import annotations
@@ -18,8 +18,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import rotation
 from fgslam.factors.bearing_residuals import (
     direction_and_turn,
-    elevation,
-    elevation_jacobians,
     elevation_pair,
 )
 from fgslam.factors.noise import KernelName, Whitening
@@ -39,26 +37,6 @@ class BearingFactors:
     def bearing(self, pose: int, landmark: int, measured: float, sigma: float) -> Any:
         """Bearing of a landmark from a pose; radians (eqs 7, 9)."""
         return gtsam.BearingFactor2D(pose, landmark, gtsam.Rot2(measured), self._model(sigma))
-
-    def elevation(
-        self, pose: int, landmark: int, height: int, measured: float, sigma: float
-    ) -> Any:
-        """Elevation of a landmark of unknown height from a pose; radians."""
-        keys = [pose, landmark, height]
-        value = np.array([measured])
-
-        def error(_: Any, values: Any, jacobians: list[FloatArray] | None) -> FloatArray:
-            at = values.atPose2(pose)
-            place = np.array([at.x(), at.y(), at.theta()])
-            point = values.atPoint2(landmark)[None, :]
-            tall = np.array([values.atDouble(height)])
-            if jacobians is not None:
-                by_pose, by_point, by_height = elevation_jacobians(place, point, tall)
-                jacobians[0] = by_pose @ tangent_to_pose(place)
-                jacobians[1], jacobians[2] = by_point, by_height[:, None]
-            return elevation(place, point, tall, value)
-
-        return gtsam.CustomFactor(self._model(sigma), keys, error)
 
     def elevation_pair(
         self,
@@ -144,11 +122,6 @@ def motion_factor(
 def weak_landmark_prior(landmark: int, position: FloatArray, sigma: float) -> Any:
     """Keeps a landmark determined when too few bearings say where it is."""
     return gtsam.PriorFactorPoint2(landmark, position, gtsam.noiseModel.Isotropic.Sigma(2, sigma))
-
-
-def weak_height_prior(height: int, value: float, sigma: float) -> Any:
-    """The same for a height."""
-    return gtsam.PriorFactorDouble(height, value, gtsam.noiseModel.Isotropic.Sigma(1, sigma))
 
 
 def tangent_to_pose(pose: FloatArray) -> FloatArray:

@@ -136,26 +136,12 @@ def offsets(views: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArr
     return points[:, 0] - views[:, :1], points[:, 1] - views[:, 1:2]
 
 
-def bearings_from_views(
-    dx: FloatArray, dy: FloatArray, squared: FloatArray, numbers: int
-) -> tuple[FloatArray, FloatArray]:
-    """(v, m, 3) and (v, m, 2 or 3) derivatives of bearings by poses and points."""
-    by_pose, by_point = np.empty((*dx.shape, 3)), np.zeros((*dx.shape, numbers))
+def bearings_from_views(dx: FloatArray, dy: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(v, m, 3) and (v, m, 2) derivatives of bearings by poses and points, of offsets (v, m)."""
+    squared = dx**2 + dy**2
+    by_pose, by_point = np.empty((*dx.shape, 3)), np.empty((*dx.shape, 2))
     by_point[..., 0], by_point[..., 1] = -dy / squared, dx / squared
-    by_pose[..., :2], by_pose[..., 2] = -by_point[..., :2], -1.0
-    return by_pose, by_point
-
-
-def elevations_from_views(
-    dx: FloatArray, dy: FloatArray, squared: FloatArray, heights: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The same of elevations of points at heights (m,)."""
-    distance = np.sqrt(squared)
-    whole = squared + heights**2
-    by_pose, by_point = np.zeros((*dx.shape, 3)), np.empty((*dx.shape, 3))
-    down = heights / (whole * distance)
-    by_pose[..., 0], by_pose[..., 1] = down * dx, down * dy
-    by_point[..., :2], by_point[..., 2] = -by_pose[..., :2], distance / whole
+    by_pose[..., :2], by_pose[..., 2] = -by_point, -1.0
     return by_pose, by_point
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, IntArray
 
 _POSE, _LANDMARK = "x", "l"
-_TARGET, _VELOCITY, _HEIGHT = "t", "v", "h"
+_TARGET, _VELOCITY = "t", "v"
 _CHARACTER_AT = 56  # bits of a key below its character
 _FIRST_LANDMARK = int(gtsam.symbol(_LANDMARK, 0))
 
@@ -52,11 +52,6 @@ def target_key() -> int:
 def velocity_key(image: int) -> int:
     """Key of the velocity at pose ``image``."""
     return int(gtsam.symbol(_VELOCITY, image))
-
-
-def height_key(variable: int) -> int:
-    """Key of the height of landmark ``variable``."""
-    return int(gtsam.symbol(_HEIGHT, variable))
 
 
 def landmarks_in(values: Any) -> tuple[IntArray, FloatArray]:

@@ -204,8 +204,8 @@ class PathFollower:
         Args:
             camera: of the robot; the path may have been taught with another one.
             path: of :func:`fgslam.teach`, or loaded.
-            estimator: its kind, ``homing_graph``, ``homing_ekf``, ``alv`` or ``snapshot``, or its
-                settings; used with tracks.
+            estimator: its kind (``homing_graph``, ``homing_ekf``, ``paper_ekf``, ``alv``,
+                ``snapshot``) or its settings; used with tracks.
             behaviour: control, steering (largest speed), skipping of targets; None: the defaults.
             front_end: features, matching, tracking.
             seed: of RANSAC's samples; the same images then give the same commands.

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.backend.homing.settings import (
-    PAPER,
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingGraphSettings,
+    PaperEkfSettings,
     SnapshotSettings,
 )
 from fgslam.backend.settings import EstimatorSettings
@@ -59,8 +59,8 @@ HOMING_VARIANTS = {
         HomingGraphSettings(),
         HomingGraphSettings(label="graph_batch", solver="batch"),
         HomingEkfSettings(),
-        PAPER,
-        dataclasses.replace(PAPER, label="paper_ekf_gated", gate_sigmas=3.0),
+        PaperEkfSettings(),
+        PaperEkfSettings(label="paper_ekf_gated", gate_sigmas=3.0),
         AverageLandmarkVectorSettings(),
         SnapshotSettings(),
     )

@@ -353,9 +353,6 @@ class SimulatedBearingsSettings:
         default=0.8, gt=0.0, lt=1.0, description="part of the way after which the drive ends"
     )
     images_per_s: Positive = Field(default=10.0, description="tracked images a second (paper: 10)")
-    tracked_elevations: bool = Field(
-        default=False, description="images on the way state elevations, too"
-    )
     lost_per_s: NonNegative = Field(
         default=0.02, description="part of the tracks that get lost in a second"
     )

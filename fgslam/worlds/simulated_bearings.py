@@ -201,17 +201,16 @@ def _tracks(
     out = []
     for k, robot in enumerate(robots):
         points = places[(jump_at <= k).astype(np.int64), np.arange(n)]
-        bearing, elevation = _measured(robot, points, heights, rng)
+        bearing, _ = _measured(robot, points, heights, rng)
         gross = rng.random(n) < outliers.gross_bearings
         bearing = np.where(gross, rng.uniform(-np.pi, np.pi, n), bearing)
-        stated = settings.tracked_elevations
         everything = TrackedBearings(
             time=(k + 1) / settings.images_per_s,
             ids=np.arange(n),
             bearing=bearing,
             sigma_bearing=np.full(n, _SIGMA),
-            elevation=elevation if stated else np.full(n, np.nan),
-            sigma_elevation=np.full(n, _SIGMA if stated else np.nan),
+            elevation=np.full(n, np.nan),
+            sigma_elevation=np.full(n, np.nan),
         )
         out.append(everything.select(lost_at > k))
     return tuple(out)

@@ -13,11 +13,11 @@ from homings import Trial, trial
 from fgslam.backend.homing.estimator import HomingEstimator
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import (
-    PAPER,
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingEstimatorSettings,
     HomingGraphSettings,
+    PaperEkfSettings,
     SnapshotSettings,
 )
 from fgslam.core.errors import EstimatorError
@@ -25,18 +25,15 @@ from fgslam.core.homing import HomingEstimate, TrackedBearings
 from fgslam.worlds.settings import SimulatedBearingsSettings
 
 EVERY: list[HomingEstimatorSettings] = [
-    PAPER,
+    PaperEkfSettings(),
     HomingEkfSettings(),
     HomingGraphSettings(),
     HomingGraphSettings(solver="batch", label="batch"),
-    HomingGraphSettings(elevations="all", label="elevations"),
     AverageLandmarkVectorSettings(),
     SnapshotSettings(),
 ]
-MAPPING = EVERY[:5]
-SETTINGS = SimulatedBearingsSettings(
-    images_per_s=4.0, part=0.6, lost_per_s=0.1, tracked_elevations=True
-)
+MAPPING = EVERY[:4]
+SETTINGS = SimulatedBearingsSettings(images_per_s=4.0, part=0.6, lost_per_s=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -111,9 +108,9 @@ def test_home_is_found(case: Trial, settings: HomingEstimatorSettings) -> None:
     robot = case.truth.robots[-1]
     offset = case.truth.target[:2] - robot[:2]
     direction = np.arctan2(offset[1], offset[0]) - robot[2]
-    limit = 25.0 if settings.kind in ("alv", "snapshot") or settings is PAPER else 6.0
+    limit = 25.0 if settings.kind in ("alv", "snapshot", "paper_ekf") else 6.0
     assert abs(np.rad2deg(home.direction - direction)) < limit
-    if settings in MAPPING and settings is not PAPER:
+    if settings in MAPPING and settings.kind != "paper_ekf":
         assert home.distance == pytest.approx(np.hypot(*offset) / case.truth.leg_m, abs=0.04)
 
 

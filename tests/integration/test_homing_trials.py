@@ -13,10 +13,10 @@ from homings import Trial, trial
 
 from fgslam.backend.homing.factory import make_homing_estimator
 from fgslam.backend.homing.settings import (
-    PAPER,
     HomingEkfSettings,
     HomingEstimatorSettings,
     HomingGraphSettings,
+    PaperEkfSettings,
 )
 from fgslam.evaluation.homing import HomingErrors, homing_errors, summarise_homings
 from fgslam.worlds.simulated_bearings import HomingOutliers
@@ -40,7 +40,7 @@ def cases(count: int, outliers: float) -> list[Trial]:
 def test_graph_beats_the_filters_at_twenty_percent_outliers() -> None:
     some = cases(6, 0.2)
     graph = summarise_homings([homed(case, GRAPH) for case in some])
-    paper = summarise_homings([homed(case, PAPER) for case in some])
+    paper = summarise_homings([homed(case, PaperEkfSettings()) for case in some])
     assert graph.diverged == 0
     assert graph.direction_median_deg < 4.0
     assert paper.direction_median_deg > 3.0 * graph.direction_median_deg
@@ -49,7 +49,7 @@ def test_graph_beats_the_filters_at_twenty_percent_outliers() -> None:
 def test_counting_target_bearings_again_ruins_consistency() -> None:
     """Bearings to the target counted once, without outliers."""
     some = cases(8, 0.0)
-    printed = replace(PAPER, gauge="unit_leg", exact_bearings=False, gate_sigmas=3.0)
+    printed = PaperEkfSettings(gate_sigmas=3.0)
     again = summarise_homings([homed(case, printed) for case in some])
     once = summarise_homings([homed(case, HomingEkfSettings()) for case in some])
     assert again.target is not None

@@ -444,8 +444,6 @@ def _call_violation(node: ast.Call) -> str | None:
 PRIVATE_IN_TESTS = frozenset(
     {
         "tests/integration/test_lab_sequence.py",
-        "tests/unit/backend/homing/test_homing_equivalence.py",
-        "tests/unit/backend/homing/test_homing_schur.py",
         "tests/unit/backend/test_error_columns.py",
         "tests/unit/backend/test_landmark_kalman.py",
         "tests/unit/backend/test_recorded_inputs.py",

@@ -8,11 +8,13 @@ from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmark
 from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.estimator import HomingEstimator
 from fgslam.backend.homing.graph import HomingGraph
+from fgslam.backend.homing.paper_ekf import PaperEkf
 from fgslam.backend.homing.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingEstimatorKind,
     HomingGraphSettings,
+    PaperEkfSettings,
     SnapshotSettings,
 )
 from fgslam.core.errors import ConfigError
@@ -23,6 +25,7 @@ _KINDS: dict[str, type[HomingEstimatorKind]] = {
     for kind in (
         HomingGraphSettings,
         HomingEkfSettings,
+        PaperEkfSettings,
         AverageLandmarkVectorSettings,
         SnapshotSettings,
     )
@@ -54,6 +57,8 @@ def make_homing_estimator(start: HomingStart, settings: HomingEstimatorKind) -> 
     match settings:
         case HomingEkfSettings():
             return HomingEkf(start, settings)
+        case PaperEkfSettings():
+            return PaperEkf(start, settings)
         case HomingGraphSettings():
             return HomingGraph(start, settings)
         case AverageLandmarkVectorSettings():

@@ -9,7 +9,7 @@ each image adds, with first guesses; :mod:`fgslam.backend.homing.schur_solver` a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import repeat
 from typing import Any, ClassVar
@@ -18,9 +18,19 @@ import numpy as np
 
 from fgslam.backend.homing.estimator import TrackedFeatures
 from fgslam.backend.homing.graph_gtsam import BatchSolver, Isam2Solver
-from fgslam.backend.homing.graph_parts import TARGET, Beginning, NewPart, Pair, Sight, Solver
+from fgslam.backend.homing.graph_parts import (
+    FORWARD,
+    SIDEWAYS,
+    TARGET,
+    TURNING,
+    Beginning,
+    NewPart,
+    Pair,
+    Sight,
+    Solver,
+)
 from fgslam.backend.homing.schur_solver import SchurSolver
-from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
+from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
@@ -28,6 +38,8 @@ from fgslam.core.planar import compose, unit, wrap
 from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
 
 _PRIOR_DISTANCES = 2.0  # deviation of the weak prior on a landmark's place, in initial distances
+_MOST_RELATIVE_SIGMA = 0.3  # of its distance: a feature enters once it is known better than this
+_GATE_SIGMAS = 4.0  # on the misfit of a bearing
 _COLLAPSED = 0.1  # of the first distance from the start: gates let no error of ninety percent in
 _CONFIRMED, _SAME_SIGMAS = 3, 1.0  # agreements in a row before a waiting feature enters
 _JUMPED = 4  # misses in a row after which a track follows something else
@@ -55,12 +67,11 @@ class Motion:
 class HomingProblem:
     """Turns a homing start and images into parts of the graph."""
 
-    def __init__(self, start: HomingStart, settings: HomingGraphSettings) -> None:
+    def __init__(self, start: HomingStart) -> None:
         """Nothing is in the graph yet; see :meth:`first`."""
-        self._start, self._settings = start, settings
+        self._start = start
         self._ids = start.local_map.ids
         self._entered = np.zeros(len(self._ids), np.bool_)
-        self._tall = np.zeros(len(self._ids), np.bool_)  # their height is a variable
         self._guesses = np.full((len(self._ids), 2), np.nan)
         self._sighted = np.full((len(self._ids), 2), np.nan)  # distance and deviation, when waiting
         self._agreed = np.zeros(len(self._ids), np.int64)
@@ -94,15 +105,14 @@ class HomingProblem:
     def first(self) -> NewPart:
         """Start, target and the features that both views triangulate well."""
         start, vector = self._start, self._start.vector
-        wider = 1.0 if self._settings.elevations == "none" else _WIDER
-        covariance = 0.5 * wider**2 * (vector.covariance + vector.covariance.T)
+        covariance = 0.5 * _WIDER**2 * (vector.covariance + vector.covariance.T)
         covariance = covariance + _LEAST_SIGMA**2 * np.eye(2)
         target = np.append(unit(np.array(vector.direction)), vector.rotation)
         beginning = Beginning(target, vector, covariance)
         new = NewPart(0, np.zeros(3), np.zeros(3), (start.time, start.time), beginning)
         chart = start.local_map
         spread = np.sqrt(chart.covariance[:, 0, 0])
-        good = self._good(chart.distance, spread)
+        good = _is_good(chart.distance, spread)
         for row in np.flatnonzero(good).tolist():
             self._enter(new, row, chart.points()[row], float(chart.distance[row]))
         return new
@@ -123,22 +133,22 @@ class HomingProblem:
         pose, fits = self._resected(tracked, taken & self._entered[rows], before, points)
         new = NewPart(image, pose, before.velocity, (before.time, tracked.time))
         entering = self._enter_seen(new, rows, tracked, taken & ~self._entered[rows], before)
-        self._see(new, rows, tracked, fits | entering)
+        which = fits | entering
+        seen = (rows, tracked.bearing, tracked.sigma_bearing)
+        new.bearings += map(Sight, repeat(image), *(values[which].tolist() for values in seen))
         return new
 
     def _resected(
         self, tracked: TrackedBearings, seen: BoolArray, before: Motion, points: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
         """First guess (3,) of the pose, and which bearings (m,) of those ``seen`` fit to it."""
-        step, settings = tracked.time - before.time, self._settings
+        step = tracked.time - before.time
         predicted = compose(before.pose, _travelled(before.velocity, step))
         rows = np.searchsorted(self.entered, tracked.ids[seen])
         bearings, sigma = tracked.bearing[seen], tracked.sigma_bearing[seen]
-        spread = _drift(settings.motion, step)
+        spread = _drift(step)
         pose = resected(predicted, spread**-2.0, points[rows], bearings, sigma)
-        if settings.gate_sigmas == 0.0:
-            return pose, seen
-        misses = np.abs(bearing(pose, points[rows], bearings)) > settings.gate_sigmas * sigma
+        misses = np.abs(bearing(pose, points[rows], bearings)) > _GATE_SIGMAS * sigma
         if np.count_nonzero(misses) > 0.5 * len(misses):
             return pose, seen
         numbers = np.searchsorted(self._ids, tracked.ids[seen])
@@ -149,60 +159,23 @@ class HomingProblem:
         fits[seen] = ~misses & (self._missed[numbers] == 0)
         return pose, fits
 
-    def _see(
-        self, new: NewPart, rows: IntArray, tracked: TrackedBearings, which: BoolArray
-    ) -> None:
-        """Notes what is seen of landmarks ``rows`` (m,), where ``which`` (m,) says so."""
-        new.bearings += _sights(
-            new.image, rows[which], tracked.bearing[which], tracked.sigma_bearing[which]
-        )
-        tall = which & self._tall[rows] & np.isfinite(tracked.elevation)
-        new.elevations += _sights(
-            new.image, rows[tall], tracked.elevation[tall], tracked.sigma_elevation[tall]
-        )
-
     # ----------------------------------------------------------------------------------------
     # Landmarks
 
-    def _good(self, distance: FloatArray, spread: FloatArray) -> BoolArray:
-        limit = self._settings.max_relative_distance_sigma
-        with np.errstate(invalid="ignore"):
-            known = (distance > 0.0) & (spread <= limit * distance)
-        return np.asarray(known & np.isfinite(distance) & np.isfinite(spread))
-
     def _enter(self, new: NewPart, row: int, point: FloatArray, distance: float) -> None:
-        """A landmark with its bearings from start and target."""
-        settings, matches = self._settings, self._start.matches
+        """A landmark with its bearings, and its elevations if any, from start and target."""
+        matches, vector = self._start.matches, self._start.vector
         new.points[row] = (point, _PRIOR_DISTANCES * distance)
         from_start, _, from_target, _ = matches.sigma[row].tolist()
         new.bearings += [
             Sight(0, row, float(matches.bearing_a[row]), from_start),
             Sight(TARGET, row, float(matches.bearing_b[row]), from_target),
         ]
-        known = bool(np.isfinite(self._elevations(row)).all())
-        if settings.elevations == "all" and known:
-            self._enter_height(new, row, distance)
-        elif settings.elevations == "two_views" and known:
-            vector = self._start.vector
-            at = unit(np.array(vector.direction))
-            first = np.array([*at, vector.rotation, *point])
-            sigmas = matches.sigma[row, [1, 3]]
-            new.pairs.append(Pair(row, self._elevations(row), sigmas, first))
+        elevations = np.array([matches.elevation_a[row], matches.elevation_b[row]])
+        if np.isfinite(elevations).all():
+            first = np.array([*unit(np.array(vector.direction)), vector.rotation, *point])
+            new.pairs.append(Pair(row, elevations, matches.sigma[row, [1, 3]], first))
         self._entered[row], self._guesses[row] = True, point
-
-    def _elevations(self, row: int) -> FloatArray:
-        matches = self._start.matches
-        return np.array([matches.elevation_a[row], matches.elevation_b[row]])
-
-    def _enter_height(self, new: NewPart, row: int, distance: float) -> None:
-        """Its height, with its elevations from start and target."""
-        matches = self._start.matches
-        up, up_target = self._elevations(row).tolist()
-        _, sigma, _, sigma_target = matches.sigma[row].tolist()
-        self._tall[row] = True
-        tall = distance * float(np.tan(up))
-        new.heights[row] = (tall, _PRIOR_DISTANCES * distance)
-        new.elevations += [Sight(0, row, up, sigma), Sight(TARGET, row, up_target, sigma_target)]
 
     def _enter_seen(
         self,
@@ -235,7 +208,7 @@ class HomingProblem:
         variance[:, 3] = tracked.sigma_bearing[waiting] ** 2
         spread = np.sqrt((by**2 * variance).sum(axis=1))
         self._compare(rows, length * legs, length * spread)
-        confirmed = self._good(legs, spread) & (self._agreed[rows] >= _CONFIRMED)
+        confirmed = _is_good(legs, spread) & (self._agreed[rows] >= _CONFIRMED)
         confirmed &= self._seen_by_target(rows, length * legs, length * spread)
         for k in np.flatnonzero(confirmed).tolist():
             distance = float(length * legs[k])
@@ -274,15 +247,17 @@ class HomingProblem:
         self._sighted[rows] = np.column_stack([distance, spread])
 
 
-def _sights(view: int, rows: IntArray, measured: FloatArray, sigma: FloatArray) -> Iterator[Sight]:
-    """Of one view: landmarks (k,), values and deviations."""
-    return map(Sight, repeat(view), rows.tolist(), measured.tolist(), sigma.tolist())
+def _is_good(distance: FloatArray, spread: FloatArray) -> BoolArray:
+    """Which distances (n,) are known well enough for a landmark to enter."""
+    with np.errstate(invalid="ignore"):
+        known = (distance > 0.0) & (spread <= _MOST_RELATIVE_SIGMA * distance)
+    return np.asarray(known & np.isfinite(distance) & np.isfinite(spread))
 
 
-def _drift(motion: GraphMotionSettings, step: float) -> FloatArray:
+def _drift(step: float) -> FloatArray:
     """(3,) how far the robot may be from where it is expected: place in legs, heading."""
-    place = max(motion.forward, motion.sideways) * step**0.5
-    return np.array([place, place, np.deg2rad(motion.turning_deg) * step**0.5])
+    place = max(FORWARD, SIDEWAYS) * step**0.5
+    return np.array([place, place, TURNING * step**0.5])
 
 
 def _travelled(velocity: FloatArray, step: float) -> FloatArray:
@@ -331,6 +306,13 @@ def resected(
     return np.asarray(_SEARCH.minimise(predicted[None], linearised)[0])
 
 
+_SOLVERS: dict[str, Callable[[], Solver]] = {
+    "schur": SchurSolver,
+    "isam2": Isam2Solver,
+    "batch": BatchSolver,
+}
+
+
 class HomingGraph:
     """Estimator of kind ``homing_graph``.
 
@@ -347,24 +329,24 @@ class HomingGraph:
             EstimatorError: they cannot be solved.
         """
         self._features = TrackedFeatures(start)
-        self._problem = HomingProblem(start, settings)
-        self._solver = make_solver(settings)
+        self._problem = HomingProblem(start)
+        self.solver: Solver = _SOLVERS[settings.solver]()
         self._image = 0
         self._covariance: FloatArray | None = None
-        self._solver.add(self._problem.first())
+        self.solver.add(self._problem.first())
 
     def update(self, tracked: TrackedBearings) -> None:
         """Takes in one image; see the protocol."""
         before = self._motion()
         _, taken = self._features.take(tracked)
-        points = self._solver.points(self._entered())
+        points = self.solver.points(self._entered())
         new = self._problem.image(tracked, taken, before, points)
         self._covariance = None
         self._image += 1
-        self._solver.add(new)
-        collapsed = self._problem.collapsed(self._solver.points(self._entered()))
+        self.solver.add(new)
+        collapsed = self._problem.collapsed(self.solver.points(self._entered()))
         if collapsed:
-            self._solver.move(collapsed)
+            self.solver.move(collapsed)
 
     def estimate(self, landmarks: bool = True) -> HomingEstimate:
         """The present state; see the protocol."""
@@ -372,11 +354,11 @@ class HomingGraph:
         covariance = self._joint(rows if landmarks else [])
         return HomingEstimate(
             time=self._features.time,
-            robot=self._solver.pose(self._image),
-            target=self._solver.target(),
+            robot=self.solver.pose(self._image),
+            target=self.solver.target(),
             covariance=covariance[:6, :6],
             ids=ids,
-            landmarks=self._solver.points(rows),
+            landmarks=self.solver.points(rows),
             landmark_covariances=_blocks(covariance[6:, 6:], len(ids)),
         )
 
@@ -394,11 +376,11 @@ class HomingGraph:
         """Covariance of robot, target and landmarks."""
         size = 6 + 2 * len(rows)
         if self._covariance is None or len(self._covariance) < size:
-            self._covariance = self._solver.covariance(rows)
+            self._covariance = self.solver.covariance(rows)
         return self._covariance[:size, :size]
 
     def _motion(self) -> Motion:
-        pose, velocity = self._solver.pose(self._image), self._solver.velocity(self._image)
+        pose, velocity = self.solver.pose(self._image), self.solver.velocity(self._image)
         return Motion(self._image, self._features.time, pose, velocity, self._variances)
 
     def _variances(self) -> FloatArray:
@@ -412,14 +394,3 @@ def _blocks(covariance: FloatArray, count: int) -> FloatArray:
         return np.full((count, 2, 2), np.nan)
     every = np.arange(count)
     return np.asarray(covariance.reshape(count, 2, count, 2)[every, :, every, :])
-
-
-def make_solver(settings: HomingGraphSettings) -> Solver:
-    """The one of the settings."""
-    match settings.solver:
-        case "schur":
-            return SchurSolver(settings)
-        case "isam2":
-            return Isam2Solver(settings)
-        case "batch":
-            return BatchSolver(settings)

@@ -11,14 +11,14 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.homing.graph_parts import (
+    FIRST_SPEEDS,
+    KERNEL,
+    KERNEL_WIDTH,
+    MOTION_DENSITIES,
     TARGET,
     Beginning,
     NewPart,
-    Sight,
-    first_speeds,
-    motion_densities,
 )
-from fgslam.backend.homing.settings import GraphMotionSettings, HomingGraphSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.factors.bearing import (
@@ -29,11 +29,9 @@ from fgslam.factors.bearing import (
     tangent_to_pose,
     vector_factor,
     velocity_prior,
-    weak_height_prior,
     weak_landmark_prior,
 )
 from fgslam.factors.graphs import (
-    height_key,
     is_pose,
     isam2_parameters,
     landmark_key,
@@ -43,63 +41,42 @@ from fgslam.factors.graphs import (
 )
 
 _TRUST_RADIUS = 1.0  # legs, radians: the first of Powell's dog leg
-_MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes three to ten
-_RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
+MAX_ITERATIONS = 50  # of Levenberg-Marquardt; from the last solution it takes three to ten
+RELATIVE_TOLERANCE = 1e-5  # of the cost: the estimate then moves by far less than its deviation
 
 
-class GtsamParts:
-    """Makes GTSAM's factors and values of parts."""
-
-    def __init__(self, robust: BearingFactors, motion: GraphMotionSettings) -> None:
-        self._robust, self._motion = robust, motion
-
-    def of(self, new: NewPart) -> tuple[Any, Any, set[int]]:
-        """Factors, first guesses, and keys of what the image touches."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pose, velocity = pose_key(new.image), velocity_key(new.image)
-        values.insert(pose, gtsam.Pose2(*new.pose))
-        values.insert(velocity, new.velocity)
-        if new.beginning is not None:
-            self._begin(graph, values, new.beginning)
-        else:
-            earlier = (pose_key(new.image - 1), velocity_key(new.image - 1), new.times[0])
-            now = (pose, velocity, new.times[1])
-            graph.add(motion_factor(earlier, now, motion_densities(self._motion)))
-        for row, (point, spread) in new.points.items():
-            values.insert(landmark_key(row), point)
-            graph.add(weak_landmark_prior(landmark_key(row), point, spread))
-        for row, (height, spread) in new.heights.items():
-            values.insert(height_key(row), height)
-            graph.add(weak_height_prior(height_key(row), height, spread))
-        return graph, values, self._see(graph, new) | {pose, velocity}
-
-    def _begin(self, graph: Any, values: Any, beginning: Beginning) -> None:
-        target, vector, covariance = beginning
-        values.insert(target_key(), gtsam.Pose2(*target))
-        graph.add(start_prior(pose_key(0)))
-        graph.add(velocity_prior(velocity_key(0), np.zeros(3), first_speeds(self._motion)))
-        graph.add(leg_factor(pose_key(0), target_key()))
-        graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
-
-    def _see(self, graph: Any, new: NewPart) -> set[int]:
-        """All that is measured; keys of the landmarks and heights in it."""
-        robust, keys = self._robust, set[int]()
-        for sight in new.bearings:
-            landmark = landmark_key(sight.row)
-            graph.add(robust.bearing(_view(sight), landmark, sight.measured, sight.sigma))
-            keys.add(landmark)
-        for sight in new.elevations:
-            landmark, height = landmark_key(sight.row), height_key(sight.row)
-            at = (_view(sight), landmark, height)
-            graph.add(robust.elevation(*at, sight.measured, sight.sigma))
-            keys |= {landmark, height}
-        for pair in new.pairs:
-            graph.add(robust.elevation_pair(target_key(), landmark_key(pair.row), *pair[1:]))
-        return keys
+def _parts(new: NewPart) -> tuple[Any, Any, set[int]]:
+    """Factors, first guesses, and keys of what an image touches."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    pose, velocity = pose_key(new.image), velocity_key(new.image)
+    values.insert(pose, gtsam.Pose2(*new.pose))
+    values.insert(velocity, new.velocity)
+    if new.beginning is not None:
+        _add_beginning(graph, values, new.beginning)
+    else:
+        earlier = (pose_key(new.image - 1), velocity_key(new.image - 1), new.times[0])
+        graph.add(motion_factor(earlier, (pose, velocity, new.times[1]), MOTION_DENSITIES))
+    for row, (point, spread) in new.points.items():
+        values.insert(landmark_key(row), point)
+        graph.add(weak_landmark_prior(landmark_key(row), point, spread))
+    robust = BearingFactors(KERNEL, KERNEL_WIDTH)
+    keys = {pose, velocity}
+    for sight in new.bearings:
+        view = target_key() if sight.view == TARGET else pose_key(sight.view)
+        graph.add(robust.bearing(view, landmark_key(sight.row), sight.measured, sight.sigma))
+        keys.add(landmark_key(sight.row))
+    for pair in new.pairs:
+        graph.add(robust.elevation_pair(target_key(), landmark_key(pair.row), *pair[1:]))
+    return graph, values, keys
 
 
-def _view(sight: Sight) -> int:
-    return target_key() if sight.view == TARGET else pose_key(sight.view)
+def _add_beginning(graph: Any, values: Any, beginning: Beginning) -> None:
+    target, vector, covariance = beginning
+    values.insert(target_key(), gtsam.Pose2(*target))
+    graph.add(start_prior(pose_key(0)))
+    graph.add(velocity_prior(velocity_key(0), np.zeros(3), FIRST_SPEEDS))
+    graph.add(leg_factor(pose_key(0), target_key()))
+    graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
 
 
 class GtsamSolver:
@@ -109,11 +86,8 @@ class GtsamSolver:
     from there: after an exception an ISAM2 object is corrupt.
     """
 
-    def __init__(self, settings: HomingGraphSettings) -> None:
+    def __init__(self) -> None:
         """Empty."""
-        self._settings = settings
-        robust = BearingFactors(settings.kernel.name, settings.kernel.width)
-        self._parts = GtsamParts(robust, settings.motion)
         self._image = 0
         self._graph = gtsam.NonlinearFactorGraph()
         self.values = gtsam.Values()
@@ -121,7 +95,7 @@ class GtsamSolver:
     def add(self, new: NewPart) -> None:
         """See :class:`Solver`."""
         self._image = new.image
-        graph, values, keys = self._parts.of(new)
+        graph, values, keys = _parts(new)
         try:
             self._update(graph, values, keys)
         except RuntimeError:
@@ -180,9 +154,9 @@ class GtsamSolver:
 class Isam2Solver(GtsamSolver):
     """iSAM2 with Powell's dog leg over the whole homing."""
 
-    def __init__(self, settings: HomingGraphSettings) -> None:
+    def __init__(self) -> None:
         """Empty."""
-        super().__init__(settings)
+        super().__init__()
         self._isam = gtsam.ISAM2(_parameters())
 
     def _update(self, graph: Any, values: Any, touched: set[int]) -> None:
@@ -228,8 +202,8 @@ def _parameters() -> Any:
 def minimised(graph: Any, values: Any) -> Any:
     """Values at the minimum, by Levenberg-Marquardt."""
     params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(_MAX_ITERATIONS)
-    params.setRelativeErrorTol(_RELATIVE_TOLERANCE)
+    params.setMaxIterations(MAX_ITERATIONS)
+    params.setRelativeErrorTol(RELATIVE_TOLERANCE)
     try:
         return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
     except RuntimeError as error:

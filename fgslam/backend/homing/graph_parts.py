@@ -11,17 +11,28 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from fgslam.backend.homing.settings import GraphMotionSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import TwoViewVector
+from fgslam.factors.noise import KernelName
 
+# Lengths are in legs, the distance from start to target, so that speeds are in legs a second: a
+# wheelchair at 0.4 m/s on a leg of 2 m drives 0.2 legs a second.
 _INITIAL_TURNING_DEG = 30.0  # of the turning rate at the start, degrees/s
 _INITIAL_SPEED = 0.5  # deviation of the speed at the start, around 0, legs/s
+# Deviations after a second, by white noise on the acceleration: of the speed forward and sideways
+# (slip), legs/s, and of the turning rate, radians/s.
+FORWARD, SIDEWAYS, TURNING = 0.1, 0.03, float(np.deg2rad(60.0))
+MOTION_DENSITIES = np.array([FORWARD, SIDEWAYS, TURNING]) ** 2
+"""(3,) of the accelerations' noise: forward, left, turning."""
+FIRST_SPEEDS = np.array([_INITIAL_SPEED, SIDEWAYS, float(np.deg2rad(_INITIAL_TURNING_DEG))])
+"""(3,) deviations of the velocity at the start."""
+KERNEL: KernelName = "cauchy"
+KERNEL_WIDTH = 2.0  # in deviations
 TARGET = -1
 
 
 class Sight(NamedTuple):
-    """A bearing or an elevation of a landmark, and its deviation; radians."""
+    """A bearing of a landmark, and its deviation; radians."""
 
     view: int
     row: int
@@ -62,8 +73,8 @@ class NewPart:
         pose, velocity: (3,) first guesses.
         times: of the image before and of this one, seconds.
         beginning: with the start alone.
-        points, heights: first guess and deviation of the weak prior, of landmarks that enter.
-        bearings, elevations, pairs: what is measured.
+        points: first guess and deviation of the weak prior, of landmarks that enter.
+        bearings, pairs: what is measured.
     """
 
     image: int
@@ -72,21 +83,8 @@ class NewPart:
     times: tuple[float, float]
     beginning: Beginning | None = None
     points: dict[int, tuple[FloatArray, float]] = field(default_factory=dict)
-    heights: dict[int, tuple[float, float]] = field(default_factory=dict)
     bearings: list[Sight] = field(default_factory=list)
-    elevations: list[Sight] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)
-
-
-def motion_densities(motion: GraphMotionSettings) -> FloatArray:
-    """(3,) of the accelerations' noise: forward, left, turning."""
-    return np.array([motion.forward, motion.sideways, np.deg2rad(motion.turning_deg)]) ** 2
-
-
-def first_speeds(motion: GraphMotionSettings) -> FloatArray:
-    """(3,) deviations of the velocity at the start."""
-    turning = float(np.deg2rad(_INITIAL_TURNING_DEG))
-    return np.array([_INITIAL_SPEED, motion.sideways, turning])
 
 
 class Solver(Protocol):

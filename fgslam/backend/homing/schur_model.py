@@ -10,8 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.backend.homing.graph_parts import NewPart, Pair, Sight, first_speeds, motion_densities
-from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.backend.homing.graph_parts import (
+    FIRST_SPEEDS,
+    KERNEL,
+    KERNEL_WIDTH,
+    MOTION_DENSITIES,
+    NewPart,
+    Pair,
+    Sight,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import wrap
 from fgslam.factors.bearing import STIFF
@@ -20,7 +27,6 @@ from fgslam.factors.bearing_residuals import (
     bearings_from_views,
     direction_and_turn,
     elevation_pair,
-    elevations_from_views,
     motion_informations,
     offsets,
 )
@@ -38,7 +44,7 @@ class State:
     Attributes:
         chain: (n, 6) pose (x, y, psi) and velocity of start and images.
         target: (3,).
-        points: (m, 2) landmarks, or (m, 3) with their heights.
+        points: (m, 2) landmarks.
     """
 
     chain: FloatArray
@@ -46,7 +52,7 @@ class State:
     points: FloatArray
 
     def moved(self, chain: FloatArray, border: FloatArray) -> State:
-        """After a step (n, 6) and (3 + 2 m,) or (3 + 3 m,)."""
+        """After a step (n, 6) and (3 + 2 m,)."""
         points = self.points + border[3:].reshape(self.points.shape)
         return State(self.chain + chain, self.target + border[:3], points)
 
@@ -62,7 +68,7 @@ class Look:
     Attributes:
         state: where.
         cost: half the robust sum of squares.
-        sights: residuals (v, m) and weighed informations of bearings, and of elevations, if any.
+        bearings: residuals (v, m) and weighed informations.
         pairs: residuals (k,), weighed informations, derivatives by target (k, 3), points (k, 2).
         motion: of the chain, with its residuals.
         initial: residual (2,) of the initialisation, and its derivative (2, 3) by the target.
@@ -70,7 +76,7 @@ class Look:
 
     state: State
     cost: float
-    sights: list[tuple[FloatArray, FloatArray]]
+    bearings: tuple[FloatArray, FloatArray]
     pairs: tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     motion: ChainMotion
     initial: tuple[FloatArray, FloatArray]
@@ -103,12 +109,11 @@ class NormalEquations:
 
 
 class Sights:
-    """Bearings or elevations, a table of views by landmarks; information 0 where there is none."""
+    """Bearings, a table of views by landmarks; information 0 where there is none."""
 
     def __init__(self) -> None:
         """Empty."""
         self._table = np.zeros((2, 0, 0))
-        self.any = False
 
     def put(self, sights: list[Sight], landmarks: dict[int, int]) -> None:
         """Notes some, of landmarks whose numbers are those of their rows.
@@ -121,13 +126,11 @@ class Sights:
         at = np.array(views) + 1, np.array([landmarks[row] for row in rows])
         self._reach(int(at[0].max()) + 1, int(at[1].max()) + 1)
         self._table[0][at], self._table[1][at] = measured, np.array(sigmas) ** -2.0
-        self.any = True
 
     def drop(self, view: int, landmark: int) -> None:
         """Forgets one, if there is one."""
-        if self.any:
-            self._reach(view + 1, landmark + 1)
-            self._table[1, view, landmark] = 0.0
+        self._reach(view + 1, landmark + 1)
+        self._table[1, view, landmark] = 0.0
 
     def first(self, views: int, landmarks: int) -> FloatArray:
         """(2, views, landmarks) measured values and informations, of the first ones."""
@@ -170,7 +173,7 @@ class Pairs:
     def residuals(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """(k,) residuals and informations, derivatives by target (k, 3) and points (k, 2)."""
         tangent, up, information = self._numbers.T
-        points = state.points[self.landmarks, :2]
+        points = state.points[self.landmarks]
         offset = points - state.target[:2]
         near, far = np.hypot(*offset.T), np.hypot(*points.T)
         height = tangent * far
@@ -184,20 +187,17 @@ class Pairs:
 class SchurModel:
     """All measurements so far, and what they say at a state."""
 
-    def __init__(self, settings: HomingGraphSettings) -> None:
+    def __init__(self) -> None:
         """Nothing is measured yet."""
-        self._kernel = settings.kernel
-        self._density = motion_densities(settings.motion)
-        self._speeds = first_speeds(settings.motion) ** -2.0
-        self.numbers = 3 if settings.elevations == "all" else 2  # of a landmark
+        self._speeds = FIRST_SPEEDS**-2.0
         self.landmarks: dict[int, int] = {}  # numbers of the variables, by row
         self._steps = np.empty(0)
         self._motions = np.empty((0, STATE, STATE))  # informations
-        self._bearings, self._elevations, self._pairs = Sights(), Sights(), Pairs()
+        self._bearings, self._pairs = Sights(), Pairs()
         self._vector = (0.0, 0.0)
         self._initial: FloatArray = np.eye(2)  # information
-        self._places = np.empty((0, self.numbers))  # the weak priors
-        self._place_informations = np.empty((0, self.numbers))
+        self._places = np.empty((0, 2))  # the weak priors
+        self._place_informations = np.empty((0, 2))
 
     def take(self, new: NewPart, state: State) -> State:
         """Notes what is new; answers the state with first guesses of the new variables."""
@@ -209,26 +209,19 @@ class SchurModel:
         else:
             step = np.array([new.times[1] - new.times[0]])
             self._steps = np.append(self._steps, step)
-            information = motion_informations(step, self._density)
+            information = motion_informations(step, MOTION_DENSITIES)
             self._motions = np.concatenate([self._motions, information])
-        for row in new.points:
-            self._enter(row, new)
+        for row, (point, spread) in new.points.items():
+            self.landmarks[row] = len(self._places)
+            self._places = np.vstack([self._places, point])
+            information = np.array([spread, spread]) ** -2.0
+            self._place_informations = np.vstack([self._place_informations, information])
         self._bearings.put(new.bearings, self.landmarks)
-        self._elevations.put(new.elevations, self.landmarks)
         for pair in new.pairs:
             self._pairs.put(self.landmarks[pair.row], pair)
         chain = np.vstack([state.chain, np.append(new.pose, new.velocity)])
         points = np.vstack([state.points, self._places[len(state.points) :]])
         return State(chain, state.target, points)
-
-    def _enter(self, row: int, new: NewPart) -> None:
-        point, spread = new.points[row]
-        height, tall_spread = new.heights.get(row, (0.0, 1.0))
-        place = np.append(point, height)[: self.numbers]
-        information = np.array([spread, spread, tall_spread])[: self.numbers] ** -2.0
-        self.landmarks[row] = len(self._places)
-        self._places = np.vstack([self._places, place])
-        self._place_informations = np.vstack([self._place_informations, information])
 
     # ----------------------------------------------------------------------------------------
     # Residuals and cost
@@ -241,33 +234,16 @@ class SchurModel:
         motion = ChainMotion(state.chain[:, :3], state.chain[:, 3:], self._steps)
         carried = self._motions @ motion.residual[..., None]
         total += 0.5 * float(np.vdot(motion.residual, carried))
-        sights = []
-        for residual, information in self._seen(state):
-            weighed, loss = self._robust(residual, information)
-            sights.append((residual, weighed))
-            total += loss
-        residual, information, *by = self._pairs.residuals(state)
-        weighed, loss = self._robust(residual, information)
-        pairs = (residual, weighed, by[0], by[1])
-        return Look(state, total + loss, sights, pairs, motion, initial)
-
-    def _robust(self, residual: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
-        """Weighed informations, and the loss of all."""
-        squared, kernel = information * residual**2, self._kernel
-        weighed = information * kernel_weights(kernel.name, kernel.width, squared)
-        return weighed, float(kernel_losses(kernel.name, kernel.width, squared).sum())
-
-    def _seen(self, state: State) -> list[tuple[FloatArray, FloatArray]]:
         views = state.views()
-        size = (len(views), len(state.points))
         dx, dy = offsets(views, state.points)
-        measured, information = self._bearings.first(*size)
-        found = [(wrap(np.arctan2(dy, dx) - views[:, 2:] - measured), information)]
-        if self._elevations.any:
-            measured, information = self._elevations.first(*size)
-            up = np.arctan2(state.points[:, 2], np.hypot(dx, dy))
-            found.append((up - measured, information))
-        return found
+        measured, information = self._bearings.first(len(views), len(state.points))
+        residual = wrap(np.arctan2(dy, dx) - views[:, 2:] - measured)
+        weighed, loss = _robust(residual, information)
+        bearings, total = (residual, weighed), total + loss
+        residual, information, *by = self._pairs.residuals(state)
+        weighed, loss = _robust(residual, information)
+        pairs = (residual, weighed, by[0], by[1])
+        return Look(state, total + loss, bearings, pairs, motion, initial)
 
     def _fixed_cost(self, state: State) -> float:
         """Of start, leg, first velocity and weak priors."""
@@ -285,7 +261,7 @@ class SchurModel:
         """Linearised at a state, robust weights as they are there."""
         state = look.state
         count, landmarks = len(state.chain), len(state.points)
-        size = 3 + self.numbers * landmarks
+        size = 3 + 2 * landmarks
         e = NormalEquations(
             np.zeros((count, STATE, STATE)),
             np.zeros((count - 1, STATE, STATE)),
@@ -294,15 +270,15 @@ class SchurModel:
             np.zeros((count, STATE)),
             np.zeros(size),
         )
-        blocks = np.zeros((landmarks, self.numbers, self.numbers))
-        every = np.arange(self.numbers)
+        blocks = np.zeros((landmarks, 2, 2))
+        every = np.arange(2)
         blocks[:, every, every] = self._place_informations
         e.border_gradient[3:] = (self._place_informations * (state.points - self._places)).ravel()
         self._add_fixed(e, look)
         self._add_motion(e, look)
-        self._add_sights(e, blocks, look)
+        self._add_bearings(e, blocks, look)
         self._add_pairs(e, blocks, look)
-        inner = e.border[3:, 3:].reshape(landmarks, self.numbers, landmarks, self.numbers)
+        inner = e.border[3:, 3:].reshape(landmarks, 2, landmarks, 2)
         number = np.arange(landmarks)
         inner[number, :, number, :] = blocks
         e.border[3:, :3] = e.border[:3, 3:].T
@@ -338,36 +314,32 @@ class SchurModel:
         e.chain_gradient[:-1] += (known_before @ residual[..., None])[..., 0]
         e.chain_gradient[1:] += (known_after @ residual[..., None])[..., 0]
 
-    def _add_sights(self, e: NormalEquations, blocks: FloatArray, look: Look) -> None:
-        state = look.state
-        views = state.views()
-        dx, dy = offsets(views, state.points)
-        squared = dx**2 + dy**2
-        derivatives = [bearings_from_views(dx, dy, squared, self.numbers)]
-        if len(look.sights) > 1:
-            derivatives.append(elevations_from_views(dx, dy, squared, state.points[:, 2]))
-        for (residual, weighed), (by_pose, by_point) in zip(look.sights, derivatives, strict=True):
-            known = weighed[..., None] * by_pose
-            of_pose = known.transpose(0, 2, 1) @ by_pose
-            pull = np.einsum("vli,vl->vi", known, residual)
-            cross = known.transpose(0, 2, 1)[..., None] * by_point[:, None]
-            cross = cross.reshape(len(views), 3, -1)
-            e.diagonal[:, :3, :3] += of_pose[1:]
-            e.cross[:, :3, 3:] += cross[1:]
-            e.chain_gradient[:, :3] += pull[1:]
-            e.border[:3, :3] += of_pose[0]
-            e.border[:3, 3:] += cross[0]
-            e.border_gradient[:3] += pull[0]
-            known = weighed[..., None] * by_point
-            blocks += known.transpose(1, 2, 0) @ by_point.transpose(1, 0, 2)
-            e.border_gradient[3:] += np.einsum("vli,vl->li", known, residual).ravel()
+    def _add_bearings(self, e: NormalEquations, blocks: FloatArray, look: Look) -> None:
+        residual, weighed = look.bearings
+        views = look.state.views()
+        dx, dy = offsets(views, look.state.points)
+        by_pose, by_point = bearings_from_views(dx, dy)
+        known = weighed[..., None] * by_pose
+        of_pose = known.transpose(0, 2, 1) @ by_pose
+        pull = np.einsum("vli,vl->vi", known, residual)
+        cross = known.transpose(0, 2, 1)[..., None] * by_point[:, None]
+        cross = cross.reshape(len(views), 3, -1)
+        e.diagonal[:, :3, :3] += of_pose[1:]
+        e.cross[:, :3, 3:] += cross[1:]
+        e.chain_gradient[:, :3] += pull[1:]
+        e.border[:3, :3] += of_pose[0]
+        e.border[:3, 3:] += cross[0]
+        e.border_gradient[:3] += pull[0]
+        known = weighed[..., None] * by_point
+        blocks += known.transpose(1, 2, 0) @ by_point.transpose(1, 0, 2)
+        e.border_gradient[3:] += np.einsum("vli,vl->li", known, residual).ravel()
 
     def _add_pairs(self, e: NormalEquations, blocks: FloatArray, look: Look) -> None:
         residual, weighed, by_target, by_point = look.pairs
         rows = self._pairs.landmarks
         known = weighed[:, None] * by_point
-        blocks[rows, :2, :2] += known[:, :, None] * by_point[:, None]
-        columns = 3 + self.numbers * rows[:, None] + np.arange(2)
+        blocks[rows] += known[:, :, None] * by_point[:, None]
+        columns = 3 + 2 * rows[:, None] + np.arange(2)
         e.border_gradient[columns] += known * residual[:, None]
         e.border[:3, columns] += np.einsum("ki,kj->ikj", by_target, known)
         e.border[:3, :3] += (weighed[:, None] * by_target).T @ by_target
@@ -391,7 +363,7 @@ class SchurModel:
         rows, residual, known = self._match_rows(look)
         places = np.zeros((len(rows), 5), np.int64)
         places[:, :3] = np.arange(3)
-        places[:, 3:] = 3 + self.numbers * np.arange(len(rows))[:, None] + np.arange(2)
+        places[:, 3:] = 3 + 2 * np.arange(len(rows))[:, None] + np.arange(2)
         joint = covariance[places[:, :, None], places[:, None, :]]
         root = np.sqrt(known)
         rows = rows * root[..., None]
@@ -412,9 +384,9 @@ class SchurModel:
         count = len(look.state.points)
         rows, residual, known = np.zeros((count, 2, 5)), np.zeros((count, 2)), np.zeros((count, 2))
         dx, dy = offsets(look.state.target[None], look.state.points)
-        by_target, by_point = bearings_from_views(dx, dy, dx**2 + dy**2, 2)
+        by_target, by_point = bearings_from_views(dx, dy)
         rows[:, 0, :3], rows[:, 0, 3:] = by_target[0], by_point[0]
-        residual[:, 0], known[:, 0] = look.sights[0][0][0], look.sights[0][1][0]
+        residual[:, 0], known[:, 0] = look.bearings[0][0], look.bearings[1][0]
         of = self._pairs.landmarks
         residual[of, 1], known[of, 1], rows[of, 1, :3], rows[of, 1, 3:] = look.pairs
         return rows, residual, known
@@ -429,5 +401,11 @@ class SchurModel:
     def drop_match(self, landmark: int) -> None:
         """What the target saw is not this landmark."""
         self._bearings.drop(0, landmark)
-        self._elevations.drop(0, landmark)
         self._pairs.drop(landmark)
+
+
+def _robust(residual: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
+    """Weighed informations, and the loss of all."""
+    squared = information * residual**2
+    weighed = information * kernel_weights(KERNEL, KERNEL_WIDTH, squared)
+    return weighed, float(kernel_losses(KERNEL, KERNEL_WIDTH, squared).sum())

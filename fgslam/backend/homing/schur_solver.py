@@ -15,7 +15,6 @@ from scipy.linalg import lapack
 
 from fgslam.backend.homing.graph_parts import NewPart
 from fgslam.backend.homing.schur_model import STATE, Look, NormalEquations, SchurModel, State
-from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.levenberg import Damping
@@ -24,12 +23,12 @@ from fgslam.core.planar import wrapped_pose
 _ROWS, _COLUMNS = np.indices((STATE, STATE))
 _LOWER = np.tril_indices(STATE)
 _LEAST_DAMPING = 1e-3  # an image later the start is another, and covariances want none
-_STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
+STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
 _EVERY = 4  # images: a doubt costs half as much as an update
-_STEPS = 1
+STEPS = 1
 """Gauss-Newton steps with an image, at most: what is left after one is gone with the next image."""
 
-_MATCH_LIMIT = 13.8
+MATCH_LIMIT = 13.8
 """What the target saw of a landmark is dropped where everything else contradicts it by more than
 this squared Mahalanobis distance: one in a thousand of right matches, by chi-square of two degrees
 of freedom."""
@@ -116,17 +115,16 @@ def _band(e: NormalEquations, damping: float) -> FloatArray:
 class SchurSolver:
     """On :class:`fgslam.backend.homing.graph_parts.Solver`."""
 
-    def __init__(self, settings: HomingGraphSettings) -> None:
+    def __init__(self) -> None:
         """Empty."""
-        self._model = SchurModel(settings)
-        numbers = self._model.numbers
-        self._state = State(np.empty((0, 6)), np.zeros(3), np.empty((0, numbers)))
+        self.model = SchurModel()
+        self.state = State(np.empty((0, 6)), np.zeros(3), np.empty((0, 2)))
         self._factored: Factored | None = None
 
     def add(self, new: NewPart) -> None:
         """See :class:`Solver`."""
-        self._state = self._model.take(new, self._state)
-        look = self._go_on(_FIRST_STEPS if new.image == 0 else _STEPS)
+        self.state = self.model.take(new, self.state)
+        look = self._go_on(_FIRST_STEPS if new.image == 0 else STEPS)
         if not np.isfinite(look.cost):
             raise EstimatorError(
                 "the homing graph cannot be solved (its cost is no number); start the homing anew"
@@ -136,65 +134,65 @@ class SchurSolver:
 
     def move(self, points: dict[int, FloatArray]) -> None:
         """See :class:`Solver`."""
-        places = self._state.points.copy()
+        places = self.state.points.copy()
         for row, point in points.items():
-            places[self._model.landmarks[row], :2] = point
-        self._state = State(self._state.chain, self._state.target, places)
+            places[self.model.landmarks[row]] = point
+        self.state = State(self.state.chain, self.state.target, places)
         self._factored = None
 
     def pose(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
-        return wrapped_pose(self._state.chain[image, :3])
+        return wrapped_pose(self.state.chain[image, :3])
 
     def velocity(self, image: int) -> FloatArray:
         """See :class:`Solver`."""
-        return self._state.chain[image, 3:].copy()
+        return self.state.chain[image, 3:].copy()
 
     def target(self) -> FloatArray:
         """See :class:`Solver`."""
-        return wrapped_pose(self._state.target)
+        return wrapped_pose(self.state.target)
 
     def points(self, rows: list[int]) -> FloatArray:
         """See :class:`Solver`."""
-        return self._state.points[self._numbers(rows), :2]
+        return self.state.points[self._numbers(rows)]
 
     def covariance(self, rows: list[int]) -> FloatArray:
         """See :class:`Solver`."""
-        first = 3 + self._model.numbers * self._numbers(rows)
+        first = 3 + 2 * self._numbers(rows)
         columns = np.concatenate([np.arange(3), (first[:, None] + np.arange(2)).ravel()])
         try:
             if self._factored is None:
-                self._factored = Factored(self._model.normal(self._model.look(self._state)))
+                self._factored = Factored(self.model.normal(self.model.look(self.state)))
         except LinAlgError:
             return np.full((3 + len(columns), 3 + len(columns)), np.nan)
         return self._factored.covariance(columns)
 
     def _numbers(self, rows: list[int]) -> IntArray:
-        return np.array([self._model.landmarks[row] for row in rows], np.int64)
+        return np.array([self.model.landmarks[row] for row in rows], np.int64)
 
     def _doubt(self, look: Look) -> None:
         """Goes on without the match that contradicts the solution most, if one does too much."""
-        if self._factored is None or not self._model.landmarks:
+        if self._factored is None or not self.model.landmarks:
             return
-        far = self._model.contradictions(look, self._factored.border_covariance())
+        far = self.model.contradictions(look, self._factored.border_covariance())
         worst = int(np.argmax(far))
-        if far[worst] > _MATCH_LIMIT:
-            self._model.drop_match(worst)
-            self._go_on(_STEPS)
+        if far[worst] > MATCH_LIMIT:
+            self.model.drop_match(worst)
+            self._go_on(STEPS)
 
     def _go_on(self, steps: int) -> Look:
         """Up to so many steps; what is left of the way is gone with the next image."""
-        look, damping = self._model.look(self._state), Damping(_LEAST_DAMPING)
+        look, damping = self.model.look(self.state), Damping(_LEAST_DAMPING)
         self._factored = None
         for _ in range(steps):
-            attempt = partial(self._tried, look.state, self._model.normal(look))
+            attempt = partial(self._tried, look.state, self.model.normal(look))
             found = damping.step(look.cost, attempt)
             if found is None:
                 break
             look, factored = found[1]
-            self._state = look.state
+            self.state = look.state
             self._factored = factored if damping.last == 0.0 else None
-            if damping.last == 0.0 and factored.decrement < _STILL:
+            if damping.last == 0.0 and factored.decrement < STILL:
                 break
         return look
 
@@ -202,5 +200,5 @@ class SchurSolver:
         self, state: State, equations: NormalEquations, damping: float
     ) -> tuple[float, tuple[Look, Factored]]:
         factored = Factored(equations, damping)
-        ahead = self._model.look(state.moved(factored.chain, factored.border))
+        ahead = self.model.look(state.moved(factored.chain, factored.border))
         return ahead.cost, (ahead, factored)

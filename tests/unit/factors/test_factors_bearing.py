@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import bearings
 from fgslam.factors import bearing as f
 from fgslam.factors import bearing_residuals as r
-from fgslam.factors.graphs import height_key, landmark_key, pose_key, target_key, velocity_key
+from fgslam.factors.graphs import landmark_key, pose_key, target_key, velocity_key
 
 POSE = np.array([1.2, -0.5, 0.7])
 POINTS = np.array([[3.0, 2.0], [-1.0, 0.4], [1.5, -3.0], [1.1, 2.0]])
@@ -140,16 +140,11 @@ def test_elevation_pairs_vanish_on_the_truth() -> None:
 def all_factors() -> list[tuple[object, FloatArray]]:
     """Factors with the residual that the specification gives at :func:`all_values`."""
     make = f.BearingFactors()
-    x, t, landmark, height = pose_key(1), target_key(), landmark_key(0), height_key(0)
+    x, t, landmark = pose_key(1), target_key(), landmark_key(0)
     point, target = POINTS[0], np.array([0.8, 0.3, 0.2])
-    tall = HEIGHTS[:1]
     pair = np.array([0.2, 0.15])
     factors = (
         (make.bearing(x, landmark, 0.4, 0.1), r.bearing(POSE, point[None], np.array([0.4]))),
-        (
-            make.elevation(x, landmark, height, 0.3, 0.1),
-            r.elevation(POSE, point[None], tall, np.array([0.3])),
-        ),
         (
             make.elevation_pair(t, landmark, pair, np.full(2, 0.01), np.append(target, point)),
             np.array([r.elevation_pair(target, point, pair)[0]]),
@@ -167,23 +162,22 @@ def all_values() -> gtsam.Values:
     values.insert(pose_key(1), pose2(POSE))
     values.insert(target_key(), gtsam.Pose2(0.8, 0.3, 0.2))
     values.insert(landmark_key(0), POINTS[0])
-    values.insert(height_key(0), float(HEIGHTS[0]))
     return values
 
 
-@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("row", range(3))
 def test_factors_are_their_specification(row: int) -> None:
     factor, residual = all_factors()[row]
     np.testing.assert_allclose(factor.unwhitenedError(all_values()), residual, atol=1e-14)
 
 
-@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("row", range(3))
 def test_factors_linearise_as_they_move(row: int) -> None:
     factor, _ = all_factors()[row]
     values = all_values()
     whitened, _ = factor.linearize(values).jacobian()
     keys = list(factor.keys())
-    sizes = {key: {"l": 2, "h": 1}.get(chr(gtsam.Symbol(key).chr()), 3) for key in keys}
+    sizes = {key: {"l": 2}.get(chr(gtsam.Symbol(key).chr()), 3) for key in keys}
 
     def moved(step: FloatArray) -> FloatArray:
         delta = gtsam.VectorValues()

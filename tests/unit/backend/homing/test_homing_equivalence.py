@@ -6,7 +6,7 @@ where the filter linearised. What has no variance in the filter is no variable o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -14,17 +14,17 @@ import pytest
 from homings import Trial, trial
 
 from fgslam.backend.homing.ekf import (
-    _INITIAL_SPEED,
+    INITIAL_SPEED,
     FilterState,
     HomingEkf,
     initial_state,
     motion,
     predicted,
     seen_from_robot,
-    seen_from_target,
     updated,
 )
-from fgslam.backend.homing.settings import PAPER, HomingEkfSettings
+from fgslam.backend.homing.paper_ekf import PaperEkf, seen_from_target, separate_initial_state
+from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.factors.bearing_residuals import (
     bearing_jacobians,
@@ -35,8 +35,7 @@ from fgslam.factors.bearing_residuals import (
 )
 
 TOLERANCE = 1e-11
-HONEST = HomingEkfSettings(gate_sigmas=0.0)
-MAP_ONLY = replace(PAPER, exact_bearings=False)
+JOINT, SEPARATE = HomingEkfSettings(gate_sigmas=0.0), PaperEkfSettings()
 
 
 def robot(k: int) -> int:
@@ -102,11 +101,11 @@ def joint_start(case: Trial, state: FilterState) -> Linear:
     return linear
 
 
-def map_start(state: FilterState, exact: bool) -> Linear:
+def map_start(state: FilterState) -> Linear:
     """Each feature's own prior; nothing without variance."""
     linear = Linear(gtsam.GaussianFactorGraph())
     for k, identity in enumerate(state.ids.tolist()):
-        rows = free_rows(state, k, exact)
+        rows = free_rows(state, k)
         at = 7 + 2 * k + rows
         if len(rows):
             half = np.linalg.inv(np.linalg.cholesky(state.covariance[np.ix_(at, at)]))
@@ -114,24 +113,20 @@ def map_start(state: FilterState, exact: bool) -> Linear:
     return linear
 
 
-def free_rows(state: FilterState, k: int, exact: bool) -> np.ndarray:
+def free_rows(state: FilterState, k: int) -> np.ndarray:
     """Which of a feature's (distance, bearing) have a variance at the start."""
-    variance = np.diagonal(state.covariance)[7 + 2 * k : 9 + 2 * k]
-    return np.flatnonzero(variance > 0.0) if exact else np.arange(2)
+    return np.flatnonzero(np.diagonal(state.covariance)[7 + 2 * k : 9 + 2 * k] > 0.0)
 
 
-def run_both(
-    case: Trial, settings: HomingEkfSettings
-) -> tuple[FilterState, FloatArray, FloatArray]:
+def run_both(case: Trial, joint: bool) -> tuple[FilterState, FloatArray, FloatArray]:
     """The filter's last state, and mean and covariance of the graph, of all that is not fixed."""
-    state = initial_state(case.start, settings)
-    joint = settings.target == "joint"
-    linear = joint_start(case, state) if joint else map_start(state, exact=True)
+    state = initial_state(case.start) if joint else separate_initial_state(case.start)
+    linear = joint_start(case, state) if joint else map_start(state)
     rows_of = {
-        identity: np.arange(2) if joint else free_rows(state, k, exact=True)
+        identity: np.arange(2) if joint else free_rows(state, k)
         for k, identity in enumerate(state.ids.tolist())
     }
-    speed = _INITIAL_SPEED
+    speed = INITIAL_SPEED
     linear.add({robot(0): np.eye(1)}, np.zeros(1), speed)
     time = case.start.time
     for k, image in enumerate(case.tracks):
@@ -140,7 +135,7 @@ def run_both(
         state = state.keeping(~np.isin(state.ids, lost))
         step = image.time - time
         time = image.time
-        moved, by, spread = motion(state.mean[:4], step, settings.motion)
+        moved, by, spread = motion(state.mean[:4], step)
         whiten = np.diag(np.diagonal(spread) ** -0.5)
         if k == 0:  # the start's pose is no variable
             by = by[:, 3:]
@@ -148,7 +143,7 @@ def run_both(
         else:
             value = moved - by @ state.mean[:4]
         linear.add({robot(k): -whiten @ by, robot(k + 1): whiten}, whiten @ value, 1.0)
-        state = predicted(state, step, settings.motion)
+        state = predicted(state, step)
         rows = np.isin(image.ids, state.ids)
         seen = seen_from_robot(state, image.bearing[rows], image.sigma_bearing[rows])
         for m, identity in enumerate(state.ids.tolist()):
@@ -167,17 +162,20 @@ def run_both(
 
 
 @pytest.mark.parametrize(
-    "settings", [HONEST, MAP_ONLY, replace(PAPER)], ids=["honest", "one_distance", "paper"]
+    ("kind", "settings"), [(HomingEkf, JOINT), (PaperEkf, SEPARATE)], ids=["corrected", "paper"]
 )
-def test_filter_is_the_graph_with_past_poses_eliminated(settings: HomingEkfSettings) -> None:
+def test_filter_is_the_graph_with_past_poses_eliminated(
+    kind: type[HomingEkf], settings: HomingEkfSettings
+) -> None:
     case = trial(5)
-    state, mean, covariance = run_both(case, settings)
-    estimator = HomingEkf(case.start, settings)
+    joint = kind is HomingEkf
+    state, mean, covariance = run_both(case, joint)
+    estimator = kind(case.start, settings)
     for image in case.tracks:
         estimator.update(image)
     np.testing.assert_array_equal(estimator.state.mean[:4], state.mean[:4])
     free = np.diagonal(state.covariance) > 0.0
-    if settings.target == "separate":
+    if not joint:
         free[4:7] = False
     assert np.count_nonzero(free) == len(mean) > 20
     np.testing.assert_allclose(state.mean[free], mean, rtol=0.0, atol=TOLERANCE)
@@ -188,7 +186,7 @@ def test_filter_is_the_graph_with_past_poses_eliminated(settings: HomingEkfSetti
 
 def test_joint_start_is_the_graph_of_the_two_views() -> None:
     case = trial(6)
-    state = initial_state(case.start, HONEST)
+    state = initial_state(case.start)
     linear = joint_start(case, state)
     keys = [TARGET, *(feature(i) for i in state.ids.tolist())]
     mean, covariance = linear.solved(keys)
@@ -199,8 +197,7 @@ def test_joint_start_is_the_graph_of_the_two_views() -> None:
 def test_printed_target_filter_counts_each_bearing_once_an_image() -> None:
     """It is the graph that has every target bearing as often as there were images."""
     case = trial(7)
-    settings = replace(PAPER, gate_sigmas=0.0)
-    estimator = HomingEkf(case.start, settings)
+    estimator = PaperEkf(case.start, SEPARATE)
     linear = Linear(gtsam.GaussianFactorGraph())
     first = estimator.state
     half = np.linalg.inv(np.linalg.cholesky(first.covariance[4:7, 4:7]))

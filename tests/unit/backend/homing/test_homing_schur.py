@@ -10,10 +10,10 @@ import pytest
 from homings import Trial, trial
 
 from fgslam.backend.homing.factory import make_homing_estimator
-from fgslam.backend.homing.schur_model import SchurModel, State
+from fgslam.backend.homing.graph import HomingGraph
+from fgslam.backend.homing.schur_model import State
 from fgslam.backend.homing.schur_solver import Factored, SchurSolver
 from fgslam.backend.homing.settings import HomingGraphSettings
-from fgslam.backend.settings import KernelSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingEstimate
@@ -21,26 +21,19 @@ from fgslam.core.planar import wrap
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import HomingOutliers
 
-NONE, CAUCHY, HUBER = (
-    KernelSettings("none"),
-    KernelSettings("cauchy", 2.0),
-    KernelSettings("huber", 1.0),
-)
 EXACT = HomingGraphSettings()
 
 
 @pytest.fixture(autouse=True)
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every image is solved to convergence, and no match is doubted."""
-    monkeypatch.setattr("fgslam.backend.homing.schur_solver._STEPS", 30)
-    monkeypatch.setattr("fgslam.backend.homing.schur_solver._MATCH_LIMIT", np.inf)
+    monkeypatch.setattr("fgslam.backend.homing.schur_solver.STEPS", 30)
+    monkeypatch.setattr("fgslam.backend.homing.schur_solver.MATCH_LIMIT", np.inf)
 
 
 @cache
 def case(images_per_s: float = 1.5) -> Trial:
-    settings = SimulatedBearingsSettings(
-        images_per_s=images_per_s, part=0.4, lost_per_s=0.1, tracked_elevations=True
-    )
+    settings = SimulatedBearingsSettings(images_per_s=images_per_s, part=0.4, lost_per_s=0.1)
     return trial(4, settings)
 
 
@@ -52,20 +45,13 @@ def estimated(settings: HomingGraphSettings) -> HomingEstimate:
     return estimator.estimate()
 
 
-@pytest.mark.parametrize(
-    ("kernel", "elevations"),
-    [(NONE, "two_views"), (CAUCHY, "two_views"), (HUBER, "none"), (CAUCHY, "all")],
-)
-def test_the_same_optimum_and_covariance_as_gtsams_batch(
-    kernel: KernelSettings, elevations: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_same_optimum_and_covariance_as_gtsams_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both driven to convergence, which reweighting reaches slowly: hundredths of a deviation."""
-    monkeypatch.setattr("fgslam.backend.homing.schur_solver._STILL", 1e-7)
-    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam._RELATIVE_TOLERANCE", 1e-14)
-    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam._MAX_ITERATIONS", 200)
-    settings = replace(EXACT, kernel=kernel, elevations=elevations)  # type: ignore[arg-type]
-    own = estimated(settings)
-    batch = estimated(replace(settings, solver="batch"))
+    monkeypatch.setattr("fgslam.backend.homing.schur_solver.STILL", 1e-7)
+    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam.RELATIVE_TOLERANCE", 1e-14)
+    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam.MAX_ITERATIONS", 200)
+    own = estimated(EXACT)
+    batch = estimated(replace(EXACT, solver="batch"))
     deviations = np.sqrt(np.diagonal(batch.covariance))
     np.testing.assert_array_less(np.abs(own.robot - batch.robot), 1e-2 * deviations[:3])
     np.testing.assert_array_less(np.abs(own.target - batch.target), 1e-2 * deviations[3:])
@@ -81,16 +67,15 @@ def solver_of(given: Trial, settings: HomingGraphSettings) -> SchurSolver:
     estimator = make_homing_estimator(given.start, settings)
     for image in given.tracks:
         estimator.update(image)
-    solver = estimator._solver  # type: ignore[attr-defined]
-    assert isinstance(solver, SchurSolver)
-    return solver
+    assert isinstance(estimator, HomingGraph)
+    assert isinstance(estimator.solver, SchurSolver)
+    return estimator.solver
 
 
 def test_gradient_is_that_of_the_cost() -> None:
-    solver = solver_of(case(), replace(EXACT, elevations="all"))
-    model: SchurModel = solver._model
+    solver = solver_of(case(), EXACT)
+    model, state = solver.model, solver.state
     rng = np.random.default_rng(0)
-    state = solver._state
     state = State(*(part + 0.01 * rng.standard_normal(part.shape) for part in parts(state)))
     equations = model.normal(model.look(state))
     gradient = np.append(equations.chain_gradient.ravel(), equations.border_gradient)
@@ -104,7 +89,7 @@ def test_gradient_is_that_of_the_cost() -> None:
 def test_the_factored_system_is_solved() -> None:
     """Step and covariance against the whole matrix, inverted."""
     solver = solver_of(case(), EXACT)
-    e = solver._model.normal(solver._model.look(solver._state))
+    e = solver.model.normal(solver.model.look(solver.state))
     count, m = len(e.diagonal), len(e.border)
     n = 6 * count
     whole = np.zeros((n + m, n + m))
@@ -138,13 +123,14 @@ def test_wrong_matches_are_found_by_what_contradicts_them(
     assert without_target(solver_of(given, HomingGraphSettings())) == wrong.tolist()
 
 
-def test_dropped_match_takes_the_elevation_from_the_target_along() -> None:
-    solver = solver_of(case(), replace(EXACT, elevations="all"))
-    model, size = solver._model, (1, len(solver._model.landmarks))
-    assert model._elevations.first(*size)[1, 0, 0] > 0.0
-    model.drop_match(0)
-    assert model._bearings.first(*size)[1, 0, 0] == 0.0
-    assert model._elevations.first(*size)[1, 0, 0] == 0.0
+def test_dropped_match_takes_the_elevations_along() -> None:
+    solver = solver_of(case(), EXACT)
+    before = solver.model.look(solver.state)
+    solver.model.drop_match(0)
+    after = solver.model.look(solver.state)
+    assert before.bearings[1][0, 0] > 0.0
+    assert after.bearings[1][0, 0] == 0.0
+    assert np.count_nonzero(before.pairs[1]) - np.count_nonzero(after.pairs[1]) == 1
 
 
 @pytest.mark.parametrize("rotation", [np.pi - 1e-9, 1e-9 - np.pi])
@@ -172,8 +158,8 @@ def test_start_that_is_no_number_is_refused() -> None:
 
 def without_target(solver: SchurSolver) -> list[int]:
     """Rows of landmarks whose bearing from the target was dropped."""
-    model = solver._model
-    information = model._bearings.first(1, len(model.landmarks))[1, 0]
+    model = solver.model
+    information = model.look(solver.state).bearings[1][0]
     return [row for row, number in model.landmarks.items() if information[number] == 0.0]
 
 
