@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from fgslam.homing.command import DriveCommand
     from fgslam.homing.path_memory import PathMemory
     from fgslam.homing.route_map import RouteMap
-    from fgslam.report.plotting import plot
+    from fgslam.report.figures import plot
     from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
     from fgslam.runs.live import Result, Slam
     from fgslam.runs.maps import Map
@@ -107,7 +107,7 @@ _HOMES = {
     "load_camera": "fgslam.cameras.omni.camera_files",
     "load_rig": "fgslam.cameras.rig",
     "open_recording": "fgslam.runs.library",
-    "plot": "fgslam.report.plotting",
+    "plot": "fgslam.report.figures",
     "rendered_recording": "fgslam.runs.library",
     "replay": "fgslam.runs.library",
     "run": "fgslam.runs.library",

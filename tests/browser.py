@@ -75,17 +75,6 @@ class Browser:
         assert self.complaints() == []
         assert self.requests() == []
 
-    def reset(self) -> None:
-        """All controls of the open report as they were when it was loaded."""
-        self.driver.execute_script(
-            "for (const box of document.querySelectorAll('input'))"
-            "  box.checked = box.defaultChecked;"
-            "for (const option of document.querySelectorAll('option'))"
-            "  option.selected = option.defaultSelected;"
-            "document.querySelector('input[data-estimator]')"
-            ".dispatchEvent(new Event('change', { bubbles: true }));"
-        )
-
     def js(self, expression: str) -> Any:
         """Value of a JavaScript expression."""
         return self.driver.execute_script(f"return {expression}")

@@ -6,8 +6,15 @@ import numpy as np
 
 from fgslam.core.homing import HomingEstimate, HomingTruth
 from fgslam.report.content import Column, Page, TextTable
-from fgslam.report.figures.homing import Line, claimed_against_true, curve_figure, local_map_figure
-from fgslam.report.figures.plan import Drive, catchment_figure, drive_figure
+from fgslam.report.homing_figures import (
+    Drive,
+    Line,
+    catchment_figure,
+    claimed_against_true,
+    curve_figure,
+    drive_figure,
+    local_map_figure,
+)
 
 FEATURES = np.array([[0.5, 0.8], [1.2, -0.6], [-0.3, 0.9], [0.7, -1.1]])
 LEG_M = 2.0
@@ -84,7 +91,6 @@ def page(title: str = "homing_lab") -> Page:
             claimed_against_true(sigma, error),
             catchment_figure(offsets, np.hypot(*offsets.T) < 4.0, [f"seed {k}" for k in range(12)]),
         ),
-        series=("homing_graph", "homing_ekf"),
         config_yaml="task: homing\n",
         versions={"fgslam": "0"},
     )

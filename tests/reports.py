@@ -12,7 +12,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.geometry import pose, so3_exp
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.run_results import EstimatorReport, ReportData
+from fgslam.report.results import EstimatorReport, ReportData
 
 HOSTILE = "<script>alert('%{x}')</script> & \"quotes\" </style>"
 

@@ -1,11 +1,29 @@
-"""What a page of results shows, whichever task made them: sentences, tables, figures, pictures."""
+"""What a page of results shows, whichever task made it; colours and geometry of what is drawn.
+
+Also the files of numbers in a run folder: metrics.json, timing.csv, any other table.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import io
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from fgslam.report.figures.traces import Figure
+import numpy as np
+
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import DatasetError
+from fgslam.core.files import replacing, write_text
+from fgslam.core.geometry import congruence
+from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
+
+if TYPE_CHECKING:
+    from plotly import graph_objects as go
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +69,38 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Figure:
+    """A figure of the page.
+
+    Attributes:
+        key: unique in the page.
+        heading: its title.
+        description: what it shows, for those who see it and those who do not.
+        drawing: Plotly's; its legend hides and shows what is drawn.
+        note: what is not drawn, in words.
+        missing: why it has no numbers, should it have none.
+    """
+
+    key: str
+    heading: str
+    description: str
+    drawing: go.Figure
+    note: str = ""
+    missing: str = "nothing was recorded"
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether anything but bands is drawn in it."""
+        return any(trace.to_plotly_json().get("fill") != "toself" for trace in self.drawing.data)
+
+    @property
+    def is_tall(self) -> bool:
+        """Whether it needs height: a plane of equal axes, panels over each other, or space."""
+        layout = self.drawing.layout.to_plotly_json()
+        return "scene" in layout or "yaxis3" in layout or "scaleanchor" in layout.get("yaxis", {})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Page:
     """All that one page shows.
 
@@ -59,11 +109,7 @@ class Page:
         headline: sentences with the main results, most important first.
         notes: what was tolerated in the recording, warnings, in words.
         tables, figures, pictures: in the order of the page.
-        series: what the figures' lines belong to (estimators, legs); each can be switched off, and
-            the i-th has the i-th colour.
-        undrawn: those of the series that no figure shows: they have no switch.
-        failed: those of the series that failed, which tables say.
-        has_truth: whether the figures draw a truth beside the series.
+        failed: rows of the tables that are of what failed.
         remarks: of the estimators, in words; None where the page has no section for them.
         config_yaml: the resolved configuration, as text.
         versions: of the program and its libraries; None where one is not installed.
@@ -75,11 +121,286 @@ class Page:
     tables: tuple[TextTable, ...] = ()
     figures: tuple[Figure, ...] = ()
     pictures: tuple[Picture, ...] = ()
-    series: tuple[str, ...] = ()
-    undrawn: frozenset[str] = frozenset()
     failed: frozenset[str] = frozenset()
-    has_truth: bool = False
     notes: tuple[str, ...] = ()
     remarks: tuple[str, ...] | None = None
     config_yaml: str = ""
     versions: Mapping[str, str | None] = field(default_factory=dict)
+
+
+# --------------------------------------------------------------------------------------------
+# Colours: Okabe and Ito's hues, which the colour-blind can tell apart. On white they are darker, on
+# black lighter than the originals, for a contrast of at least 3 to 1 (WCAG 2.2, 1.4.11).
+
+ON_LIGHT = (
+    "#0072b2",
+    "#c64f00",
+    "#00805e",
+    "#a8457f",
+    "#8f6b00",
+    "#5b4bb5",
+    "#7a3e12",
+    "#1f86bf",
+    "#5f6b00",
+    "#6a7480",
+)
+ON_DARK = (
+    "#4aa8e8",
+    "#f5803e",
+    "#22c79a",
+    "#e28cc0",
+    "#e6b52e",
+    "#a99cf2",
+    "#d0966a",
+    "#9bd6f7",
+    "#b9c84a",
+    "#b4bcc6",
+)
+COLOURS = len(ON_LIGHT)
+"""How many series have a colour of their own; more share them."""
+
+INK = "#1b1f24"
+"""Of the truth and of text."""
+
+GREY = "#a3abb4"
+"""Of walls and landmarks."""
+
+# --------------------------------------------------------------------------------------------
+# Geometry of what is drawn
+
+SIGMAS = 3.0
+"""How many standard deviations an ellipse reaches."""
+
+_CORNERS = 33
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+_BULK = (1.5, 98.5)
+
+
+def level_axes(up: FloatArray) -> FloatArray:
+    """Rotation (3, 3) from the world to (right, ahead, up)."""
+    vertical = up / np.linalg.norm(up)
+    # A camera that looks along the vertical about its x axis has no level x: then its z serves.
+    first = np.array([1.0, 0.0, 0.0] if abs(vertical[0]) < 0.9 else [0.0, 0.0, 1.0])
+    right = first - vertical * (vertical @ first)
+    right /= np.linalg.norm(right)
+    return np.array([right, np.cross(vertical, right), vertical])
+
+
+def bulk_limits(path: FloatArray, *maps: FloatArray) -> list[list[float]]:
+    """Limits along each of d axes: all of the path (n, d) and the bulk of every map (m, d).
+
+    A few far landmarks of tiny disparity must not shrink the rest to a dot.
+    """
+    corners = [path[np.isfinite(path).all(axis=1)]]
+    corners += [np.percentile(points, _BULK, axis=0) for points in maps if len(points)]
+    everything = np.concatenate(corners)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    centre, half = 0.5 * (low + high), 0.53 * np.maximum(high - low, 0.2)
+    return [
+        [float(a), float(b)] for a, b in np.column_stack([centre - half, centre + half]).tolist()
+    ]
+
+
+def thinned(count: int, limit: int) -> IntArray:
+    """At most ``limit`` of ``count`` rows, evenly spread, with the first and the last."""
+    if count <= limit:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, limit).round().astype(np.int64))
+
+
+def peaks(values: FloatArray, limit: int) -> IntArray:
+    """Rows of values (n,) so thinned that the largest of each stretch stays; NaN only if alone."""
+    if len(values) <= limit:
+        return np.arange(len(values))
+    known = np.where(np.isnan(values), -np.inf, values)
+    parts = np.array_split(known, limit)
+    starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    return np.asarray(starts + np.array([int(np.argmax(part)) for part in parts]), np.int64)
+
+
+def joined(polylines: FloatArray) -> FloatArray:
+    """Polylines (k, m, d) as one (k (m + 1), d) with a gap (NaN) after each."""
+    k, _, d = polylines.shape
+    return np.concatenate([polylines, np.full((k, 1, d), np.nan)], axis=1).reshape(-1, d)
+
+
+def world_position_covariances(poses: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Position covariances (k, 3, 3) in the world of poses with tangent covariances (k, 6, 6)."""
+    return congruence(poses[:, :3, :3], covariances[:, 3:, 3:])
+
+
+def in_plane(covariances: FloatArray, plane: FloatArray) -> FloatArray:
+    """Covariances (k, 2, 2) in the plane whose axes are the rows of ``plane`` (2, 3)."""
+    return congruence(np.broadcast_to(plane, (len(covariances), 2, 3)), covariances)
+
+
+def outlines(centres: FloatArray, covariances: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Closed polylines (k, corners, 2) of SIGMAS standard deviations about centres (k, 2).
+
+    Args:
+        centres: (k, 2).
+        covariances: (k, 2, 2); where one is not finite, its polyline is NaN.
+        scale: enlarges all of them.
+    """
+    known = np.asarray(np.isfinite(covariances).all(axis=(1, 2)))
+    variances, directions = np.linalg.eigh(np.where(known[:, None, None], covariances, 0.0))
+    radii = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+    circle = np.column_stack([np.cos(angle), np.sin(angle)])
+    around = np.einsum("kij,kj,mj->kmi", directions, radii, circle)
+    around[~known] = np.nan
+    return np.asarray(centres[:, None] + scale * around)
+
+
+def exaggeration(covariances: FloatArray, span: float) -> int:
+    """Factor that makes the larger half of the ellipses at least 2 % of ``span`` wide."""
+    if not len(covariances):
+        return 1
+    width = 2.0 * SIGMAS * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0.0))
+    typical = float(np.percentile(width, 75.0))
+    for factor in _FACTORS:
+        if factor * typical >= 0.02 * span:
+            return factor
+    return 1 if typical == 0.0 else _FACTORS[-1]
+
+
+# --------------------------------------------------------------------------------------------
+# Files of numbers
+
+Cell: TypeAlias = "str | bool | int | float | np.generic | None"
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
+    """Writes a table: ten significant digits; empty where a value is None or not finite.
+
+    Raises:
+        ValueError: a row has not as many cells as there are columns.
+        OutputError: the file cannot be written.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        if len(row) != len(columns):
+            raise ValueError(f"{len(row)} cells in a table of {len(columns)} columns")
+        writer.writerow([_text(cell) for cell in row])
+    write_text(path, out.getvalue())
+
+
+def write_parquet(
+    path: Path, columns: Mapping[str, Sequence[Cell]], about: Mapping[str, str]
+) -> None:
+    """Writes a table as Parquet, atomically; equal values give equal bytes.
+
+    Args:
+        path: the file; `pandas.read_parquet` opens it.
+        columns: n cells each, of one type; None where a value is not known.
+        about: texts for the file's own metadata.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    import pyarrow
+    from pyarrow import parquet
+
+    table = pyarrow.table({name: pyarrow.array(cells) for name, cells in columns.items()})
+    with replacing(path) as partial:
+        parquet.write_table(table.replace_schema_metadata(about), partial, compression="zstd")
+
+
+def write_json(path: Path, document: Mapping[str, JsonValue]) -> None:
+    """Writes a document; what is not finite becomes null. Raises OutputError."""
+    write_text(path, json.dumps(plain(document), indent=2, allow_nan=False) + "\n")
+
+
+def _text(cell: Cell) -> str:
+    if isinstance(cell, np.generic):
+        cell = cell.item()
+    if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
+        return ""
+    if isinstance(cell, bool):
+        return "true" if cell else "false"
+    return f"{cell:.10g}" if isinstance(cell, float) else str(cell)
+
+
+@dataclass(frozen=True, slots=True)
+class StageTime:
+    """How long one stage took for one frame.
+
+    Attributes:
+        frame: the recording's frame number.
+        timestamp: seconds.
+        stage: name of the stage (`sift`, `match`, ...).
+        milliseconds: wall-clock time.
+    """
+
+    frame: int
+    timestamp: float
+    stage: str
+    milliseconds: float
+
+
+def write_metrics(
+    path: Path,
+    frames: int,
+    estimators: Mapping[str, EstimatorMetrics],
+    more: Mapping[str, JsonValue] | None = None,
+) -> None:
+    """Write metrics.json atomically; NaN and infinities become null, never a missing name.
+
+    Args:
+        path: the file.
+        frames: number of frames processed.
+        estimators: metrics by the estimator's kind.
+        more: further values of the run as a whole.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    document: dict[str, Any] = {
+        "frames": frames,
+        **(more or {}),
+        "estimators": {kind: metrics.as_json() for kind, metrics in estimators.items()},
+    }
+    write_json(path, document)
+
+
+def read_metrics(path: Path) -> dict[str, Any]:
+    """The metrics.json of a run of any task: :func:`write_metrics` wrote those of SLAM.
+
+    Raises:
+        DatasetError: the file is missing or is not one.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
+    except ValueError as error:
+        raise DatasetError(f"{path} is not JSON ({error}); run the experiment again") from error
+    if not isinstance(document, dict) or not document.keys() & {"estimators", "task"}:
+        raise DatasetError(f"{path} holds no metrics; give the metrics.json of a run folder")
+    return document
+
+
+def write_timing(path: Path, times: Sequence[StageTime]) -> None:
+    """Write timing.csv: frame, timestamp (s), stage, milliseconds. Raises OutputError."""
+    lines = ["frame,timestamp,stage,milliseconds"]
+    lines += [
+        f"{time.frame},{time.timestamp:.9f},{time.stage},{time.milliseconds:.4f}" for time in times
+    ]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """Plain JSON types: NumPy numbers unwrapped, what is not finite as None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -2,7 +2,7 @@
 
 A jinja2 template with automatic escaping; the page's own policy lets only the two scripts run whose
 digests it names, so that not even a mistake here would run what a configuration or a file name
-says. Plotly and the numbers of the figures are compressed: the browser unpacks them.
+says. Plotly and the figures are compressed: the browser unpacks them.
 """
 
 from __future__ import annotations
@@ -12,22 +12,20 @@ import gzip
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from fgslam.core.files import write_text
+from fgslam.report import figures as drawn
 from fgslam.report.content import Page, Picture
-from fgslam.report.figures import palette
+from fgslam.report.results import EstimatorReport, ReportData
 
 if TYPE_CHECKING:
-    import jinja2
     from PIL import Image
-
-NOT_KNOWN = "not known"
 
 MAX_WIDTH = 1100
 BUDGET_BYTES = 440_000
@@ -35,6 +33,8 @@ BUDGET_BYTES = 440_000
 _TOO_MUCH = "Left out to keep this page small, see the run folder"
 _KEPT_AS_IT_IS = 40_000
 _QUALITY = 55
+_ASSETS = resources.files(__package__) / "templates"
+_DRAW = (_ASSETS / "draw.js").read_text(encoding="utf-8")
 
 
 def write_html(path: Path, page: Page) -> None:
@@ -52,25 +52,7 @@ def write_html(path: Path, page: Page) -> None:
 
 def render(page: Page) -> str:
     """The page as text."""
-    shown, left_out = embed(page.pictures)
-    script = _asset("page.js")
-    return _template().render(
-        page=page,
-        pictures=shown,
-        left_out=left_out,
-        not_known=NOT_KNOWN,
-        style=palette.style_sheet() + _asset("page.css"),
-        colours=palette.COUNT,
-        script=script,
-        script_digest=_digest(script),
-        plotly=_packed_plotly()[0],
-        plotly_digest=_packed_plotly()[1],
-        figures=_packed(_numbers(page)),
-    )
-
-
-def _template() -> jinja2.Template:
-    import jinja2
+    import jinja2  # what draws no page needs none
 
     environment = jinja2.Environment(
         autoescape=True,
@@ -79,24 +61,29 @@ def _template() -> jinja2.Template:
         keep_trailing_newline=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters["json"] = json.dumps  # into attributes: escaped like any text
-    return environment.from_string(_asset("page.html"))
-
-
-def _numbers(page: Page) -> str:
-    """Traces and layouts of the figures that show something, by key, as JSON."""
-    values: dict[str, Any] = {
-        figure.key: {"traces": figure.traces, "layout": figure.layout}
-        for figure in page.figures
-        if figure.has_numbers
-    }
-    return json.dumps(values, allow_nan=False, sort_keys=True)
+    shown, left_out = embed(page.pictures)
+    plotly, digest = _plotly()
+    drawings = (
+        f"{json.dumps(one.key)}: {one.drawing.to_json(engine='json')}"
+        for one in page.figures
+        if one.has_numbers
+    )
+    return environment.from_string((_ASSETS / "page.html").read_text(encoding="utf-8")).render(
+        page=page,
+        pictures=shown,
+        left_out=left_out,
+        style=(_ASSETS / "page.css").read_text(encoding="utf-8"),
+        draw=_DRAW,
+        digests=(digest, _digest(_DRAW)),
+        plotly=plotly,
+        figures=_packed(f"{{{', '.join(drawings)}}}"),
+    )
 
 
 @lru_cache(maxsize=1)
-def _packed_plotly() -> tuple[str, str]:
-    """Plotly's script as :func:`_packed`, and the digest under which the page lets it run."""
-    from plotly.offline import get_plotlyjs  # most of the file, needed by nothing else
+def _plotly() -> tuple[str, str]:
+    """Plotly's script, packed, and the digest under which the page lets it run."""
+    from plotly.offline import get_plotlyjs
 
     # As the browser's parser hands a script on, so that its digest is the same there.
     script = str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")
@@ -111,11 +98,6 @@ def _packed(text: str) -> str:
 
 def _digest(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
-
-
-def _asset(name: str) -> str:
-    folder = resources.files(__package__) / "templates"
-    return (folder / name).read_text(encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,3 +157,104 @@ def _as_webp(image: Image.Image) -> bytes:
     out = io.BytesIO()
     small.save(out, format="WEBP", quality=_QUALITY, method=4)
     return out.getvalue()
+
+
+# --------------------------------------------------------------------------------------------
+# The page of a SLAM run: sentences on accuracy and consistency, tables, figures
+
+_ABOUT_EQUAL = 1.05
+_ROUND_FROM = 1000.0
+_JUDGED = {
+    "consistent": "errors as large as the covariances say",
+    "overconfident": "errors larger than the covariances say",
+    "conservative": "errors smaller than the covariances say",
+}
+
+
+def write_report(path: Path, data: ReportData) -> None:
+    """Writes a run's page atomically; the same data give the same bytes. Raises OutputError."""
+    write_html(path, slam_page(data))
+
+
+def slam_page(data: ReportData) -> Page:
+    """Sentences, tables and figures of a run."""
+    remarks = [f"{e.title}: {remark}" for e in data.estimators for remark in e.remarks]
+    remarks += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
+    rig = data.calibration
+    return Page(
+        title=data.title,
+        subtitle=data.subtitle,
+        headline=headline(data),
+        tables=data.tables,
+        figures=(
+            drawn.drive_from_above(data),
+            drawn.map_to_turn(data),
+            drawn.error_over_time(data),
+            drawn.error_by_axis(data),
+            drawn.nees_over_time(data),
+            drawn.time_per_frame(data),
+            *([drawn.noise_over_time(data)] if any(e.noise for e in data.estimators) else []),
+            *([drawn.calibration_over_time(rig, data.start)] if rig is not None else []),
+        ),
+        pictures=data.pictures,
+        failed=frozenset(e.title for e in data.estimators if e.failure),
+        notes=data.notes,
+        remarks=tuple(remarks),
+        config_yaml=data.config_yaml,
+        versions=data.versions,
+    )
+
+
+def headline(data: ReportData) -> tuple[str, ...]:
+    """Sentences about accuracy, consistency and failures, most important first."""
+    working = [e for e in data.estimators if not e.failure]
+    lines = [_accuracy(data, working)] if working else ["No estimator gave a result."]
+    lines += _consistency(working)
+    lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
+    return tuple(lines)
+
+
+def metres(value: float) -> str:
+    """A length to be read: centimetres below a metre."""
+    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
+
+
+def _accuracy(data: ReportData, working: list[EstimatorReport]) -> str:
+    ranked = sorted((e.ate_m, e.title) for e in working if e.ate_m is not None)
+    if not ranked:
+        why = "there is no ground truth" if data.truth is None else "too few poses have a truth"
+        return f"How accurate the path is, is not known: {why}."
+    how = f"root mean square position error, {data.alignment}"
+    first, title = ranked[0]
+    if len(ranked) == 1:
+        return f"{title} is off by {metres(first)} ({how})."
+    second, other = ranked[1]
+    if second <= _ABOUT_EQUAL * first:
+        equal = [name for error, name in ranked if error <= _ABOUT_EQUAL * first]
+        return f"{_listed(equal)} are about equally accurate: {metres(first)} ({how})."
+    ratio = f", {second / first:.2g} times as much" if first > 0.0 else ""
+    return (
+        f"{title} is the most accurate: off by {metres(first)} ({how}). "
+        f"The next, {other}, is off by {metres(second)}{ratio}."
+    )
+
+
+def _consistency(working: list[EstimatorReport]) -> Iterator[str]:
+    for word, meaning in _JUDGED.items():
+        found = [e for e in working if e.verdict == word]
+        if found:
+            names = [f"{e.title} ({_nees(e.nees_per_dof)})" for e in found]
+            yield f"{word.capitalize()} ({meaning}): {_listed(names)}."
+    unknown = [e.title for e in working if e.verdict not in _JUDGED]
+    if unknown:
+        yield f"Whether the covariances of {_listed(unknown)} can be believed is not known."
+
+
+def _nees(value: float | None) -> str:
+    if value is None:
+        return "NEES not known"
+    return f"NEES {value:,.0f}" if value >= _ROUND_FROM else f"NEES {value:.3g}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

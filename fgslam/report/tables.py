@@ -1,77 +1,15 @@
-"""Files of numbers in a run folder: metrics.json, timing.csv, comparison.csv, any other table."""
+"""comparison.csv: estimators side by side."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import numpy as np
-
-from fgslam.core.errors import DatasetError
-from fgslam.core.files import replacing, write_text
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
-
-Cell: TypeAlias = "str | bool | int | float | np.generic | None"
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
-    """Writes a table: ten significant digits; empty where a value is None or not finite.
-
-    Raises:
-        ValueError: a row has not as many cells as there are columns.
-        OutputError: the file cannot be written.
-    """
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    for row in rows:
-        if len(row) != len(columns):
-            raise ValueError(f"{len(row)} cells in a table of {len(columns)} columns")
-        writer.writerow([_text(cell) for cell in row])
-    write_text(path, out.getvalue())
-
-
-def write_parquet(
-    path: Path, columns: Mapping[str, Sequence[Cell]], about: Mapping[str, str]
-) -> None:
-    """Writes a table as Parquet, atomically; equal values give equal bytes.
-
-    Args:
-        path: the file; `pandas.read_parquet` opens it.
-        columns: n cells each, of one type; None where a value is not known.
-        about: texts for the file's own metadata.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    import pyarrow
-    from pyarrow import parquet
-
-    table = pyarrow.table({name: pyarrow.array(cells) for name, cells in columns.items()})
-    with replacing(path) as partial:
-        parquet.write_table(table.replace_schema_metadata(about), partial, compression="zstd")
-
-
-def write_json(path: Path, document: Mapping[str, JsonValue]) -> None:
-    """Writes a document; what is not finite becomes null. Raises OutputError."""
-    write_text(path, json.dumps(plain(document), indent=2, allow_nan=False) + "\n")
-
-
-def _text(cell: Cell) -> str:
-    if isinstance(cell, np.generic):
-        cell = cell.item()
-    if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
-        return ""
-    if isinstance(cell, bool):
-        return "true" if cell else "false"
-    return f"{cell:.10g}" if isinstance(cell, float) else str(cell)
-
+from fgslam.core.files import write_text
+from fgslam.evaluation.metrics import value_at
 
 RESULT_COLUMNS: tuple[tuple[str, str], ...] = (
     ("kind", "kind"),
@@ -160,86 +98,3 @@ def _cell(value: Any) -> str:
     if value is None:
         return ""
     return f"{value:.9g}" if isinstance(value, float) else str(value)
-
-
-@dataclass(frozen=True, slots=True)
-class StageTime:
-    """How long one stage took for one frame.
-
-    Attributes:
-        frame: the recording's frame number.
-        timestamp: seconds.
-        stage: name of the stage (`sift`, `match`, ...).
-        milliseconds: wall-clock time.
-    """
-
-    frame: int
-    timestamp: float
-    stage: str
-    milliseconds: float
-
-
-def write_metrics(
-    path: Path,
-    frames: int,
-    estimators: Mapping[str, EstimatorMetrics],
-    more: Mapping[str, JsonValue] | None = None,
-) -> None:
-    """Write metrics.json atomically; NaN and infinities become null, never a missing name.
-
-    Args:
-        path: the file.
-        frames: number of frames processed.
-        estimators: metrics by the estimator's kind.
-        more: further values of the run as a whole.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    document: dict[str, Any] = {
-        "frames": frames,
-        **(more or {}),
-        "estimators": {kind: metrics.as_json() for kind, metrics in estimators.items()},
-    }
-    write_json(path, document)
-
-
-def read_metrics(path: Path) -> dict[str, Any]:
-    """The metrics.json of a run of any task: :func:`write_metrics` wrote those of SLAM.
-
-    Raises:
-        DatasetError: the file is missing or is not one.
-    """
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is not JSON ({error}); run the experiment again") from error
-    if not isinstance(document, dict) or not document.keys() & {"estimators", "task"}:
-        raise DatasetError(f"{path} holds no metrics; give the metrics.json of a run folder")
-    return document
-
-
-def write_timing(path: Path, times: Sequence[StageTime]) -> None:
-    """Write timing.csv: frame, timestamp (s), stage, milliseconds. Raises OutputError."""
-    lines = ["frame,timestamp,stage,milliseconds"]
-    lines += [
-        f"{time.frame},{time.timestamp:.9f},{time.stage},{time.milliseconds:.4f}" for time in times
-    ]
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def plain(value: Any) -> Any:
-    """Plain JSON types: NumPy numbers unwrapped, what is not finite as None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

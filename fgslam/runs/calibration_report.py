@@ -19,8 +19,8 @@ from fgslam.cameras.board_check import (
 from fgslam.cameras.board_projection import INTRINSICS, PARAMETERS
 from fgslam.cameras.boards import Board
 from fgslam.core.arrays import FloatArray
+from fgslam.report.content import write_csv
 from fgslam.report.pictures.board import draw_corners
-from fgslam.report.tables import write_csv
 
 Files = Sequence[tuple[Path, ...]]
 """Images of each moment, in the cameras' order."""

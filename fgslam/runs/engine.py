@@ -18,9 +18,8 @@ from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.content import Page, TextTable
+from fgslam.report.content import Page, TextTable, read_metrics, write_json
 from fgslam.report.page import write_html
-from fgslam.report.tables import read_metrics, write_json
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.crews import Crew

@@ -19,11 +19,11 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.trajectories import read_covariances
+from fgslam.report.content import read_metrics
 from fgslam.report.graph_file import PoseLandmarkGraph, require_graph_suffix, write_g2o
 from fgslam.report.point_cloud import MapPoints, read_ply, write_map
 from fgslam.report.ros_bag import SUFFIX as MCAP
 from fgslam.report.ros_bag import write_mcap
-from fgslam.report.tables import read_metrics
 from fgslam.runs.config import load_config, load_experiment
 from fgslam.runs.config_reading import read_mapping
 from fgslam.runs.exporting_images import export_images, rows_of_frames

@@ -17,7 +17,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, moved_pixels
 from fgslam.core.trajectories import Trajectory
 from fgslam.datasets.film_files import require_film_suffix, write_film
-from fgslam.report.figures.trajectory import level_axes
+from fgslam.report.content import level_axes
 from fgslam.report.pictures.film import FilmCanvas, Moment
 from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.runs.config import load_config, load_experiment

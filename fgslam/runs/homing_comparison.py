@@ -25,10 +25,8 @@ from fgslam.evaluation.homing import (
     summarise_homings,
 )
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
-from fgslam.report.figures.traces import Figure
-from fgslam.report.tables import Cell, write_csv
+from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
+from fgslam.report.homing_figures import Line, curve_figure, local_map_figure
 from fgslam.runs.config_models import HomingExperiment
 from fgslam.runs.engine import Context, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.folder import COMPARISON_FILE, digest_of
@@ -333,7 +331,7 @@ def _finish(
     write_csv(folder / COMPARISON_FILE, columns, [[title, *row] for title, row in rows])
     write_document(result, {"logs": sorted(logs)}, numbers)
     figures = tuple(_figures(logs, replays, errors))
-    write_page(result, "bearing logs replayed", figures=figures, series=tuple(replays))
+    write_page(result, "bearing logs replayed", figures=figures)
     return result
 
 

@@ -20,17 +20,16 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.sensors import vertical_of
 from fgslam.core.trajectories import read_covariances
 from fgslam.core.yaml_text import plain_values
-from fgslam.report.content import Picture
+from fgslam.report.content import Picture, read_metrics
+from fgslam.report.page import write_report
 from fgslam.report.point_cloud import MapPoints, read_ply
-from fgslam.report.run_results import (
+from fgslam.report.results import (
     EstimatorReport,
     ReportData,
     judged_report,
     same_times,
     truth_in_their_world,
 )
-from fgslam.report.slam_page import write_report
-from fgslam.report.tables import read_metrics
 from fgslam.runs.estimator_files import NOISE_TABLE
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
 from fgslam.runs.marks import SYNTHETIC, marked

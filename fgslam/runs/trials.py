@@ -18,7 +18,8 @@ from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsS
 from fgslam.evaluation.comparing import MeanInterval, PairedTest, mean_interval, paired_test
 from fgslam.evaluation.consistency import Consistency, judge
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
-from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv, write_metrics
+from fgslam.report.content import write_metrics
+from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig

@@ -17,10 +17,8 @@ from scipy.spatial.transform import Rotation
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import MissingDependencyError, OutputError
 from fgslam.core.files import replacing, require_output
-from fgslam.report.figures.palette import COUNT, ON_DARK
-from fgslam.report.figures.traces import thinned, world_position_covariances
-from fgslam.report.figures.trajectory import level_axes
-from fgslam.report.run_results import EstimatorReport, ReportData
+from fgslam.report.content import COLOURS, ON_DARK, level_axes, thinned, world_position_covariances
+from fgslam.report.results import EstimatorReport, ReportData
 from fgslam.runs.report import load_report
 
 Colour: TypeAlias = tuple[int, int, int]
@@ -108,7 +106,7 @@ def _log(rerun: Any, stream: Any, data: ReportData) -> None:
         stream.log("world/first_camera/truth", line, static=True)
     for i, estimator in enumerate(data.estimators):
         if len(estimator):
-            colour = rgb(ON_DARK[i % COUNT])
+            colour = rgb(ON_DARK[i % COLOURS])
             _log_scene(rerun, stream, estimator, colour)
             _log_numbers(rerun, stream, estimator, colour, data.start)
     for i, picture in enumerate(data.pictures):

@@ -23,9 +23,7 @@ from fgslam.core.files import remove_left_behind, replacing
 from fgslam.core.measurements import Increment, moved_pixels
 from fgslam.core.sensors import CameraRig, vertical_of
 from fgslam.evaluation.trajectory import to_estimate_world
-from fgslam.report.figures.palette import ON_DARK
-from fgslam.report.figures.traces import world_position_covariances
-from fgslam.report.figures.trajectory import level_axes
+from fgslam.report.content import ON_DARK, level_axes, world_position_covariances
 from fgslam.runs.config_models import Experiment, ExperimentConfig
 from fgslam.runs.tasks.slam import Watch
 from fgslam.runs.tasks.slam_outputs import RunOutputs

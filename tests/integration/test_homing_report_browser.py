@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from browser import PHONE, Browser, browsing
 from homing_pages import page
+from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
 
 from fgslam.report.page import write_html
 
@@ -41,34 +41,14 @@ def test_every_figure_is_drawn(browser: Browser) -> None:
         assert browser.js(f"{DRAWN.format(figure)}.length") >= 1, figure
 
 
-def test_the_slider_moves_the_robot_and_one_moment_is_drawn(browser: Browser) -> None:
+def test_play_moves_the_robot_to_the_end_and_the_slider_with_it(browser: Browser) -> None:
     assert robot(browser)[1] == pytest.approx(0.0, abs=1e-6)
-    slider = browser.driver.find_element(
-        By.CSS_SELECTOR, 'input[type="range"][data-figure="local-map"]'
-    )
-    for _ in range(6):
-        slider.send_keys(Keys.ARROW_RIGHT)
-    browser.wait(f"{DRAWN.format('local-map')}.some(t => t.name === 'lost feature')")
-    assert robot(browser)[1] == pytest.approx(6 / 9, abs=1e-6)
-    assert browser.js("document.querySelector('.moments output').textContent") == "3.0 s"
-
-
-def test_play_runs_to_the_end_and_stops(browser: Browser) -> None:
-    button = browser.driver.find_element(By.CSS_SELECTOR, 'button[data-play="local-map"]')
-    browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", button)
-    button.click()
-    browser.wait("document.querySelector('button[data-play=\"local-map\"]').textContent === 'Play'")
+    play = browser.driver.find_element(By.CSS_SELECTOR, "#plot-local-map .updatemenu-button")
+    browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", play)
+    ActionChains(browser.driver).move_to_element(play).click().perform()
+    layout = "document.getElementById('plot-local-map')._fullLayout"
+    browser.wait(f"{layout}.sliders[0].active === 8")
     assert robot(browser)[1] == pytest.approx(8 / 9, abs=1e-6)
-
-
-def test_a_switch_hides_what_it_names(browser: Browser) -> None:
-    switch = 'input[data-figure="local-map"][data-switch="ellipses"]'
-    shown = f"{DRAWN.format('local-map')}.some(t => t.visible === true && /sigma/.test(t.name))"
-    assert browser.js(shown) is True
-    box = browser.driver.find_element(By.CSS_SELECTOR, switch)
-    browser.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", box)
-    box.click()
-    browser.wait(f"!({shown})")
 
 
 def test_page_fits_on_a_phone(browser: Browser) -> None:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.report.figures.trajectory import bulk_limits
+from fgslam.report.content import bulk_limits
 from fgslam.report.pictures.style import INK, ORANGE, PICTURE_STYLE, SKY, YELLOW, show_image
 
 _INCHES = (12.8, 5.4)

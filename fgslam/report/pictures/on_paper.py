@@ -1,4 +1,4 @@
-"""Figures as PNG: what a page shows as Plotly's traces, drawn by matplotlib from the same values.
+"""Figures as PNG: Plotly's traces of a page, drawn by matplotlib from the same values.
 
 Plotly's own export would need a browser. Of the traces, lines, markers, bands and the colour bar
 are drawn: what the figures of this package are made of.
@@ -7,7 +7,7 @@ are drawn: what the figures of this package are made of.
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,7 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.figures.palette import printed
-from fgslam.report.figures.traces import Figure, Trace
+from fgslam.report.content import Figure
 from fgslam.report.pictures.style import MAP_COLOURS, colour_bar, picture
 
 _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
@@ -38,35 +37,36 @@ _VIEWS = (
 )
 
 
-def draw_figure(
-    path: Path, figure: Figure, title: str, switches: Mapping[str, bool] | None = None
-) -> None:
+def draw_figure(path: Path, figure: Figure, title: str, shown: Collection[str] = ()) -> None:
     """A figure of a plane, or panels over each other, with a legend.
 
     Args:
         path: the PNG to write.
         figure: of the plane.
         title: heading.
-        switches: states by key that differ from how they start.
+        shown: names of traces that are drawn although the page hides them at first.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    traces = printed(figure, switches)
-    panels = sorted(name.replace("axis", "") for name in figure.layout if name.startswith("yaxis"))
-    with picture(path, *_size(figure, len(panels))) as canvas:
+    layout = figure.drawing.layout
+    traces = _seen(figure, shown)
+    panels = sorted(name.replace("axis", "") for name in layout if name.startswith("yaxis"))
+    with picture(path, *_size(layout, len(panels))) as canvas:
         found = canvas.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
         for axes, panel in zip(found, panels, strict=True):
-            own = [trace for trace in traces if trace.get("yaxis", "y") == panel]
+            own = [trace for trace in traces if (trace.yaxis or "y") == panel]
             for order, trace in enumerate(own):
                 _draw(axes, trace, order)
-            _dress(axes, figure.layout, panel)
+            _dress(axes, layout, panel)
             if len(panels) > 1 and own:
                 # Above the panel, where no curve is.
                 axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=_FEW_ENTRIES)
         found[0].set_title(title, pad=22.0)
-        _note(found[0], figure, switches)
-        found[-1].set_xlabel(figure.layout["xaxis"]["title"]["text"])
+        found[0].annotate(
+            figure.note, (0.0, 1.0), (0.0, 8.0), "axes fraction", textcoords="offset points"
+        )
+        found[-1].set_xlabel(layout.xaxis.title.text)
         canvas.align_ylabels()
         if len(panels) == 1:
             _legend(canvas, found[0])
@@ -83,15 +83,15 @@ def draw_views(path: Path, figure: Figure, title: str) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
-    traces, scene = printed(figure), figure.layout["scene"]
+    traces, scene = _seen(figure, ()), figure.drawing.layout.scene
     with picture(path, 17.0, 6.4) as canvas:
         for k, (name, elevation, azimuth) in enumerate(_VIEWS):
             place = (1, len(_VIEWS), k + 1)
             axes: Any = canvas.add_subplot(*place, projection="3d", proj_type="persp")
             for order, trace in enumerate(traces):
                 _draw(axes, trace, order, "xyz")
-            axes.set(**{f"{a}lim": scene[f"{a}axis"]["range"] for a in "xyz"})
-            axes.set_box_aspect([scene["aspectratio"][a] for a in "xyz"], zoom=1.1)
+            axes.set(**{f"{a}lim": scene[f"{a}axis"].range for a in "xyz"})
+            axes.set_box_aspect([scene.aspectratio[a] for a in "xyz"], zoom=1.1)
             axes.view_init(elevation, azimuth)
             axes.set_title(name, y=0.98)
             for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
@@ -109,67 +109,60 @@ def draw_views(path: Path, figure: Figure, title: str) -> None:
         _legend(canvas, canvas.axes[0], "outside upper right")
 
 
-def _draw(axes: Any, trace: Trace, order: int, names: str = "xy") -> None:
+def _seen(figure: Figure, shown: Collection[str]) -> list[Any]:
+    return [one for one in figure.drawing.data if one.visible is True or one.name in shown]
+
+
+def _draw(axes: Any, trace: Any, order: int, names: str = "xy") -> None:
     points = [trace[name] for name in names]
-    if trace.get("fill") == "toself":
+    if trace.type == "scatter" and trace.fill == "toself":
         axes.fill(*points, label=_label(trace), zorder=2.0 + 0.01 * order, **_BAND)
         return
-    if "lines" in trace["mode"]:
-        line = trace.get("line", {})
-        style = {"color": line.get("color"), "linestyle": _DASHES[line.get("dash", "solid")]}
-        width = line.get("width", 2.0) * (0.5 if len(names) == 3 else _POINTS_A_PIXEL)
+    if "lines" in trace.mode:
+        style = {"color": trace.line.color, "linestyle": _DASHES[trace.line.dash]}
+        width = trace.line.width * (0.5 if len(names) == 3 else _POINTS_A_PIXEL)
         axes.plot(*points, linewidth=width, label=_label(trace), zorder=2.0 + 0.01 * order, **style)
-    if "markers" in trace["mode"] and len(points[0]):
+    elif len(points[0]):
         _draw_markers(axes, trace, order, points)
 
 
-def _draw_markers(axes: Any, trace: Trace, order: int, points: Sequence[FloatArray]) -> None:
-    marker = trace["marker"]
+def _draw_markers(axes: Any, trace: Any, order: int, points: Sequence[FloatArray]) -> None:
+    marker = trace.marker
     style: dict[str, Any] = {
         "label": _label(trace),
-        "marker": _MARKERS[marker.get("symbol", "circle")],
+        "marker": _MARKERS[marker.symbol],
         "zorder": 2.0 + 0.01 * order,
     }
     # Dense maps get finer dots.
-    size = (_POINTS_A_PIXEL * marker["size"]) ** 2
+    size = (_POINTS_A_PIXEL * marker.size) ** 2
     style["s"] = min(size, max(_FINE / len(points[0]), 1.0))
     if len(points) == 3:
         style["depthshade"] = False
-    colours = marker["color"]
-    if isinstance(colours, str):
-        axes.scatter(*points, color=colours, linewidths=1.4, **style)
+    if isinstance(marker.color, str):
+        axes.scatter(*points, color=marker.color, linewidths=1.4, **style)
         return
-    if len(colours):
-        norm = Normalize(marker["cmin"], marker["cmax"])
-        axes.scatter(*points, c=colours, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
-        if len(points) == 2:
-            bar = marker["colorbar"]["title"]["text"]
-            colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
+    norm = Normalize(marker.cmin, marker.cmax)
+    axes.scatter(*points, c=marker.color, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
+    if len(points) == 2:
+        bar = marker.colorbar.title.text
+        colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
 
 
-def _label(trace: Trace) -> str:
+def _label(trace: Any) -> str:
     """Words of the legend."""
-    return html.unescape(trace["name"])
+    return html.unescape(trace.name)
 
 
-def _dress(axes: Axes, layout: Mapping[str, Any], panel: str) -> None:
+def _dress(axes: Axes, layout: Any, panel: str) -> None:
     vertical = layout[f"yaxis{panel[1:]}"]
-    axes.set_ylabel(vertical["title"]["text"])
+    axes.set_ylabel(vertical.title.text)
     axes.grid(visible=True)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
-    if vertical.get("rangemode") == "tozero":
+    if vertical.rangemode == "tozero":
         axes.set_ylim(0.0, None)
-    if "scaleanchor" in vertical:
-        axes.set(xlim=layout["xaxis"]["range"], ylim=vertical["range"], aspect="equal")
+    if vertical.scaleanchor:
+        axes.set(xlim=layout.xaxis.range, ylim=vertical.range, aspect="equal")
         axes.xaxis.set_major_locator(MaxNLocator(nbins=9, steps=[1, 2, 5, 10]))
-
-
-def _note(axes: Axes, figure: Figure, switches: Mapping[str, bool] | None) -> None:
-    """What is left out, and that ellipses are larger than they are."""
-    states = {switch.key: switch.on for switch in figure.switches} | dict(switches or {})
-    larger = [s.label for s in figure.switches if s.key == "enlarged" and states[s.key]]
-    text = "; ".join(filter(None, [*(f"ellipses {label}" for label in larger), figure.note]))
-    axes.annotate(text, (0.0, 1.0), (0.0, 8.0), "axes fraction", textcoords="offset points")
 
 
 def _legend(canvas: Canvas, axes: Axes, where: Any = "outside lower center") -> None:
@@ -182,11 +175,11 @@ def _legend(canvas: Canvas, axes: Axes, where: Any = "outside lower center") -> 
         canvas.legend(list(unique.values()), list(unique), loc=where, ncols=_FEW_ENTRIES)
 
 
-def _size(figure: Figure, panels: int) -> tuple[float, float]:
+def _size(layout: Any, panels: int) -> tuple[float, float]:
     """Inches: panels are wide; a plane keeps its shape, with room for a bar and a legend."""
-    if "scaleanchor" not in figure.layout["yaxis"]:
+    if not layout.yaxis.scaleanchor:
         return 11.0, 1.6 + 2.0 * panels
-    (left, right), (low, high) = (figure.layout[axis]["range"] for axis in ("xaxis", "yaxis"))
+    (left, right), (low, high) = layout.xaxis.range, layout.yaxis.range
     # A straight road is long and thin; half its length keeps the picture readable.
     aspect = float(np.clip((high - low) / (right - left), 0.2, 5.0))
     height = float(np.clip(8.2 * aspect, 3.6, 9.0))

@@ -13,7 +13,8 @@ from typing import Any
 
 from fgslam.core.errors import ConfigError, FgslamError
 from fgslam.evaluation.metrics import JsonValue, value_at
-from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, plain, read_metrics
+from fgslam.report.content import plain, read_metrics
+from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS
 from fgslam.runs.compare import Choice, choose
 from fgslam.runs.config import make_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig

@@ -9,10 +9,8 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.evaluation.comparing import MeanInterval, mean_interval
-from fgslam.report.content import Column, Page, TextTable
-from fgslam.report.figures.homing import sorted_errors
-from fgslam.report.figures.sweeps import effect_figure
-from fgslam.report.figures.traces import Figure
+from fgslam.report.content import Column, Figure, Page, TextTable
+from fgslam.report.homing_figures import effect_figure, sorted_errors
 from fgslam.report.page import write_html
 from fgslam.runs.folder import versions
 from fgslam.runs.marks import measured_marks, with_marks
@@ -123,7 +121,6 @@ def write_sweep_page(
         notes=tuple(f"case {k}: {why}" for k, why in sorted(failures.items()))[:_FAILURES_SHOWN],
         tables=comparison_tables(findings),
         figures=tuple(_figures(findings, series)),
-        series=tuple(series),
         config_yaml=description,
         versions=versions(),
     )

@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 
 import yaml
 
-from fgslam.report.tables import write_parquet
+from fgslam.report.content import write_parquet
 from fgslam.runs.sweeps.case import CaseResult, Row
 from fgslam.runs.sweeps.grid import Case, Grid
 

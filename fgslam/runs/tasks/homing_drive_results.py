@@ -27,9 +27,8 @@ from fgslam.homing.drive_record import (
     slope_by_leg,
     truly_arrived,
 )
-from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.plan import PASS_RADIUS_M, Drive
-from fgslam.report.tables import Cell, write_csv
+from fgslam.report.content import Cell, Column, TextTable, write_csv
+from fgslam.report.homing_figures import PASS_RADIUS_M, Drive
 from fgslam.runs.homing_comparison import save_bearing_logs
 
 _UNKNOWN = "-"

@@ -35,10 +35,14 @@ from fgslam.homing.path_following import HomingChain
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.settings import FrontEndSettings
 from fgslam.homing.steering import Steering, make_avoider
-from fgslam.report.content import Picture
-from fgslam.report.figures.homing import Line, curve_figure, local_map_figure
-from fgslam.report.figures.plan import catchment_figure, drive_figure
-from fgslam.report.figures.traces import Figure
+from fgslam.report.content import Figure, Picture
+from fgslam.report.homing_figures import (
+    Line,
+    catchment_figure,
+    curve_figure,
+    drive_figure,
+    local_map_figure,
+)
 from fgslam.runs.config_models import DrivingConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.homing_comparison import replay_homing

@@ -20,10 +20,8 @@ from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view_geometry import make_local_map
-from fgslam.report.content import TextTable
-from fgslam.report.figures.homing import sorted_errors
-from fgslam.report.figures.traces import Figure
-from fgslam.report.tables import Cell, write_csv
+from fgslam.report.content import Cell, Figure, TextTable, write_csv
+from fgslam.report.homing_figures import sorted_errors
 from fgslam.runs.config_models import HomingTrialsConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.folder import TIMING_FILE, TRIALS_FILE
@@ -195,7 +193,7 @@ def finish_trials(
     estimators = {title: {"kind": kinds[title], **values} for title, values in found.items()}
     write_document(result, numbers, estimators)
     subtitle = f"{len(trials)} simulated homings of bearings alone, seed {config.seed}"
-    write_page(result, subtitle, figures=tuple(_figures(groups, titles)), series=tuple(titles))
+    write_page(result, subtitle, figures=tuple(_figures(groups, titles)))
     return result
 
 
@@ -285,7 +283,7 @@ def _figures(groups: dict[float, list[HomingTrial]], titles: Sequence[str]) -> I
         if any(map(len, errors.values())):
             heading = f"Error of the home direction at {100.0 * share:.0f} % outliers"
             figure = sorted_errors(errors, "degrees", (f"direction-{100.0 * share:.0f}", heading))
-            figure.layout["xaxis"]["type"] = "log"
+            figure.drawing.update_xaxes(type="log")
             yield figure
 
 

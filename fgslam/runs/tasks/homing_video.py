@@ -15,9 +15,8 @@ from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
 from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker, TrackedImage, VideoState
-from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.figures.homing import Line, curve_figure
-from fgslam.report.tables import write_csv
+from fgslam.report.content import Column, Picture, TextTable, write_csv
+from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import OmniVideoConfig
 from fgslam.runs.engine import (
     Context,

@@ -47,11 +47,14 @@ from fgslam.homing.links import Answer, Link, Pair
 from fgslam.homing.localisation import Localiser
 from fgslam.homing.retrieval import VisualWords
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
-from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.figures.homing import claimed_against_true, sorted_errors
-from fgslam.report.figures.plan import Links, network_figure, unfolded
-from fgslam.report.figures.traces import Figure
-from fgslam.report.tables import Cell, write_csv
+from fgslam.report.content import Cell, Column, Figure, Picture, TextTable, write_csv
+from fgslam.report.homing_figures import (
+    Links,
+    claimed_against_true,
+    network_figure,
+    sorted_errors,
+    unfolded,
+)
 from fgslam.runs.config_models import HomingPairsConfig, TopologicalMapConfig
 from fgslam.runs.engine import (
     Context,
@@ -132,7 +135,6 @@ def _run_pairs(config: HomingPairsConfig, views: OmniRecording, context: Context
         f"{len(answers)} pairs of {len(features)} views of {views.name}",
         figures=figures,
         pictures=pictures,
-        series=("direction", "rotation") if figures else (),
     )
     return result
 

@@ -24,10 +24,8 @@ from fgslam.evaluation.localisation import (
     score,
 )
 from fgslam.evaluation.metrics import JsonValue
-from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.located import Located, located_figure
-from fgslam.report.figures.traces import Figure
-from fgslam.report.tables import Cell, write_csv, write_json
+from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv, write_json
+from fgslam.report.homing_figures import Located, located_figure
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import RunResult, write_page
 from fgslam.runs.folder import METRICS_FILE

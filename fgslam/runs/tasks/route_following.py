@@ -23,10 +23,8 @@ from fgslam.homing.command import SURE, DriveCommand, MetricPlace
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.picture_sides import PictureSides
 from fgslam.homing.settings import DRIVING, HomingBehaviourSettings
-from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.homing import Line, curve_figure
-from fgslam.report.figures.traces import Figure
-from fgslam.report.tables import Cell, write_csv
+from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
+from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import FollowConfig
 from fgslam.runs.engine import (
     Context,

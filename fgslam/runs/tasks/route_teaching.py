@@ -20,10 +20,8 @@ from fgslam.datasets.omni_checks import open_checked
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.settings import DRIVING
 from fgslam.homing.teaching import FULL, GAP, Taught, TaughtImage, Teacher
-from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.figures.homing import Line, curve_figure
-from fgslam.report.figures.traces import Figure
-from fgslam.report.tables import write_csv
+from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
+from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import TeachConfig
 from fgslam.runs.engine import (
     Context,

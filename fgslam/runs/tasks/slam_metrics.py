@@ -17,8 +17,7 @@ from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correla
 from fgslam.evaluation.closures import JudgedClosure, judge_closures
 from fgslam.evaluation.judging import Answer, Truth, judge_answer, predicted_poses
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.report.content import Column, TextTable
-from fgslam.report.tables import Cell, write_csv
+from fgslam.report.content import Cell, Column, TextTable, write_csv
 from fgslam.runs.engine import LocatedShare
 from fgslam.slam.part_remarks import located_frames
 from fgslam.slam.replay import peak_memory_mb

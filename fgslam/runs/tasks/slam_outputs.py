@@ -18,11 +18,16 @@ from fgslam.core.recordings import LANDMARK_TRUTH_FILE, Sequence, write_landmark
 from fgslam.core.sensors import vertical_of
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
-from fgslam.report.content import Column, TextTable
-from fgslam.report.figures.over_time import error_by_axis, matches_over_time
-from fgslam.report.figures.trajectory import ON_PAPER, drive_from_above, map_to_turn
-from fgslam.report.run_results import ReportData, judged_report, truth_in_their_world
-from fgslam.report.tables import StageTime, write_metrics, write_timing
+from fgslam.report.content import Column, StageTime, TextTable, write_metrics, write_timing
+from fgslam.report.figures import (
+    LANDMARK_ELLIPSES,
+    ON_PAPER,
+    drive_from_above,
+    error_by_axis,
+    map_to_turn,
+    matches_over_time,
+)
+from fgslam.report.results import ReportData, judged_report, truth_in_their_world
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
 from fgslam.runs.folder import LOG_FILE
@@ -407,8 +412,8 @@ def draw_run(run: Path, figures: RunFigures) -> list[Path]:
     results = _results(figures)
     kind = "valid landmarks" if figures.valid.any() else "landmarks"
     what = figures.title(f"{len(results.estimators[0].landmarks):,} {kind}")
-    above, ellipses = drive_from_above(results, ON_PAPER), {"landmark-ellipses": True}
-    draw_figure(folder / "map_from_above.png", above, what, ellipses)
+    above = drive_from_above(results, ON_PAPER)
+    draw_figure(folder / "map_from_above.png", above, what, {LANDMARK_ELLIPSES})
     draw_views(folder / "map_views.png", map_to_turn(results, ON_PAPER), what)
     # The first frame has no landmarks to match.
     counts = (figures.frames, figures.matched, figures.inliers, figures.landmarks)

@@ -11,7 +11,7 @@ import pytest
 
 from fgslam.core.errors import DatasetError
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime
-from fgslam.report.tables import StageTime, read_metrics, write_metrics, write_timing
+from fgslam.report.content import StageTime, read_metrics, write_metrics, write_timing
 
 CONTRACT = {
     "ate_rmse_m",

@@ -19,17 +19,16 @@ from fgslam.core.errors import OutputError
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.features import Features
 from fgslam.core.geometry import pose, se3_exp, so3_exp
-from fgslam.report.figures import palette
-from fgslam.report.figures.located import Located, located_figure
-from fgslam.report.figures.over_time import error_by_axis, matches_over_time
-from fgslam.report.figures.palette import printed
-from fgslam.report.figures.traces import SIGMAS, exaggeration, world_position_covariances
-from fgslam.report.figures.trajectory import (
+from fgslam.report.content import SIGMAS, bulk_limits, exaggeration, world_position_covariances
+from fgslam.report.figures import (
+    LANDMARK_ELLIPSES,
     ON_PAPER,
-    bulk_limits,
     drive_from_above,
+    error_by_axis,
     map_to_turn,
+    matches_over_time,
 )
+from fgslam.report.homing_figures import Located, located_figure
 from fgslam.report.pictures import style
 from fgslam.report.pictures.image_overlays import (
     draw_disparities,
@@ -38,7 +37,7 @@ from fgslam.report.pictures.image_overlays import (
     oriented_squares,
 )
 from fgslam.report.pictures.on_paper import draw_figure, draw_views
-from fgslam.report.run_results import ReportData, judged_report
+from fgslam.report.results import ReportData, judged_report
 from fgslam.runs.tasks.slam_outputs import RunFigures
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
@@ -229,8 +228,8 @@ def test_poses_that_no_landmark_measured_are_marked_and_counted_in_every_title(
     predicted = np.array([False, False, True, True, False, False])
     marked = replace(data, estimators=(replace(data.estimators[0], predicted=predicted),))
     for figure in (drive_from_above(marked, ON_PAPER), map_to_turn(marked, ON_PAPER)):
-        (mark,) = [t for t in printed(figure) if t["name"] == "a, predicted poses"]
-        assert np.allclose(mark["x"], data.estimators[0].final_poses[2:4, 0, 3], rtol=0, atol=1e-6)
+        (mark,) = [t for t in figure.drawing.data if t.name == "a, predicted poses"]
+        assert np.allclose(mark.x, data.estimators[0].final_poses[2:4, 0, 3], rtol=0, atol=1e-6)
         draw = draw_figure if figure.key == "above" else draw_views
         draw(tmp_path / "drawn.png", figure, "with marks")
     assert "no landmark measured" in drive_from_above(marked).description
@@ -246,16 +245,15 @@ def test_poses_that_no_landmark_measured_are_marked_and_counted_in_every_title(
     assert whole.title("matches") == "drive: matches"
 
 
-def test_switches_that_are_off_and_other_moments_are_not_printed() -> None:
+@pytest.mark.usefixtures("coarse")
+def test_what_a_page_hides_at_first_is_printed_where_it_is_named(tmp_path: Path) -> None:
     figure = drive_from_above(results(5, 5, full=True))
-    names = [trace["name"] for trace in printed(figure)]
-    assert "uncertainty of a landmark" not in names
-    assert {"a, final", "truth", "start", "landmark of a"} <= set(names)
-    shown = printed(figure, {"landmark-ellipses": True, "final": False})
-    names = [trace["name"] for trace in shown]
-    assert "uncertainty of a landmark" in names
-    assert "a, final" not in names
-    assert {t["line"]["color"] for t in shown if t["name"] == "truth"} == {palette.INK}
+    seen = {trace.name for trace in figure.drawing.data if trace.visible is True}
+    assert LANDMARK_ELLIPSES not in seen
+    assert {"a, final", "truth", "start", "landmarks of a"} <= seen
+    draw_figure(tmp_path / "without.png", figure, "Above")
+    draw_figure(tmp_path / "with.png", figure, "Above", {LANDMARK_ELLIPSES})
+    assert (tmp_path / "without.png").read_bytes() != (tmp_path / "with.png").read_bytes()
 
 
 def test_errors_along_the_axes_are_those_of_the_level_world() -> None:
@@ -264,15 +262,15 @@ def test_errors_along_the_axes_are_those_of_the_level_world() -> None:
     poses[1:, 1, 3] -= 0.02  # the world's y points down
     moved = dataclasses.replace(data.estimators[0], final_poses=poses)
     figure = error_by_axis(dataclasses.replace(data, estimators=(moved,)))
-    lines = {t["yaxis"]: t for t in printed(figure) if "rmse" in t["name"]}
-    np.testing.assert_allclose(lines["y3"]["y"][1:], 2.0, atol=1e-5)  # up, in centimetres
-    np.testing.assert_allclose(lines["y"]["y"], 0.0, atol=1e-5)
-    bands = {t["yaxis"]: t for t in printed(figure) if t["name"] == "3 sigma"}
-    assert np.abs(bands["y3"]["y"]).max() == pytest.approx(3.0, rel=1e-5)  # of 1 cm each
+    lines = {t.yaxis: t for t in figure.drawing.data if "rmse" in t.name}
+    np.testing.assert_allclose(lines["y3"].y[1:], 2.0, atol=1e-5)  # up, in centimetres
+    np.testing.assert_allclose(lines["y"].y, 0.0, atol=1e-5)
+    bands = {t.yaxis: t for t in figure.drawing.data if t.name == "3 sigma"}
+    assert np.abs(bands["y3"].y).max() == pytest.approx(3.0, rel=1e-5)  # of 1 cm each
 
 
 def test_located_poses_refusals_and_false_ones_differ() -> None:
-    names = [t["name"] for t in located_figure(located(8), "k", "Found").traces]
+    names = [t.name for t in located_figure(located(8), "k", "Found").drawing.data]
     assert {"found", "found, but false", "refused", "to the true pose"} <= set(names)
 
 

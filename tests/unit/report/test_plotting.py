@@ -9,7 +9,7 @@ from reports import landmark_map, loop
 
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer
-from fgslam.report.plotting import plot
+from fgslam.report.figures import plot
 
 FRAMES = 40
 
@@ -42,7 +42,7 @@ def test_paths_errors_nees_and_times_have_a_panel_each() -> None:
 def test_the_legend_names_each_estimator_and_the_truth_once() -> None:
     figure = plot({"a": timed(estimate(0.1)), "b<i>": timed(estimate(0.2))}, loop(FRAMES))
     shown = [(t.name, t.legendgroup) for t in figure.data if t.showlegend]
-    assert shown == [("a", "estimator 0"), ("b&lt;i&gt;", "estimator 1"), ("truth", "truth")]
+    assert shown == [("a", "a"), ("b&lt;i&gt;", "b<i>"), ("truth", "truth")]
     colours = {t.legendgroup: t.line.color for t in figure.data if t.showlegend}
     assert len(set(colours.values())) == 3
 

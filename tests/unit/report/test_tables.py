@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import OutputError
-from fgslam.report.tables import write_csv, write_json
+from fgslam.report.content import write_csv, write_json
 
 
 def test_cells_are_text_that_reads_back(tmp_path: Path) -> None:

@@ -28,11 +28,7 @@ from fgslam.evaluation.judging import Answer, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
 from fgslam.report.content import TextTable
 from fgslam.report.point_cloud import MapPoints
-from fgslam.report.tables import (
-    RESULT_COLUMNS,
-    TIME_COLUMNS,
-    write_comparison_csv,
-)
+from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
 from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.estimator_files import points_from_log

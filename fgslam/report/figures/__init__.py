@@ -1,1 +1,0 @@
-"""Figures as plotly traces in plain values, made of plain arrays; pages and PNGs show them."""
