@@ -47,6 +47,7 @@ check: setup ## linter, formatter and type checker; changes nothing
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+	.venv/bin/python -m scripts.check_words
 
 docs: setup ## build the documentation into build/site; strict, without network
 	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --strict --quiet

@@ -1,4 +1,4 @@
-"""What a person sees in the terminal: progress, and what any run, comparison or trial says."""
+"""What a person sees in the terminal: progress, and what any run, comparison or trial reports."""
 
 from __future__ import annotations
 

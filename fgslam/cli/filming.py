@@ -26,7 +26,7 @@ def film(
     ] = None,
     overwrite: options.Overwrite = False,
 ) -> None:
-    """Make a film of a run: images with their matches, beside the map as it grows.
+    """Make a film of a run: images with their matches, next to the map as it grows.
 
     Of what fgslam follow wrote: images with the path image, its probability, the way home as an
     arrow, and the command or why there is none.

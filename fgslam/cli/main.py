@@ -75,10 +75,10 @@ def run(  # noqa: PLR0913 - each option is a parameter
 ) -> None:
     """Map a recording, or run an experiment: images in, run folder out.
 
-    Of a recording the layout is recognised and said; its odometry is used where it has some, and
+    Of a recording the layout is recognised and printed; its odometry is used where it has some, and
     what is known of the truth only to judge. fgslam init prints the configuration that repeats it.
 
-    With --map-in it begins in a saved map: map.start says where, map.extend whether it changes it.
+    With --map-in it begins in a saved map: map.start is where, map.extend whether it changes it.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
@@ -90,9 +90,9 @@ def run(  # noqa: PLR0913 - each option is a parameter
     )
     steered = {"estimator.kind": estimator, "map.load": map_in, "map.save": map_out}
     chosen += options.as_overrides(steered)
-    settings, said = experiment_of(config, camera, [*(overrides or ()), *chosen])
-    if said:
-        typer.echo(said)
+    settings, about = experiment_of(config, camera, [*(overrides or ()), *chosen])
+    if about:
+        typer.echo(about)
     folder = out or Path("runs") / settings.name
 
     # Not before: a wrong key is answered before any library of numbers is loaded.
@@ -162,9 +162,9 @@ def compare(  # noqa: PLR0913 - each option is a parameter
 ) -> None:
     """Replay runs' measurements through estimators and set them side by side.
 
-    Every estimator gets exactly the measurements that the run has logged. An estimator that fails
-    says where and why; the others go on. With --trials the experiment is repeated with new noise,
-    and paired tests say whether the smoothers beat the filters.
+    Every estimator gets exactly the measurements that the run has logged. One that fails reports
+    where and why; the others go on. With --trials the experiment is repeated with new noise, and
+    paired tests say whether the smoothers beat the filters.
 
     Ctrl-C ends it early; the same command with --resume does what is left.
     """
@@ -225,7 +225,7 @@ def localize(  # noqa: PLR0913 - each option is a parameter
 ) -> None:
     """Where in a map were these frames taken? Without any prior.
 
-    A pose is given only where it is beyond doubt, with the reasons. Exits with 3 where fewer than
+    A pose is given only where it is certain, with the reasons. Exits with 3 where fewer than
     half of the queries were answered, with 2 where map or recording cannot be used.
     """
     from fgslam.runs.tasks.localisation import Wanted
@@ -275,7 +275,7 @@ def export(  # noqa: PLR0913 - each option is a parameter
 ) -> None:
     """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
 
-    Of a saved map alone it says what is in it.
+    Of a saved map alone it lists what is in it.
     """
     from fgslam.runs.exporting import Wanted, export_run
 
@@ -303,7 +303,7 @@ def merge(
     out: Annotated[Path, typer.Option(metavar="MAP", help="where to write both as one")],
     overwrite: options.Overwrite = False,
 ) -> None:
-    """Make two saved maps of one place into one; refuses what does not overlap beyond doubt."""
+    """Make two saved maps of one place into one; refuses what does not surely overlap."""
     from fgslam.runs.maps import merge_files
 
     for line in merge_files(first, second, out, overwrite):
@@ -342,7 +342,7 @@ def inspect(  # noqa: PLR0913 - each option is a parameter
 ) -> None:
     """Say what is in a recording, and what is wrong with it, in words.
 
-    Exits with 0 whatever the report says, with 2 where the recording cannot be opened at all.
+    Exits with 0 whatever the report finds, with 2 where the recording cannot be opened at all.
     """
     from fgslam.cli.console import progress_bar
     from fgslam.runs.inspection import inspect_recording
@@ -380,7 +380,7 @@ def main() -> None:
     """Entry point: runs a command, turns a user's mistake into one line and exit status 2."""
     # None is used, and the search through all installed packages is a tenth of reading settings.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    # What is wrong with an image is said here; what its header claims is not believed.
+    # What is wrong with an image is reported here; what its header claims is not trusted.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "100000000")
     arguments = sys.argv[1:] or ["--help"]

@@ -355,7 +355,7 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         metavar="ADDRESS",
-        help="of a Dask scheduler whose workers do it, tcp://HOST:PORT; whoever reaches that "
+        help="of a Dask scheduler whose workers do it, tcp://HOST:PORT; anyone who reaches that "
         "address runs code as its workers' user",
     ),
 ]

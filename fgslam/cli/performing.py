@@ -1,4 +1,4 @@
-"""What the commands that run something share: progress and stop flag, what is said, how it ends."""
+"""What the commands that run something share: progress and stop flag, results, exit status."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def under_way() -> Iterator[tuple[Tell, Callable[[], bool]]]:
 
 @contextmanager
 def watched_by(config: Experiment, live: bool, file: Path | None) -> Iterator[Watch | None]:
-    """What shows a run in the viewer, frame by frame; None where nobody watches."""
+    """What shows a run in the viewer, frame by frame; None without a viewer."""
     if not live and file is None:
         yield None
         return

@@ -78,7 +78,7 @@ def follow(  # noqa: PLR0913 - each option is a parameter
 ) -> None:
     """Follow a route with another recording of the way: place, homing vector and command.
 
-    What a robot would be told at each image, by the same follower; refusals with their reason.
+    What a robot would be commanded at each image, by the same follower; refusals with their reason.
     Exits with 1 where no image is recognised. Without --camera it is the route's own.
     """
     from fgslam.runs.bare_routes import following
@@ -100,7 +100,7 @@ def join(
     """Join routes where their views match: one map, with crossroads.
 
     A place is called after its route's file and its image: monday/12. Routes may have been taught
-    on different days; where they have nothing in common they stay apart, and that is said.
+    on different days; where they have nothing in common they stay apart, and that is reported.
     """
     from fgslam.runs.bare_routes import joining
 

@@ -104,7 +104,7 @@ def _require_current_folder() -> None:
         os.getcwd()
     except FileNotFoundError:
         print(
-            "fgslam: the current folder has been deleted, or made anew; change to one that "
+            "fgslam: the current folder has been deleted, or made again; change to one that "
             "exists: cd FOLDER",
             file=sys.stderr,
         )

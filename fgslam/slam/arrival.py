@@ -27,7 +27,7 @@ class Arrival:
         saved: the map; its world is the run's.
         prior: pose expected of the first frame, and how well it is known before its landmarks
             are seen.
-        relocalised: it was found by these landmarks, and says nothing beside them.
+        relocalised: it was found by these landmarks, and adds nothing to them.
         extends: the run adds to the map and corrects it; else it leaves it as it is.
     """
 
@@ -55,10 +55,10 @@ class MapStart:
         """Refuses a map of other cameras, and an empty one. Raises MapError."""
         require_rig(self.saved, rig, self.name)
         if not len(self.saved):
-            raise MapError(f"{self.name}: holds no landmark; make the map anew")
+            raise MapError(f"{self.name}: holds no landmark; make the map again")
 
     def known(self) -> Arrival | None:
-        """Where the map itself tells the first pose; None where a frame is to be located in it.
+        """Where the map itself states the first pose; None where a frame is to be located in it.
 
         Raises:
             MapError: it is to be the map's last pose, and the map has no trajectory.
@@ -80,7 +80,7 @@ class MapStart:
 
 
 def trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
-    """Landmarks seen often enough to be there (Se et al. 6.1), with their looks."""
+    """Landmarks seen often enough to be there (Se et al. 6.1), with their appearances."""
     sure = saved.permanent | (saved.hits >= valid_hits)
     landmarks = saved.landmarks.select(sure)
     return landmarks, saved.appearances.of(landmarks.ids)

@@ -1,10 +1,10 @@
 """Final poses of frames that nothing measured, between frames that landmarks located.
 
-What such a frame was predicted to be says nothing once the frames after it are located: its steps
+The prediction of such a frame is worth nothing once the frames after it are located: its steps
 are free, and the estimators leave it where it was guessed. It is interpolated in time between the
-located frames around its gap, and so are frames that are located beside each other only: along the
+located frames around its gap, and so are frames located relative to each other only: along the
 screw motion from one to the other, bent towards the cubic (Hermite's) that begins and ends with the
-velocities there. By how much, and how uncertain that is, the drive tells: wherever as many frames
+velocities there. By how much, and how uncertain that is, the drive shows: wherever as many frames
 in a row are located, the same is done with them and compared. So the weight of the cubic is found
 by least squares (stacking: Breiman, Machine Learning 24, 1996), and the deviations are the errors
 left.
@@ -50,8 +50,8 @@ def bridged(estimate: Estimate, parts: MapParts) -> Estimate:
     Frames after the last located one stay.
 
     Args:
-        estimate: of as many frames as ``parts`` has booked; of others it stays as it is.
-        parts: says which frames and landmarks hang together with the first frame.
+        estimate: of as many frames as ``parts`` has recorded; of others it stays as it is.
+        parts: which frames and landmarks are connected with the first frame.
     """
     known, trajectory = parts.connected, estimate.trajectory
     if len(known) != len(trajectory) or known.all():
@@ -104,7 +104,7 @@ def _bridged_parts(parts: MapParts) -> list[tuple[int, IntArray, Gap]]:
 def _between(gap: Gap, frame: int, drive: _Drive, covariances: FloatArray) -> PoseSigma:
     """Pose of a frame between the ends of its gap, and its covariance."""
     first, last = gap
-    compared = drive.stretches(gap)
+    compared = drive.compared_with(gap)
     shift = frame - first
     ways = [drive.way(start, start + shift, start + last - first) for start in compared]
     true = drive.poses[compared + shift]
@@ -120,21 +120,21 @@ def _between(gap: Gap, frame: int, drive: _Drive, covariances: FloatArray) -> Po
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Way:
-    """Where a frame lies between two others: straight on, and by how much beside it on the cubic.
+    """Where a frame lies between two others: on the straight motion, and on the cubic next to it.
 
     Attributes:
         start: (4, 4) pose of the first.
         straight: (6,) tangent vector at it.
-        bend: (6,) to be added to that.
+        correction: (6,) to be added to that.
     """
 
     start: FloatArray
     straight: FloatArray
-    bend: FloatArray
+    correction: FloatArray
 
     def pose(self, weight: FloatArray) -> FloatArray:
         """Pose (4, 4); ``weight`` (2,) is that of the cubic, in rotation and position."""
-        return self.start @ se3_exp(self.straight + np.repeat(weight, 3) * self.bend)
+        return self.start @ se3_exp(self.straight + np.repeat(weight, 3) * self.correction)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,7 +145,7 @@ class _Drive:
     poses: FloatArray
     known: BoolArray
 
-    def stretches(self, gap: Gap) -> IntArray:
+    def compared_with(self, gap: Gap) -> IntArray:
         """(w,) where located frames begin, in a row as many as a gap with its ends; the nearest."""
         count = gap[1] - gap[0] + 1
         before = np.concatenate([[0], np.cumsum(self.known)])  # located frames before each
@@ -178,23 +178,24 @@ class _Drive:
 
 def _weight(ways: list[_Way], true: FloatArray) -> FloatArray:
     """(2,) of the cubic in rotation and position, from 0 to 1: least squares over known poses."""
-    beside, along = np.zeros(2), np.zeros(2)
+    across, along = np.zeros(2), np.zeros(2)
     for way, pose in zip(ways, true, strict=True):
-        off, bend = se3_log(inverse(way.start) @ pose) - way.straight, way.bend
-        beside += (off * bend).reshape(2, 3).sum(axis=1)
-        along += (bend * bend).reshape(2, 3).sum(axis=1)
-    return np.clip(beside / np.maximum(along, _STILL**2), 0.0, 1.0)
+        off = se3_log(inverse(way.start) @ pose) - way.straight
+        correction = way.correction
+        across += (off * correction).reshape(2, 3).sum(axis=1)
+        along += (correction * correction).reshape(2, 3).sum(axis=1)
+    return np.clip(across / np.maximum(along, _STILL**2), 0.0, 1.0)
 
 
 def _variance(own: FloatArray, errors: FloatArray, lengths: FloatArray) -> FloatArray:
     """(2,) of rotation and position, per axis, of an interpolated frame.
 
     One sample is the gap's own length: all of it may have been made at once. Where that is longer
-    than the stretches compared, their errors count for more in the same proportion.
+    than the segments compared, their errors count for more in the same proportion.
 
     Args:
         own: (2,) angle and distance between the gap's ends.
-        errors: (w, 2) of stretches that were interpolated.
+        errors: (w, 2) of segments that were interpolated.
         lengths: (w, 2) angles and distances between their ends.
     """
     usual = np.sqrt((lengths**2).mean(axis=0)) if len(lengths) else own
@@ -212,7 +213,7 @@ def _apart(a: FloatArray, b: FloatArray) -> FloatArray:
 def _better(one: PoseSigma, other: PoseSigma) -> PoseSigma:
     """The more certain rotation and the more certain position of two; the first where it is both.
 
-    Where they come from different ones, nothing is known of how their errors hang together.
+    Where they come from different ones, the correlation of their errors is not known.
     """
     turn, place = (
         one if np.trace(one[1][k, k]) <= np.trace(other[1][k, k]) else other

@@ -1,4 +1,4 @@
-"""What a session says of its cameras: frames whose images could not be used, unequal exposure."""
+"""Remarks of a session on its cameras: frames whose images could not be used, unequal exposure."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
-_LOCATING_STREAM = 12  # of random numbers, beside those of the recording
+_LOCATING_STREAM = 12  # of random numbers, next to those of the recording
 
 
 def as_measured(rig: CameraRig, settings: FrontendSettings) -> CameraRig:

@@ -15,8 +15,8 @@ _FEWEST = 3  # frames: one or two may show a blank wall
 _LEAST_MATCHED = 0.02
 """Of the right image's features, share that finds its partner. Of swapped images only what agrees
 by chance does, under 0.01 (rendered lab with three cameras, kitti06); of sound ones a third and
-more (those two, the light field, the flight, the suburb). Of two swapped cameras up to 0.13 agree
-in the lab, 0.07 in euroc_v101: those the camera watch tells."""
+more (those two, the light field, the drone, the suburb). Of two swapped cameras up to 0.13 agree
+in the lab, 0.07 in euroc_v101: those the camera watch finds."""
 _DARK = 15
 """Largest grey value of a dark image, of 255: 12-bit values reach 4095, of which the upper eight of
 16 bits are 15."""

@@ -41,7 +41,7 @@ def turned_by(guess: Odometry, turn: Odometry) -> Odometry:
 class GyroscopeError:
     """Bias of the gyroscope, and by how much its noise exceeds what is stated.
 
-    A Kalman filter beside the estimator. The pose of a frame was predicted by the step, whose error
+    A Kalman filter of its own. The pose of a frame was predicted by the step, whose error
     the bias is part of; what matches then corrected is by that part the bias's. Neither the
     matches nor their noise need be known for it: the correction and the covariances before and
     after it say the same.
@@ -87,7 +87,7 @@ class GyroscopeError:
         return step
 
     def observe(self, pose: Prediction) -> None:
-        """Learns from the pose that followed; one that is the prediction itself says nothing."""
+        """Learns from the pose that followed; the prediction itself is no measurement."""
         step, before = self._step, self._before
         self._step, self._before = None, pose
         if step is None or before is None:
@@ -105,7 +105,7 @@ class GyroscopeError:
             self._covariance = 0.5 * (left + left.T)
 
     def _learn_noise(self, correction: FloatArray, prior: FloatArray, gained: FloatArray) -> None:
-        """The corrections' squares beside those that the covariances make expect, fading."""
+        """The corrections' squares relative to those that the covariances make expect, fading."""
         found = float(correction @ np.linalg.solve(prior, correction))
         expected = max(float(np.trace(np.linalg.solve(prior, gained))), 0.0)
         self._found = _FADING * self._found + self.noise_factor * found

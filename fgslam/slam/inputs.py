@@ -46,7 +46,7 @@ def _is_colour(image: np.ndarray) -> bool:
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     """Grey rectified images (right, left[, top]) of the rig's size from (left, right[, top]).
 
-    Copies: tracking looks back at the last images, and a camera loop may fill the same ones again.
+    Copies: tracking needs the last images again, and a camera loop may fill the same ones again.
 
     Raises:
         FrameError: another number of images, or one of another size, type or shape.

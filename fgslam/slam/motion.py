@@ -44,14 +44,14 @@ class MotionModel(Protocol):
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
         """Learns the last frame's pose; ``measured``: tied to odometry or the map, or its first.
 
-        The pose's covariance is what its matches left of it, beside the map.
+        The pose's covariance is what its matches left of it, relative to the map.
         """
         ...
 
     def displaced(self, timestamp: float, wTc: FloatArray, carried: bool) -> None:
         """Learns a pose that does not go on from the one before: between them lies no motion.
 
-        A closed loop has corrected it; or the camera was ``carried`` and has been found anew.
+        A closed loop has corrected it; or the camera was ``carried`` and has been found again.
         """
         ...
 
@@ -65,7 +65,7 @@ MOTION_MEMBERS = ("uses_odometry", "between", "observe", "displaced", "regained"
 
 
 def description_of(motion: MotionModel) -> dict[str, Any]:
-    """What the log says of a motion model.
+    """What the log holds of a motion model.
 
     Of one that is not of this package only the name: what it measured is in the log frame by
     frame, and over other frames a replay assumes constant velocity.
@@ -191,8 +191,8 @@ class ConstantVelocityMotion:
     def observe(self, timestamp: float, pose: Prediction, measured: bool) -> None:
         """Updates the velocity from the last two measured poses, its noise from how it changed.
 
-        The frame that founds the map counts as one, whatever its pose: what follows is measured
-        against it. Until then the start moves on with the frames.
+        The frame that initialises the map counts as one, whatever its pose: what follows is
+        measured against it. Until then the start moves on with the frames.
         """
         wTc = pose.wTc
         if measured and self._founded:
@@ -205,7 +205,7 @@ class ConstantVelocityMotion:
         self._timestamp = timestamp
 
     def _learn(self, step: FloatArray, left: FloatArray, dt: float) -> None:
-        """A step (4, 4) over ``dt`` seconds beside the one that the velocity made expect."""
+        """A step (4, 4) over ``dt`` seconds relative to the one that the velocity made expect."""
         if self._velocity is not None and self._settings.adapt:
             innovation = se3_log(se3_exp(-self._velocity * dt) @ step)
             self._noise.learn(innovation, left, dt**2)

@@ -25,7 +25,7 @@ LiveFrame: TypeAlias = tuple[float, Images | None, BodyMotion]
 
 
 class NewestFrame:
-    """Holds one frame, the newest that nobody has taken; safe between threads.
+    """Holds one frame, the newest that has not been taken; safe between threads.
 
     ::
 

@@ -1,4 +1,4 @@
-"""The noise that each frame was estimated with, where the drive itself says how large it is.
+"""The noise that each frame was estimated with, where the drive itself shows how large it is.
 
 Of the motion model (:mod:`fgslam.slam.motion_noise`), of matches
 (:mod:`fgslam.frontend.tracking.match_noise`) and of a graph's measurements

@@ -1,4 +1,4 @@
-"""What a session says of frames that only a guess places beside the rest, or against odometry."""
+"""Remarks on frames that a guess alone places relative to the rest, or that contradict odometry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def connected_frames(recorder: RunRecorder, parts: MapParts) -> BoolArray:
 
 
 def in_first_map(recorder: RunRecorder, parts: MapParts) -> int:
-    """How many frames are located in what hangs together with the first one by measurements."""
+    """How many frames are located in what measurements connect with the first one."""
     return int((located_frames(recorder) & connected_frames(recorder, parts)).sum())
 
 
@@ -36,7 +36,7 @@ def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     """Lines on frames that nothing measured, that lie in parts of their own, or off odometry."""
     return (
         *_of_bridged(recorder, parts),
-        *_of_adrift(recorder, parts),
+        *_of_unconnected(recorder, parts),
         *_of_contradicted(recorder),
     )
 
@@ -55,16 +55,16 @@ def _of_bridged(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     )
 
 
-def _of_adrift(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+def _of_unconnected(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
     """A line where frames are located in parts that a guess alone joins to the first."""
-    adrift = located_frames(recorder) & ~connected_frames(recorder, parts)
-    if not adrift.any():
+    apart = located_frames(recorder) & ~connected_frames(recorder, parts)
+    if not apart.any():
         return ()
-    numbers = recorder.log.numbers[adrift]
+    numbers = recorder.log.numbers[apart]
     known, n = in_first_map(recorder, parts), len(recorder)
     return (
-        f"{_named(numbers)}: located beside each other only, not in the first map; before is a gap "
-        f"that neither landmarks nor odometry bridge; {known} of {n} frames "
+        f"{_named(numbers)}: located relative to each other only, not in the first map; before is "
+        f"a gap that neither landmarks nor odometry bridge; {known} of {n} frames "
         f"({100.0 * known / n:.0f} %) are located in the first map",
     )
 

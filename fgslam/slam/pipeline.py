@@ -102,7 +102,7 @@ class SlamPipeline:
         places: None where none are recognised.
         calibration: of the rig, from the drive; None where the calibration is taken as stated.
         key_frames: tracking between key frames; None where every frame is one.
-        watch: says which frames' images cannot be used; None uses all.
+        watch: which frames' images cannot be used; None uses all.
         describe: finds the features of a frame that came without: of all images, or of the
             reference image where patches measure the rest (`frontend.stereo.others`).
         describe_reference: of the first frame, and of one that tracked patches have located,
@@ -149,7 +149,7 @@ class SlamPipeline:
         carried = self._track_patches(prediction, frame, landmarks)  # between key frames
         if self.key_frames and carried and self._needs_no_features(carried):
             stereo, features = carried.carried.features, None
-            matched = Matched(carried.tracked.ego_motion, self.key_frames.book(carried))
+            matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
         else:
             frame = self._find_features(frame, carried, snapshot)  # 2.1
             every = self._match_stereo(frame)  # 2.2
@@ -309,7 +309,7 @@ class SlamPipeline:
         if self.key_frames is None:
             tracked = self.tracker.track(prediction, landmarks, stereo)
         else:
-            tracked, stereo = self.key_frames.beside(carried, prediction, landmarks, stereo)
+            tracked, stereo = self.key_frames.track(carried, prediction, landmarks, stereo)
         located, initialises = False, True
         if frame.i == 0 and self.located is not None:
             again = self.tracker.track_anew(self.located, landmarks, stereo)
@@ -378,7 +378,7 @@ class SlamPipeline:
         noise = noise_in_use(self.motion, increment.odometry, self.tracker.noise, self.estimator)
         observe(self.motion, increment, ego_motion, stats)
         self.tracker.noise.learn(ego_motion)
-        self.tracker.parts.book(increment, stats.closed)
+        self.tracker.parts.record(increment, stats.closed)
         if self.places is not None:
             self.places.remember(increment, ego_motion.wTc, stats)
         return stats, noise

@@ -147,7 +147,7 @@ def replay(
     for k, increment in enumerate(log):
         try:
             frame = replay_frame(increment, estimator, solver, motion, k)
-            run.book(increment, frame)
+            run.record(increment, frame)
         except ESTIMATOR_FAULTS as error:
             where, why = f"frame {increment.index}: ", reason(error)
             return run.result(estimator, before_mb, where + why.removeprefix(where))
@@ -275,7 +275,7 @@ class _Replaying:
         self._noise: list[FrameNoise] = []
         self._parts = MapParts()
 
-    def book(self, increment: Increment, frame: ReplayedFrame) -> None:
+    def record(self, increment: Increment, frame: ReplayedFrame) -> None:
         """Keeps a frame's numbers. Raises FloatingPointError for a pose that is not finite."""
         stats, times = frame.stats, frame.stage_ms
         if not np.isfinite(stats.wTc).all():
@@ -284,7 +284,7 @@ class _Replaying:
         self._covariances.append(np.array(stats.covariance))
         self._closed += stats.closed
         self._noise.append(frame.noise)
-        self._parts.book(increment, stats.closed)
+        self._parts.record(increment, stats.closed)
         self._rows.append(
             ReplayRow(
                 status=frame.tracking.status.value,

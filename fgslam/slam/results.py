@@ -32,7 +32,7 @@ STAGES = (
     "update",
     "calibrate",
 )
-"""Per frame: `load` and `sift` run in threads beside the loop, `wait` is what they held it up."""
+"""Per frame: `load` and `sift` run in threads next to the loop, `wait` is what they held it up."""
 
 
 class FrameRow(NamedTuple):
@@ -76,9 +76,9 @@ class RunRecorder:
 
     def add(self, report: FrameReport, wait_ms: float, stereo_precision: float) -> None:
         """Appends one frame."""
-        beside = {"load": report.found.load_ms, "sift": report.found.sift_ms, "wait": wait_ms}
+        waited = {"load": report.found.load_ms, "sift": report.found.sift_ms, "wait": wait_ms}
         stages = dict.fromkeys(STAGES, 0.0) | report.stage_ms
-        times = stages | beside
+        times = stages | waited
         row = _row(report, stereo_precision)
         self.log.append(report.increment)  # may write to disk, and fail
         self.stage_ms.append(np.array([times[stage] for stage in STAGES]))
@@ -160,7 +160,7 @@ class Step(Brief):
 
     Attributes:
         index: number of the frame in the session, from 0, and from 0 again where the session begins
-            anew; -1 of one that was not located in the map that the session is to begin in.
+            again; -1 of one that was not located in the map that the session is to begin in.
         timestamp: seconds.
         wTc: (4, 4) pose of the right camera in the world, metres.
         covariance: (6, 6) of it, [rotation, translation], radians and metres, in the tangent space
@@ -236,7 +236,7 @@ class SessionResult(Brief):
         online_covariances: (n, 6, 6) of those.
         closed: of all loop closures offered so far, whether the estimator took them.
         frames: the record of every frame, by name of the column.
-        notes: what is to be said of the images, and of frames left out.
+        notes: remarks on the images, and of frames left out.
         rig: what the drive shows of the rig's calibration: estimated, with its covariance, and
             applied; None where the calibration is taken as it is stated.
     """
@@ -268,7 +268,7 @@ class SessionResult(Brief):
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What is to be said of the images, and what the estimator left out or had to repair."""
+        """Remarks on the images, and on what the estimator left out or had to repair."""
         return (*self.notes, *self.estimate.remarks)
 
     def column(self, name: str) -> npt.NDArray[Any]:

@@ -59,7 +59,7 @@ class Session:
 
     The world is the right camera's first frame: x right, y down, z forward, metres. Frames before
     the first one that shows enough to begin a map are left out of every result when that one comes,
-    unless odometry was measured to it: nothing says where they lie.
+    unless odometry was measured to it: nothing shows where they lie.
 
     Attributes:
         rig: the cameras.
@@ -285,7 +285,7 @@ class Session:
         except BaseException as error:
             if self.pipeline.rewound:
                 raise
-            # Parts of the frame may be booked: going on would estimate something else.
+            # Parts of the frame may be recorded: going on would estimate something else.
             self._failed = True
             self._ended = f"it failed at t = {timestamp:.6f} s ({' '.join(str(error).split())})"
             raise

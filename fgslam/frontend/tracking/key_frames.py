@@ -93,13 +93,13 @@ class KeyFrameTracker:
         tracked = self._tracker.solved(prediction, landmarks, (expected, matches, carried.features))
         return CarriedFrame(carried, tracked, self.lasts(carried, tracked, images[0]))
 
-    def book(self, frame: CarriedFrame) -> Association:
+    def record(self, frame: CarriedFrame) -> Association:
         """Records a frame between key frames; outliers are carried no further."""
         inliers = frame.tracked.ego_motion.inliers
         self._carrier.forget(frame.carried.ids[~inliers])
         return self._tracker.associate_carried(frame.tracked, frame.carried.features)
 
-    def beside(
+    def track(
         self,
         frame: CarriedFrame | None,
         prediction: Prediction,

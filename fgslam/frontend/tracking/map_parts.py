@@ -64,7 +64,7 @@ class MapParts:
         """The part that most of the landmarks (k,) belong to, the oldest of several; -1 of none."""
         return int(np.argmax(np.bincount(self.of(ids)))) if len(ids) else -1
 
-    def book(self, increment: Increment, closed: tuple[bool, ...]) -> None:
+    def record(self, increment: Increment, closed: tuple[bool, ...]) -> None:
         """Takes in a frame; ``closed``: which of its loops the estimator took."""
         seen = increment.observations
         held = self._held_by(seen.ids[~seen.is_new & ~increment.rejected], increment)

@@ -123,7 +123,7 @@ class Asker:
         frontend = config.frontend
         self.landmarks, looks = trusted(given.saved, frontend.database.valid_hits)
         if not len(self.landmarks):
-            raise MapError(f"{given.path}: holds no trusted landmark; make the map anew")
+            raise MapError(f"{given.path}: holds no trusted landmark; make the map again")
         self._config, self._sequence = config, sequence
         self._stereo: RigStereo = make_stereo(sequence.rig, frontend)
         self._relocaliser: Relocaliser = make_relocaliser(sequence.rig, frontend)

@@ -36,7 +36,7 @@ def frame(
 def booked(*frames: Increment) -> MapParts:
     parts = MapParts()
     for one in frames:
-        parts.book(one, (True,) * len(one.loops))
+        parts.record(one, (True,) * len(one.loops))
     return parts
 
 
@@ -88,7 +88,7 @@ def test_frames_before_the_first_landmark_are_the_beginning() -> None:
 def test_a_closure_joins_where_it_is_taken(taken: bool) -> None:
     loop = LoopClosure(0, np.eye(4), np.eye(6), observed(range(5), range(0)), np.empty((0, 2)))
     parts = booked(*BEFORE, GAP)
-    parts.book(frame(range(30, 50), loops=(loop,)), (taken,))
+    parts.record(frame(range(30, 50), loops=(loop,)), (taken,))
     assert bool(parts.connected.all()) is taken
 
 
@@ -96,7 +96,7 @@ def test_continued_from_its_state_it_is_the_same() -> None:
     parts, again = booked(*BEFORE, GAP), MapParts()
     again.restore(parts.state())
     for one in (parts, again):
-        one.book(frame(new=range(50, 60)), ())
+        one.record(frame(new=range(50, 60)), ())
     np.testing.assert_array_equal(parts.of(np.arange(60)), again.of(np.arange(60)))
     np.testing.assert_array_equal(parts.connected, again.connected)
     assert parts.of(np.array([55])) == [2]

@@ -52,7 +52,7 @@ def test_frames_that_are_interpolated_are_told() -> None:
 def test_frames_beyond_a_gap_are_told() -> None:
     parts = Apart([True, True, False, False, False])
     (remark,) = part_remarks(recorded(STATUSES), parts)
-    assert remark.startswith("2 frames from 30 to 40: located beside each other only")
+    assert remark.startswith("2 frames from 30 to 40: located relative to each other only")
     assert remark.endswith("2 of 5 frames (40 %) are located in the first map")
 
 
