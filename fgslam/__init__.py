@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from typing import Any
 
     from fgslam.backend.protocol import Estimator
-    from fgslam.cameras.omni.camera_files import load_camera
+    from fgslam.cameras.omni_files import load_camera
     from fgslam.cameras.rig import StereoRig, load_rig
     from fgslam.core.features import Features
     from fgslam.core.homing import Refusal, TwoViewVector
@@ -104,7 +104,7 @@ _HOMES = {
     "Trajectory": "fgslam.core.trajectories",
     "TwoViewVector": "fgslam.core.homing",
     "compare": "fgslam.evaluation.comparing",
-    "load_camera": "fgslam.cameras.omni.camera_files",
+    "load_camera": "fgslam.cameras.omni_files",
     "load_rig": "fgslam.cameras.rig",
     "open_recording": "fgslam.runs.library",
     "plot": "fgslam.report.figures",

@@ -1,9 +1,9 @@
 """How straight and upright vertical edges are in an unwrapped picture: a check of a calibration.
 
-In a cylinder view (:class:`fgslam.cameras.omni.panoramas.Cylinder`) of a level camera the image of
+In a cylinder view (:class:`fgslam.cameras.omni.Cylinder`) of a level camera the image of
 an upright edge is a part of a column, wherever it is. A wrong centre leans and bends them; so does
 a tilted camera, by the tilt times the sine of their bearing from its axis. A wrong profile of the
-mirror alone leaves them upright: that is for :mod:`fgslam.cameras.omni.ring_calibration`.
+mirror alone leaves them upright: that is for :mod:`fgslam.cameras.rings`.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray
 from fgslam.worlds.patches import RayCaster, Surface, Thing, rectangle, stack
 from fgslam.worlds.renderer import Layer, flat_light

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from PIL import Image as PictureFile
 from scipy import ndimage
 
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.sensors import CameraRig
 

@@ -26,7 +26,7 @@ from fgslam.cameras.lenses import (
     checked_camera,
     checked_view,
 )
-from fgslam.cameras.omni.ocamcalib import read_ocamcalib
+from fgslam.cameras.omni import read_ocamcalib
 from fgslam.cameras.stereo_formats import (
     has_intrinsics,
     has_step,

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.camera_files import make_camera
+from fgslam.cameras.omni import OmniCamera
+from fgslam.cameras.omni_files import make_camera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.files import read_text, shown_in

@@ -8,11 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgslam.cameras.omni.lens_camera import LensCamera
-from fgslam.cameras.omni.mirrors import RadialCamera
-from fgslam.cameras.omni.ocamcalib import OCamCamera
-from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.cameras.omni.ring_calibration import MirrorCircle, find_mirror_circle
+from fgslam.cameras.omni import Equirectangular, LensCamera, OCamCamera, RadialCamera
+from fgslam.cameras.rings import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.datasets.omni import OmniRecording

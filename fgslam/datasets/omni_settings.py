@@ -7,7 +7,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.cameras.omni.settings import (
+from fgslam.cameras.settings import (
     BloggieSettings,
     EquirectangularSettings,
     HyperbolicMirrorSettings,

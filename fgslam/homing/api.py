@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from fgslam.backend.homing.factory import homing_settings_of, make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorKind
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import Image
 from fgslam.core.checks import is_finite_number, later_time, require_seed
 from fgslam.core.errors import (

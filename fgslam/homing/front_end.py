@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.homing import (
     BearingMatches,

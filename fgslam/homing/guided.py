@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import ByteArray
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError

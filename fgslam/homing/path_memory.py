@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.camera_values import camera_of, camera_values
+from fgslam.cameras.omni import OmniCamera
+from fgslam.cameras.omni_files import camera_of, camera_values
 from fgslam.core.array_files import (
     ArrayFile,
     Items,

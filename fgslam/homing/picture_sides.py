@@ -13,10 +13,7 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.lens_camera import LensCamera
-from fgslam.cameras.omni.mirrors import RadialCamera
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialCamera
 from fgslam.core.arrays import Image
 from fgslam.core.homing import OmniFeatures
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor

@@ -16,7 +16,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import IntArray
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import Image
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of
 from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays

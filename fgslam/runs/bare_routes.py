@@ -120,7 +120,7 @@ def way_said(
 
 
 def _place(joined: RouteMap, picture: Path, camera: str | None) -> MapPlace:
-    from fgslam.cameras.omni.camera_files import load_camera
+    from fgslam.cameras.omni_files import load_camera
     from fgslam.core.homing import Refusal
     from fgslam.datasets.images import read_colour_image
 
@@ -159,7 +159,7 @@ def _named(recording: Path) -> str:
 
 
 def _dataset(recording: Path, camera: str) -> dict[str, Any]:
-    from fgslam.cameras.omni.camera_files import camera_keys  # loads arrays
+    from fgslam.cameras.omni_files import camera_keys  # loads arrays
 
     if not recording.exists():
         raise DatasetError(f"{recording}: no such film or folder; check the path")

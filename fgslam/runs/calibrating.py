@@ -11,13 +11,12 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from fgslam.cameras.board_calibration import View, calibrate
-from fgslam.cameras.board_check import held_out, held_out_alone
 from fgslam.cameras.boards import Board, Corners, find_corners, find_corners_of_wide, sizes_that_fit
+from fgslam.cameras.calibrate import View, calibrate, held_out, held_out_alone
 from fgslam.cameras.lenses import Calibration
-from fgslam.cameras.omni.mirrors import MirrorFrame
-from fgslam.cameras.omni.ring_calibration import calibrate_from_rings, find_mirror_circle
+from fgslam.cameras.omni import MirrorFrame
 from fgslam.cameras.rig import assembled
+from fgslam.cameras.rings import calibrate_from_rings, find_mirror_circle
 from fgslam.cameras.write_formats import raw_values
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError

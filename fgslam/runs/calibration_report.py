@@ -7,17 +7,20 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.board_calibration import NAMES, BoardCalibration, View
-from fgslam.cameras.board_check import (
+from fgslam.cameras.boards import Board
+from fgslam.cameras.calibrate import (
     DEPTH_SHARE,
+    INTRINSICS,
+    NAMES,
+    PARAMETERS,
+    BoardCalibration,
     HeldOut,
     HeldOutAlone,
+    View,
     coverage,
     coverage_of_circle,
     farthest_from_axis,
 )
-from fgslam.cameras.board_projection import INTRINSICS, PARAMETERS
-from fgslam.cameras.boards import Board
 from fgslam.core.arrays import FloatArray
 from fgslam.report.content import write_csv
 from fgslam.report.pictures.board import draw_corners

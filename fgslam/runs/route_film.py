@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera, unit_rays
+from fgslam.cameras.omni import OmniCamera, unit_rays
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, StoredMapError
 from fgslam.datasets.omni import OmniRecording

@@ -13,9 +13,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.mirrors import HyperbolicMirror
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular, HyperbolicMirror, OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.errors import CalibrationError
 from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house

@@ -28,7 +28,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.worlds.patches import PatchArrays, RayCaster

@@ -14,8 +14,7 @@ from scipy.optimize import least_squares
 
 import fgslam as fg
 from fgslam.cameras.lenses import RawCamera
-from fgslam.cameras.omni.lens_camera import LensCamera
-from fgslam.cameras.omni.mirrors import MirrorFrame, RadialPolynomial
+from fgslam.cameras.omni import LensCamera, MirrorFrame, RadialPolynomial
 from fgslam.cameras.rig import read_calibration_file
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import so3_exp, so3_log

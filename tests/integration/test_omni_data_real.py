@@ -9,12 +9,9 @@ import numpy as np
 import pytest
 from edge_straightness import upright_edges
 
-from fgslam.cameras.omni.camera import unwrap_maps
-from fgslam.cameras.omni.mirrors import RadialCamera
-from fgslam.cameras.omni.ocamcalib import OCamCamera
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
-from fgslam.cameras.omni.ring_calibration import find_mirror_circle, mirror_offset
-from fgslam.cameras.omni.settings import OCamCalibSettings
+from fgslam.cameras.omni import Cylinder, Equirectangular, OCamCamera, RadialCamera, unwrap_maps
+from fgslam.cameras.rings import find_mirror_circle, mirror_offset
+from fgslam.cameras.settings import OCamCalibSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni import OmniRecording

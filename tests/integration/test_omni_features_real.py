@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import between

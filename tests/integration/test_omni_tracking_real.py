@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.camera_files import make_camera
-from fgslam.cameras.omni.ring_calibration import find_mirror_circle
-from fgslam.cameras.omni.settings import HyperbolicMirrorSettings
+from fgslam.cameras.omni_files import make_camera
+from fgslam.cameras.rings import find_mirror_circle
+from fgslam.cameras.settings import HyperbolicMirrorSettings
 from fgslam.core.homing import FeatureKind, TwoViewVector
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni_settings import OmniVideoSettings

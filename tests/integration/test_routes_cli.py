@@ -117,7 +117,7 @@ def test_a_mirrored_recording_is_told(
 
 
 def textured_room_camera() -> object:
-    from fgslam.cameras.omni.panoramas import Equirectangular
+    from fgslam.cameras.omni import Equirectangular
 
     top = float(np.deg2rad(54.0))
     return Equirectangular(301, 91, top, -top)

@@ -6,9 +6,15 @@ import numpy as np
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fgslam.cameras.omni.camera import OmniCamera, angles_of, measure
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni import (
+    Cylinder,
+    Equirectangular,
+    HyperbolicMirror,
+    MirrorFrame,
+    OmniCamera,
+    angles_of,
+    measure,
+)
 from fgslam.core.planar import wrap
 
 frames = st.builds(

@@ -450,7 +450,6 @@ PRIVATE_IN_TESTS = frozenset(
         "tests/unit/backend/test_rig_doubt.py",
         "tests/unit/backend/test_sampled_errors.py",
         "tests/unit/backend/test_submaps.py",
-        "tests/unit/cameras/test_wide_calibration.py",
         "tests/unit/core/test_log_blocks.py",
         "tests/unit/core/test_log_file.py",
         "tests/unit/datasets/test_clock.py",

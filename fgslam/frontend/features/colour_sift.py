@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fgslam.cameras.omni.camera import OmniCamera, measure
+from fgslam.cameras.omni import OmniCamera, measure
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.homing import UprightFeatures
 from fgslam.core.planar import wrap

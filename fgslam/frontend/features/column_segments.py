@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.homing import ColumnSegments
 from fgslam.frontend.features.colour_moments import colour_from_means, moment_images

@@ -5,8 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera, require_own_image, unit_rays, unwrap_maps
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni import (
+    Cylinder,
+    Equirectangular,
+    OmniCamera,
+    require_own_image,
+    unit_rays,
+    unwrap_maps,
+)
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures

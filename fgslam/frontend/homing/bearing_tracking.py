@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.camera import OmniCamera, measure
+from fgslam.cameras.omni import OmniCamera, measure
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.homing import (
     BearingMatches,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import unit_rays
+from fgslam.cameras.omni import unit_rays
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.core.geometry import skew

@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 
-from fgslam.cameras.omni.camera import Float32, OmniCamera, require_own_image, unwrap_maps
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular, Float32, OmniCamera, require_own_image, unwrap_maps
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import FrameError
 from fgslam.frontend.features.colour_sift import wrapping_period

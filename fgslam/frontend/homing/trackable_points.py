@@ -13,7 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures
 from fgslam.core.planar import wrap

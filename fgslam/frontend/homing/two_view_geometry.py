@@ -26,7 +26,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import unit_rays
+from fgslam.cameras.omni import unit_rays
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.homing import BearingMatches, LocalMap, TwoViewVector
 from fgslam.core.planar import wrap

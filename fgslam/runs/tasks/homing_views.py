@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from fgslam.cameras.omni.camera import OmniCamera
+from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import ConfigError, OutputError, StoredMapError
 from fgslam.core.files import make_subfolder

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.board_calibration import BoardCalibration, View, calibrate
-from fgslam.cameras.board_check import coverage, held_out, judged
 from fgslam.cameras.boards import Board, Corners, find_corners, sizes_that_fit
+from fgslam.cameras.calibrate import BoardCalibration, View, calibrate, coverage, held_out, judged
 from fgslam.cameras.lenses import RawCamera
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError

@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image as PictureFile
 
-from fgslam.cameras.omni.camera import OmniCamera, angles_of
-from fgslam.cameras.omni.camera_files import load_camera
-from fgslam.cameras.omni.camera_values import camera_of, camera_values
-from fgslam.cameras.omni.lens_camera import LensCamera
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
+from fgslam.cameras.omni import HyperbolicMirror, LensCamera, MirrorFrame, OmniCamera, angles_of
+from fgslam.cameras.omni_files import camera_of, camera_values, load_camera
 from fgslam.core.errors import CalibrationError
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.omni_settings import OmniPathSettings

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.polynomial import polynomial
 
-from fgslam.cameras.omni.camera import angles_of
-from fgslam.cameras.omni.ocamcalib import OCamCalibration, read_ocamcalib
+from fgslam.cameras.omni import OCamCalibration, angles_of, read_ocamcalib
 from fgslam.core.errors import CalibrationError
 
 DIRECT = (-266.588, 0.0, 1.220001e-3, -5.78173e-7, 2.003631e-9)

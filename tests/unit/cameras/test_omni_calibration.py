@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from edge_straightness import upright_edges
 
-from fgslam.cameras.omni.camera import OmniCamera, unwrap_maps
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.panoramas import Cylinder
-from fgslam.cameras.omni.ring_calibration import (
+from fgslam.cameras.omni import Cylinder, HyperbolicMirror, MirrorFrame, OmniCamera, unwrap_maps
+from fgslam.cameras.rings import (
     calibrate_from_rings,
     find_mirror_circle,
     mirror_offset,

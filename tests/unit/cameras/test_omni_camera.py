@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.camera import OUTSIDE, OmniCamera, angles_of, measure, unwrap_maps
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni import (
+    OUTSIDE,
+    Cylinder,
+    Equirectangular,
+    HyperbolicMirror,
+    MirrorFrame,
+    OmniCamera,
+    angles_of,
+    measure,
+    unwrap_maps,
+)
 from fgslam.core.planar import wrap
 
 MIRROR = HyperbolicMirror.with_view((640, 480), 0.92, (np.radians(-70), np.radians(25)))

@@ -6,9 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.camera import OmniCamera, angles_of
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni import (
+    Cylinder,
+    Equirectangular,
+    HyperbolicMirror,
+    MirrorFrame,
+    OmniCamera,
+    angles_of,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.planar import wrap

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.mirrors import (
+from fgslam.cameras.omni import (
     HyperbolicMirror,
     MirrorFrame,
     RadialPolynomial,

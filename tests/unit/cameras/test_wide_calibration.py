@@ -8,12 +8,17 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras import board_calibration
-from fgslam.cameras.board_calibration import BoardCalibration, View, calibrate
-from fgslam.cameras.board_check import coverage_of_circle, farthest_from_axis, held_out_alone
-from fgslam.cameras.board_projection import PARAMETERS, projected
-from fgslam.cameras.board_start import board_pose
+from fgslam.cameras import calibrate as module
 from fgslam.cameras.boards import Board, Corners, find_corners
+from fgslam.cameras.calibrate import (
+    BoardCalibration,
+    View,
+    board_pose,
+    calibrate,
+    coverage_of_circle,
+    farthest_from_axis,
+    held_out_alone,
+)
 from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
@@ -165,7 +170,7 @@ def test_an_image_without_a_pose_is_left_out_of_the_calibration() -> None:
 
 
 def test_a_fit_that_does_not_converge_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(board_calibration, "_STEPS", 2)
+    monkeypatch.setattr(module, "MOST_STEPS", 2)
     true = CAMERAS["fisheye"]
     with pytest.raises(CalibrationError, match="equidistant cameras does not converge in 2 steps"):
         calibrate(BOARD, views_of("fisheye", 0), true.size, true.model)
@@ -176,13 +181,13 @@ def test_a_corner_that_is_left_out_counts_for_nothing_and_no_second_guess_is_mad
 ) -> None:
     """The corner farthest from the axis was found 20 px farther out."""
     guessed = []
-    guess = board_calibration.first_guess
+    guess = module.first_guess
 
     def counted(*given: Any) -> FloatArray:
         guessed.append(1)
         return guess(*given)
 
-    monkeypatch.setattr(board_calibration, "first_guess", counted)
+    monkeypatch.setattr(module, "first_guess", counted)
     true, views = CAMERAS["fisheye"], views_of("fisheye", 2, count=12)
     middle, seen = true.matrix[:2, 2], [c for (c,) in views if c is not None]
     v = int(np.argmax([np.linalg.norm(c.pixels - middle, axis=1).max() for c in seen]))
@@ -201,29 +206,6 @@ def test_a_corner_that_is_left_out_counts_for_nothing_and_no_second_guess_is_mad
     assert angles[0] > angles[1] + 1.0
     (view, *_) = wide_verdict([], found, None)
     assert f"corners up to {angles[1]:.0f} degrees" in view
-
-
-@pytest.mark.parametrize("model", PARAMETERS)
-def test_derivatives_are_those_of_finite_differences_and_pixels_those_of_the_model(
-    model: str,
-) -> None:
-    numbers = {
-        "radtan": [500.0, 510.0, 320.0, 240.0, -0.2, 0.05, 0.001, -0.002, 0.01],
-        "equidistant": [300.0, 310.0, 320.0, 240.0, 0.02, -0.01, 0.004, -0.001],
-        "omni": [500.0, 510.0, 320.0, 240.0, 1.2, -0.2, 0.05, 0.001, -0.002],
-    }[model]
-    x = np.array([0.3, -0.5, 0.2, 0.1, 0.2, 0.6 if model == "radtan" else -0.02, *numbers])
-    pixels, by = projected(model, BOARD.points, x[:6], x[6:])
-    there = BOARD.points @ so3_exp(x[:3]).T + x[3:6]
-    exact = camera(model, (640, 480), numbers).project(there)
-    assert (there[:, 2] < 0.0).any() == (model != "radtan")
-    np.testing.assert_allclose(pixels, exact, rtol=0, atol=1e-9)
-    for k, value in enumerate(x):
-        step = np.zeros(len(x))
-        step[k] = 1e-6 * max(1.0, abs(value))
-        ends = [projected(model, BOARD.points, (x + s)[:6], (x + s)[6:])[0] for s in (step, -step)]
-        slope = ((ends[0] - ends[1]) / (2.0 * step[k])).ravel()
-        np.testing.assert_allclose(by[:, k], slope, rtol=0, atol=1e-6 * np.abs(by[:, k]).max())
 
 
 def test_a_board_beside_the_camera_has_a_pose() -> None:

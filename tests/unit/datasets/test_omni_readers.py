@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.camera import angles_of
-from fgslam.cameras.omni.camera_files import make_camera
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, RadialPolynomial
-from fgslam.cameras.omni.ocamcalib import OCamCamera
-from fgslam.cameras.omni.panoramas import Equirectangular
-from fgslam.cameras.omni.settings import (
+from fgslam.cameras.omni import (
+    Equirectangular,
+    HyperbolicMirror,
+    OCamCamera,
+    RadialPolynomial,
+    angles_of,
+)
+from fgslam.cameras.omni_files import make_camera
+from fgslam.cameras.settings import (
     BloggieSettings,
     EquirectangularSettings,
     HyperbolicMirrorSettings,

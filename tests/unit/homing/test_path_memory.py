@@ -9,10 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame, RadialPolynomial
-from fgslam.cameras.omni.ocamcalib import OCamCamera
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni import (
+    Cylinder,
+    Equirectangular,
+    HyperbolicMirror,
+    MirrorFrame,
+    OCamCamera,
+    OmniCamera,
+    RadialPolynomial,
+)
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures

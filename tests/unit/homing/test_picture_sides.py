@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 import fgslam as fg
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.lens_camera import LensCamera
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import (
+    Equirectangular,
+    HyperbolicMirror,
+    LensCamera,
+    MirrorFrame,
+    OmniCamera,
+)
 from fgslam.core.arrays import Image
 from fgslam.homing.path_memory import PathMemory
 from fgslam.homing.picture_sides import PictureSides

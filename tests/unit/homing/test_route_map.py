@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import fgslam as fg
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.homing.route_map import RouteMap, route_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fgslam as fg
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import BearingMatches, OmniFeatures

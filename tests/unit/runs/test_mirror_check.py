@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.mirrors import HyperbolicMirror, MirrorFrame
-from fgslam.cameras.omni.settings import (
+from fgslam.cameras.omni import HyperbolicMirror, MirrorFrame
+from fgslam.cameras.settings import (
     EquirectangularSettings,
     HyperbolicMirrorSettings,
     OCamCalibSettings,

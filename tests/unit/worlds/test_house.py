@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.mirrors import HyperbolicMirror
+from fgslam.cameras.omni import HyperbolicMirror
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.worlds import house as house_world

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fgslam.cameras.omni.camera import OmniCamera
-from fgslam.cameras.omni.mirrors import HyperbolicMirror
+from fgslam.cameras.omni import HyperbolicMirror, OmniCamera
 from fgslam.core import geometry
 from fgslam.core.errors import DatasetError
 from fgslam.worlds.house import camera_pose

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.panoramas import Cylinder
+from fgslam.cameras.omni import Cylinder
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.homing import ColumnSegments
 from fgslam.core.planar import wrap

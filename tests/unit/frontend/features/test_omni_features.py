@@ -8,9 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fgslam.cameras.omni.camera import unwrap_maps
-from fgslam.cameras.omni.mirrors import HyperbolicMirror
-from fgslam.cameras.omni.panoramas import Cylinder, Equirectangular
+from fgslam.cameras.omni import Cylinder, Equirectangular, HyperbolicMirror, unwrap_maps
 from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures

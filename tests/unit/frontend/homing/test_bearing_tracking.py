@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from fgslam.cameras.omni.panoramas import Equirectangular
+from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing import TrackedBearings

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.cameras.omni.mirrors import (
+from fgslam.cameras.omni import (
     PAPER_DEGREE,
     MirrorFrame,
     RadialCamera,

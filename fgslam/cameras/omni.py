@@ -1,0 +1,954 @@
+"""Omnidirectional cameras: panoramas, mirrors and lenses, as what every model offers.
+
+Camera axes are the robot's: x forward, y left, z up. A ray's *bearing* is ``atan2(y, x)``, its
+*elevation* ``atan2(z, hypot(x, y))``: radians, counter-clockwise and up positive. Pixels are
+(column, row), the centre of the top-left one is (0, 0).
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar, Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import polynomial
+
+from fgslam.cameras.lenses import RawCamera, checked_camera
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.errors import CalibrationError, FrameError
+from fgslam.core.files import read_text
+from fgslam.core.planar import wrap
+
+
+class OmniCamera(Protocol):
+    """A calibrated camera that sees (nearly) all around. Immutable."""
+
+    @property
+    def width(self) -> int:
+        """Of the image, in pixels."""
+        ...
+
+    @property
+    def height(self) -> int:
+        """Of the image, in pixels."""
+        ...
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) unit vectors along which pixels (n, 2) look; NaN outside the field of view."""
+        ...
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """(n, 2) pixels of rays (n, 3) of any length; NaN where the camera does not see them."""
+        ...
+
+
+def require_own_image(camera: OmniCamera, image: Image) -> None:
+    """Raises FrameError unless an image is (height, width, 3) uint8 of the camera's size."""
+    wanted = (camera.height, camera.width, 3)
+    if image.shape != wanted or image.dtype != np.uint8:
+        raise FrameError(
+            f"an image is {image.dtype} {image.shape}, but the camera's are uint8 {wanted} "
+            "(rows, columns, R G B); take the calibration of this camera at this size"
+        )
+
+
+# --------------------------------------------------------------------------------------------
+# Pixels to bearings and elevations with their covariance
+
+
+_STEP_PX = 0.05  # of the central difference: its error is a millionth of the derivative
+
+
+def unit_rays(bearing: FloatArray, elevation: FloatArray) -> FloatArray:
+    """(n, 3) rays of bearings and elevations (n,), radians; the inverse of :func:`angles_of`."""
+    level = np.cos(elevation)
+    return np.column_stack([level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation)])
+
+
+def angles_of(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Bearings and elevations (n,) of rays (n, 3), radians."""
+    bearing = np.arctan2(rays[:, 1], rays[:, 0])
+    elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+    return bearing, elevation
+
+
+def measure(
+    camera: OmniCamera, pixels: FloatArray, sigma_px: float | FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What pixels measure, to first order in their noise.
+
+    Args:
+        camera: that took the image.
+        pixels: (n, 2).
+        sigma_px: standard deviation of each coordinate in pixels, one number or (n,).
+
+    Returns:
+        Bearing (n,) and elevation (n,) in radians, and covariance (n, 2, 2) of both; NaN outside
+        the field of view. At its very border the derivative is one-sided.
+    """
+    pixels = np.asarray(pixels, dtype=np.float64)
+    n = len(pixels)
+    offsets = _STEP_PX * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=np.float64)
+    bearing, elevation = angles_of(camera.rays((offsets[:, None] + pixels[None]).reshape(-1, 2)))
+    bearings, elevations = bearing.reshape(5, n), elevation.reshape(5, n)
+    jacobian = np.empty((n, 2, 2))
+    for axis in range(2):
+        plus, minus = 1 + 2 * axis, 2 + 2 * axis
+        jacobian[:, 0, axis] = _slope(bearings[[plus, 0, minus]])
+        jacobian[:, 1, axis] = _slope(elevations[[plus, 0, minus]])
+    variance = np.broadcast_to(np.square(sigma_px), (n,))
+    covariance = (jacobian @ jacobian.transpose(0, 2, 1)) * variance[:, None, None]
+    return bearings[0], elevations[0], covariance
+
+
+def _slope(values: FloatArray) -> FloatArray:
+    """(n,) derivative from (3, n) angles after, at and before; one-sided where one is NaN."""
+    after, before = wrap(values[0] - values[1]), wrap(values[1] - values[2])
+    both = 0.5 * (after + before)
+    return np.asarray(
+        np.where(np.isfinite(both), both, np.where(np.isfinite(after), after, before)) / _STEP_PX
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Whether pixels lie in a picture, and whether a picture has a sensible size
+
+
+def require_size(what: str, width: int, height: int) -> None:
+    """Raises CalibrationError for a picture without two rows and columns; ``what`` names it."""
+    if width < 2 or height < 2:
+        raise CalibrationError(f"{what}: a picture of {width}x{height} pixels; give at least 2x2")
+
+
+def inside(pixels: FloatArray, width: int, height: int) -> FloatArray:
+    """Pixels (n, 2), NaN where they lie outside the picture.
+
+    A pixel reaches half a pixel around its centre, so the picture reaches from -0.5 to size - 0.5.
+    """
+    c, r = pixels[:, 0], pixels[:, 1]
+    outside = (c < -0.5) | (c > width - 0.5) | (r < -0.5) | (r > height - 0.5)
+    return np.where(outside[:, None], np.nan, pixels)
+
+
+# --------------------------------------------------------------------------------------------
+# Where each pixel of one camera's image lies in another's, both at one viewpoint
+
+
+Float32 = npt.NDArray[np.float32]
+
+OUTSIDE = -1e4
+"""Coordinate of pixels that the source does not see: outside any image, so that it stays black."""
+
+
+def unwrap_maps(source: OmniCamera, target: OmniCamera) -> tuple[Float32, Float32]:
+    """Columns and rows (target.height, target.width) in the source's image, for a remap."""
+    columns, rows = np.meshgrid(np.arange(target.width), np.arange(target.height))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+    rays = target.rays(pixels)
+    seen = np.isfinite(rays[:, 0])
+    found = np.full((len(pixels), 2), np.nan)
+    found[seen] = source.pixels(rays[seen])
+    found = np.where(np.isfinite(found), found, OUTSIDE)
+    maps = found.reshape(target.height, target.width, 2).astype(np.float32)
+    return np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1])
+
+
+# --------------------------------------------------------------------------------------------
+# Unwrapped views: the equirectangular panorama and the cylinder; both are cameras themselves
+#
+# Columns run clockwise: the centre column looks forward, the first and the last one both look
+# backward, so a turn of the robot shifts the picture sideways.
+
+
+_HALF_TURN = np.pi
+
+
+def _bearing(columns: FloatArray, width: int) -> FloatArray:
+    return _HALF_TURN - columns * (2.0 * _HALF_TURN / (width - 1))
+
+
+def _column(rays: FloatArray, width: int) -> FloatArray:
+    bearing = np.arctan2(rays[:, 1], rays[:, 0])
+    return (_HALF_TURN - bearing) * ((width - 1) / (2.0 * _HALF_TURN))
+
+
+@dataclass(frozen=True, slots=True)
+class Equirectangular:
+    """Rows proportional to elevation.
+
+    Column u looks to bearing pi - 2 pi u / (width - 1), row v to elevation
+    ``top_elevation - v (top_elevation - bottom_elevation) / (height - 1)``; radians.
+    """
+
+    width: int
+    height: int
+    top_elevation: float = np.pi / 2
+    bottom_elevation: float = -np.pi / 2
+
+    def __post_init__(self) -> None:
+        require_size("equirectangular panorama", self.width, self.height)
+        if not -np.pi / 2 <= self.bottom_elevation < self.top_elevation <= np.pi / 2:
+            raise CalibrationError(
+                f"equirectangular panorama: elevations from {self.bottom_elevation:g} to "
+                f"{self.top_elevation:g} rad; they must rise, within a quarter turn of the horizon"
+            )
+
+    def _per_row(self) -> float:
+        return (self.top_elevation - self.bottom_elevation) / (self.height - 1)
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) unit rays; see :class:`OmniCamera`."""
+        pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
+        bearing = _bearing(pixels[:, 0], self.width)
+        elevation = self.top_elevation - pixels[:, 1] * self._per_row()
+        return unit_rays(bearing, elevation)
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """(n, 2) pixels; see :class:`OmniCamera`."""
+        rays = np.asarray(rays, dtype=np.float64)
+        elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+        rows = (self.top_elevation - elevation) / self._per_row()
+        return inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """Rows proportional to the tangent of elevation.
+
+    A vertical line then keeps its straightness, and a column segment scales about the horizon's row
+    alone when its distance changes. Row v looks along tangent
+    ``tan_top - v (tan_top - tan_bottom) / (height - 1)``.
+    """
+
+    width: int
+    height: int
+    tan_bottom: float
+    tan_top: float
+
+    def __post_init__(self) -> None:
+        require_size("cylinder", self.width, self.height)
+        if not -np.inf < self.tan_bottom < self.tan_top < np.inf:
+            raise CalibrationError(
+                f"cylinder: tangents of elevation from {self.tan_bottom:g} to {self.tan_top:g}; "
+                "they must rise"
+            )
+
+    def tangents(self, rows: FloatArray) -> FloatArray:
+        """Tangents of elevation of rows, any shape."""
+        per_row = (self.tan_top - self.tan_bottom) / (self.height - 1)
+        return np.asarray(self.tan_top - np.asarray(rows, dtype=np.float64) * per_row)
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) unit rays; see :class:`OmniCamera`."""
+        pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
+        bearing = _bearing(pixels[:, 0], self.width)
+        tangent = self.tangents(pixels[:, 1])
+        level = 1.0 / np.sqrt(1.0 + tangent**2)
+        return np.column_stack([level * np.cos(bearing), level * np.sin(bearing), level * tangent])
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """(n, 2) pixels; see :class:`OmniCamera`."""
+        rays = np.asarray(rays, dtype=np.float64)
+        per_row = (self.tan_top - self.tan_bottom) / (self.height - 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            tangent = rays[:, 2] / np.hypot(rays[:, 0], rays[:, 1])
+        rows = (self.tan_top - tangent) / per_row
+        return inside(np.column_stack([_column(rays, self.width), rows]), self.width, self.height)
+
+
+# --------------------------------------------------------------------------------------------
+# Cameras with a mirror or lens of revolution: elevation depends on the radius alone
+#
+# The picture of a mirror above an upward-looking camera is seen *from below*: bearings run
+# clockwise in it, and what is left of the robot lies right of what is ahead, if ahead is up.
+
+
+# Relative: what a round trip may lose at the very rim.
+_RIM = 1e-9
+AHEAD_IS_UP = -np.pi / 2
+
+
+@dataclass(frozen=True, slots=True)
+class MirrorFrame:
+    """How polar coordinates around the mirror's centre lie in the picture.
+
+    Attributes:
+        width, height: of the picture, pixels.
+        centre: column and row of the mirror's axis.
+        ahead: direction in the picture of the robot's heading: ``atan2(row, column)`` from the
+            centre, so 0 is right and -pi/2, the default, is up. This is where a camera that is
+            turned on its axis is corrected.
+        clockwise: whether bearings grow clockwise in the picture. True for the raw picture of an
+            upward-looking camera; False where it was mirrored, or the camera looks down.
+        affine: (c, d, e) of OCamCalib, for sensors that are skew or have oblong pixels: a point at
+            (x, y) rows and columns from the centre is seen at (c x + d y, e x + y).
+    """
+
+    width: int
+    height: int
+    centre: tuple[float, float]
+    ahead: float = AHEAD_IS_UP
+    clockwise: bool = True
+    affine: tuple[float, float, float] = (1.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        require_size("mirror image", self.width, self.height)
+        column, row = self.centre
+        if not (-0.5 <= column <= self.width - 0.5 and -0.5 <= row <= self.height - 0.5):
+            raise CalibrationError(
+                f"mirror image: the mirror's centre ({column:g}, {row:g}) lies outside the "
+                f"{self.width}x{self.height} picture; correct the centre or the size"
+            )
+        c, d, e = self.affine
+        if not (np.isfinite([self.ahead, c, d, e]).all() and c - d * e > 0.0):
+            raise CalibrationError(
+                f"mirror image: ahead {self.ahead:g} and affine ({c:g}, {d:g}, {e:g}) must be "
+                "finite, with c - d e > 0"
+            )
+
+    def polar(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Radius in pixels (n,) and bearing in radians (n,) of pixels (n, 2)."""
+        across, down = pixels[:, 0] - self.centre[0], pixels[:, 1] - self.centre[1]
+        c, d, e = self.affine
+        determinant = c - d * e
+        x, y = (down - d * across) / determinant, (c * across - e * down) / determinant
+        angle = np.arctan2(x, y) - self.ahead
+        return np.hypot(x, y), angle if self.clockwise else -angle
+
+    def pixels(self, radius: FloatArray, bearing: FloatArray) -> FloatArray:
+        """(n, 2) pixels of polar coordinates (n,) each, also where they leave the picture."""
+        angle = (bearing if self.clockwise else -bearing) + self.ahead
+        x, y = radius * np.sin(angle), radius * np.cos(angle)
+        c, d, e = self.affine
+        return np.column_stack(
+            [self.centre[0] + e * x + y, self.centre[1] + c * x + d * y],
+        )
+
+
+@dataclass(frozen=True)
+class RadialCamera(ABC):
+    """A camera whose elevation is a function of the radius alone.
+
+    Attributes:
+        frame: where in the picture.
+        inner_radius, outer_radius: the ring that shows the surroundings, pixels; nothing is seen
+            inside (the camera sees itself there) or outside.
+    """
+
+    frame: MirrorFrame
+    inner_radius: float
+    outer_radius: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.inner_radius < self.outer_radius < np.inf:
+            raise CalibrationError(
+                f"mirror image: radii from {self.inner_radius:g} to {self.outer_radius:g} px; they "
+                "must rise from 0 or more"
+            )
+
+    @abstractmethod
+    def elevation(self, radius: FloatArray) -> FloatArray:
+        """(n,) elevations in radians of radii (n,) in pixels within the ring."""
+
+    @abstractmethod
+    def radius(self, elevation: FloatArray) -> FloatArray:
+        """(n,) radii of elevations (n,); NaN or outside the ring where they are not seen."""
+
+    @property
+    def width(self) -> int:
+        """Of the image, in pixels."""
+        return self.frame.width
+
+    @property
+    def height(self) -> int:
+        """Of the image, in pixels."""
+        return self.frame.height
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) unit rays; see :class:`OmniCamera`."""
+        pixels = inside(np.asarray(pixels, dtype=np.float64), self.width, self.height)
+        radius, bearing = self.frame.polar(pixels)
+        elevation = self.elevation(self._within(radius))
+        return unit_rays(bearing, elevation)
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """(n, 2) pixels; see :class:`OmniCamera`."""
+        rays = np.asarray(rays, dtype=np.float64)
+        elevation = np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]))
+        bearing = np.arctan2(rays[:, 1], rays[:, 0])
+        radius = self._within(self.radius(elevation))
+        return inside(self.frame.pixels(radius, bearing), self.width, self.height)
+
+    def _within(self, radius: FloatArray) -> FloatArray:
+        seen = (radius >= self.inner_radius * (1.0 - _RIM)) & (
+            radius <= self.outer_radius * (1.0 + _RIM)
+        )
+        return np.where(seen, radius, np.nan)
+
+
+# --------------------------------------------------------------------------------------------
+# Exact inverse of a smooth monotone function: started from a table, ended by Newton's method
+
+
+ValueAndSlope: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
+_KNOTS = 513
+# From a table of 513 knots two steps reach rounding; the others guard uneven functions.
+_STEPS = 5
+
+
+class MonotoneInverse:
+    """Solves ``function(x) = y`` for x in an interval over which the function is monotone."""
+
+    def __init__(self, function: ValueAndSlope, lowest: float, highest: float) -> None:
+        """Tabulates ``function``, which gives values and slopes, over [lowest, highest]."""
+        self._function, self._limits = function, (lowest, highest)
+        knots = np.linspace(lowest, highest, _KNOTS)
+        values, slopes = function(knots)
+        self.monotone = bool(np.all(slopes > 0.0) or np.all(slopes < 0.0))
+        self.knots = knots
+        self.slopes = slopes
+        rising = values[-1] > values[0]
+        self._values = values if rising else values[::-1]
+        self._starts = knots if rising else knots[::-1]
+
+    def __call__(self, wanted: FloatArray) -> FloatArray:
+        """Arguments (n,) of values (n,); NaN where the function does not take them."""
+        wanted = np.asarray(wanted, dtype=np.float64)
+        slack = 1e-12 * (1.0 + np.abs(self._values[[0, -1]]).max())
+        seen = (wanted >= self._values[0] - slack) & (wanted <= self._values[-1] + slack)
+        x = np.interp(np.where(seen, wanted, self._values[0]), self._values, self._starts)
+        for _ in range(_STEPS):
+            value, slope = self._function(x)
+            x = np.clip(x - (value - wanted) / slope, *self._limits)
+        return np.where(seen, x, np.nan)
+
+
+@dataclass(frozen=True)
+class InvertedCamera(RadialCamera):
+    """A camera whose elevation is a smooth function of the radius, inverted numerically.
+
+    Raises:
+        CalibrationError: the elevation is not monotone over the ring.
+    """
+
+    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
+    _turns_back: ClassVar[str]
+    """What to do about an elevation that turns back."""
+
+    def __post_init__(self) -> None:
+        RadialCamera.__post_init__(self)
+        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
+        if not inverse.monotone:
+            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
+            raise CalibrationError(
+                f"mirror image: elevation turns back near radius {turn:.1f} px of the ring "
+                f"{self.inner_radius:.1f} to {self.outer_radius:.1f} px; {self._turns_back}"
+            )
+        object.__setattr__(self, "_inverse", inverse)
+
+    def radius(self, elevation: FloatArray) -> FloatArray:
+        """(n,) radii, exact to rounding; see :class:`RadialCamera`."""
+        return self._inverse(elevation)
+
+    @abstractmethod
+    def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(n,) elevations of radii (n,), and their derivatives."""
+
+
+# --------------------------------------------------------------------------------------------
+# The hyperbolic mirror as a unified sphere, above and below the horizon
+
+
+@dataclass(frozen=True)
+class HyperbolicMirror(RadialCamera):
+    """A hyperbolic (xi < 1) or parabolic (xi = 1) mirror above an upward-looking camera.
+
+    A ray is moved to the unit sphere around the mirror's focus and projected from a point ``xi``
+    above it: ``radius = focal cos(elevation) / (xi - sin(elevation))``. GTSAM's Cal3Unified divides
+    by the ray's third coordinate first, and so covers only what lies below the horizon.
+
+    Attributes:
+        xi: ``2 e / (1 + e^2)`` of the hyperbola's eccentricity e.
+        focal_px: of the unified model; the horizon has the radius ``focal_px / xi``.
+    """
+
+    xi: float
+    focal_px: float
+
+    def __post_init__(self) -> None:
+        RadialCamera.__post_init__(self)
+        if not (0.0 < self.xi <= 1.0 and 0.0 < self.focal_px < np.inf):
+            raise CalibrationError(
+                f"hyperbolic mirror: xi {self.xi:g} must lie in (0, 1] and focal_px "
+                f"{self.focal_px:g} be positive; correct them"
+            )
+
+    @classmethod
+    def with_view(
+        cls,
+        size: tuple[int, int],
+        xi: float,
+        elevations: tuple[float, float],
+        ahead: float = AHEAD_IS_UP,
+        clockwise: bool = True,
+        margin_px: float = 0.0,
+    ) -> HyperbolicMirror:
+        """A mirror centred in a picture (width, height), whose rim touches the nearest border.
+
+        ``elevations`` in radians are those at the inner and at the outer rim; ``margin_px`` is left
+        free around the rim.
+        """
+        lowest, highest = elevations
+        limit = np.arcsin(min(max(xi, 0.0), 1.0))
+        if not -np.pi / 2 <= lowest < highest < limit:
+            raise CalibrationError(
+                f"hyperbolic mirror: elevations from {np.degrees(lowest):g} to "
+                f"{np.degrees(highest):g} degrees; they must rise from -90 or more, and stay "
+                f"below arcsin(xi) = {np.degrees(limit):.1f}"
+            )
+        outer = (min(size) - 1) / 2.0 - margin_px
+        focal_px = outer * (xi - np.sin(highest)) / np.cos(highest)
+        inner = focal_px * np.cos(lowest) / (xi - np.sin(lowest))
+        centre = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
+        frame = MirrorFrame(*size, centre, ahead, clockwise)
+        return cls(frame, float(inner), outer, xi=xi, focal_px=float(focal_px))
+
+    def elevation(self, radius: FloatArray) -> FloatArray:
+        """(n,) elevations; see :class:`RadialCamera`."""
+        r = np.asarray(radius, dtype=np.float64) / self.focal_px
+        eta = (self.xi + np.sqrt(1.0 + (1.0 - self.xi**2) * r**2)) / (1.0 + r**2)
+        return np.asarray(np.arctan2(self.xi - eta, eta * r))
+
+    def radius(self, elevation: FloatArray) -> FloatArray:
+        """(n,) radii; see :class:`RadialCamera`."""
+        below = self.xi - np.sin(elevation)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            r = self.focal_px * np.cos(elevation) / below
+        return np.where(below > 0.0, r, np.nan)
+
+
+# --------------------------------------------------------------------------------------------
+# The paper's own calibration: elevation as a polynomial of the image radius (fig. 3)
+
+
+PAPER_DEGREE = 5
+
+
+@dataclass(frozen=True)
+class RadialPolynomial(InvertedCamera):
+    """Elevation = sum of ``coefficients[k] x^k``, x = radius scaled to [-1, 1]; rising or falling.
+
+    The paper names the degree, five, and a calibration image, not the argument. Here it is the
+    radius, scaled so that the ring's inner and outer rim lie at -1 and 1, which keeps the fit well
+    conditioned.
+
+    It falls with the radius where the picture's middle looks up: a mirror that is looked at from
+    above, or one with a second, flat mirror.
+    """
+
+    coefficients: tuple[float, ...]
+    _turns_back = "fit a lower degree, correct the samples, or take more near the rims"
+
+    def __post_init__(self) -> None:
+        if not self.coefficients or not np.isfinite(self.coefficients).all():
+            raise CalibrationError("radial polynomial: its coefficients must be finite, at least 1")
+        InvertedCamera.__post_init__(self)
+
+    def elevation(self, radius: FloatArray) -> FloatArray:
+        """(n,) elevations; see :class:`RadialCamera`."""
+        return np.asarray(polynomial.polyval(self._scaled(radius), np.array(self.coefficients)))
+
+    def _scaled(self, radius: FloatArray) -> FloatArray:
+        return _scaled(radius, self.inner_radius, self.outer_radius)
+
+    def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
+        slope = polynomial.polyder(np.array(self.coefficients))
+        per_pixel = 2.0 / (self.outer_radius - self.inner_radius)
+        slopes = per_pixel * polynomial.polyval(self._scaled(radius), slope)
+        return self.elevation(radius), np.asarray(slopes)
+
+
+def _scaled(radius: FloatArray, inner: float, outer: float) -> FloatArray:
+    return (2.0 * np.asarray(radius, dtype=np.float64) - (inner + outer)) / (outer - inner)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RadialFit:
+    """A fitted camera and the residuals (n,) of its samples: measured minus fitted, radians."""
+
+    camera: RadialPolynomial
+    residuals: FloatArray
+
+    @property
+    def worst(self) -> float:
+        """Largest residual, radians."""
+        return float(np.abs(self.residuals).max())
+
+
+def fit_radial_polynomial(
+    frame: MirrorFrame,
+    radii: tuple[float, float],
+    samples: tuple[FloatArray, FloatArray],
+    degree: int = PAPER_DEGREE,
+) -> RadialFit:
+    """Least squares of elevation over radius.
+
+    Args:
+        frame: where the mirror lies in the picture.
+        radii: inner and outer, pixels. The fit is extrapolated where samples do not reach them.
+        samples: radii (n,) in pixels and elevations (n,) in radians, n > degree.
+        degree: of the polynomial.
+
+    Raises:
+        CalibrationError: too few different radii, values that are not finite, or a polynomial
+            that is not monotone over the ring.
+    """
+    radius, elevation = (np.asarray(v, dtype=np.float64) for v in samples)
+    if not (np.isfinite(radius).all() and np.isfinite(elevation).all()):
+        raise CalibrationError("radial polynomial: a sample is not finite; leave it out")
+    different = len(np.unique(radius))
+    if different <= degree:
+        raise CalibrationError(
+            f"radial polynomial: {different} different radii cannot fix degree {degree}; give at "
+            f"least {degree + 1}"
+        )
+    x = _scaled(radius, *radii)
+    coefficients = polynomial.polyfit(x, elevation, degree)
+    camera = RadialPolynomial(frame, *radii, coefficients=tuple(coefficients.tolist()))
+    return RadialFit(camera, elevation - polynomial.polyval(x, coefficients))
+
+
+# --------------------------------------------------------------------------------------------
+# A lens or mirror calibrated as an ordinary camera, that looks straight up or down
+
+
+AROUND = ("omni", "equidistant", "fov", "ds", "eucm", "ocam")
+"""Models of cameras that may see a half space and more."""
+
+
+@dataclass(frozen=True)
+class LensCamera:
+    """A camera of :mod:`fgslam.cameras.lenses` whose axis is the robot's vertical one.
+
+    Mei's unified model with its distortion, for one, which need not be radial.
+
+    Attributes:
+        width, height: of the picture, pixels.
+        lens: name of its model; one of :data:`AROUND`.
+        matrix: (9,) intrinsics row by row.
+        distortion: parameters of the lens.
+        ring: inner and outer radius around the principal point that show the surroundings, pixels.
+        up: whether the picture's middle looks up; else down, as of a mirror above the camera.
+        ahead, clockwise: as of :class:`MirrorFrame`.
+
+    Raises:
+        CalibrationError: the lens is none of these, or the radii do not rise from 0 or more.
+    """
+
+    width: int
+    height: int
+    lens: str
+    matrix: tuple[float, ...]
+    distortion: tuple[float, ...]
+    ring: tuple[float, float]
+    up: bool = False
+    ahead: float = AHEAD_IS_UP
+    clockwise: bool = True
+    _raw: RawCamera = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.lens not in AROUND:
+            raise CalibrationError(
+                f"camera: a {self.lens} lens does not see all around; known: {', '.join(AROUND)}"
+            )
+        if not 0.0 <= self.ring[0] < self.ring[1] < np.inf:
+            raise CalibrationError(
+                f"camera: ring_px is {self.ring[0]:g} to {self.ring[1]:g}; radii must rise from 0 "
+                "or more"
+            )
+        matrix = np.array(self.matrix).reshape(3, 3)
+        distortion = np.array(self.distortion)
+        size = (self.width, self.height)
+        raw = RawCamera(*size, matrix, distortion, np.eye(4), model=self.lens)
+        object.__setattr__(self, "_raw", checked_camera(raw))
+
+    @classmethod
+    def of(
+        cls,
+        raw: RawCamera,
+        ring: tuple[float, float] | None,
+        up: bool,
+        ahead: float = AHEAD_IS_UP,
+        clockwise: bool = True,
+    ) -> LensCamera:
+        """The camera of a calibration; without a ring the largest circle within the picture."""
+        column, row = raw.matrix[:2, 2].tolist()
+        circle = min(column, row, raw.width - 1 - column, raw.height - 1 - row)
+        numbers = (tuple(raw.matrix.ravel().tolist()), tuple(raw.distortion.tolist()))
+        ring = ring or (0.0, circle)
+        return cls(raw.width, raw.height, raw.model, *numbers, ring, up, ahead, clockwise)
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Principal point, column and row in pixels."""
+        return self.matrix[2], self.matrix[5]
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) unit rays; see :class:`OmniCamera`."""
+        seen = self._raw.unproject(self._within(np.asarray(pixels, np.float64)))
+        angle = np.arctan2(seen[:, 1], seen[:, 0]) - self.ahead
+        height = np.arctan2(seen[:, 2], np.hypot(seen[:, 0], seen[:, 1]))
+        return unit_rays(angle if self.clockwise else -angle, height if self.up else -height)
+
+    def pixels(self, rays: FloatArray) -> FloatArray:
+        """(n, 2) pixels; see :class:`OmniCamera`."""
+        rays = np.asarray(rays, np.float64)
+        bearing = np.arctan2(rays[:, 1], rays[:, 0])
+        angle = (bearing if self.clockwise else -bearing) + self.ahead
+        level, along = np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2] if self.up else -rays[:, 2]
+        own = np.column_stack([level * np.cos(angle), level * np.sin(angle), along])
+        return self._within(self._raw.project(own))
+
+    def _within(self, pixels: FloatArray) -> FloatArray:
+        """The pixels, NaN outside the picture and the ring."""
+        radius = np.hypot(*(pixels - self._raw.matrix[:2, 2]).T)
+        seen = (radius >= self.ring[0]) & (radius <= self.ring[1])
+        return np.where(seen[:, None], inside(pixels, self.width, self.height), np.nan)
+
+
+# --------------------------------------------------------------------------------------------
+# OCamCalib's polynomial camera (Scaramuzza, Martinelli and Siegwart 2006) and its result file
+#
+# A pixel at radius rho from the centre looks along (rho cos, rho sin, f(rho)), f a polynomial.
+# The file's inverse polynomial is a fit of its own, good to a fraction of a pixel; pixels are found
+# here by solving f exactly.
+
+
+_MAX_TERMS = 64
+# The file's two polynomials are fits of one another: further apart, one of them is damaged.
+_MAX_DISAGREEMENT_PX = 3.0
+
+
+@dataclass(frozen=True)
+class OCamCamera(InvertedCamera):
+    """A camera with the direct polynomial ``f(rho) = sum direct[k] rho^k``, rho in pixels.
+
+    With the mirror above an upward-looking camera f is negative where the camera sees downward, in
+    the middle, and elevation is ``atan2(f, rho)``; it must rise over the ring.
+    """
+
+    direct: tuple[float, ...]
+    _turns_back = "narrow the ring to what the mirror shows"
+
+    def elevation(self, radius: FloatArray) -> FloatArray:
+        """(n,) elevations; see :class:`RadialCamera`."""
+        radius = np.asarray(radius, dtype=np.float64)
+        return np.asarray(np.arctan2(polynomial.polyval(radius, np.array(self.direct)), radius))
+
+    def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
+        f = polynomial.polyval(radius, np.array(self.direct))
+        slope = polynomial.polyval(radius, polynomial.polyder(np.array(self.direct)))
+        return np.arctan2(f, radius), (slope * radius - f) / (f * f + radius * radius)
+
+
+@dataclass(frozen=True, slots=True)
+class OCamCalibration:
+    """The contents of a ``calib_results.txt``.
+
+    Attributes:
+        source: the file, for messages.
+        direct: coefficients of f, from the constant upward, pixels.
+        inverse: coefficients of radius over the angle atan(f / rho), from the constant upward.
+        centre: row and column, from 0.
+        affine: c, d, e.
+        width, height: of the calibrated picture.
+        ring: inner and outer radius that the mirror shows, pixels, or None where not stated.
+        cropped: columns that were cut off at the left and right before calibrating.
+    """
+
+    source: str
+    direct: tuple[float, ...]
+    inverse: tuple[float, ...]
+    centre: tuple[float, float]
+    affine: tuple[float, float, float]
+    width: int
+    height: int
+    ring: tuple[float, float] | None = None
+    cropped: tuple[int, int] = (0, 0)
+
+    def camera(
+        self,
+        size: tuple[int, int] | None = None,
+        ring: tuple[float, float] | None = None,
+        ahead: float = AHEAD_IS_UP,
+        clockwise: bool = True,
+    ) -> OCamCamera:
+        """The camera for pictures of a size (width, height): cropped as calibrated, or not yet.
+
+        ``ring`` replaces the file's; where neither is known the largest circle within the picture
+        is taken. Raises CalibrationError for a picture of any other size.
+        """
+        left, right = self.cropped
+        wide = (self.width + left + right, self.height)
+        size = size or (self.width, self.height)
+        if size not in ((self.width, self.height), wide):
+            uncropped = f" (or {wide[0]}x{wide[1]} uncropped)" if left + right else ""
+            raise CalibrationError(
+                f"{self.source} calibrates pictures of {self.width}x{self.height}{uncropped}, but "
+                f"the picture has {size[0]}x{size[1]} pixels; scale or crop it back, or calibrate "
+                "again"
+            )
+        shift = left if size == wide else 0
+        centre = (self.centre[1] + shift, self.centre[0])
+        frame = MirrorFrame(*size, centre, ahead, clockwise, self.affine)
+        inner, outer = ring or self.ring or (0.0, _largest_circle(frame))
+        return OCamCamera(frame, inner, outer, direct=self.direct)
+
+    def disagreement(self, ring: tuple[float, float]) -> float:
+        """How far the file's inverse polynomial is off over a ring, pixels."""
+        radius = np.linspace(*ring, 200)
+        angle = np.arctan2(polynomial.polyval(radius, np.array(self.direct)), radius)
+        found = polynomial.polyval(angle, np.array(self.inverse))
+        return float(np.abs(found - radius).max())
+
+
+def _largest_circle(frame: MirrorFrame) -> float:
+    column, row = frame.centre
+    return min(column, row, frame.width - 1 - column, frame.height - 1 - row)
+
+
+# --------------------------------------------------------------------------------------------
+# The file
+
+
+def read_ocamcalib(path: Path) -> OCamCalibration:
+    """Reads a ``calib_results.txt``.
+
+    Besides OCamCalib's own five entries two more are understood where their comments name them:
+    the ring that the mirror shows ("ROI max min radius") and columns that were cut off before
+    calibrating ("left right cropped pixel").
+
+    Raises:
+        CalibrationError: with file and line, for anything missing, malformed or contradictory.
+    """
+    entries = _entries(path)
+    if len(entries) < 5:
+        raise CalibrationError(
+            f"{path} has {len(entries)} entries, an OCamCalib result has 5 (two polynomials, "
+            "centre, affine parameters, size): it is truncated or another kind of file; export it "
+            "again"
+        )
+    direct = _polynomial(path, entries[0], "direct")
+    inverse = _polynomial(path, entries[1], "inverse")
+    row, column = _numbers(path, entries[2], 2, "centre (row, column)")
+    c, d, e = _numbers(path, entries[3], 3, "affine parameters (c, d, e)")
+    height, width = _wholes(path, entries[4], "size (height, width)")
+    calibration = OCamCalibration(
+        str(path), direct, inverse, (row, column), (c, d, e), width, height
+    )
+    for entry in entries[5:]:
+        calibration = _with_extra(path, entry, calibration)
+    _require_sense(path, calibration)
+    return calibration
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    line: int
+    comment: str
+    words: list[str]
+
+
+def _entries(path: Path) -> list[_Entry]:
+    """Lines of numbers, each with the comment before it."""
+    text = read_text(path, CalibrationError, "give OCamCalib's calib_results.txt")
+    entries, comment = [], ""
+    for number, line in enumerate(text.splitlines(), 1):
+        values, _, beside = line.replace("%", "#").partition("#")  # MATLAB's comments, too
+        words = values.replace(",", " ").split()
+        if words:
+            entries.append(_Entry(number, comment, words))
+        comment = "" if words else beside.strip(" \t#") or comment
+    return entries
+
+
+def _floats(path: Path, entry: _Entry, what: str) -> tuple[float, ...]:
+    values = []
+    for word in entry.words:
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise CalibrationError(
+                f"{path}, line {entry.line}: {what}: {word!r} is no finite number; correct it"
+            )
+        values.append(value)
+    return tuple(values)
+
+
+def _numbers(path: Path, entry: _Entry, count: int, what: str) -> tuple[float, ...]:
+    values = _floats(path, entry, what)
+    if len(values) != count:
+        raise CalibrationError(
+            f"{path}, line {entry.line}: {what}: {len(values)} numbers, expected {count}; correct "
+            "the line"
+        )
+    return values
+
+
+def _wholes(path: Path, entry: _Entry, what: str) -> tuple[int, int]:
+    first, second = _numbers(path, entry, 2, what)
+    if first != int(first) or second != int(second) or first < 0 or second < 0:
+        raise CalibrationError(
+            f"{path}, line {entry.line}: {what}: {first:g} and {second:g}, expected whole numbers "
+            "of pixels; correct the line"
+        )
+    return int(first), int(second)
+
+
+def _polynomial(path: Path, entry: _Entry, which: str) -> tuple[float, ...]:
+    count, *coefficients = _floats(path, entry, f"{which} polynomial")
+    if count != len(coefficients) or not 2 <= count <= _MAX_TERMS:
+        raise CalibrationError(
+            f"{path}, line {entry.line}: {which} polynomial: states {count:g} coefficients (2 to "
+            f"{_MAX_TERMS}) and has {len(coefficients)}; correct the line"
+        )
+    return tuple(coefficients)
+
+
+def _with_extra(path: Path, entry: _Entry, calibration: OCamCalibration) -> OCamCalibration:
+    comment = entry.comment.lower()
+    if "roi" in comment and "radius" in comment:
+        outer, inner = _numbers(path, entry, 2, "ring (largest, smallest radius)")
+        if not 0.0 <= inner < outer:
+            raise CalibrationError(
+                f"{path}, line {entry.line}: ring: largest radius {outer:g} and smallest "
+                f"{inner:g}; the first must be larger"
+            )
+        return replace(calibration, ring=(inner, outer))
+    if "crop" in comment:
+        return replace(calibration, cropped=_wholes(path, entry, "cropped columns (left, right)"))
+    raise CalibrationError(
+        f"{path}, line {entry.line}: an entry that is not known "
+        f"({entry.comment or 'without a comment'}); remove it"
+    )
+
+
+def _require_sense(path: Path, calibration: OCamCalibration) -> None:
+    try:
+        camera = calibration.camera()
+    except CalibrationError as cause:
+        raise CalibrationError(f"{path}: {cause}") from cause
+    apart = calibration.disagreement((camera.inner_radius, camera.outer_radius))
+    if not apart <= _MAX_DISAGREEMENT_PX:
+        raise CalibrationError(
+            f"{path}: the inverse polynomial is {apart:.3g} px off the direct one, at most "
+            f"{_MAX_DISAGREEMENT_PX:g} px are credible: one of the two is damaged; export it again"
+        )

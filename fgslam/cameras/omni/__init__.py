@@ -1,1 +1,0 @@
-"""Omnidirectional camera models: pixels to rays and back, for cameras that see all around."""
