@@ -173,7 +173,7 @@ def visit_twice() -> Visits:
     found = find_features(experiment("lab_loop", EVERY_FRAME))
     pipeline = make_system(experiment("lab_loop", _KEEP_ALL), found.sequence)
     reports = list(_with_places(found, pipeline))
-    lives = Lives(int(pipeline.tracker.database.state()["next_id"]))
+    lives = Lives(int(pipeline.tracker.database.next_id))
     for report, places in reports:
         lives.follow(report, places)
     saved = _map_of(pipeline, found.sequence)

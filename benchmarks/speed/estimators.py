@@ -37,6 +37,7 @@ from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.store import restore, state_of
 from fgslam.factors.graphs import solver_parameters
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import make_estimator
@@ -145,7 +146,7 @@ def worst_update(drive: MeasuredDrive) -> float:
         graph = make_estimator(log.rig, LandmarkKalmanGraphSettings(), drive.ego_motion)
         assert isinstance(closed, LandmarkKalman)
         assert isinstance(graph, LandmarkKalmanGraph)
-        graph.restore(closed.state())
+        restore(graph, state_of(closed))
         found = replay_frame(increment, closed, solver, motion, k)
         # The pose found by the one serves both: without a point to weight at, it is the tracking's.
         graph.predict(increment.odometry)

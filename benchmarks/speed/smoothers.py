@@ -45,13 +45,13 @@ class PlainGtsam:
         start = play(drive, BatchSettings()).estimator
         assert isinstance(start, Smoother)
         self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        tracked, points = start._inputs.tracked, start.landmarks()
+        tracked, points = [one.tracking for one in start.inputs], start.landmarks()
         stiff = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
-        held = gtsam.PriorFactorPose3(gtsam.symbol("x", 0), gtsam.Pose3(tracked(0).wTc), stiff)
+        held = gtsam.PriorFactorPose3(gtsam.symbol("x", 0), gtsam.Pose3(tracked[0].wTc), stiff)
         self.graph.add(held)
         for k, increment in enumerate(drive.log.increments):
             pose = gtsam.symbol("x", k)
-            self.values.insert(pose, gtsam.Pose3(tracked(k).wTc))
+            self.values.insert(pose, gtsam.Pose3(tracked[k].wTc))
             seen = increment.observations
             for i, row in enumerate(points.rows(seen.ids).tolist()):
                 point = gtsam.symbol("l", row)

@@ -8,6 +8,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, GrowingColumns, IntArray, StateArrays
 from fgslam.core.measurements import Observations
+from fgslam.core.store import Kept
 
 LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
 LONGEST = 30  # sightings of a track, at which it is judged although it goes on
@@ -44,6 +45,8 @@ def tracks_of(counts: IntArray) -> Tracks:
 
 class OpenTracks:
     """Sightings of tracks that go on, in order of time."""
+
+    _rows: Kept[GrowingColumns]
 
     def __init__(self) -> None:
         """None yet."""
@@ -84,24 +87,6 @@ class OpenTracks:
         """Takes out all tracks, as :meth:`take_ended`."""
         track, counts = self._numbered()
         return self._take(np.ones(len(counts), np.bool_), track, counts)
-
-    def state(self) -> StateArrays:
-        """Sightings of the tracks one after the other."""
-        track, counts = self._numbered()
-        rows = {name: of[np.argsort(track, kind="stable")] for name, of in self._columns().items()}
-        starts = tracks_of(counts).start
-        return {
-            "ids": rows["ids"][starts],
-            "counts": counts,
-            "frames": rows["frame"],
-            "measurement": rows["measurement"],
-            "covariance": rows["covariance"],
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        ids = np.repeat(state["ids"], state["counts"])
-        self._rows.restore(state | {"ids": ids, "frame": state["frames"]})
 
     def _columns(self) -> StateArrays:
         return self._rows.columns()

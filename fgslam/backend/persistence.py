@@ -27,6 +27,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 
 _EVERY = 5  # frames between judgements
 _ITERATIONS = 5
@@ -99,12 +100,18 @@ class StatedNoise:
 class Persistence:
     """Variances of measurements over the stated ones: of a single one, and by whole tracks."""
 
+    _tracks: Kept[OpenTracks]
+    _pose: Kept[FloatArray]
+    _poses: Kept[dict[int, FloatArray]]
+    _sums: Kept[FloatArray]
+    _expected: Kept[float]
+
     def __init__(self, sensor: CameraRig) -> None:
         """As stated, until tracks have ended."""
         self._sensor = sensor
         self._tracks = OpenTracks()
         self._pose = np.eye(4)
-        self._poses: dict[int, FloatArray] = {}
+        self._poses = {}
         # Of single residuals and of leanings (rows) the sum of squares, and its expectation.
         self._sums = np.column_stack([STATED, STATED])
         self._expected = 1.0
@@ -150,23 +157,6 @@ class Persistence:
             for frame, wTc in zip(frames[first:], poses[first:], strict=True):
                 self._poses[frame] = reorthonormalise(by @ wTc)
             self._pose = self._poses[frames[-1]]
-
-    def state(self) -> StateArrays:
-        """Everything needed to continue; sightings of the open tracks one after the other."""
-        return self._tracks.state() | {
-            "sums": self._sums.copy(),
-            "expected": np.array(self._expected),
-            "pose": self._pose,
-            "pose_frames": np.array(list(self._poses), np.int64),
-            "poses": np.array(list(self._poses.values())).reshape(-1, 4, 4),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._sums, self._pose = state["sums"].copy(), state["pose"]
-        self._expected = float(state["expected"])
-        self._poses = dict(zip(state["pose_frames"].tolist(), state["poses"], strict=True))
-        self._tracks.restore(state)
 
     def _ratio(self, which: int) -> float:
         squares, expectation = self._sums[which]

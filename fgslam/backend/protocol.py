@@ -10,9 +10,10 @@ To add an estimator:
    values (:mod:`fgslam.core.measurements`, :mod:`fgslam.core.estimates`): poses ``wTc`` in metres,
    covariances in the pose's tangent space, rotation first. ``examples/`` shows a small one; an
    object of it can be given to ``fgslam.Slam(rig, estimator=...)`` as it is.
-2. Where it can do more, add the members of :class:`Resumable` (interrupted runs),
-   :class:`JointCovariances` or :class:`MapUser` (beginning in a saved map). What asks for them
-   refuses an estimator without, in one line. :class:`NoiseEstimating` is only shown.
+2. Where it can do more, add the members of :class:`~fgslam.core.store.Resumable` (interrupted runs;
+   or mark what it keeps as :class:`~fgslam.core.store.Kept`), :class:`JointCovariances` or
+   :class:`MapUser` (beginning in a saved map). What asks for them refuses an estimator without, in
+   one line. :class:`NoiseEstimating` is only shown.
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
    derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
    its family; add it to the union there, and one ``case`` to ``make_estimator`` in
@@ -31,7 +32,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.measurements import Increment, MeasurementType, Odometry
@@ -112,19 +113,6 @@ class JointCovariances(Protocol):
 
 
 @runtime_checkable
-class Resumable(Protocol):
-    """An estimator whose run can be interrupted and resumed to the same bits; optional."""
-
-    def state(self) -> StateArrays:
-        """Everything needed to continue, as plain arrays; later updates leave them alone."""
-        ...
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from what :meth:`state` gave; on a new estimator with the same settings."""
-        ...
-
-
-@runtime_checkable
 class MapUser(Protocol):
     """An estimator that can begin in a saved map.
 
@@ -178,7 +166,7 @@ class NoiseEstimating(Protocol):
         ...
 
 
-class FullEstimator(Estimator, JointCovariances, Resumable, Protocol):
+class FullEstimator(Estimator, JointCovariances, Protocol):
     """What the estimators of this package offer: everything but, in some, :class:`MapUser`."""
 
 

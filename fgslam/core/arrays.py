@@ -166,14 +166,16 @@ class GrowingColumns:
         if not (np.diff(self[name][max(since - 1, 0) :]) > 0).all():
             self.take(0, np.argsort(self[name], kind="stable"))
 
-    def state(self) -> StateArrays:
-        """A snapshot of all columns."""
-        return {name: view.copy() for name, view in self.columns().items()}
+    def packed(self) -> StateArrays:
+        """All columns, without the room for more."""
+        return self.columns()
 
-    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Continues from :meth:`state`."""
-        self._length = 0
-        self.append({name: state[name] for name in self._buffers})
+    @classmethod
+    def unpacked(cls, packed: StateArrays) -> GrowingColumns:
+        """Back from :meth:`packed`."""
+        out = cls(**packed)
+        out.append(packed)
+        return out
 
     def bytes_per_row(self) -> int:
         """Memory of a row, without the room kept for growth."""

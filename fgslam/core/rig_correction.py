@@ -18,6 +18,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.features import Features
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 
 TERMS = (
     "column",  # principal point
@@ -226,8 +227,8 @@ class RigCorrection(Brief):
     """
 
     rig: CameraRig
-    values: FloatArray
-    covariance: FloatArray
+    values: Kept[FloatArray]
+    covariance: Kept[FloatArray]
     field_px: float = 0.0
 
     @staticmethod

@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.quantiles import middle
 from fgslam.core.rig_correction import IMPLAUSIBLE_PX
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.store import Kept
 from fgslam.frontend.image_lag import (
     Followed,
     Lag,
@@ -48,14 +50,21 @@ class _Pair:
     """
 
     model: LagModel
-    rows: tuple[list[LineRows], list[LineRows]]
-    ratios: list[float]
-    unequal: int = 0
-    swapped: bool = False
+    rows: Kept[tuple[list[LineRows], list[LineRows]]]
+    ratios: Kept[list[float]]
+    unequal: Kept[int] = 0
+    swapped: Kept[bool] = False
 
 
 class CameraWatch:
     """Says of each frame whether its images can be used."""
+
+    _pairs: Kept[list[_Pair]]
+    _turns: Kept[TurnWatch]
+    _late: Kept[list[bool]]
+    _before: Kept[Sequence[Image]]
+    _sums: Kept[list[int]]
+    _frames: Kept[int]
 
     def __init__(self, rig: CameraRig) -> None:
         """Nothing seen yet."""
@@ -65,7 +74,7 @@ class CameraWatch:
         self._pairs = [_Pair(LagModel(rig, c), ([], []), []) for c in range(1, rig.cameras)]
         self._turns = TurnWatch(rig, self._spread)
         self._late = [False] * rig.cameras
-        self._before: list[Image] = []
+        self._before = []
         self._sums = [-1] * rig.cameras
         self._frames = 0
 
@@ -223,48 +232,6 @@ class CameraWatch:
         return f"{_named(self._late)} old images" if any(self._late) else ""
 
     # ----------------------------------------------------------------------------------------
-
-    def state(self) -> StateArrays:
-        """All that is needed to continue to the bit."""
-        out: StateArrays = {
-            "late": np.array(self._late),
-            "sums": np.array(self._sums, np.int64),
-            "frames": np.array(self._frames),
-            "swapped": np.array([pair.swapped for pair in self._pairs]),
-            "before": np.array(self._before, np.uint8),
-        }
-        out |= {f"turns/{name}": value for name, value in self._turns.state().items()}
-        for k, pair in enumerate(self._pairs):
-            out[f"{k}/ratios"] = np.array(pair.ratios, np.float64)
-            out[f"{k}/unequal"] = np.array(pair.unequal)
-            for way, window in enumerate(pair.rows):
-                table = [np.column_stack([r.offset, r.shift, r.place]) for r in window]
-                out[f"{k}/rows{way}"] = np.concatenate([np.empty((0, 4)), *table])
-                out[f"{k}/sizes{way}"] = np.array([len(r) for r in window], np.int64)
-        return out
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`.
-
-        A checkpoint of an earlier version holds nothing of turned cameras: their watch begins anew.
-        """
-        self._late = [bool(one) for one in state["late"]]
-        self._sums = state["sums"].tolist()
-        self._frames = int(state["frames"])
-        self._before = list(state["before"])
-        self._turns = TurnWatch(self._rig, self._spread)
-        own = [name for name in state if name.startswith("turns/")]
-        if own:  # not in states of versions that did not look for turns
-            self._turns.restore({name.removeprefix("turns/"): state[name] for name in own})
-        for k, pair in enumerate(self._pairs):
-            pair.swapped = bool(state["swapped"][k])
-            pair.ratios = state[f"{k}/ratios"].tolist()
-            pair.unequal = int(state[f"{k}/unequal"])
-            for way, window in enumerate(pair.rows):
-                ends = np.cumsum(state[f"{k}/sizes{way}"])[:-1]
-                table = state[f"{k}/rows{way}"]
-                parts = np.split(table, ends) if len(state[f"{k}/sizes{way}"]) else []
-                window[:] = [LineRows(p[:, 0], p[:, 1], p[:, 2:]) for p in parts]
 
 
 def _named(which: list[bool]) -> str:

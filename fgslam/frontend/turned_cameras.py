@@ -15,11 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import TERMS, camera_displacements
 from fgslam.core.robust import cauchy_fit
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.store import Kept
 from fgslam.frontend.image_lag import LineRows
 
 WINDOW = 6
@@ -131,6 +132,17 @@ class _Change:
 class TurnWatch:
     """Finds knocks from the offsets of points across their lines, window by window."""
 
+    _window: Kept[Turns]
+    _shown: Kept[int]
+    _begins: Kept[int]
+    _known: Kept[Turns]
+    _windows: Kept[int]
+    _suspected: Kept[Turns]
+    _agreed: Kept[int]
+    _since: Kept[int]
+    _noise: Kept[FloatArray]
+    knocks: Kept[list[Knock]]
+
     def __init__(self, rig: CameraRig, spread_px: float) -> None:
         """``spread_px``: least deviation of an offset, pixels."""
         self._rig, self._spread = rig, spread_px
@@ -139,7 +151,7 @@ class TurnWatch:
         self._known, self._windows = Turns.none(others), 0
         self._suspected, self._agreed, self._since = Turns.none(others), 0, -1
         self._noise = np.array([_PRIOR_WINDOWS * _STATED_NOISE, _PRIOR_WINDOWS])
-        self.knocks: list[Knock] = []
+        self.knocks = []
 
     def take(self, frame: int, seen: Sequence[LineRows]) -> None:
         """Takes in a frame by its number; as :func:`turns_of`."""
@@ -247,28 +259,6 @@ class TurnWatch:
         return " against the right one (or that one by the opposite)" * pair
 
     # ----------------------------------------------------------------------------------------
-
-    def state(self) -> StateArrays:
-        """All that is needed to continue to the bit."""
-        sums = (self._window, self._known, self._suspected, *(k.before for k in self.knocks))
-        return {
-            "information": np.array([one.information for one in sums]),
-            "score": np.array([one.score for one in sums]),
-            "counts": np.array([self._shown, self._begins, self._windows, self._agreed]),
-            "since": np.array(self._since),
-            "noise": self._noise,
-            "knocks": np.array([knock.frame for knock in self.knocks], np.int64),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        pairs = zip(state["information"], state["score"], strict=True)
-        self._window, self._known, self._suspected, *before = (Turns(a, b) for a, b in pairs)
-        self._shown, self._begins, self._windows, self._agreed = state["counts"].tolist()
-        self._since = int(state["since"])
-        self._noise = state["noise"]
-        frames = state["knocks"].tolist()
-        self.knocks = [Knock(*one) for one in zip(frames, before, strict=True)]
 
 
 def _change(before: Turns, after: Turns) -> tuple[FloatArray, FloatArray]:

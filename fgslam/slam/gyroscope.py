@@ -9,10 +9,11 @@ import dataclasses
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import compose_covariance, inverse, se3_exp, se3_log, so3_exp, so3_log
 from fgslam.core.measurements import Odometry
+from fgslam.core.store import Kept
 
 _FADING = float(np.exp(-0.1))  # frames remembered, as of the noise of constant velocity: ten
 _STATED_WEIGHT = 3.0  # one turn's worth of the stated noise, which is never undercut
@@ -47,13 +48,21 @@ class GyroscopeError:
     after it say the same.
     """
 
+    _bias: Kept[FloatArray]
+    _covariance: Kept[FloatArray | None]
+    _jacobian: Kept[FloatArray | None]
+    _step: Kept[Odometry | None]
+    _before: Kept[Prediction | None]
+    _found: Kept[float]
+    _expected: Kept[float]
+
     def __init__(self) -> None:
         """Knows nothing but that it is about zero, within what the first step states."""
         self._bias = np.zeros(3)
-        self._covariance: FloatArray | None = None
-        self._jacobian: FloatArray | None = None
-        self._step: Odometry | None = None
-        self._before: Prediction | None = None
+        self._covariance = None
+        self._jacobian = None
+        self._step = None
+        self._before = None
         self._found, self._expected = _STATED_WEIGHT, _STATED_WEIGHT
 
     @property
@@ -117,26 +126,3 @@ class GyroscopeError:
     def displaced(self) -> None:
         """Between the last pose and the next lies no motion."""
         self._step = self._before = None
-
-    def state(self) -> StateArrays:
-        """What is needed to continue; NaN where unknown."""
-        covariance, before = self._covariance, self._before
-        return {
-            "gyroscope_bias": self._bias,
-            "gyroscope_covariance": np.full((3, 3), np.nan) if covariance is None else covariance,
-            "gyroscope_pose": np.full((4, 4), np.nan) if before is None else before.wTc,
-            "gyroscope_pose_covariance": np.full((6, 6), np.nan)
-            if before is None
-            else before.covariance,
-            "gyroscope_noise": np.array([self._found, self._expected]),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`, between two frames."""
-        self._bias = state["gyroscope_bias"]
-        covariance, pose = state["gyroscope_covariance"], state["gyroscope_pose"]
-        self._covariance = None if np.isnan(covariance[0, 0]) else covariance
-        known = not np.isnan(pose[0, 0])
-        self._before = Prediction(pose, state["gyroscope_pose_covariance"]) if known else None
-        self._step = self._jacobian = None
-        self._found, self._expected = map(float, state["gyroscope_noise"])

@@ -7,11 +7,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import inverse, odometry_of_camera, se3_exp, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
+from fgslam.core.store import Kept
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.slam.gyroscope import GyroscopeError, turn_of_camera, turned_by
 from fgslam.slam.motion_noise import MotionNoise
@@ -82,6 +83,9 @@ class OdometryMotion:
     turns, which are corrected by what the matches say of its bias.
     """
 
+    _stand_in: Kept[ConstantVelocityMotion]
+    gyroscope: Kept[GyroscopeError]
+
     uses_odometry = True
 
     def __init__(self, bTc: FloatArray, kind: str, stand_in: ConstantVelocityMotion) -> None:
@@ -129,18 +133,16 @@ class OdometryMotion:
         """The kind of odometry and what bridges its gaps."""
         return {"kind": self._kind, "stand_in": self._stand_in.description()}
 
-    def state(self) -> StateArrays:
-        """State of the stand-in and of the gyroscope's bias."""
-        return self._stand_in.state() | self.gyroscope.state()
-
-    def restore(self, state: StateArrays) -> None:
-        """State of the stand-in and of the gyroscope's bias."""
-        self._stand_in.restore(state)
-        self.gyroscope.restore(state)
-
 
 class ConstantVelocityMotion:
     """The camera keeps its last velocity, up to a random acceleration; no sensor needed."""
+
+    _noise: Kept[MotionNoise]
+    _timestamp: Kept[float | None]
+    _measured_at: Kept[float]
+    _founded: Kept[bool]
+    _pose: Kept[FloatArray]
+    _velocity: Kept[FloatArray | None]
 
     uses_odometry = False
 
@@ -152,11 +154,11 @@ class ConstantVelocityMotion:
         self._start_sigma = np.repeat(
             [np.deg2rad(settings.start_rotation_sigma_dps), settings.start_speed_sigma_mps], 3
         )
-        self._timestamp: float | None = None
+        self._timestamp = None
         self._measured_at = 0.0
         self._founded = False
         self._pose = np.eye(4)
-        self._velocity: FloatArray | None = None
+        self._velocity = None
 
     @property
     def acceleration_variance(self) -> FloatArray:
@@ -233,27 +235,6 @@ class ConstantVelocityMotion:
     def description(self) -> dict[str, Any]:
         """Kind and numbers."""
         return asdict(self._settings)
-
-    def state(self) -> StateArrays:
-        """Last time, last measured pose and its time, velocity; NaN where unknown."""
-        return {
-            "timestamp": np.array(np.nan if self._timestamp is None else self._timestamp),
-            "measured_at": np.array(self._measured_at),
-            "founded": np.array(self._founded),
-            "pose": self._pose,
-            "velocity": np.full(6, np.nan) if self._velocity is None else self._velocity,
-            "noise": self._noise.state(),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        timestamp = float(state["timestamp"])
-        self._timestamp = None if np.isnan(timestamp) else timestamp
-        self._measured_at = float(state["measured_at"])
-        self._founded = bool(state["founded"])
-        self._pose = state["pose"]
-        self._velocity = None if np.isnan(state["velocity"][0]) else state["velocity"]
-        self._noise.restore(state["noise"])
 
 
 def _faded(velocity: FloatArray, wandered: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.store import Kept
 
 _MEMORY = 10.0  # frames after which a sample has lost all but 1/e of its weight
 _FADING = float(np.exp(-1.0 / _MEMORY))
@@ -22,6 +23,10 @@ _LEAST_SIGMA = np.repeat([np.deg2rad(0.05), 0.001], 3)
 
 class MotionNoise:
     """Variances of the random acceleration about and along the camera's axes."""
+
+    _sum: Kept[FloatArray]
+    _weight: Kept[float]
+    _start_weight: Kept[float]
 
     def __init__(self, start_sigma: FloatArray) -> None:
         """``start_sigma`` (6,): [rotation, translation], rad/s^2 and m/s^2, before any sample."""
@@ -50,12 +55,3 @@ class MotionNoise:
         self._sum = _FADING * self._sum + (innovation**2 + left) / span**2
         self._weight = _FADING * self._weight + 1.0
         self._start_weight *= _START_FADING
-
-    def state(self) -> FloatArray:
-        """(8,) what is needed to continue."""
-        return np.append(self._sum, [self._weight, self._start_weight])
-
-    def restore(self, state: FloatArray) -> None:
-        """Continues from :meth:`state`."""
-        self._sum = np.array(state[:6])
-        self._weight, self._start_weight = map(float, state[6:])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator, Resumable, predicted, recalibrated, updated
+from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.core.arrays import IntArray, StateArrays
 from fgslam.core.estimates import (
     EgoMotion,
@@ -25,6 +25,7 @@ from fgslam.core.estimates import (
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.rig_correction import RigCorrection
+from fgslam.core.store import Kept, has_state, restore, state_of
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import unmeasured
@@ -90,7 +91,7 @@ def timed(stage: str) -> Callable[[Step], Step]:
     return decorate
 
 
-Snapshot: TypeAlias = "list[tuple[Resumable, StateArrays]]"
+Snapshot: TypeAlias = list[tuple[Any, StateArrays]]
 """Parts, and their states before a frame, for the rollback where its features cannot be found."""
 
 
@@ -127,7 +128,7 @@ class SlamPipeline:
     describe_reference: Callable[[FeatureFrame], FeatureFrame] | None = None
     rewound: bool = False
     watch_of_frame: Stopwatch = field(default_factory=Stopwatch, init=False)
-    _ended: IntArray = field(default_factory=no_ids, init=False)
+    _ended: Kept[IntArray] = field(default_factory=no_ids, init=False)
     _tried: tuple[FeatureFrame, StereoFeatures] | None = field(default=None, init=False)
 
     def process(
@@ -174,9 +175,9 @@ class SlamPipeline:
         if frame.frame is None:
             return False
         if self.watch is not None:
-            before = self.watch.state()
+            before = state_of(self.watch)
             refused = self._check_cameras(frame, frame.i).refused
-            self.watch.restore(before)  # the frame comes again
+            restore(self.watch, before)  # the frame comes again
             if refused:
                 return False
         first = self._find_features(dataclasses.replace(frame, i=0), None, [])
@@ -193,17 +194,6 @@ class SlamPipeline:
             found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
         return bridged(found, self.tracker.parts)
 
-    def state(self) -> StateArrays:
-        """What the loop itself keeps between frames."""
-        tracker = self.tracker
-        return {"ended": self._ended} | tracker.noise.state() | tracker.other_motion.state()
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`; the parts have states of their own."""
-        self._ended = state["ended"]
-        self.tracker.noise.restore(state)
-        self.tracker.other_motion.restore(state)
-
     # -- the steps, in their order -------------------------------------------------------------
 
     def _snapshot(self, frame: FeatureFrame) -> Snapshot:
@@ -212,7 +202,7 @@ class SlamPipeline:
         if self.describe is None or frame.frame is None or frame.features:
             return []
         parts = self.watch, self.motion, self.key_frames
-        return [(part, part.state()) for part in parts if isinstance(part, Resumable)]
+        return [(part, state_of(part)) for part in parts if has_state(part)]
 
     @timed("watch")
     def _check_cameras(self, frame: FeatureFrame, index: int) -> FeatureFrame:
@@ -275,7 +265,7 @@ class SlamPipeline:
             return find(frame)
         except BaseException:
             for part, state in snapshot:
-                part.restore(state)
+                restore(part, state)
             self.rewound = True
             raise
 

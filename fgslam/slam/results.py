@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from fgslam.backend.filters.rig_models import WeighedCorrection
 from fgslam.backend.protocol import Estimator
-from fgslam.core.arrays import BoolArray, Brief, FloatArray, StateArrays
+from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Observations
+from fgslam.core.store import Kept
 from fgslam.slam.noise_in_use import FrameNoise
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
@@ -61,15 +62,15 @@ class RunRecorder:
     """
 
     log: MeasurementLog
-    rows: list[FrameRow] = field(default_factory=list)
-    tracked_poses: list[FloatArray] = field(default_factory=list)
-    online_poses: list[FloatArray] = field(default_factory=list)
-    online_covariances: list[FloatArray] = field(default_factory=list)
-    stage_ms: list[FloatArray] = field(default_factory=list)
-    frame_digests: list[int] = field(default_factory=list)
-    noise: list[FrameNoise] = field(default_factory=list)
+    rows: Kept[list[FrameRow]] = field(default_factory=list)
+    tracked_poses: Kept[list[FloatArray]] = field(default_factory=list)
+    online_poses: Kept[list[FloatArray]] = field(default_factory=list)
+    online_covariances: Kept[list[FloatArray]] = field(default_factory=list)
+    stage_ms: Kept[list[FloatArray]] = field(default_factory=list)
+    frame_digests: Kept[list[int]] = field(default_factory=list)
+    noise: Kept[list[FrameNoise]] = field(default_factory=list)
     left_out: int = 0
-    most_stereo: int = field(default=0, init=False)
+    most_stereo: Kept[int] = field(default=0, init=False)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -99,30 +100,6 @@ class RunRecorder:
         """(n, stages) milliseconds, without the frames of a session before: NaN there."""
         times = np.array(self.stage_ms).reshape(-1, len(STAGES))
         return times[np.isfinite(times).all(axis=1)]
-
-    def state(self) -> StateArrays:
-        """All but the log, as arrays."""
-        out: StateArrays = {name: self.column(name) for name in FrameRow._fields}
-        out["tracked_poses"] = np.array(self.tracked_poses).reshape(-1, 4, 4)
-        out["online_poses"] = np.array(self.online_poses).reshape(-1, 4, 4)
-        out["online_covariances"] = np.array(self.online_covariances).reshape(-1, 6, 6)
-        out["stage_ms"] = np.array(self.stage_ms).reshape(-1, len(STAGES))
-        out["noise"] = np.array(self.noise).reshape(-1, len(FrameNoise._fields))
-        out["frame_digests"] = np.array(self.frame_digests, np.int64)
-        return out
-
-    def restore(self, state: StateArrays, log: MeasurementLog) -> None:
-        """Continues from :meth:`state` and the log of as many frames."""
-        columns = [state[name].tolist() for name in FrameRow._fields]
-        self.rows = [FrameRow(*values) for values in zip(*columns, strict=True)]
-        self.most_stereo = max((row.stereo for row in self.rows), default=0)
-        self.tracked_poses = list(state["tracked_poses"])
-        self.online_poses = list(state["online_poses"])
-        self.online_covariances = list(state["online_covariances"])
-        self.stage_ms = list(state["stage_ms"])
-        self.noise = [FrameNoise(*row) for row in state["noise"].tolist()]
-        self.frame_digests = state["frame_digests"].tolist()
-        self.log.increments[:] = log.increments[: len(self.rows)]
 
 
 def _row(report: FrameReport, stereo_precision: float) -> FrameRow:

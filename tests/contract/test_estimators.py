@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam.backend.protocol import Estimator, Resumable
+from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
     BatchSettings,
     EstimatorSettings,
@@ -29,6 +29,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.store import has_state, restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
@@ -179,7 +180,7 @@ def test_estimator_reports_kind_family_and_supported_sensors(
     settings = SETTINGS[request.node.callspec.params["make"]]
     assert estimator.kind == settings.kind
     assert (family_of(settings.kind) == "smoother") == isinstance(estimator, Smoother)
-    assert isinstance(estimator, Resumable)
+    assert has_state(estimator)
     assert estimator.supports
     assert all(isinstance(kind, MeasurementType) for kind in estimator.supports)
 
@@ -336,9 +337,9 @@ def test_a_restored_state_continues_to_the_same_bits(
     first, second = make(), make()
     play(first, world.increments[:6])
     # As a file does: plain arrays, copied.
-    state = {name: np.array(array) for name, array in first.state().items()}
+    state = {name: np.array(array) for name, array in state_of(first).items()}
     assert all(array.dtype != np.object_ for array in state.values())
-    second.restore(state)
+    restore(second, state)
     play(second, world.increments[6:])
     assert_same_bits(everything(second), everything(driven))
 

@@ -20,6 +20,7 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.features import Features
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import BiasEffect, Odometry
+from fgslam.core.store import state_of
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.slam.factory import make_extractor
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -149,7 +150,7 @@ def turn_of(bTc: FloatArray, steps: int) -> Odometry:
 
 def watched_and_carried(slam: fg.Slam) -> dict[str, StateArrays]:
     parts = {"watch": slam.pipeline.watch, "key_frames": slam.pipeline.key_frames}
-    return {name: dict(part.state()) for name, part in parts.items() if part is not None}
+    return {name: dict(state_of(part)) for name, part in parts.items() if part is not None}
 
 
 def test_a_frame_whose_features_could_not_be_found_leaves_no_trace(

@@ -11,7 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, moved, placed
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     adjoint,
@@ -22,6 +22,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 
 
 class DeadReckoning:
@@ -29,6 +30,10 @@ class DeadReckoning:
 
     kind: ClassVar[str] = "odometry"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+    _current: Kept[Prediction]
+    _past: Kept[FilteredTrajectory]
+    _map: Kept[LandmarkMap]
+    _first_frame: Kept[IntArray]
 
     def __init__(self, sensor: CameraRig, prior: Prediction) -> None:
         """Starts at the prior: pose of the first frame and its covariance."""
@@ -36,7 +41,7 @@ class DeadReckoning:
         self._current = prior
         self._past = FilteredTrajectory()
         self._map = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-        self._first_frame: IntArray = np.empty(0, np.int64)
+        self._first_frame = np.empty(0, np.int64)
 
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
@@ -86,24 +91,6 @@ class DeadReckoning:
         for a, row in zip(at, rows.tolist(), strict=False):
             out[a, a] = self._map.covariances[row]
         return np.asarray(0.5 * (out + out.T))
-
-    def state(self) -> StateArrays:
-        """Everything needed to continue; nothing in it is ever written to again."""
-        return self._past.state() | {
-            "current_pose": self._current.wTc,
-            "current_covariance": self._current.covariance,
-            "ids": self._map.ids,
-            "positions": self._map.positions,
-            "covariances": self._map.covariances,
-            "first_frame": self._first_frame,
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._past = FilteredTrajectory.restored(state)
-        self._current = Prediction(state["current_pose"], state["current_covariance"])
-        self._map = LandmarkMap(state["ids"], state["positions"], state["covariances"])
-        self._first_frame = state["first_frame"]
 
     # ----------------------------------------------------------------------------------------
 

@@ -25,7 +25,7 @@ from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovar
 from fgslam.backend.filters.loop_correction import within_gate
 from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.settings import EkfSettings
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.floor import Floor
@@ -42,6 +42,7 @@ from fgslam.core.geometry import (
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
 _ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted
@@ -56,6 +57,16 @@ class FullEkf:
 
     kind: ClassVar[str] = "ekf"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+    _past: Kept[FilteredTrajectory]
+    _wTc: Kept[FloatArray]
+    _covariance: Kept[GrowingCovariance]
+    _ids: Kept[IntArray]
+    _positions: Kept[FloatArray]
+    _matched: Kept[int]
+    _gated: Kept[int]
+    _skipped: Kept[int]
+    _remarks: Kept[list[str]]
+    _doubt: Kept[OnlineDoubt]
 
     def __init__(
         self, sensor: CameraRig, settings: EkfSettings, floor: Floor, prior: Prediction
@@ -66,12 +77,12 @@ class FullEkf:
         self._floor = floor
         self._wTc = floor.constrain(prior.wTc) if floor.rigid_dof < 6 else prior.wTc
         self._covariance = GrowingCovariance(floor.allowed_part(self._wTc, prior.covariance))
-        self._ids: IntArray = np.empty(0, np.int64)
-        self._positions: FloatArray = np.empty((0, 3))
+        self._ids = np.empty(0, np.int64)
+        self._positions = np.empty((0, 3))
         self._past = FilteredTrajectory()
         self._doubt = OnlineDoubt(sensor, floor)
         self._matched = self._gated = self._skipped = 0
-        self._remarks: list[str] = []
+        self._remarks = []
         self._map: LandmarkMap | None = None
         self._fixed = False
 
@@ -173,30 +184,8 @@ class FullEkf:
         rows = rows_of(self._blocks(ids)).ravel()
         return self._doubt.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
 
-    def state(self) -> StateArrays:
-        """Everything needed to continue; the covariance as its lower triangle."""
-        return (
-            self._past.state()
-            | {
-                "pose": self._wTc,
-                "covariance": self._covariance.packed(),
-                "ids": self._ids,
-                "positions": self._positions,
-                "counts": np.array([self._matched, self._gated, self._skipped]),
-                "remarks": np.array(self._remarks, np.str_),
-            }
-            | self._doubt.state()
-        )
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._past = FilteredTrajectory.restored(state)
-        self._wTc = state["pose"]
-        self._covariance = GrowingCovariance.unpacked(state["covariance"])
-        self._ids, self._positions = state["ids"], state["positions"]
-        self._matched, self._gated, self._skipped = state["counts"].tolist()
-        self._remarks = [str(words) for words in state["remarks"]]
-        self._doubt.restore(state)
+    def remake(self) -> None:
+        """The map is made anew of what was put back."""
         self._map = None
 
     # -- what may fail, before anything is changed ---------------------------------------------

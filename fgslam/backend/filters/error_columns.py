@@ -10,18 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, StateArrays
-
-_PREFIX = "doubt_"  # of names in a state
-
-
-def under(prefix: str, state: StateArrays) -> StateArrays:
-    """A part's state, its names prefixed so that they differ from those of other parts."""
-    return {prefix + name: array for name, array in state.items()}
-
-
-def found_under(prefix: str, state: StateArrays) -> StateArrays:
-    """The part of a state that :func:`under` has named."""
-    return {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
+from fgslam.core.store import Kept
 
 
 class ErrorColumns:
@@ -30,6 +19,11 @@ class ErrorColumns:
     Those of a landmark stay in one place while it is there: what comes and goes costs what it is,
     whatever the map.
     """
+
+    _gain: Kept[FloatArray]
+    _order: Kept[GrowingColumns]
+    _map: Kept[GrowingColumns]
+    _free: Kept[IntArray]
 
     def __init__(self, count: int, kind: type = np.float64, **more: FloatArray) -> None:
         """All zero, the map empty.
@@ -59,24 +53,7 @@ class ErrorColumns:
             self._free = np.concatenate([self._free, self._order["row"][gone]])
             self._order.drop(gone)
 
-    def state(self) -> StateArrays:
-        """Everything needed to continue."""
-        return under(_PREFIX, self._state())
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._restore(found_under(_PREFIX, state))
-
     # ----------------------------------------------------------------------------------------
-
-    def _state(self) -> StateArrays:
-        held = {name: of[self._order["row"]] for name, of in self._map.columns().items()}
-        return {"pose_gain": self._gain, "ids": self._order["ids"].copy(), **held}
-
-    def _restore(self, state: StateArrays) -> None:
-        self._gain = state["pose_gain"]
-        self.forget(self._order["ids"].copy())
-        self._append({"ids": state["ids"], **{name: state[name] for name in self._map.columns()}})
 
     def _append(self, values: StateArrays) -> None:
         """Landmarks (k,) that are not there yet; their identities ascend."""

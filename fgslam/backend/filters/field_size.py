@@ -13,11 +13,12 @@ import numpy as np
 from scipy.linalg import null_space
 
 from fgslam.backend.filters.online_doubt import pixels_of
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.measurements import Observations
 from fgslam.core.rig_correction import displacements, prior_information
 from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import CameraRig, pixel_model, vertical_to_horizontal
+from fgslam.core.store import Kept
 
 _GROUPS = 8  # of landmarks; a deviation from them is known to a quarter
 _LEAST_GROUPS = 4
@@ -29,6 +30,11 @@ _SURE = 2.0  # standard errors above zero from which a field is one
 
 class FieldSize:
     """Normal equations of rig terms and field, by group of landmarks; and the field's size."""
+
+    _normal: Kept[FloatArray]
+    _rows: Kept[IntArray]
+    _frames: Kept[int]
+    px: Kept[float]
 
     def __init__(self, rig: CameraRig, pixel_sigma: float) -> None:
         """Nothing seen yet; ``pixel_sigma`` of one coordinate, pixels."""
@@ -54,20 +60,6 @@ class FieldSize:
         if self._frames % _EVERY == 0:
             variance, error = self._variance()
             self.px = float(np.sqrt(variance)) if variance > _SURE * error else 0.0
-
-    def state(self) -> StateArrays:
-        """All that changes."""
-        return {
-            "field_normal": self._normal.copy(),
-            "field_rows": self._rows.copy(),
-            "field_found": np.array([self._frames, self.px]),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._normal, self._rows = state["field_normal"].copy(), state["field_rows"].copy()
-        frames, self.px = state["field_found"].tolist()
-        self._frames = int(frames)
 
     # ----------------------------------------------------------------------------------------
 

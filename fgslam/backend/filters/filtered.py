@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Prediction, Trajectory
 from fgslam.core.geometry import (
@@ -64,24 +64,6 @@ class FilteredTrajectory:
     def pose_covariances(self) -> FloatArray:
         """(n, 6, 6) of all poses."""
         return np.array(self.covariances).reshape(-1, 6, 6)
-
-    def state(self) -> StateArrays:
-        """All of it as plain arrays."""
-        trajectory = self.trajectory()
-        return {
-            "timestamps": trajectory.timestamps,
-            "poses": trajectory.poses,
-            "pose_covariances": self.pose_covariances(),
-        }
-
-    @staticmethod
-    def restored(state: StateArrays) -> FilteredTrajectory:
-        """Back from :meth:`state`."""
-        return FilteredTrajectory(
-            [float(t) for t in state["timestamps"]],
-            list(state["poses"]),
-            list(state["pose_covariances"]),
-        )
 
 
 def require_finite(increment: Increment, tracking: EgoMotion | None = None) -> None:

@@ -35,7 +35,7 @@ from fgslam.backend.filters.sampled_errors import Moved, SampledErrors, Step, la
 from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     congruence,
@@ -48,6 +48,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
@@ -62,6 +63,13 @@ class LandmarkKalman:
 
     kind: ClassVar[str] = "landmark_kalman"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+    _current: Kept[Prediction]
+    _past: Kept[FilteredTrajectory]
+    _rows: Kept[LandmarkRows]
+    _drive: Kept[DriveRecord]
+    _errors: Kept[SampledErrors]
+    _applied: Kept[FloatArray]
+    _disparity_sigma: Kept[float]
 
     def __init__(
         self,
@@ -211,34 +219,7 @@ class LandmarkKalman:
         known = self._errors.landmarks(self._rows.map().select(self._rows.rows(ids)))
         return self._errors.joint(self._errors.pose(self._current).covariance, known)
 
-    def state(self) -> StateArrays:
-        """Everything needed to continue; a snapshot, which later updates leave alone."""
-        names = ("ids", "positions", "covariances", "counts", "homes", "lasts")
-        held = {name: a.copy() for name, a in zip(names, self._arrays(), strict=True)}
-        current = {
-            "current_pose": self._current.wTc,
-            "current_covariance": self._current.covariance,
-            "rig_correction": self._applied,
-            "disparity_sigma": np.array(self._disparity_sigma),
-        }
-        return self._past.state() | current | held | self._drive.state() | self._errors.state()
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._past = FilteredTrajectory.restored(state)
-        self._current = Prediction(state["current_pose"], state["current_covariance"])
-        landmarks = LandmarkMap(state["ids"], state["positions"], state["covariances"])
-        self._rows.load(landmarks, state["counts"], state["homes"], state["lasts"])
-        self._applied = state["rig_correction"]
-        self._disparity_sigma = float(state["disparity_sigma"])
-        self._drive.restore(state)
-        self._errors.restore(state)
-
     # ----------------------------------------------------------------------------------------
-
-    def _arrays(self) -> tuple[IntArray | FloatArray, ...]:
-        rows = self._rows
-        return rows.ids, rows.positions, rows.covariances, rows.counts, rows.homes, rows.lasts
 
     def _step(self, increment: Increment, tracking: EgoMotion) -> Step:
         """The step to a frame, before it is taken."""

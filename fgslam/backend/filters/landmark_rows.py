@@ -6,6 +6,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.estimates import LandmarkMap
+from fgslam.core.store import Kept
 
 
 class LandmarkRows:
@@ -15,6 +16,8 @@ class LandmarkRows:
     mostly young, so that only what lies behind the first of them moves.
     The arrays are views of the room in use: writing to rows of them changes the landmarks.
     """
+
+    _columns: Kept[GrowingColumns]
 
     def __init__(self) -> None:
         """No landmark."""

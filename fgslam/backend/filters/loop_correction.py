@@ -16,11 +16,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
+from fgslam.core.store import Kept
 from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
 from fgslam.factors.motion import odometry_factor, pose_prior
 from fgslam.factors.noise import robust
@@ -135,33 +136,6 @@ class Chain:
         errors = as_motions_of_the_world(poses, np.array(self.steps))
         sums = [errors[a + 1 : b + 1].sum(axis=0) for a, b in itertools.pairwise([-1, *frames])]
         return congruence(adjoint(_inverses(poses[frames])), np.array(sums))
-
-    def state(self) -> StateArrays:
-        """All of it as plain arrays."""
-        n, known = len(self.poses), self.constraints
-        return {
-            "chain_poses": np.array(self.poses).reshape(n, 4, 4),
-            "chain_steps": np.array(self.steps).reshape(n, 6, 6),
-            "chain_between": np.array([(c.before, c.after) for c in known], np.int64).reshape(
-                -1, 2
-            ),
-            "chain_motions": np.array([c.motion for c in known]).reshape(-1, 4, 4),
-            "chain_doubted": np.array([c.doubted for c in known], np.bool_),
-            "chain_covariances": np.array([c.covariance for c in known]).reshape(-1, 6, 6),
-        }
-
-    @staticmethod
-    def restored(state: StateArrays) -> Chain:
-        """Back from :meth:`state`."""
-        known = zip(
-            state["chain_between"].tolist(),
-            state["chain_motions"],
-            state["chain_covariances"],
-            state["chain_doubted"].tolist(),
-            strict=True,
-        )
-        constraints = [Constraint(a, b, *rest) for (a, b), *rest in known]
-        return Chain(list(state["chain_poses"]), list(state["chain_steps"]), constraints)
 
 
 def corrected(
@@ -339,12 +313,17 @@ class DriveRecord:
     was carried off, unknown.
     """
 
+    _chain: Kept[Chain]
+    _tied: Kept[int]
+    _coherent: Kept[bool]
+    remarks: Kept[list[str]]
+
     def __init__(self) -> None:
         """An empty drive."""
         self._chain = Chain()
         self._tied = -1
         self._coherent = True
-        self.remarks: list[str] = []
+        self.remarks = []
 
     @property
     def chain(self) -> Chain:
@@ -433,18 +412,3 @@ class DriveRecord:
             f"{what}: the camera moved by {np.linalg.norm(shift):.2f} m, the drive with it"
         )
         return poses
-
-    def state(self) -> StateArrays:
-        """All of it as plain arrays."""
-        return self._chain.state() | {
-            "chain_tied": np.array(self._tied),
-            "chain_sound": np.array(self._coherent),
-            "chain_remarks": np.array(self.remarks, np.str_),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._chain = Chain.restored(state)
-        self._tied = int(state["chain_tied"])
-        self._coherent = bool(state["chain_sound"])
-        self.remarks = [str(words) for words in state["chain_remarks"]]

@@ -15,7 +15,7 @@ import dataclasses
 import numpy as np
 
 from fgslam.backend.filters.error_columns import ErrorColumns
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -35,6 +35,7 @@ from fgslam.core.rig_correction import (
 )
 from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import CameraRig, pixel_model, rig_map, vertical_to_horizontal
+from fgslam.core.store import Kept
 
 _LEAST_MATCHES = 6  # of a frame; with fewer, its pose follows the one before
 _LEAST_DISPARITY_PX = 0.5  # farther points are known no better than their noise
@@ -48,14 +49,18 @@ class RigTerms:
     Of a rig that is exact, or that is taken as stated, there is no doubt.
     """
 
+    deviations: Kept[FloatArray | None]
+    _applied: Kept[FloatArray]
+    _field_px: Kept[float]
+
     def __init__(self, sensor: CameraRig) -> None:
         """Those of a rig that is not exact."""
         self.rig = None if sensor.exact else sensor
         self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig))
         """How many there are, q."""
-        self.deviations: FloatArray | None = None
+        self.deviations = None
         """(q, q) lower root of their covariance; None: no doubt."""
-        self._applied: FloatArray = np.empty(0)
+        self._applied = np.empty(0)
         self._field_px = 0.0
 
     @property
@@ -76,15 +81,6 @@ class RigTerms:
         of_pixels = [shared_displacements(self.rig, pixels), field_displacements(self.rig, pixels)]
         return fused(self.rig, np.concatenate(of_pixels, axis=2))
 
-    def state(self) -> StateArrays:
-        """What was heard last."""
-        return {"applied": self._applied, "field_px": np.array(self._field_px)}
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        applied = state["applied"]
-        self._hear(applied if applied.size else None, float(state["field_px"]))
-
     def _hear(self, correction: FloatArray | None, field_px: float) -> None:
         """Both change seldom."""
         if self.rig is None or correction is None:
@@ -104,6 +100,9 @@ class OnlineDoubt(ErrorColumns):
     Of a rig that is exact, or that is taken as stated, there is no doubt: nothing is added.
     """
 
+    _terms: Kept[RigTerms]
+    _wTc: Kept[FloatArray | None]
+
     def __init__(self, sensor: CameraRig, floor: Floor) -> None:
         """The first pose is known, the map empty.
 
@@ -115,7 +114,7 @@ class OnlineDoubt(ErrorColumns):
         self._terms = RigTerms(sensor)
         super().__init__(self._terms.count, information=np.empty((0, 3, 3)))
         self._floor = floor
-        self._wTc: FloatArray | None = None
+        self._wTc = None
 
     @property
     def present(self) -> bool:
@@ -173,15 +172,6 @@ class OnlineDoubt(ErrorColumns):
         return np.asarray(covariance + gain @ terms @ gain.T)
 
     # ----------------------------------------------------------------------------------------
-
-    def _state(self) -> StateArrays:
-        pose = np.empty((0, 4, 4)) if self._wTc is None else self._wTc[None]
-        return {**self._terms.state(), "pose": pose, **super()._state()}
-
-    def _restore(self, state: StateArrays) -> None:
-        self._terms.restore(state)
-        self._wTc = next(iter(state["pose"]), None)
-        super()._restore(state)
 
     def _at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         return self._map["gain"][rows], self._map["information"][rows]

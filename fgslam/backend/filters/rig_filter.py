@@ -15,12 +15,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fgslam.backend.filters.rig_alignment import RigAlignment, RigEvidence
-from fgslam.core.arrays import BoolArray, FloatArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.measurements import Observations
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.rig_correction import RigCorrection, prior_information
 from fgslam.core.rig_field import field_modes
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 
 TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
 _KERNEL_FACTOR = {2: 0.61, 3: 0.49}
@@ -89,12 +90,12 @@ class RigFilter:
         freedom: how many numbers that is of.
     """
 
-    known: RigCorrection
+    known: Kept[RigCorrection]
     free: BoolArray
     prior: FloatArray
-    field: _Field
-    misfit: float = 0.0
-    freedom: float = 0.0
+    field: Kept[_Field]
+    misfit: Kept[float] = 0.0
+    freedom: Kept[float] = 0.0
 
     @staticmethod
     def of(rig: CameraRig, free: BoolArray) -> RigFilter:
@@ -179,20 +180,3 @@ class RigFilter:
         """What a window (wTc, what the ego-motion accepted) says of the free terms, if anything."""
         alignment = RigAlignment(rig, frames, sigma_px, self.free)
         return alignment.evidence(self.known.values, self.information)
-
-    def state(self, prefix: str) -> StateArrays:
-        """All that changes."""
-        return {
-            f"{prefix}values": self.known.values,
-            f"{prefix}covariance": self.known.covariance,
-            f"{prefix}evidence": np.array([self.misfit, self.freedom]),
-            **{f"{prefix}field_{name}": part for name, part in self.field._asdict().items()},
-        }
-
-    def restored(self, state: StateArrays, prefix: str) -> RigFilter:
-        """The filter as it was at :meth:`state`."""
-        values, covariance = state[f"{prefix}values"], state[f"{prefix}covariance"]
-        known = dataclasses.replace(self.known, values=values, covariance=covariance)
-        misfit, freedom = map(float, state[f"{prefix}evidence"])
-        field = _Field(*(state[f"{prefix}field_{name}"] for name in _Field._fields))
-        return RigFilter(known, self.free, self.prior, field, misfit, freedom)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fgslam.backend.filters.error_columns import ErrorColumns, found_under, under
+from fgslam.backend.filters.error_columns import ErrorColumns
 from fgslam.backend.filters.loop_correction import (
     CLOSURE_FACTOR,
     FREE,
@@ -27,7 +27,7 @@ from fgslam.backend.filters.loop_correction import (
 )
 from fgslam.backend.filters.online_doubt import RigTerms
 from fgslam.backend.persistence import Persistence, learn_from
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.geometry import (
     adjoint,
@@ -41,6 +41,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.measurements import Increment, LoopClosure, Observations
+from fgslam.core.store import Kept
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 SAMPLES = 48
@@ -135,6 +136,9 @@ class Sights(NamedTuple):
 
 class SampledErrors(ErrorColumns):
     """Columns by what is unknown of the rig, then by SAMPLES draws of all noise."""
+
+    _terms: Kept[RigTerms]
+    _noise: Kept[Persistence]
 
     def __init__(self, solver: EgoMotionSolver, off: bool = False) -> None:
         """The first pose is known, the map empty.
@@ -258,15 +262,6 @@ class SampledErrors(ErrorColumns):
         return np.where(own > 0.0, blocks, kept * (columns @ columns.T))
 
     # ----------------------------------------------------------------------------------------
-
-    def _state(self) -> StateArrays:
-        learned = under(_NOISE, self._noise.state())
-        return {**self._terms.state(), **learned, **super()._state()}
-
-    def _restore(self, state: StateArrays) -> None:
-        self._terms.restore(state)
-        self._noise.restore(found_under(_NOISE, state))
-        super()._restore(state)
 
     def _sights(self, wTc: FloatArray, seen: PoseProblem) -> Sights:
         points = transform_to_camera(wTc, seen.points)

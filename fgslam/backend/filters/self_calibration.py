@@ -8,17 +8,17 @@ known of the truth. Derived in docs/derivations/self_calibration.md.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 
 from fgslam.backend.filters.field_size import FieldSize
 from fgslam.backend.filters.rig_filter import TRUSTED_WINDOWS, RigFilter
 from fgslam.backend.filters.rig_models import WeighedCorrection, weighed
-from fgslam.core.arrays import FloatArray, StateArrays
+from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import Increment, Observations, SettledRig
 from fgslam.core.rig_correction import early_terms
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 
 WINDOW = 6
 """Frames of one window: motion enough to see depth change, few enough to cost little."""
@@ -53,22 +53,6 @@ class CalibrationStep:
         return CalibrationStep(timestamp, known.values, known.covariance, applied, knocks)
 
 
-def _step_arrays(steps: Sequence[CalibrationStep], terms: int) -> StateArrays:
-    return {
-        "step_time": np.array([step.timestamp for step in steps], np.float64),
-        "step_values": np.array([step.values for step in steps]).reshape(-1, terms),
-        "step_covariance": np.array([step.covariance for step in steps]).reshape(-1, terms, terms),
-        "step_applied": np.array([step.applied for step in steps]).reshape(-1, terms),
-        "step_knocks": np.array([step.knocks for step in steps], np.int64),
-    }
-
-
-def _steps_of(state: StateArrays) -> list[CalibrationStep]:
-    names = ("step_time", "step_values", "step_covariance", "step_applied", "step_knocks")
-    rows = zip(*(state[name] for name in names), strict=True)
-    return [CalibrationStep(float(t), v, c, a, int(k)) for t, v, c, a, k in rows]
-
-
 def _accepted(increment: Increment) -> Observations:
     """What the ego-motion accepted."""
     return increment.observations.select(~increment.rejected)
@@ -76,6 +60,17 @@ def _accepted(increment: Increment) -> Observations:
 
 class SelfCalibration:
     """Estimates the correction of a rig while it is driven."""
+
+    _whole: Kept[RigFilter]
+    _early: Kept[RigFilter]
+    _field: Kept[FieldSize]
+    _applied: Kept[FloatArray]
+    steps: Kept[list[CalibrationStep]]
+    windows: Kept[int]
+    knocks: Kept[int]
+    _suspected: Kept[bool]
+    _frames: Kept[list[tuple[FloatArray, Observations]]]
+    _last_time: Kept[float | None]
 
     def __init__(self, rig: CameraRig, pixel_sigma: float) -> None:
         """Begins with the calibration as stated; ``pixel_sigma`` of one coordinate, pixels."""
@@ -85,16 +80,17 @@ class SelfCalibration:
         self._field = FieldSize(rig, pixel_sigma)
         self.found = self._weighed()
         """As known now, and what of it is worth applying."""
-        self.steps: list[CalibrationStep] = []
+        self.steps = []
         """How it became known, window by window."""
         self.windows = 0
         """How many gave evidence."""
         self.knocks = 0
         """How often the rig was found to have moved."""
+        self._applied = self.found.applied.values
         self._suspected = False
         self._sigma = pixel_sigma
-        self._frames: list[tuple[FloatArray, Observations]] = []
-        self._last_time: float | None = None
+        self._frames = []
+        self._last_time = None
 
     @property
     def noise_factor(self) -> float:
@@ -151,45 +147,18 @@ class SelfCalibration:
         self._early, self._whole = (of.after(what) for of, (_, what) in pairs)
         found = self._weighed()
         self.found = self._held(found)
+        self._applied = self.found.applied.values
         self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
 
     # ----------------------------------------------------------------------------------------
 
-    def state(self) -> StateArrays:
-        """All that changes but the frames of the window in work, which the log and poses hold."""
-        filters = self._whole.state("") | self._early.state("early_")
-        return (
-            filters
-            | {
-                "applied": self.found.applied.values,
-                "time": np.array(np.nan if self._last_time is None else self._last_time),
-                "counts": np.array([self.windows, self.knocks, self._suspected, len(self._frames)]),
-            }
-            | _step_arrays(self.steps, len(self._whole.free))
-            | self._field.state()
-        )
-
-    def restore(
-        self, state: StateArrays, log: Sequence[Increment], poses: Sequence[FloatArray]
-    ) -> None:
-        """Continues from :meth:`state`, the log so far and the poses as first estimated."""
-        self._whole = self._whole.restored(state, "")
-        self._early = self._early.restored(state, "early_")
-        self._last_time = None if np.isnan(state["time"]) else float(state["time"])
-        self.windows, self.knocks, suspected, waiting = map(int, state["counts"])
-        self._suspected = bool(suspected)
-        self.steps = _steps_of(state)
-        self._field.restore(state)
-        found = self._weighed()
-        applied = dataclasses.replace(found.applied, values=state["applied"])
-        self.found = dataclasses.replace(found, applied=applied)
-        begin = len(log) - waiting
-        self._frames = [
-            (wTc, _accepted(increment))
-            for wTc, increment in zip(poses[begin:], log[begin:], strict=True)
-        ]
-
     # ----------------------------------------------------------------------------------------
+
+    def remake(self) -> None:
+        """What is applied, of the filters that were put back."""
+        found = self._weighed()
+        applied = dataclasses.replace(found.applied, values=self._applied)
+        self.found = dataclasses.replace(found, applied=applied)
 
     def _weighed(self) -> WeighedCorrection:
         """As known now, under the field found so far."""

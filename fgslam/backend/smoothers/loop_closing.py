@@ -29,7 +29,7 @@ from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.solver import Drive
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import Prediction
+from fgslam.core.estimates import EgoMotion, Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, transform_to_world
 from fgslam.core.measurements import LoopClosure
 from fgslam.core.quantiles import chi_square_quantile
@@ -155,7 +155,7 @@ def misfit(factor: Any, values: Any) -> float:
 
 
 def carried_to(
-    frame: int, loop: LoopClosure, tracked: Callable[[int], Prediction], last: int
+    frame: int, loop: LoopClosure, tracked: Callable[[int], Prediction | EgoMotion], last: int
 ) -> Constraint:
     """The closure as one to a neighbour of the earlier frame, by how both were tracked.
 

@@ -14,7 +14,7 @@ The parts: a tracker (:class:`~fgslam.backend.filters.landmark_kalman.LandmarkKa
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,6 @@ from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, fill_between
 from fgslam.backend.smoothers.loop_closing import carried_to
-from fgslam.backend.smoothers.recorded_inputs import RecordedInputs
 from fgslam.backend.smoothers.solver import Drive, GraphSolver, Smoothed, Solution
 from fgslam.backend.smoothers.tracker_map import TrackerMap
 from fgslam.backend.smoothers.turns import Turn
@@ -41,6 +40,7 @@ from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import (
     EgoMotion,
+    EgoMotionStatus,
     Estimate,
     LandmarkMap,
     Prediction,
@@ -56,6 +56,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import pack, unpack
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,39 @@ class GraphProblem:
         return GraphProblem(sensor, settings, floor, prior, tracker, builder)
 
 
+class Input(NamedTuple):
+    """What an update was given."""
+
+    increment: Increment
+    tracking: EgoMotion
+
+    @property
+    def used(self) -> Input:
+        """With that alone of the tracking which a smoother uses: the same from a log."""
+        found = self.tracking
+        measured = found.status.measured
+        status = EgoMotionStatus.OK if measured else EgoMotionStatus.TOO_FEW_MATCHES
+        kept = found.wTc, found.covariance, found.inliers, found.residuals, status, 0
+        return Input(self.increment, EgoMotion(*kept, noise=found.noise))
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class BegunIn:
+    """The map that a smoother began in, and the first pose in it."""
+
+    landmarks: LandmarkMap
+    hits: IntArray
+    prior: Prediction
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Given:
+    """All that a smoother was given: its state."""
+
+    inputs: list[Input]
+    begun_in: BegunIn | None
+
+
 class Smoother:
     """A smoothing estimator, on :class:`fgslam.backend.protocol.Estimator`."""
 
@@ -111,7 +145,8 @@ class Smoother:
         self.tracker, self.builder = problem.tracker, problem.builder
         self.solver, self._segments = solver, segments
         self._map = TrackerMap(problem.sensor, problem.tracker, problem.builder.admission)
-        self._inputs = RecordedInputs(problem.sensor)
+        self.inputs: list[Input] = []
+        self._begun_in: BegunIn | None = None
         self._smoothed = problem.prior
         self._answer: Solution | None = None
         self._takeovers = 0
@@ -148,7 +183,7 @@ class Smoother:
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
         free = increment.relocalised or founds_anew(increment, tracking)
-        if free and len(self._inputs):
+        if free and len(self.inputs):
             step = self._unknown_step(increment, tracking)
             increment = dataclasses.replace(increment, odometry=step)
         require_finite(increment, tracking)
@@ -158,7 +193,7 @@ class Smoother:
         plain = dataclasses.replace(increment, loops=(), rig_correction=None)
         stats = self.tracker.update(plain, tracking)
         self._record(increment, tracking)
-        learn_from(self.builder.noise, len(self._inputs) - 1, increment, tracking, before)
+        learn_from(self.builder.noise, len(self.inputs) - 1, increment, tracking, before)
         tracked = self._admitted(increment, tracking)
         entering = self._entering(tracked, at_once=bool(increment.loops))
         for frame in entering:
@@ -185,7 +220,7 @@ class Smoother:
 
     def estimate(self) -> Estimate:
         """All poses and landmarks as the graph has them now, with their marginals."""
-        if not len(self._inputs):
+        if not len(self.inputs):
             return self.tracker.estimate()
         answer = self._solved()
         covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
@@ -193,7 +228,7 @@ class Smoother:
             covariances = covariances + np.array(self._doubts)
             landmarks = self._doubt.landmarks(landmarks)
         return Estimate(
-            Trajectory(self._inputs.timestamps(), answer.poses),
+            Trajectory(np.array([one.increment.timestamp for one in self.inputs]), answer.poses),
             covariances,
             landmarks,
             (*self.solver.remarks, *self.builder.admission.remarks, *answer.remarks),
@@ -225,13 +260,16 @@ class Smoother:
 
     def state(self) -> StateArrays:
         """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
-        return self._inputs.state()
+        return pack(Given([one.used for one in self.inputs], self._begun_in))
 
     def restore(self, state: StateArrays) -> None:
         """Repeats all updates of :meth:`state`."""
-        if len(self._inputs):
+        if len(self.inputs):
             raise EstimatorError("only a new estimator can be restored")
-        for increment, tracking in self._inputs.recalled(state):
+        self._repeat(unpack(state, Given))
+
+    def _repeat(self, given: Given) -> None:
+        for increment, tracking in given.inputs:
             self.update(increment, tracking)
 
     # -- its steps -----------------------------------------------------------------------------
@@ -250,8 +288,8 @@ class Smoother:
         return Odometry(motion, covariance, measured=False, turned=True, bias=turn.bias)
 
     def _record(self, increment: Increment, tracking: EgoMotion) -> None:
-        self._inputs.append(increment, tracking)
-        frame = len(self._inputs) - 1
+        self.inputs.append(Input(increment, tracking))
+        frame = len(self.inputs) - 1
         self.builder.corrections.note(frame, increment)
         self._eras.append(self._takeovers)
         self._answer = None
@@ -267,7 +305,7 @@ class Smoother:
         self._restart(moved)
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
-        frame, step = len(self._inputs) - 1, increment.odometry
+        frame, step = len(self.inputs) - 1, increment.odometry
         return TrackedFrame(frame, tracking.wTc, step, self._held(accepted), Turn.of((step,)))
 
     def _held(self, observed: Observations) -> Observations:
@@ -293,7 +331,7 @@ class Smoother:
     def _add(self, frame: TrackedFrame) -> None:
         landmarks = self.tracker.landmarks()
         self._map.entered(frame.frame, frame.wTc)
-        timestamp = self._inputs.timestamp(frame.frame)
+        timestamp = self.inputs[frame.frame].increment.timestamp
         self.solver.add(self.builder.add(frame, landmarks), landmarks, timestamp)
 
     def _solve(self, entered: TrackedFrame, tracked: TrackedFrame, closes_loop: bool) -> None:
@@ -325,7 +363,7 @@ class Smoother:
         An earlier frame that has none gives way to the nearest one that was tracked on the same
         map, since only the tracked poses of such are relative to each other.
         """
-        last = len(self._inputs) - 1
+        last = len(self.inputs) - 1
         if not 0 <= loop.frame < last:
             raise EstimatorError(
                 f"{self.kind}: a loop closure of frame {last} of the log leads to frame "
@@ -336,7 +374,7 @@ class Smoother:
         near = min(fellows, key=lambda frame: abs(frame - loop.frame))
         covariance = CLOSURE_FACTOR**2 * loop.covariance
         loop = dataclasses.replace(loop, covariance=covariance)
-        return carried_to(near, loop, self._inputs.tracked, last)
+        return carried_to(near, loop, lambda frame: self.inputs[frame].tracking, last)
 
     def _current(self, tracking: EgoMotion) -> Prediction:
         """The last pose: the tracker's, whose map is as uncertain as the pose last smoothed."""
@@ -357,7 +395,7 @@ class Smoother:
                 tracks = self.builder.admission.tracks
                 variable_of = {i: track.variable for i, track in tracks.items()}
                 between = self._segments.settled(self.builder.corrections)
-                motions = self._inputs.motions()
+                motions = [one.increment.odometry for one in self.inputs]
                 self._answer = fill_between(
                     self._sensor, self._floor, self._answer, between, motions, variable_of
                 )
@@ -365,7 +403,7 @@ class Smoother:
 
     def _at_last_frame(self, joint: FloatArray) -> FloatArray:
         """A joint covariance with the graph's last pose, carried on to the last frame's."""
-        entered, last = self.builder.frames[-1], len(self._inputs) - 1
+        entered, last = self.builder.frames[-1], len(self.inputs) - 1
         if entered == last:
             return joint
         answer = self._solved()
@@ -385,7 +423,6 @@ class MapSmoother(Smoother):
         """As :class:`Smoother`."""
         super().__init__(problem, solver, segments)
         self._prior = problem.prior
-        self._begun_in: StateArrays = {}
 
     @property
     def keeps_maps(self) -> bool:
@@ -396,26 +433,13 @@ class MapSmoother(Smoother):
         """Takes a saved map over: a prior factor for each landmark that is seen again."""
         self.tracker.begin_in(landmarks, hits, fixed=False)
         self.builder.admission.know(landmarks)
-        self._begun_in = {
-            "map/ids": landmarks.ids,
-            "map/positions": landmarks.positions,
-            "map/covariances": landmarks.covariances,
-            "map/hits": hits,
-            "map/prior_pose": self._prior.wTc,
-            "map/prior_covariance": self._prior.covariance,
-        }
+        self._begun_in = BegunIn(landmarks, hits, self._prior)
 
-    def state(self) -> StateArrays:
-        """The map that it began in, and where, and everything that was put in."""
-        return super().state() | self._begun_in
-
-    def restore(self, state: StateArrays) -> None:
-        """Repeats everything since the beginning."""
-        if "map/ids" in state:
-            self._start_at(Prediction(state["map/prior_pose"], state["map/prior_covariance"]))
-            known = (state[f"map/{name}"] for name in ("ids", "positions", "covariances"))
-            self.begin_in(LandmarkMap(*known), state["map/hits"], fixed=False)
-        super().restore(state)
+    def _repeat(self, given: Given) -> None:
+        if (begun := given.begun_in) is not None:
+            self._start_at(begun.prior)
+            self.begin_in(begun.landmarks, begun.hits, fixed=False)
+        super()._repeat(given)
 
     def _start_at(self, prior: Prediction) -> None:
         """Another prior pose: who goes on with a run in a map does not know where that began."""

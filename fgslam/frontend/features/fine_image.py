@@ -8,6 +8,7 @@ Dubuc 1989, Symmetric iterative interpolation processes), and between its values
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -26,12 +27,11 @@ _HERE = np.ones(1)
 _BEFORE = 2  # of the six pixels: those before the one that the place lies behind
 
 
+@dataclass(eq=False)
 class FineImage:
-    """A grey image, and its values halfway between its pixels, found where they are asked for."""
+    """A grey image (h, w) uint8, and its values halfway between its pixels, found when needed."""
 
-    def __init__(self, image: Image) -> None:
-        """``image`` (h, w) uint8."""
-        self.image = image
+    image: Image
 
     @cached_property
     def grey(self) -> Float32:

@@ -16,6 +16,7 @@ from fgslam.core.estimates import EgoMotion, LandmarkMap, Relocalisation
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import adjoint, congruence, inverse, se3_log
 from fgslam.core.measurements import LoopClosure
+from fgslam.core.store import Kept
 from fgslam.frontend.features.matching import choose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.sightings import SightingMemory
@@ -58,11 +59,14 @@ class LoopGates:
 class Confirmation:
     """Counts frames in a row that find the same offset."""
 
+    count: Kept[int]
+    offset: Kept[FloatArray]
+
     def __init__(self, gates: LoopGates) -> None:
         """Has seen nothing yet."""
         self._gates = gates
         self.count = 0
-        self.offset: FloatArray = np.eye(4)
+        self.offset = np.eye(4)
 
     @property
     def begun(self) -> bool:

@@ -11,12 +11,12 @@ from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction, Relocalisation, UpdateStats
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import inverse
-from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure
+from fgslam.core.store import Kept
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.closures import (
     Confirmation,
@@ -86,6 +86,14 @@ class PlaceRecognition:
     gives the same closures, interrupted or not.
     """
 
+    memory: Kept[SightingMemory]
+    _confirmation: Kept[Confirmation | None]
+    _lost: Kept[int]
+    _offered: Kept[int]
+    merging: Kept[IntArray]
+    fuse_since: Kept[int]
+    _pose: Kept[FloatArray]
+
     def __init__(self, parts: RecognitionParts, tracker: LandmarkTracker) -> None:
         """Nothing is remembered yet; the tracker is the run's own, with the map it begins in."""
         self._parts = parts
@@ -96,7 +104,7 @@ class PlaceRecognition:
         self._offered = -1  # frame of the last closure, taken or not
         self.merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
         self.fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
-        self._pose: FloatArray = np.eye(4)
+        self._pose = np.eye(4)
         self._looks: _Looks = (-1, _NOBODY, None)
         self._find_words()
 
@@ -278,30 +286,8 @@ class PlaceRecognition:
         if len(self.memory) % _WORDS_EVERY == 0:
             self._find_words()
 
-    def state(self) -> StateArrays:
-        """All but what the log tells."""
-        confirmation = self._confirmation
-        return self.memory.state() | {
-            "counts": np.array(
-                [
-                    self._lost,
-                    self._offered,
-                    self.fuse_since,
-                    0 if confirmation is None else confirmation.count,
-                ]
-            ),
-            **({} if confirmation is None else {"offset": confirmation.offset}),
-            "merging": self.merging,
-            "pose": self._pose,
-        }
-
-    def restore(self, state: StateArrays, log: MeasurementLog) -> None:
-        """Continues from :meth:`state` and the log of as many frames."""
-        self.memory.restore(state, log)
-        self._lost, self._offered, self.fuse_since, count = state["counts"].tolist()
-        self.merging, self._pose = state["merging"], state["pose"]
-        if self._confirmation is not None:
-            self._confirmation.count, self._confirmation.offset = count, state["offset"]
+    def remake(self) -> None:
+        """Words are found before the next look."""
         self._find_words()
 
     # ----------------------------------------------------------------------------------------

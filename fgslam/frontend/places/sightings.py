@@ -9,10 +9,10 @@ import numpy as np
 from scipy.sparse import lil_array
 from scipy.sparse.csgraph import dijkstra
 
-from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
+from fgslam.core.store import Kept
 
 _RETURN_FRAMES = 30  # unseen for so long: tracking them again ties the frame to an older one
 _RETURN_MATCHES = 10  # of them, as for the ties of the filter's backward correction; so many of a
@@ -30,22 +30,34 @@ class SightingMemory:
     it do not drift apart, and what the run has yet to see of it was "seen" where the run entered.
 
     Attributes:
+        frames: what was measured, which the log of the run holds.
         taken: whether the estimator took the log's closures, in their order.
     """
+
+    _given: Kept[int]
+    _seen: Kept[GrowingColumns]
+    _starts: Kept[list[int]]
+    _way: Kept[list[float]]
+    _newest: Kept[list[int]]
+    _returns: Kept[list[tuple[int, int]]]
+    _ties: Kept[list[int]]
+    _on_map: Kept[bool]
+    _last_seen: Kept[IntArray]
+    taken: Kept[list[bool]]
 
     def __init__(self, given: int = -1) -> None:
         """Nothing was seen yet; ``given`` is the last identity of the map it all begins in."""
         self._given = given
-        self._frames: list[Increment] = []
+        self.frames: list[Increment] = []
         self._seen = GrowingColumns(ids=np.empty(0, np.int32))
-        self._starts: list[int] = []
-        self._way: list[float] = []
-        self._newest: list[int] = []
-        self._returns: list[tuple[int, int]] = []
-        self._ties: list[int] = []
+        self._starts = []
+        self._way = []
+        self._newest = []
+        self._returns = []
+        self._ties = []
         self._on_map = False
-        self._last_seen: IntArray = np.full(given + 1, -1)
-        self.taken: list[bool] = []
+        self._last_seen = np.full(given + 1, -1)
+        self.taken = []
 
     def __len__(self) -> int:
         return len(self._starts)
@@ -143,31 +155,11 @@ class SightingMemory:
                 frame saw them, only that map places the frame beside them.
             landmarks: the map.
         """
-        seen = self._frames[frame].kept
+        seen = self.frames[frame].kept
         keep = np.isin(seen.ids, landmarks.ids)
         if self._never_seen(ids) > int(np.isin(seen.ids, ids).sum()):
             keep &= self.of_given(seen.ids)
         return seen.select(keep)
-
-    def state(self) -> StateArrays:
-        """What the log does not tell."""
-        return {
-            "way": np.array(self._way),
-            "given": np.array(self._given),
-            "taken": np.array(self.taken, np.bool_),
-        }
-
-    def restore(self, state: StateArrays, log: MeasurementLog) -> None:
-        """Continues from :meth:`state` and the log of as many frames."""
-        self._seen = GrowingColumns(ids=np.empty(0, np.int32))
-        self._starts, self._newest, self._returns, self._ties = [], [], [], []
-        self._frames = []
-        self._given, self._on_map = int(state["given"]), False
-        self._last_seen = np.full(self._given + 1, -1)
-        accepted, self.taken = iter(state["taken"].tolist()), []
-        for increment in log:
-            self._book(increment, tuple(itertools.islice(accepted, len(increment.loops))))
-        self._way = state["way"].tolist()
 
     def _book(self, increment: Increment, closed: tuple[bool, ...]) -> None:
         seen = increment.observations.select(~increment.rejected)
@@ -185,7 +177,7 @@ class SightingMemory:
         if by_map >= _RETURN_MATCHES:
             self._tie(here)
         self._last_seen[ids] = here
-        self._frames.append(increment)
+        self.frames.append(increment)
         self._starts.append(len(self._seen))
         self._seen.append({"ids": seen.ids.astype(np.int32)})
         self._returns += [(here, loop.frame) for loop in loops]

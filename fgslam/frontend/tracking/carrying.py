@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.features import (
     CUT_PIXELS,
     PATCH_PX,
@@ -27,6 +27,7 @@ from fgslam.core.features import (
 )
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 from fgslam.frontend.features.fine_image import FineImage, Float32
 from fgslam.frontend.features.patches import (
     ReferencePatches,
@@ -141,11 +142,16 @@ class Begun(Rows):
 class LandmarkCarrier:
     """The patches of the landmarks in view, and the last reference image."""
 
+    _last: Kept[FineImage | None]
+    _points: Kept[Points]
+    _patches: Kept[ReferencePatches]
+    _fresh: Kept[Begun]
+
     def __init__(self, rig: CameraRig, stereo: StereoMatcher) -> None:
         """Carries nothing yet; ``stereo`` measures, by its gates."""
         self._rig = rig
         self._stereo = stereo
-        self._last: FineImage | None = None
+        self._last = None
         self._points = Points.none()
         self._patches = ReferencePatches.none(PATCH_PX)
         self._fresh = Begun.none()  # of the last image, their patches yet to be looked for
@@ -227,24 +233,6 @@ class LandmarkCarrier:
         self._points = Points(self._points.ids[good], places[good], depths[good])
         self._patches = patches.select(good)
         return Carried(self._points.ids, rows[good], features)
-
-    def state(self) -> StateArrays:
-        """All that is carried over."""
-        points, fresh = self._points, self._fresh
-        out: StateArrays = {name: getattr(points, name) for name in _POINTS}
-        out |= {f"fresh_{name}": getattr(fresh.points, name) for name in _POINTS}
-        out |= {f"fresh_{name}": getattr(fresh, name) for name in _BEGUN}
-        out["last"] = np.empty((0, 0), np.uint8) if self._last is None else self._last.image
-        return out | {f"patch_{name}": getattr(self._patches, name) for name in _PATCH_ARRAYS}
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`, to the same bits."""
-        self._points = Points(**{name: state[name] for name in _POINTS})
-        fresh = Points(**{name: state[f"fresh_{name}"] for name in _POINTS})
-        self._fresh = Begun(fresh, **{name: state[f"fresh_{name}"] for name in _BEGUN})
-        self._last = FineImage(state["last"]) if state["last"].size else None
-        patches = {name: state[f"patch_{name}"] for name in _PATCH_ARRAYS}
-        self._patches = ReferencePatches(PATCH_PX, **patches)
 
     # ----------------------------------------------------------------------------------------
 

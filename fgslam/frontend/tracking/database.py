@@ -181,8 +181,8 @@ class LandmarkDatabase(LandmarkTable):
         directions: FloatArray | None = None,
     ) -> IntArray:
         """Type IV: starts a track for each chosen feature (4.2); returns their identities."""
-        ids = np.arange(self._next_id, self._next_id + len(which))
-        self._next_id += len(which)
+        ids = np.arange(self.next_id, self.next_id + len(which))
+        self.next_id += len(which)
         views = Views.of(features, which, directions, self._frame)
         self._append(ids, views, colour)
         return ids

@@ -14,10 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.features import StereoFeatures
 from fgslam.core.rig_correction import RigCorrection
+from fgslam.core.store import Kept
 from fgslam.frontend.tracking.carrying import Begun, Carried, LandmarkCarrier, Points
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
@@ -68,6 +69,10 @@ class CarriedFrame:
 
 class KeyFrameTracker:
     """A tracker that is asked for matches of SIFT features on key frames only."""
+
+    _carrier: Kept[LandmarkCarrier]
+    _count: Kept[int]
+    _cells: Kept[int]
 
     def __init__(self, tracker: LandmarkTracker, carrier: LandmarkCarrier) -> None:
         """Takes the tracker whose landmarks are carried."""
@@ -154,15 +159,6 @@ class KeyFrameTracker:
         database.keep_patches(begun.points.ids, begun.patches(image))
         begun = begun.join(Begun.again(old, database.patches(old.ids)))
         return begun.select(np.argsort(begun.points.ids))
-
-    def state(self) -> StateArrays:
-        """What the last key frame was like, and what is carried."""
-        return self._carrier.state() | {"key_frame": np.array([self._count, self._cells])}
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._count, self._cells = state["key_frame"].tolist()
-        self._carrier.restore(state)
 
     def lasts(self, carried: Carried, tracked: Tracked, image: Image) -> bool:
         """Whether enough landmarks are left, over enough of the image, and few contradict."""

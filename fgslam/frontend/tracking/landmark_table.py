@@ -16,6 +16,7 @@ from fgslam.core.arrays import (
 from fgslam.core.errors import MapError
 from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.store import Kept
 from fgslam.frontend.tracking.views import Places, ViewPool, Views
 
 _COUNTS = ("hits", "misses", "missed", "unlooked", "seen", "contradicted")
@@ -43,13 +44,18 @@ class LandmarkTable:
     The arrays over landmarks are read only by agreement, and good until the next change.
     """
 
+    _pool: Kept[ViewPool]
+    next_id: Kept[int]
+    _frame: Kept[int]
+    _columns: Kept[GrowingColumns]
+
     def __init__(self, max_views: int, view_angle: float, patch_pixels: int = 0) -> None:
         """Starts empty; see ``views.ViewPool`` for the views (radians).
 
         With ``patch_pixels`` there is room for each landmark's own patch of so many grey values.
         """
         self._pool = ViewPool(max_views, view_angle)
-        self._next_id = 0
+        self.next_id = 0
         self._frame = 0
         self._columns = _no_columns(max_views, patch_pixels)
 
@@ -215,29 +221,8 @@ class LandmarkTable:
                 **self._as_columns(saved.patches, len(ids)),
             }
         )
-        self._next_id = int(ids[-1]) + 1 if len(ids) else 0
+        self.next_id = int(ids[-1]) + 1 if len(ids) else 0
         self._frame = 0
-
-    def state(self) -> StateArrays:
-        """All entries, as arrays; a snapshot."""
-        out = self._columns.state()
-        del out[_PLACES]
-        views = self._pool.at(self._places_of(np.arange(len(self)))[1])
-        out |= {name: getattr(views, name) for name in _VIEWS}
-        out["next_id"] = np.array(self._next_id)
-        out["frame"] = np.array(self._frame)
-        if self._pool.several:
-            out["view_counts"] = np.asarray((self._places >= 0).sum(axis=1))
-        return out
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        counts = state["view_counts"] if self._pool.several else np.ones(len(state["ids"]), int)
-        self._clear(state["patch"].shape[1])
-        places = self._pool.load(counts, Views(**{name: state[name] for name in _VIEWS}))
-        self._columns.restore(state | {_PLACES: places})
-        self._next_id = int(state["next_id"])
-        self._frame = int(state["frame"])
 
     def _append(self, ids: IntArray, views: Views, colour: ByteArray) -> None:
         """New landmarks (k,), seen once, in this frame."""

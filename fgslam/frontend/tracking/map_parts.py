@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, IntArray, StateArrays
+from fgslam.core.arrays import BoolArray, IntArray
 from fgslam.core.measurements import Increment
+from fgslam.core.store import Kept
 
 _HOLD = 6
 """Landmarks of a part that place a frame in it, beside those of another: by chance none agree."""
@@ -23,12 +24,18 @@ class MapParts:
     A saved map that a run begins in is of the first part.
     """
 
+    _of: Kept[IntArray]
+    _known: Kept[int]
+    _several: Kept[bool]
+    _frames: Kept[list[int]]
+    _newest: Kept[int]
+
     def __init__(self) -> None:
         """Nothing is there yet."""
         self._of = np.empty(0, np.int64)  # with room for more: identities only grow
         self._known = 0
         self._several = False
-        self._frames: list[int] = []
+        self._frames = []
         self._newest = _FIRST
 
     def __len__(self) -> int:
@@ -77,21 +84,6 @@ class MapParts:
         self._join(held, part)
         self._frames.append(part)
         self._begin(seen.ids[seen.is_new], part)
-
-    def state(self) -> StateArrays:
-        """All of it."""
-        return {
-            "landmarks": self._landmarks.copy(),
-            "frames": np.array(self._frames, np.int64),
-            "newest": np.array(self._newest),
-        }
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._of, self._newest = state["landmarks"].copy(), int(state["newest"])
-        self._known = len(self._of)
-        self._several = bool((self._of != _FIRST).any())
-        self._frames = state["frames"].tolist()
 
     # ----------------------------------------------------------------------------------------
 

@@ -11,10 +11,8 @@ from __future__ import annotations
 import math
 from collections import deque
 
-import numpy as np
-
-from fgslam.core.arrays import StateArrays
 from fgslam.core.estimates import EgoMotion
+from fgslam.core.store import Kept
 
 _FRAMES = 30  # latest ones that count: as many sightings as the longest track that is judged
 _STATED = 2  # frames that the stated noise counts for: three must contradict it
@@ -26,9 +24,11 @@ one right match in twenty."""
 class MatchNoise:
     """Variance of a drive's measurements over the stated one."""
 
+    _latest: Kept[deque[float]]
+
     def __init__(self) -> None:
         """As stated, until frames contradict it."""
-        self._latest: deque[float] = deque(maxlen=_FRAMES)
+        self._latest = deque(maxlen=_FRAMES)
 
     @property
     def variance(self) -> float:
@@ -41,11 +41,3 @@ class MatchNoise:
         """Takes in a frame; one that was not measured says nothing."""
         if not math.isnan(tracking.misfit):
             self._latest.append(tracking.misfit)
-
-    def state(self) -> StateArrays:
-        """What is needed to continue."""
-        return {"misfits": np.array(self._latest)}
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._latest = deque(state["misfits"].tolist(), maxlen=_FRAMES)

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import ByteArray, FloatArray, IntArray, Rows, StateArrays
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import rotate_covariances, transform_to_world
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.regaining import FALSE_POSES, log_false_poses, places
@@ -66,14 +67,18 @@ class _Unexplained(Rows):
 class OtherMotion:
     """Remembers the frames of a drive that show a second rigid motion."""
 
+    _before: Kept[_Unexplained]
+    _latest: Kept[deque[tuple[int, float]]]
+    _doubted: Kept[dict[int, float]]
+
     def __init__(self, rig: CameraRig, solver: EgoMotionSolver) -> None:
         """Nothing seen yet."""
         self._solver = solver
         self._resection = Resection(solver)
         self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
         self._before = _Unexplained.none()
-        self._latest: deque[tuple[int, float]] = deque(maxlen=_WINDOW)
-        self._doubted: dict[int, float] = {}
+        self._latest = deque(maxlen=_WINDOW)
+        self._doubted = {}
 
     def look(
         self,
@@ -155,19 +160,3 @@ class OtherMotion:
         return log_false_poses(matches, agreeing, size, self._by_chance) <= math.log(FALSE_POSES)
 
     # ----------------------------------------------------------------------------------------
-
-    def state(self) -> StateArrays:
-        """All that is needed to continue to the bit."""
-        out = {
-            f"before_{one.name}": getattr(self._before, one.name) for one in fields(_Unexplained)
-        }
-        out["other_motions"] = np.array(list(self._latest)).reshape(-1, 2)
-        out["doubted"] = np.array(list(self._doubted.items())).reshape(-1, 2)
-        return out
-
-    def restore(self, state: StateArrays) -> None:
-        """Continues from :meth:`state`."""
-        self._before = _Unexplained(*(state[f"before_{one.name}"] for one in fields(_Unexplained)))
-        pairs = [(int(one), float(share)) for one, share in state["other_motions"]]
-        self._latest = deque(pairs, maxlen=_WINDOW)
-        self._doubted = {int(one): float(share) for one, share in state["doubted"]}

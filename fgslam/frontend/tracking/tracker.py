@@ -12,6 +12,7 @@ from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import in_front, project, transform_to_camera
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.frontend.tracking.map_matching import (
@@ -24,6 +25,7 @@ from fgslam.frontend.tracking.map_matching import (
     predicted_covariance,
 )
 from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.match_noise import MatchNoise
 from fgslam.frontend.tracking.other_motion import OtherMotion
 from fgslam.frontend.tracking.regaining import Regainer
 from fgslam.frontend.tracking.resection import Resection
@@ -81,6 +83,11 @@ class Association:
 
 class LandmarkTracker:
     """Joins the database's appearance with the estimator's geometry."""
+
+    database: Kept[LandmarkDatabase]
+    noise: Kept[MatchNoise]
+    parts: Kept[MapParts]
+    other_motion: Kept[OtherMotion]
 
     def __init__(
         self,

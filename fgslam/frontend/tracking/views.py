@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.features import StereoFeatures, Words
+from fgslam.core.store import Kept
 from fgslam.frontend.features.descriptor_index import words_of
 
 Places = npt.NDArray[np.int32]
@@ -65,16 +66,23 @@ class Views(Rows):
 class ViewPool:
     """The views of all landmarks."""
 
+    _free: Kept[list[int]]
+    _size: Kept[FloatArray]
+    _orientation: Kept[FloatArray]
+    _descriptors: Kept[ByteArray]
+    _direction: Kept[Directions]
+    _used: Kept[IntArray]
+
     def __init__(self, max_views: int, angle: float) -> None:
         """Takes how many views a landmark may have, and the angle that makes another (radians)."""
         self.max_views = max_views
         self._nearest_cosine = np.float32(np.cos(angle))
-        self._free: list[int] = []
-        self._size: FloatArray = np.zeros(0)
-        self._orientation: FloatArray = np.zeros(0)
-        self._descriptors: ByteArray = np.zeros((0, 128), np.uint8)
-        self._direction: Directions = np.zeros((0, 3), np.float32)
-        self._used: IntArray = np.zeros(0, np.int64)
+        self._free = []
+        self._size = np.zeros(0)
+        self._orientation = np.zeros(0)
+        self._descriptors = np.zeros((0, 128), np.uint8)
+        self._direction = np.zeros((0, 3), np.float32)
+        self._used = np.zeros(0, np.int64)
         self._words: Words = np.zeros(0, np.int16)
         self.changes = 0
         """Counts what was stored or renewed: while it stands, all views are as they were."""
@@ -192,6 +200,11 @@ class ViewPool:
             elif self._used[place[0]] <= view.used[0]:
                 self.refresh(stays, view)
         self.release(ends)
+
+    def remake(self) -> None:
+        """Words are found anew, of all views that were put back."""
+        self._words = np.full(len(self._size), _UNKNOWN, np.int16)
+        self.changes += 1
 
     def bytes_per_view(self) -> int:
         """Memory of one view, without the room kept for growth."""

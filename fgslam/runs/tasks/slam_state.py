@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from fgslam.backend.protocol import Estimator, Resumable
-from fgslam.core import __version__
+from fgslam.core import __version__, store
 from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import OutputError
@@ -20,7 +19,6 @@ from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE
 from fgslam.runs.tasks.slam_outputs import RunOutputs
 from fgslam.slam.arrival import evidence_of, saved_map
 from fgslam.slam.map_settings import MapSettings
-from fgslam.slam.motion import MotionModel
 from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
 
@@ -32,24 +30,9 @@ def save_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
 
 def state_of(pipeline: SlamPipeline, recorder: RunRecorder) -> StateArrays:
     """All that changes during a run but its log, as arrays named ``part/name``."""
-    parts = {
-        "database": pipeline.tracker.database.state(),
-        "estimator": _resumable(pipeline.estimator).state(),
-        "motion": _resumable(pipeline.motion).state(),
-        "parts": pipeline.tracker.parts.state(),
-        "pipeline": pipeline.state(),
-        "recorder": recorder.state(),
-    }
-    if pipeline.places is not None:
-        parts["places"] = pipeline.places.state()
-    if pipeline.calibration is not None:
-        parts["calibration"] = pipeline.calibration.state()
-    if pipeline.key_frames is not None:
-        parts["key_frames"] = pipeline.key_frames.state()
-    if pipeline.watch is not None:
-        parts["watch"] = pipeline.watch.state()
+    states = {part: store.state_of(it) for part, it in _parts(pipeline, recorder).items()}
     return {
-        f"{part}/{name}": array for part, arrays in parts.items() for name, array in arrays.items()
+        f"{part}/{name}": array for part, state in states.items() for name, array in state.items()
     }
 
 
@@ -59,23 +42,39 @@ def restore(
     """Continues from :func:`state_of` and the log.
 
     Raises:
-        KeyError, ValueError, IndexError: the state is another's.
+        KeyError, ValueError, TypeError, IndexError: the state is another's.
     """
-    pipeline.tracker.database.restore(_part(state, "database"))
-    _resumable(pipeline.estimator).restore(_part(state, "estimator"))
-    _resumable(pipeline.motion).restore(_part(state, "motion"))
-    pipeline.tracker.parts.restore(_part(state, "parts"))
-    pipeline.restore(_part(state, "pipeline"))
-    recorder.restore(_part(state, "recorder"), log)
+    for part, it in _parts(pipeline, recorder).items():
+        start = f"{part}/"
+        own = {n.removeprefix(start): array for n, array in state.items() if n.startswith(start)}
+        store.restore(it, own)
+    frames = log.increments[: len(recorder)]
+    recorder.log.increments[:] = frames
     if pipeline.places is not None:
-        pipeline.places.restore(_part(state, "places"), recorder.log)
-    if pipeline.calibration is not None:
-        part, frames = _part(state, "calibration"), recorder.log.increments
-        pipeline.calibration.restore(part, frames, recorder.online_poses)
-    if pipeline.key_frames is not None:
-        pipeline.key_frames.restore(_part(state, "key_frames"))
-    if pipeline.watch is not None:
-        pipeline.watch.restore(_part(state, "watch"))
+        pipeline.places.memory.frames[:] = frames
+
+
+def _parts(pipeline: SlamPipeline, recorder: RunRecorder) -> dict[str, Any]:
+    """Whose state a run has. Raises OutputError where that of one cannot be kept."""
+    parts = {
+        "tracker": pipeline.tracker,
+        "estimator": pipeline.estimator,
+        "motion": pipeline.motion,
+        "pipeline": pipeline,
+        "recorder": recorder,
+        "places": pipeline.places,
+        "calibration": pipeline.calibration,
+        "key_frames": pipeline.key_frames,
+        "watch": pipeline.watch,
+    }
+    for part in (pipeline.estimator, pipeline.motion):
+        if not store.has_state(part):
+            name = f"estimator {part.kind}" if hasattr(part, "kind") else type(part).__name__
+            raise OutputError(
+                f"{name} has no state() and restore(): its run keeps no "
+                "checkpoint; give it both, or set output.checkpoint_seconds beyond the run's length"
+            )
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -94,7 +93,7 @@ def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
     log = MeasurementLog.load(folder / LOG_FILE)
     try:
         restore(state, log, pipeline, recorder)
-    except (KeyError, ValueError, IndexError) as error:
+    except (KeyError, ValueError, TypeError, IndexError) as error:
         raise OutputError(
             f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "
             "with --overwrite"
@@ -104,25 +103,6 @@ def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
             f"{folder / LOG_FILE}: holds {len(log)} frames, the checkpoint {len(recorder)}; "
             "restore it, or start again with --overwrite"
         )
-
-
-def _resumable(part: Estimator | MotionModel) -> Resumable:
-    """The part of a run, if its state can be kept. Raises OutputError where it cannot."""
-    if not isinstance(part, Resumable):
-        name = f"estimator {part.kind}" if hasattr(part, "kind") else type(part).__name__
-        raise OutputError(
-            f"{name} has no state() and restore(): its run keeps no "
-            "checkpoint; give it both, or set output.checkpoint_seconds beyond the run's length"
-        )
-    return part
-
-
-def _part(state: StateArrays, part: str) -> StateArrays:
-    return {
-        name.removeprefix(f"{part}/"): array
-        for name, array in state.items()
-        if name.startswith(f"{part}/")
-    }
 
 
 def remove_checkpoint(folder: Path) -> None:

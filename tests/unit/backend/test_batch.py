@@ -30,6 +30,7 @@ from fgslam.backend.smoothers import refinement
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.errors import EstimatorError
+from fgslam.core.store import restore, state_of
 from fgslam.evaluation.consistency import judge
 
 METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
@@ -150,7 +151,7 @@ def test_restored_smoother_continues_to_the_bit(name: str) -> None:
     straight, first, second = (build(SMOOTHERS[name]) for _ in range(3))
     play(straight, increments, FREE)
     play(first, increments[:7], FREE)
-    second.restore({key: np.array(array) for key, array in first.state().items()})
+    restore(second, {key: np.array(array) for key, array in state_of(first).items()})
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), straight.estimate())
 

@@ -20,6 +20,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.store import state_of
 from fgslam.evaluation.consistency import judge, landmark_nees, pose_nees
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
@@ -318,13 +319,13 @@ def test_too_many_landmarks_are_refused_and_change_nothing() -> None:
     accepted = int(np.flatnonzero(counts <= limit).max()) + 1
     for increment in simulation.increments[:accepted]:
         step(estimator, increment)
-    before = copy.deepcopy(estimator.state())
+    before = copy.deepcopy(state_of(estimator))
     with pytest.raises(EstimatorError, match=r"frame \d+: \d+ landmarks exceed max_landmarks") as e:
         step(estimator, simulation.increments[accepted])
     assert "GB" in str(e.value)
     assert "isam2" in str(e.value)
     assert "\n" not in str(e.value)
-    assert_same_bits(estimator.state(), before)
+    assert_same_bits(state_of(estimator), before)
 
 
 def test_wrong_matches_are_left_out_with_a_remark() -> None:
@@ -392,13 +393,13 @@ def test_failed_update_names_the_frame_and_changes_nothing(kind: str) -> None:
         measurement = seen.measurement.copy()
         measurement[1, 1] = np.inf
         seen = dataclasses.replace(seen, measurement=measurement)
-    before = copy.deepcopy(estimator.state())
+    before = copy.deepcopy(state_of(estimator))
     tracking = tracked_at(estimator.predict(increment.odometry), 0)
     bad = dataclasses.replace(increment, odometry=odometry, observations=seen)
     with pytest.raises(EstimatorError, match=f"frame {increment.index}: ") as caught:
         estimator.update(bad, tracking)
     assert "\n" not in str(caught.value)
-    assert_same_bits(estimator.state(), before)
+    assert_same_bits(state_of(estimator), before)
     step(estimator, increment)
     assert np.isfinite(estimator.estimate().trajectory.poses).all()
 
@@ -485,4 +486,4 @@ def test_tracked_pose_is_ignored() -> None:
     play(tracked, simulation.increments, EgoMotionSettings(min_matches=3))
     for increment in simulation.increments:
         step(alone, increment)
-    assert_same_bits(tracked.state(), alone.state())
+    assert_same_bits(state_of(tracked), state_of(alone))

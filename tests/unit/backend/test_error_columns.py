@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.backend.filters.error_columns import ErrorColumns
+from fgslam.core.store import restore, state_of
 
 _COUNT = 4
 
@@ -21,12 +22,13 @@ def test_columns_are_their_landmarks_whatever_comes_and_goes() -> None:
         gain = rng.standard_normal((len(ids), 3, _COUNT))
         columns._append({"ids": ids, "gain": gain})
         expected |= dict(zip(ids.tolist(), gain, strict=True))
-        state = columns.state()
-        assert state["doubt_ids"].tolist() == sorted(expected)
-        assert np.array_equal(state["doubt_gain"], [expected[i] for i in sorted(expected)])
+        state = state_of(columns)
+        assert state["order/ids"].tolist() == sorted(expected)
+        kept = state["map/gain"][state["order/row"]]
+        assert np.array_equal(kept, [expected[i] for i in sorted(expected)])
     again = ErrorColumns(_COUNT)
     again._append({"ids": np.array([7]), "gain": np.ones((1, 3, _COUNT))})
-    again.restore(state)
+    restore(again, state)
     asked = np.array([*sorted(expected), 999])
     found = [*(expected[i] for i in sorted(expected)), np.zeros((3, _COUNT))]
     assert np.array_equal(again._of("gain", asked), found)

@@ -18,6 +18,7 @@ from fgslam.core.sensors import (
     pixel_model,
     vertical_to_horizontal,
 )
+from fgslam.core.store import restore, state_of
 
 PAIR = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
 THREE = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
@@ -90,12 +91,12 @@ def test_little_is_no_evidence_and_a_state_continues_to_the_same_bits() -> None:
     seen = frames(PAIR, 0.4, 1)
     assert after(PAIR, seen[:5]).px == 0.0
     whole, first, second = after(PAIR, seen), after(PAIR, seen[:20]), FieldSize(PAIR, SIGMA_PX)
-    second.restore(first.state())
+    restore(second, state_of(first))
     for each in seen[20:]:
         second.observe(each)
     assert whole.px > 0.0
     assert second.px == whole.px
-    assert_same_bits(second.state(), whole.state())
+    assert_same_bits(state_of(second), state_of(whole))
 
 
 def test_what_not_all_images_show_says_nothing() -> None:

@@ -30,6 +30,7 @@ from fgslam.backend.smoothers.window_parts import LandmarkUndeterminedError
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
+from fgslam.core.store import restore, state_of
 
 LAG = FixedLagSettings(lag_frames=5)
 
@@ -265,7 +266,7 @@ def test_restored_smoother_continues_to_the_bit(at: int) -> None:
     straight, first, second = smoother(), smoother(), smoother()
     play(straight, increments, FREE)
     play(first, increments[:at], FREE)
-    second.restore({name: np.array(array) for name, array in first.state().items()})
+    restore(second, {name: np.array(array) for name, array in state_of(first).items()})
     play(second, increments[at:], FREE)
     assert_same_bits(second.estimate(), straight.estimate())
     held = [i for i, track in second.builder.admission.tracks.items() if track.variable >= 0][:2]

@@ -26,6 +26,7 @@ from smoothing import (
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
+from fgslam.core.store import restore, state_of
 from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
 
 EVERY_FRAME = Isam2Settings(update_every=1)
@@ -224,14 +225,14 @@ def test_restored_between_updates_and_keyframes_it_continues_to_the_bit(
     straight, first, second = build(settings), build(settings), build(settings)
     play(straight, increments, FREE)
     play(first, increments[:at], FREE)
-    second.restore({name: np.array(array) for name, array in first.state().items()})
+    restore(second, {name: np.array(array) for name, array in state_of(first).items()})
     assert_same_bits(second.estimate(), first.estimate())
     third = build(settings)
-    third.restore(second.state())
+    restore(third, state_of(second))
     play(third, increments[at:], FREE)
     assert_same_bits(third.estimate(), straight.estimate())
     with pytest.raises(EstimatorError, match="only a new estimator"):
-        straight.restore(first.state())
+        restore(straight, state_of(first))
 
 
 @pytest.mark.parametrize("frames", [13, 15, 16])

@@ -29,6 +29,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.tracking.ego_motion import unmeasured
 
 SIGMA = np.array([0.3, 0.4, 0.2])
@@ -391,11 +392,11 @@ def test_time_running_backwards_changes_nothing(timestamp: float, rng: np.random
     estimator, points = started(5, rng)
     z = noisy(points, np.eye(4), rng)
     estimator.update(frame(1, np.arange(5), z, False), at(np.eye(4), 5))
-    before = copy.deepcopy(estimator.state())
+    before = copy.deepcopy(state_of(estimator))
     late = dataclasses.replace(frame(2, np.arange(5), z, False), timestamp=timestamp)
     with pytest.raises(EstimatorError, match=r"frame 2: time stamp .* sort the measurements"):
         estimator.update(late, at(nearby_pose(rng), 5))
-    assert_same_bits(estimator.state(), before)
+    assert_same_bits(state_of(estimator), before)
 
 
 @pytest.mark.parametrize("update", UPDATES)
@@ -425,15 +426,15 @@ def test_a_restored_filter_continues_to_the_same_bits(
     straight, first, second = make(update=update), make(update=update), make(update=update)
     play(straight, simulation.increments)
     play(first, simulation.increments[:cut])
-    state = first.state()
+    state = state_of(first)
     snapshot = copy.deepcopy(state)
     play(first, simulation.increments[cut:])
     # The state is a snapshot: what the first filter does later must not reach into it.
     assert_same_bits(state, snapshot)
-    second.restore(state)
+    restore(second, state)
     play(second, simulation.increments[cut:])
-    assert_same_bits(second.state(), straight.state())
-    assert_same_bits(first.state(), straight.state())
+    assert_same_bits(state_of(second), state_of(straight))
+    assert_same_bits(state_of(first), state_of(straight))
     assert_same_bits(state, snapshot)
 
 

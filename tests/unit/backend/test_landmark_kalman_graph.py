@@ -29,6 +29,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
+from fgslam.core.store import state_of
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import pose_prior
@@ -250,7 +251,7 @@ def test_two_runs_give_the_same_bits() -> None:
     (_, first), (_, second) = both(), both()
     run(first, EgoMotionSettings())
     run(second, EgoMotionSettings())
-    assert_same_bits(first.state(), second.state())
+    assert_same_bits(state_of(first), state_of(second))
 
 
 # --------------------------------------------------------------------------------------------

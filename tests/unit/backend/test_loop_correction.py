@@ -12,6 +12,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.geometry import pose
 from fgslam.core.measurements import LoopClosure, Observations, Odometry
+from fgslam.core.store import restore, state_of
 
 _TRACKED = np.diag([1e-6] * 6)
 _WHEELS = np.diag([1e-4] * 6)
@@ -114,7 +115,7 @@ def test_restored_record_continues_after_an_incoherent_frame() -> None:
     one, other = (DriveRecord() for _ in range(2))
     for metres, used in ((0.0, 80), (0.1, 80), (0.9, 20)):
         _add_frame(one, metres, used)
-    other.restore(one.state())
+    restore(other, state_of(one))
     for record in (one, other):
         _add_frame(record, -0.7)
     np.testing.assert_array_equal(one.chain.poses, other.chain.poses)

@@ -22,6 +22,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Observations, Odometry
+from fgslam.core.store import restore, state_of
 from fgslam.factors.noise import plain
 
 SIGMA = np.array([0.2, 0.2, 0.15])  # of (column, row, disparity), pixels, as stated
@@ -57,8 +58,8 @@ def driven(
     errors: dict[int, FloatArray] = {}
     for k in range(frames):
         if k == resumed:
-            state, noise = noise.state(), Persistence(RIG)
-            noise.restore(state)
+            state, noise = state_of(noise), Persistence(RIG)
+            restore(noise, state)
         wTc = wTc @ STEP
         for i in range(5 * k, 5 * k + 5):
             at = np.array([*rng.uniform(-0.8, 0.8, 2), rng.uniform(2.0, 5.0)])
@@ -123,8 +124,8 @@ def test_steps_that_a_map_in_doubt_has_leaned_are_put_right_by_the_smoothed_path
 def test_a_state_continues_to_the_byte() -> None:
     whole, resumed = driven(1.0, kept=0.7, frames=60), driven(1.0, kept=0.7, frames=60, resumed=33)
     assert (whole.spread, whole.power) == (resumed.spread, resumed.power)
-    for name, array in whole.state().items():
-        np.testing.assert_array_equal(array, resumed.state()[name], err_msg=name)
+    for name, array in state_of(whole).items():
+        np.testing.assert_array_equal(array, state_of(resumed)[name], err_msg=name)
 
 
 @pytest.mark.parametrize("scale", [1.0, 4.0])

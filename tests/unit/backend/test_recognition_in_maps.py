@@ -35,6 +35,7 @@ from fgslam.core.arrays import StateArrays
 from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.places.closures import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.arrival import Arrival, take_over
@@ -98,7 +99,7 @@ def returned_with_states(extends: bool, /) -> tuple[SlamPipeline, list[FrameRepo
     """The whole drive; the state before each frame."""
     pipeline, reports, states = in_map(extends), list[FrameReport](), list[States]()
     for frame in seen(PATH, DARK):
-        states.append(tuple(one.state() for one in held_by(pipeline)))
+        states.append(tuple(state_of(one) for one in held_by(pipeline)))
         reports += drive(pipeline, [frame])
     return pipeline, reports, states
 
@@ -186,9 +187,10 @@ def test_continued_from_its_state_it_goes_on_to_the_bit(extends: bool, after_clo
         log.append(report.increment)
     *others, places = states[stop]
     for one, state in zip(held_by(again), others, strict=False):
-        one.restore(state)
-    again.places.restore(places, log)
-    assert_same_bits(again.places.state(), places)
+        restore(one, state)
+    restore(again.places, places)
+    again.places.memory.frames[:] = log
+    assert_same_bits(state_of(again.places), places)
     for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_increments(report.increment, expected.increment)

@@ -27,6 +27,7 @@ from fgslam.core.measurements import Increment, SettledRig
 from fgslam.core.rig_correction import displacements, term_names
 from fgslam.core.sensors import pixel_model, rig_map
 from fgslam.core.settings import RigPlaces
+from fgslam.core.store import restore, state_of
 from fgslam.slam.factory import make_estimator
 
 SETTINGS: dict[str, EstimatorSettings] = {
@@ -199,7 +200,7 @@ def test_an_interrupted_run_moves_its_map_the_same(kind: str, drive: Simulation)
     whole = make_estimator(RIG, SETTINGS[kind])
     play(whole, increments[:WINDOW])
     resumed = make_estimator(RIG, SETTINGS[kind])
-    resumed.restore(whole.state())
+    restore(resumed, state_of(whole))
     for estimator in (whole, resumed):
         play(estimator, increments[WINDOW:])
     assert_same_bits(whole.estimate(), resumed.estimate())

@@ -42,6 +42,7 @@ from fgslam.core.rig_correction import (
 )
 from fgslam.core.rig_field import field_modes
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import restore, state_of
 from fgslam.evaluation.consistency import pose_errors, pose_nees, within
 from fgslam.slam.factory import make_estimator
 
@@ -313,7 +314,7 @@ def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: st
     through, first, second = (make_estimator(CALIBRATED.rig, ONLINE[kind], FREE) for _ in range(3))
     play(through, increments, FREE)
     play(first, increments[:7], FREE)
-    second.restore(dict(sorted(first.state().items())))  # as a saved map's session has it
+    restore(second, dict(sorted(state_of(first).items())))  # as a saved map's session has it
     play(second, increments[7:], FREE)
     assert_same_bits(second.estimate(), through.estimate())
 

@@ -28,6 +28,7 @@ from fgslam.core.sensors import (
     rig_map,
     vertical_to_horizontal,
 )
+from fgslam.core.store import restore, state_of
 from fgslam.runs.tasks.slam_calibration import calibration_note
 
 RIG = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
@@ -379,14 +380,14 @@ def test_a_state_taken_within_a_window_goes_on_with_the_same_bits() -> None:
     for increment, wTc in zip(log[:21], poses[:21], strict=True):
         one.observe(increment, wTc)
     other = SelfCalibration(RIG, SIGMA_PX)
-    other.restore(one.state(), log[:21], poses[:21])
+    restore(other, state_of(one))
     for increment, wTc in zip(log[21:], poses[21:], strict=True):
         one.observe(increment, wTc)
         other.observe(increment, wTc)
     assert one.windows == 5
-    assert other.state().keys() == one.state().keys()
-    for name, array in one.state().items():
-        np.testing.assert_array_equal(other.state()[name], array, err_msg=name)
+    assert state_of(other).keys() == state_of(one).keys()
+    for name, array in state_of(one).items():
+        np.testing.assert_array_equal(state_of(other)[name], array, err_msg=name)
     np.testing.assert_array_equal(other.found.applied.values, one.found.applied.values)
 
 

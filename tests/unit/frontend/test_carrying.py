@@ -8,6 +8,7 @@ import pytest
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import PATCH_PX, LandmarkPatches
 from fgslam.core.geometry import project
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.features.fine_image import FineImage
 from fgslam.frontend.features.patches import ReferencePatches, crowding
 from fgslam.frontend.features.settings import AppearanceSettings
@@ -235,12 +236,12 @@ def test_a_restored_carrier_goes_on_to_the_same_bits() -> None:
     one = begun(pictures(HERE), HERE)
     for k in range(1, 5):
         other = begun(pictures(HERE), np.array([0.3, 0.3, 0.3]))
-        other.restore(one.state())
+        restore(other, state_of(one))
         a, b = followed(one, places[k]), followed(other, places[k])
         np.testing.assert_array_equal(a.ids, b.ids)
         np.testing.assert_array_equal(a.features.pixels, b.features.pixels)
-        for name, array in one.state().items():
-            np.testing.assert_array_equal(array, other.state()[name])
+        for name, array in state_of(one).items():
+            np.testing.assert_array_equal(array, state_of(other)[name])
 
 
 @pytest.mark.parametrize("looked", [False, True])
@@ -249,8 +250,8 @@ def test_a_state_that_lacks_an_array_is_refused(looked: bool) -> None:
     carrier = begun(pictures(HERE), HERE)
     if looked:
         followed(carrier, np.array([0.03, 0.01, 0.0]))
-    state = carrier.state()
-    assert "patch_first" in state
+    state = state_of(carrier)
+    assert "patches/first" in state
     for name in state:
         with pytest.raises(KeyError, match=name):
-            carrier.restore({key: array for key, array in state.items() if key != name})
+            restore(carrier, {key: array for key, array in state.items() if key != name})

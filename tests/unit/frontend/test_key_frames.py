@@ -12,6 +12,7 @@ import pytest
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.features import CUT_PIXELS, StereoFeatures
+from fgslam.core.store import state_of
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import DatabaseSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
@@ -107,10 +108,10 @@ def test_a_landmark_found_again_keeps_the_patch_of_its_first_key_frame() -> None
     again = database.patches(ids)
     np.testing.assert_array_equal(again.grey, kept.grey)
     np.testing.assert_array_equal(again.distances, kept.distances)
-    state = key_frames.state()
-    np.testing.assert_array_equal(state["fresh_cut"], kept.grey)
-    assert state["fresh_growth"].tolist() == [2.0, 2.0]
-    assert state["fresh_known"].all()
+    state = state_of(key_frames)
+    np.testing.assert_array_equal(state["carrier/fresh/cut"], kept.grey)
+    assert state["carrier/fresh/growth"].tolist() == [2.0, 2.0]
+    assert state["carrier/fresh/known"].all()
 
 
 def seen_at(places: list[tuple[float, float]], distance: float) -> StereoFeatures:

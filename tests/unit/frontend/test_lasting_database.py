@@ -15,6 +15,7 @@ from fgslam.core.errors import MapError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.settings import (
     DatabaseSettings,
     PermanenceSettings,
@@ -117,18 +118,18 @@ def test_merging_adds_counts_and_keeps_the_later_look() -> None:
         hit(database, 2)
     end_frame(database, 3)
     looks = {i: database.appearances(np.array([i])).descriptors[0] for i in (0, 2, 3)}
-    seen = database.state()["seen"][[0, 2, 3]].copy()
+    seen = state_of(database)["columns/seen"][[0, 2, 3]].copy()
     assert seen.tolist() == [1, 1, 0]
     database.merge(np.array([[2, 0], [3, 1]]))
     assert database.ids.tolist() == [0, 1]
     assert database.hits.tolist() == [5, 2]
     assert database.misses.tolist() == [1, 1]
     assert database.missed.tolist() == [0, 0]
-    assert database.state()["seen"].tolist() == [1, 0]
+    assert state_of(database)["columns/seen"].tolist() == [1, 0]
     assert database.permanent.tolist() == [True, False]
     np.testing.assert_array_equal(database.appearances(np.array([0])).descriptors[0], looks[2])
     # What ends is never named again.
-    assert database.state()["next_id"] == 4
+    assert database.next_id == 4
 
 
 def test_several_landmarks_are_merged_into_one() -> None:
@@ -141,7 +142,6 @@ def test_several_landmarks_are_merged_into_one() -> None:
     assert database.hits.tolist() == [8]
     found = database.appearances()
     assert len(found) == 3  # as many as it may have
-    assert database.state()["view_counts"].tolist() == [3]
 
 
 @pytest.mark.parametrize(
@@ -156,17 +156,17 @@ def test_several_landmarks_are_merged_into_one() -> None:
 )
 def test_what_cannot_be_merged_is_refused_and_nothing_done(pairs, why) -> None:
     database = database_of(PLACES, LASTING)
-    before = copy.deepcopy(database.state())
+    before = copy.deepcopy(state_of(database))
     with pytest.raises(ValueError, match=why):
         database.merge(np.array(pairs))
-    assert_same_bits(database.state(), before)
+    assert_same_bits(state_of(database), before)
 
 
 def test_merging_no_pairs_changes_nothing() -> None:
     database = database_of(PLACES, LASTING)
-    before = copy.deepcopy(database.state())
+    before = copy.deepcopy(state_of(database))
     database.merge(np.empty((0, 2), np.int64))
-    assert_same_bits(database.state(), before)
+    assert_same_bits(state_of(database), before)
 
 
 # --------------------------------------------------------------------------------------------
@@ -202,17 +202,17 @@ def test_appearances_are_all_views_the_latest_last() -> None:
 def test_a_restored_database_with_views_continues_exactly() -> None:
     first = seen_around()
     end_frame(first, 1)
-    state = first.state()
+    state = state_of(first)
     kept = copy.deepcopy(state)
     second = LandmarkDatabase(RIG, VIEWS, 40.0)
-    second.restore(state)
+    restore(second, state)
     for database in (first, second):
         hit(database, 0, 2, directions=towards(140.0, 100.0))
         database.add(stereo_features(PLACES), np.array([3]), np.array([9], np.uint8), towards(10))
         end_frame(database, 3)
         hit(database, 0, directions=towards(200.0))
     assert_same_bits(state, kept)
-    assert_same_bits(first.state(), second.state())
+    assert_same_bits(state_of(first), state_of(second))
     map_now = landmark_map(np.concatenate([PLACES, PLACES[:1]]))
     assert_same_bits(first.expected(map_now, np.eye(4)), second.expected(map_now, np.eye(4)))
 
@@ -244,7 +244,7 @@ def test_a_visit_that_carries_none_keeps_the_patches_of_its_map() -> None:
     added = second.add(stereo_features(PLACES), np.array([3]), np.array([9], np.uint8), towards(10))
     assert second.patches(added).distances.tolist() == [0.0]
     third = LandmarkDatabase(RIG, VIEWS, 40.0)
-    third.restore(second.state())
+    restore(third, state_of(second))
     assert_same_bits(third.patches(given.landmarks.ids), patches)
 
 
@@ -261,8 +261,8 @@ def test_a_saved_map_s_database() -> None:
     for name in ("ids", "hits", "misses", "permanent", "colour"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
     assert_same_bits(second.appearances(), first.appearances())
-    assert second.missed.tolist() == second.state()["contradicted"].tolist() == [0, 0, 0]
-    assert second.state()["next_id"] == 4
+    assert second.missed.tolist() == state_of(second)["columns/contradicted"].tolist() == [0, 0, 0]
+    assert second.next_id == 4
     # Its own columns, not the map's: the map is not touched by the visit.
     kept = copy.deepcopy(given)
     hit(second, 0, directions=towards(130.0))
@@ -302,7 +302,7 @@ def test_an_empty_map() -> None:
     database = seen_around()
     database.load(given)
     assert len(database) == len(database.appearances()) == 0
-    assert database.state()["next_id"] == 0
+    assert database.next_id == 0
 
 
 def test_memory_a_landmark_is_as_documented() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.tracking.map_parts import MapParts
 
 GUESS = Odometry(np.eye(4), np.eye(6), measured=False)
@@ -94,7 +95,7 @@ def test_a_closure_joins_where_it_is_taken(taken: bool) -> None:
 
 def test_continued_from_its_state_it_is_the_same() -> None:
     parts, again = booked(*BEFORE, GAP), MapParts()
-    again.restore(parts.state())
+    restore(again, state_of(parts))
     for one in (parts, again):
         one.record(frame(new=range(50, 60)), ())
     np.testing.assert_array_equal(parts.of(np.arange(60)), again.of(np.arange(60)))

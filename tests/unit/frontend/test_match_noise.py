@@ -10,6 +10,7 @@ from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.backend.settings import BatchSettings, LandmarkKalmanSettings
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.store import restore, state_of
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
@@ -71,10 +72,10 @@ def test_a_drive_goes_on_from_a_state_as_it_would_have() -> None:
     )
     for k, increment in enumerate(log):
         if k == 12:
-            again.restore(whole.state())
+            restore(again, state_of(whole))
             other, other_motion = EgoMotionSolver(log.rig, PLANAR), replay_motion(log)
-            other.noise.restore(solver.noise.state())
-            other_motion.restore(motion.state())
+            restore(other.noise, state_of(solver.noise))
+            restore(other_motion, state_of(motion))
         found = replay_frame(increment, whole, solver, motion, k)
         if k >= 12:
             same = replay_frame(increment, again, other, other_motion, k)

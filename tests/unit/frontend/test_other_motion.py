@@ -12,6 +12,7 @@ from textured_room import TEXTURE
 
 from fgslam.core.arrays import Image
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.other_motion import OtherMotion
@@ -64,10 +65,10 @@ def test_something_large_that_passes_is_told() -> None:
         assert len(told) == 1, session.result().notes
         watch = session.pipeline.tracker.other_motion
         other = OtherMotion(RIG, EgoMotionSolver(RIG, EgoMotionSettings()))
-        other.restore(watch.state())
+        restore(other, state_of(watch))
         assert other.remarks() == watch.remarks() == (told[0],)
-        for name, array in watch.state().items():
-            np.testing.assert_array_equal(other.state()[name], array)
+        for name, array in state_of(watch).items():
+            np.testing.assert_array_equal(state_of(other)[name], array)
 
 
 def test_a_scene_that_stands_has_one_motion(monkeypatch: pytest.MonkeyPatch) -> None:

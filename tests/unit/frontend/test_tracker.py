@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
+from fgslam.core.store import TREE, restore, state_of
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import (
     DatabaseSettings,
@@ -198,13 +200,14 @@ def test_landmarks_out_of_view_are_left_alone() -> None:
     """Type I: bit-identical, however long nobody looks."""
     scene = Scene()
     scene.step(np.eye(4))
-    before = copy.deepcopy(scene.tracker.database.state())
+    before = copy.deepcopy(state_of(scene.tracker.database))
     away = g.se3_exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
     for _ in range(10):
         _, association = scene.step(away)
         assert len(association.missed_ids) == len(association.pruned_ids) == 0
-    after = scene.tracker.database.state()
-    assert int(after.pop("frame")) == int(before.pop("frame")) + 10  # frames counted, no entry
+    after = state_of(scene.tracker.database)
+    frames = [json.loads(str(state.pop(TREE)))["part"]["_frame"] for state in (before, after)]
+    assert frames[1] == frames[0] + 10  # frames counted, no entry
     assert_same_bits(after, before)
 
 
@@ -214,9 +217,9 @@ def test_outliers_count_as_misses_and_are_marked(monkeypatch: pytest.MonkeyPatch
     # One landmark of the map is not where it was seen: 4 px off, but inside the window.
     scene.settings = SETTINGS
     monkeypatch.setattr(map_matching, "WINDOW_PX", 20.0)
-    state = scene.tracker.database.state()
+    state = state_of(scene.tracker.database)
     scene.tracker = make_tracker(RIG, SETTINGS)
-    scene.tracker.database.restore(state)
+    restore(scene.tracker.database, state)
     expected = scene.tracker.database.expected(scene.map, np.eye(4))
     wrong = int(expected.ids[len(expected) // 2])
     row = int(scene.map.rows(np.array([wrong]))[0])
@@ -303,11 +306,11 @@ def test_tracking_alone_changes_nothing() -> None:
     scene.step(np.eye(4))
     stereo = scene.stereo.match(scene.world.features(np.eye(4)))
     given = (Prediction(np.eye(4), CERTAIN.copy()), scene.map, stereo)
-    kept, state = copy.deepcopy(given), copy.deepcopy(scene.tracker.database.state())
+    kept, state = copy.deepcopy(given), copy.deepcopy(state_of(scene.tracker.database))
     first, second = scene.tracker.track(*given), scene.tracker.track(*given)
     assert_same_bits(first, second)
     assert_same_bits(given, kept)
-    assert_same_bits(scene.tracker.database.state(), state)
+    assert_same_bits(state_of(scene.tracker.database), state)
 
 
 def test_nothing_seen_is_a_miss_for_all_in_view() -> None:

@@ -12,6 +12,7 @@ from test_tracker import CERTAIN, IMAGE, SETTINGS
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
+from fgslam.core.store import state_of
 from fgslam.frontend.settings import (
     DatabaseSettings,
     FrontendSettings,
@@ -78,10 +79,14 @@ class Things:
 
     def entry(self, landmark: int) -> dict[str, int]:
         row = int(self.database.rows(np.array([landmark]))[0])
-        names = ("hits", "misses", "missed", "contradicted", "permanent", "view_counts")
-        state = self.database.state()
-        state.setdefault("view_counts", np.ones(len(self.database), np.int64))
-        return {name: int(state[name][row]) for name in names}
+        names = ("hits", "misses", "missed", "contradicted", "permanent")
+        state = state_of(self.database)
+        entry = {name: int(state[f"columns/{name}"][row]) for name in names}
+        return entry | {"views": int(views_of(self.database)[row])}
+
+
+def views_of(database: LandmarkDatabase) -> IntArray:
+    return np.asarray((state_of(database)["columns/places"] >= 0).sum(axis=1))
 
 
 def cloud(count: int = 40, spread: float = 0.5) -> FloatArray:
@@ -111,7 +116,7 @@ def test_the_four_branches(branch: str) -> None:
     before = things.database.appearances(np.array([landmark]))
     association = things.step(from_angle(angle), None if matched else np.array([7]))
     found = things.entry(landmark)
-    assert (found["view_counts"], found["misses"]) == (views, misses)
+    assert (found["views"], found["misses"]) == (views, misses)
     assert found["hits"] == (2 if matched else 1)
     assert (landmark in association.observations.ids) is matched
     assert (landmark in association.missed_ids) is (misses == 1)
@@ -128,7 +133,7 @@ def test_without_viewpoints_a_failure_from_elsewhere_is_a_miss() -> None:
     landmark = things.id_of(7)
     things.step(from_angle(24.0), np.array([7]))
     assert things.entry(landmark) == {
-        "hits": 1, "misses": 1, "missed": 1, "contradicted": 0, "permanent": 0, "view_counts": 1,
+        "hits": 1, "misses": 1, "missed": 1, "contradicted": 0, "permanent": 0, "views": 1,
     }  # fmt: skip
 
 
@@ -172,7 +177,7 @@ def test_an_orbit_around_a_pillar(several: bool) -> None:
     assert lost == 0
     assert len(things.map) == len(born)
     # Seen over 120 degrees of their own, a little less of the orbit's (the pillar is thick).
-    views = things.database.state()["view_counts"]
+    views = views_of(things.database)
     assert 4 <= np.median(views) <= views.max() <= 1 + 120 // 20
 
 
@@ -268,7 +273,7 @@ def test_a_thing_behind_a_person_stays() -> None:
         assert not np.isin(ids, association.pruned_ids).any()
     rows = things.database.rows(ids)
     assert (things.database.missed[rows] == 40).all()
-    assert (things.database.state()["contradicted"][rows] == 0).all()
+    assert (state_of(things.database)["columns/contradicted"][rows] == 0).all()
     assert things.database.permanent[rows].all()
 
 

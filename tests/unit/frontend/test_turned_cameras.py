@@ -16,6 +16,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import so3_exp
 from fgslam.core.rig_correction import TERMS, camera_displacements
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.image_lag import LineRows
 from fgslam.frontend.turned_cameras import WINDOW, Knock, Turns, TurnWatch, turns_of
@@ -256,8 +257,8 @@ def test_a_watch_goes_on_from_its_state_to_the_bit() -> None:
         rng, watch = np.random.default_rng(3), TurnWatch(PAIR, 0.1)
         for frame in range(9 * WINDOW):
             if frame == stop:
-                state, watch = watch.state(), TurnWatch(PAIR, 0.1)
-                watch.restore(state)
+                state, watch = state_of(watch), TurnWatch(PAIR, 0.1)
+                restore(watch, state)
             show(watch, frame, rng, 0.5 if frame >= 4 * WINDOW else 0.0)
         return watch
 
@@ -266,5 +267,5 @@ def test_a_watch_goes_on_from_its_state_to_the_bit() -> None:
     for stop in (3 * WINDOW + 2, 5 * WINDOW, 6 * WINDOW + 3, 8 * WINDOW + 1):
         again = watched(stop)
         assert again.remarks() == whole.remarks()
-        for name, value in whole.state().items():
-            np.testing.assert_array_equal(again.state()[name], value)
+        for name, value in state_of(whole).items():
+            np.testing.assert_array_equal(state_of(again)[name], value)

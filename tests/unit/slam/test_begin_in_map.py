@@ -26,6 +26,7 @@ from fgslam.core.features import LandmarkAppearances
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import restore, state_of
 from fgslam.slam.arrival import Arrival, require_map_user, take_over
 from fgslam.slam.factory import make_estimator
 
@@ -168,7 +169,7 @@ def test_state_and_restore_to_the_bit(
     increment = seen(saved, 0.2 * rng.standard_normal((20, 3)))
     estimator.update(increment, tracked(increment))
     again = make_estimator(RIG, settings)  # who goes on with a session does not know the prior
-    again.restore(estimator.state())
+    restore(again, state_of(estimator))
     one, other = estimator.estimate(), again.estimate()
     assert one.trajectory.poses.tobytes() == other.trajectory.poses.tobytes()
     assert one.landmarks.positions.tobytes() == other.landmarks.positions.tobytes()

@@ -14,6 +14,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import BiasEffect, Odometry
+from fgslam.core.store import restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam.gyroscope import GyroscopeError, turn_of_camera
@@ -123,7 +124,7 @@ def test_the_bias_is_found_with_its_covariance() -> None:
     for seed in range(12):
         found = gyroscope_of(driven(60, seed)[0])
         error = found.bias - TRUE_BIAS
-        covariance = found.state()["gyroscope_covariance"]
+        covariance = state_of(found)["covariance"]
         assert np.degrees(np.abs(error).max()) < 0.5
         squares.append(error @ np.linalg.solve(covariance, error))
     # It leaves out that the pose before is off by the bias, too: too modest, never too sure.
@@ -157,24 +158,24 @@ def test_nothing_is_learnt_over_a_jump() -> None:
 def test_it_continues_from_its_state_with_the_same_bits() -> None:
     motion, _ = driven(20, 1)
     other = motion_model()
-    other.restore({name: np.array(array) for name, array in motion.state().items()})
+    restore(other, {name: np.array(array) for name, array in state_of(motion).items()})
     for each in (motion, other):
         given = each.between(DT * 20, measured(np.eye(3), np.zeros(3), TRUE_BIAS))
         assert given is not None
         each.observe(DT * 20, Prediction(np.eye(4), 1e-6 * np.eye(6)), measured=True)
-    assert_same_bits(motion.state(), other.state())
+    assert_same_bits(state_of(motion), state_of(other))
 
 
 def test_a_frame_taken_back_leaves_no_step_to_learn_from() -> None:
     """What follows it has no turn: the camera went on, by no step of the gyroscope's."""
     motion, other = driven(20, 1)[0], driven(20, 1)[0]
-    before = motion.state()
+    before = state_of(motion)
     motion.between(DT * 20, measured(g.so3_exp(np.full(3, 0.05)), np.zeros(3), TRUE_BIAS))
-    motion.restore(before)
+    restore(motion, before)
     for each in (motion, other):
         each.between(DT * 20, None)
         each.observe(DT * 20, Prediction(np.eye(4), 1e-6 * np.eye(6)), measured=True)
-    assert_same_bits(motion.state(), other.state())
+    assert_same_bits(state_of(motion), state_of(other))
 
 
 # --------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Prediction
 from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 
@@ -301,9 +302,9 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
     first, second = make(), make()
     for k in range(seen):
         first.observe(0.5 * k, at(g.se3_exp(0.5 * k * TWIST)), measured=True)
-    state = first.state()
+    state = state_of(first)
     kept = copy.deepcopy(state)
-    second.restore({name: np.array(array) for name, array in state.items()})
+    restore(second, {name: np.array(array) for name, array in state.items()})
     for k in range(seen, 6):
         a, b = first.between(0.5 * k, None), second.between(0.5 * k, None)
         assert (a is None) == (b is None)
@@ -312,7 +313,7 @@ def test_a_restored_motion_continues_to_the_same_bits(seen: int, kind: str) -> N
         first.observe(0.5 * k, at(g.se3_exp(0.5 * k * TWIST)), measured=True)
         second.observe(0.5 * k, at(g.se3_exp(0.5 * k * TWIST)), measured=True)
     assert_same_bits(state, kept)
-    assert_same_bits(first.state(), second.state())
+    assert_same_bits(state_of(first), state_of(second))
 
 
 def test_descriptions_are_plain_values() -> None:

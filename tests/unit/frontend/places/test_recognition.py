@@ -23,12 +23,12 @@ from rings import (
 from simulated import RIG, assert_same_bits
 
 from fgslam.backend.filters import loop_correction
-from fgslam.backend.protocol import Resumable
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.store import restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.features.descriptor_index import AppearanceIndex
 from fgslam.frontend.places.closures import difference
@@ -66,12 +66,11 @@ class State:
     taken: tuple[bool, ...]
 
 
-def state_of(pipeline: SlamPipeline) -> State:
+def states_of(pipeline: SlamPipeline) -> State:
     assert pipeline.places is not None
-    assert isinstance(pipeline.estimator, Resumable)
     tracker = pipeline.tracker
     held = (tracker.database, tracker.parts, pipeline.estimator, pipeline.places)
-    return State(*(one.state() for one in held), taken=pipeline.places.taken)
+    return State(*(state_of(one) for one in held), taken=pipeline.places.taken)
 
 
 @lru_cache(maxsize=2)
@@ -82,7 +81,7 @@ def ring_and_states(refusing: bool) -> tuple[SlamPipeline, list[FrameReport], li
         if refusing:
             refuse_closures(patch)
         for frame in seen(RING, DARK):
-            states.append(state_of(pipeline))
+            states.append(states_of(pipeline))
             reports += drive(pipeline, [frame])
     return pipeline, reports, states
 
@@ -99,10 +98,12 @@ def gone_on(refusing: bool, stop: int, path: list[FloatArray] = RING) -> SlamPip
     for report in reports[:stop]:
         log.append(report.increment)
     again, state = round_the_ring(path), states[stop]
-    again.tracker.database.restore(state.database)
-    again.tracker.parts.restore(state.parts)
-    again.estimator.restore(state.estimator)
-    again.places.restore(state.places, log)
+    assert again.places is not None
+    restore(again.tracker.database, state.database)
+    restore(again.tracker.parts, state.parts)
+    restore(again.estimator, state.estimator)
+    restore(again.places, state.places)
+    again.places.memory.frames[:] = log
     return again
 
 
@@ -200,7 +201,7 @@ def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_bits(report.increment.observations, expected.increment.observations)
         np.testing.assert_array_equal(report.increment.pruned_ids, expected.increment.pruned_ids)
-    assert_same_bits(pipeline.tracker.database.state(), without.tracker.database.state())
+    assert_same_bits(state_of(pipeline.tracker.database), state_of(without.tracker.database))
 
 
 def test_a_refused_closure_is_offered_again_after_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -279,7 +280,7 @@ def test_continued_from_its_state_it_goes_on_to_the_bit(
     stop = closings(reports)[0] + after_closing
     state, frames = states[stop], list(seen(RING, DARK))
     again = gone_on(refusing, stop)
-    assert_same_bits(again.places.state(), state.places)
+    assert_same_bits(state_of(again.places), state.places)
     assert again.places.taken == state.taken
     for report, expected in zip(drive(again, frames[stop:]), reports[stop:], strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)

@@ -14,6 +14,7 @@ from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Relocalisation, 
 from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
+from fgslam.core.store import restore, state_of
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.closures import (
     Confirmation,
@@ -202,8 +203,9 @@ def test_a_closure_bounds_the_drift_only_if_the_estimator_took_it(taken: bool, w
         points = np.tile([0.0, 0.0, 3.0], (len(ids), 1))
         log.append(frame(k, sight(np.eye(4), points, np.array(ids))))
     log.append(last)
-    restored.restore(memory.state(), log)
-    assert_same_bits(restored.state(), memory.state())
+    restore(restored, state_of(memory))
+    restored.frames[:] = log
+    assert_same_bits(state_of(restored), state_of(memory))
     assert restored.way_since(0) == memory.way_since(0)
     np.testing.assert_array_equal(restored.unseen_for(30, again), memory.unseen_for(30, again))
 
@@ -213,8 +215,9 @@ def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
     held = _map(np.arange(600), np.zeros((600, 3)))
     for k in range(len(memory)):
         log.append(frame(k, memory.view(k, NOBODY, held)))
-    again.restore(memory.state(), log)
-    assert_same_bits(again.state(), memory.state())
+    restore(again, state_of(memory))
+    again.frames[:] = log
+    assert_same_bits(state_of(again), state_of(memory))
     unseen = np.arange(32, 60)
     for one in (memory, again):
         new = np.arange(600, 620)
@@ -233,8 +236,9 @@ def test_memory_restored_from_log_goes_on_the_same(given: int) -> None:
     for k in range(3):
         log.append(frame(k, memory.view(k, NOBODY, _map(np.arange(9), np.zeros((9, 3))))))
     again = SightingMemory()
-    again.restore(memory.state(), log)
-    assert_same_bits(again.state(), memory.state())
+    restore(again, state_of(memory))
+    again.frames[:] = log
+    assert_same_bits(state_of(again), state_of(memory))
     asked = np.arange(9)
     for frames_ago in range(3):
         np.testing.assert_array_equal(

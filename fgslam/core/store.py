@@ -1,0 +1,409 @@
+"""One codec from dataclasses to ``.npz`` files and back, and the state of a run's parts on it.
+
+A file holds plain arrays and one JSON text ``tree`` with the structure and all single numbers; no
+pickle. The same value gives the same bytes. What is read back is what the reader's type hints say,
+and of a union only its own members. Lists are stacked by column: 10,000 poses are one array, a list
+of dataclasses one column a field.
+
+A class that changes during a run marks what it keeps: ``_pose: Kept[FloatArray]``. That is its
+state; what is made of it (caches) or given to it (settings, cameras) is not. :func:`state_of` takes
+a snapshot, :func:`restore` puts it back into a part made with the same settings.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import types
+import typing
+from collections import abc, deque
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from functools import cache
+from itertools import pairwise
+from typing import Annotated, Any, Protocol, Self, TypeAlias, TypeVar, get_args, get_origin
+
+import numpy as np
+
+from fgslam.core.arrays import StateArrays
+
+T = TypeVar("T")
+_KEPT = "kept"
+Kept: TypeAlias = Annotated[T, _KEPT]
+"""Marks an attribute as a part of its class's state."""
+
+TREE = "tree"
+"""Name of the array with the structure."""
+
+_SINGLE = 16
+"""Numbers of a list that stand in the structure; more of them are an array."""
+
+
+@typing.runtime_checkable
+class Compact(Protocol):
+    """A value with room or caches that are no state: it is stored as what :meth:`packed` gives."""
+
+    def packed(self) -> Any:
+        """An array or a mapping of arrays that tells all."""
+        ...
+
+    @classmethod
+    def unpacked(cls, packed: Any) -> Self:
+        """The value back."""
+        ...
+
+
+@typing.runtime_checkable
+class Resumable(Protocol):
+    """A part that keeps its state in its own way: one that holds a solver, or a user's own."""
+
+    def state(self) -> StateArrays:
+        """Everything needed to continue, as plain arrays; later updates leave them alone."""
+        ...
+
+    def restore(self, state: StateArrays) -> None:
+        """Continues from what :meth:`state` gave; on a new part with the same settings."""
+        ...
+
+
+# --------------------------------------------------------------------------------------------
+# Values
+
+
+def pack(value: Any) -> StateArrays:
+    """A value as arrays. Raises TypeError for what is neither data nor made of it."""
+    packing = _Packing()
+    tree = packing.node(value, "")
+    return packing.arrays | {TREE: np.array(json.dumps(tree))}
+
+
+def unpack(arrays: StateArrays, kind: Any) -> Any:
+    """The value of :func:`pack`, as the type ``kind``: a dataclass, a container or a union.
+
+    Raises:
+        KeyError, ValueError, TypeError, IndexError: they are not those of such a value.
+    """
+    return _Unpacking(arrays).value(json.loads(str(arrays[TREE])), kind)
+
+
+class _Packing:
+    """Nodes of the structure; arrays by their place in it."""
+
+    def __init__(self) -> None:
+        self.arrays: StateArrays = {}
+
+    def node(self, value: Any, at: str) -> Any:
+        """A value as JSON; its arrays are stored beside, under names that begin with ``at``."""
+        value = _plain(value)
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        if isinstance(value, np.ndarray):
+            return {"array": self._stored(value, at)}
+        if isinstance(value, bytes):
+            return {"bytes": self._stored(np.frombuffer(value, np.uint8), at)}
+        if isinstance(value, tuple | list | deque) and not _field_names(type(value)):
+            return self._sequence(value, at)
+        return self._composed(value, at)
+
+    def _sequence(self, value: Sequence[Any], at: str) -> Any:
+        if isinstance(value, deque):
+            return {"deque": self.column(list(value), at), "most": value.maxlen}
+        if isinstance(value, tuple) and len(value) <= _SINGLE:  # its items may be of all types
+            return [self.node(one, _below(at, str(k))) for k, one in enumerate(value)]
+        return self.column(list(value), at)
+
+    def _composed(self, value: Any, at: str) -> Any:
+        if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+            return {"named": {n: self.node(one, _below(at, n)) for n, one in value.items()}}
+        if isinstance(value, Mapping):
+            keys = self.column(list(value), _below(at, "keys"))
+            return {"keys": keys, "values": self.column(list(value.values()), at)}
+        if isinstance(value, Compact):
+            return {"compact": self.node(value.packed(), at)}
+        if isinstance(value, Resumable):
+            own = value.state().items()
+            return {"own": {n: self._stored(a, _below(at or "own", n)) for n, a in own}}
+        kind: Any = type(value)
+        kept = kept_hints(kind)
+        if names := kept or _field_names(kind):
+            parts = {n: self.node(getattr(value, n), _below(at, n)) for n in names}
+            return {"part": parts} if kept else {"class": kind.__name__, "fields": parts}
+        raise TypeError(f"{type(value).__name__} cannot be stored")
+
+    def column(self, values: list[Any], at: str) -> Any:
+        """A list; its items in one array, or one column a field, where they are alike."""
+        values = [_plain(value) for value in values]
+        types_of = {type(value) for value in values}
+        if types_of <= {bool} or types_of <= {int} or types_of <= {float}:
+            numbers = np.array(values) if len(values) > _SINGLE else np.empty(0, np.object_)
+            several = numbers.dtype.kind in "bif"  # integers beyond 64 bits are none
+            return {"numbers": self._stored(numbers, at)} if several else values
+        stacked: Any = None
+        if type(None) in types_of:
+            known = [value is not None for value in values]
+            some = [value for value in values if value is not None]
+            if some and len(values) > _SINGLE:
+                known_at = _below(at, "known")
+                return {"known": self.column(known, known_at), "some": self.column(some, at)}
+        elif len(types_of) == 1:
+            stacked = self._stacked(values, types_of.pop(), at)
+        if stacked is None:
+            stacked = [self.node(value, _below(at, str(k))) for k, value in enumerate(values)]
+        return stacked
+
+    def _stacked(self, values: list[Any], kind: type, at: str) -> Any:
+        """Values of one type by column; None where they are not alike."""
+        if kind is np.ndarray:
+            if len({(v.dtype, v.shape) for v in values}) == 1:
+                return {"stack": self._stored(np.array(values), at)}
+            if min(v.ndim for v in values) and len({(v.dtype, v.shape[1:]) for v in values}) == 1:
+                sizes = self.column([len(v) for v in values], _below(at, "sizes"))
+                return {"joined": self._stored(np.concatenate(values), at), "sizes": sizes}
+        elif kind is tuple and len({len(v) for v in values}) == 1:
+            turned = [list(column) for column in zip(*values, strict=True)]
+            parts = [self.column(column, _below(at, str(k))) for k, column in enumerate(turned)]
+            return {"tuples": parts, "count": len(values)}
+        elif kind in (list, tuple):
+            sizes = self.column([len(v) for v in values], _below(at, "sizes"))
+            return {"of": self.column([one for v in values for one in v], at), "sizes": sizes}
+        elif (names := _field_names(kind)) and not kept_hints(kind):
+            columns = {
+                n: self.column([getattr(v, n) for v in values], _below(at, n)) for n in names
+            }
+            return {"class": kind.__name__, "columns": columns, "count": len(values)}
+        return None
+
+    def _stored(self, array: np.ndarray[Any, Any], at: str) -> str:
+        if array.dtype.hasobject:
+            raise TypeError("an array of objects cannot be stored")
+        name = at or "value"
+        if name in self.arrays or name == TREE:
+            raise ValueError(f"two arrays of the name {name}")
+        self.arrays[name] = array.copy()
+        return name
+
+
+class _Unpacking:
+    """Values from nodes of the structure, by the types that are asked for."""
+
+    def __init__(self, arrays: StateArrays) -> None:
+        self.arrays = arrays
+
+    def value(self, node: Any, kind: Any, now: Any = None) -> Any:
+        """The value of a node; ``now``: what a part holds there, whose given things stay."""
+        members = _members(kind)
+        out: Any
+        if not isinstance(node, dict | list):
+            if has_state(now):
+                raise ValueError(f"no state of {type(now).__name__}")
+            return _scalar(node, members)
+        match node:
+            case {"array": name}:
+                out = self.arrays[name].copy()
+            case {"bytes": name}:
+                out = self.arrays[name].tobytes()
+            case {"compact": inner}:
+                compact = next(m for m in members if isinstance(m, type) and issubclass(m, Compact))
+                out = compact.unpacked(self.value(inner, Any))
+            case {"part": parts}:
+                out = self._part(parts, now)
+            case {"own": names}:
+                now.restore({name: self.arrays[stored] for name, stored in names.items()})
+                out = now
+            case {"class": name, "fields": parts}:
+                made = _named(name, members)
+                hints = _hints(made)
+                out = made(**{n: self.value(part, hints[n]) for n, part in parts.items()})
+            case {"named": named}:
+                item = (*get_args(_first(members, abc.Mapping)), Any, Any)[1]
+                out = {n: self.value(one, item) for n, one in named.items()}
+            case {"keys": keys, "values": values}:
+                key, item = (*get_args(_first(members, abc.Mapping)), Any, Any)[:2]
+                out = dict(zip(self.column(keys, key), self.column(values, item), strict=True))
+            case {"deque": items, "most": most}:
+                out = deque(self.column(items, _item_kind(_first(members, deque))), most)
+            case _:
+                out = self._sequence(node, _first(members, abc.Sequence), now)
+        return out
+
+    def _sequence(self, node: Any, kind: Any, now: Any) -> Any:
+        items = get_args(kind)
+        if isinstance(node, list) and get_origin(kind) is tuple and items[-1:] != (Ellipsis,):
+            return tuple(self.value(one, of) for one, of in zip(node, items, strict=True))
+        return _made_of(self.column(node, _item_kind(kind), now), kind)
+
+    def column(self, node: Any, kind: Any, now: Any = None) -> list[Any]:
+        """The items of a list, each of the type."""
+        out: list[Any]
+        match node:
+            case list():
+                before = (
+                    now if isinstance(now, list) and len(now) == len(node) else [None] * len(node)
+                )
+                out = [self.value(one, kind, was) for one, was in zip(node, before, strict=True)]
+            case {"numbers": name}:
+                members = _members(kind)
+                out = [_scalar(number, members) for number in self.arrays[name].tolist()]
+            case {"stack": name}:
+                array = self.arrays[name].copy()
+                out = list(array) if array.ndim > 1 else [np.array(one) for one in array]
+            case {"joined": name, "sizes": sizes}:
+                out = np.split(self.arrays[name].copy(), np.cumsum(self.column(sizes, int))[:-1])
+            case {"known": known, "some": some}:
+                found = iter(self.column(some, kind))
+                out = [next(found) if so else None for so in self.column(known, bool)]
+            case {"tuples": parts, "count": count}:
+                of = _item_kinds(_first(_members(kind), tuple), len(parts))
+                columns = [self.column(part, one) for part, one in zip(parts, of, strict=True)]
+                out = list(zip(*columns, strict=True)) if parts else [()] * count
+            case {"of": items, "sizes": sizes}:
+                inner = _first(_members(kind), abc.Sequence)
+                every = self.column(items, _item_kind(inner))
+                ends = [0, *np.cumsum(self.column(sizes, int)).tolist()]
+                out = [_made_of(every[a:b], inner) for a, b in pairwise(ends)]
+            case {"class": name, "columns": columns, "count": count}:
+                made = _named(name, _members(kind))
+                hints = _hints(made)
+                fields = {n: self.column(column, hints[n]) for n, column in columns.items()}
+                out = [made(**{n: items[k] for n, items in fields.items()}) for k in range(count)]
+            case _:
+                raise ValueError(f"holds no list, but {node}")
+        return out
+
+    def _part(self, parts: dict[str, Any], now: Any) -> Any:
+        """A part with its state put back; one that is frozen is replaced."""
+        kind: Any = type(now)
+        hints = kept_hints(kind)
+        if set(hints) != set(parts):
+            raise ValueError(f"no state of {type(now).__name__}")
+        values = {n: self.value(parts[n], hints[n], getattr(now, n)) for n in parts}
+        if _is_frozen(now):
+            return dataclasses.replace(now, **values)
+        for name, value in values.items():
+            setattr(now, name, value)
+        if isinstance(now, Remade):
+            now.remake()
+        return now
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of NumPy and members of enumerations as what they are in JSON."""
+    if isinstance(value, np.generic):
+        return value.item()
+    return value.value if isinstance(value, Enum) else value
+
+
+def _below(at: str, name: str) -> str:
+    return f"{at}/{name.strip('_')}" if at else name.strip("_")
+
+
+def _is_frozen(value: Any) -> bool:
+    return bool(getattr(getattr(value, "__dataclass_params__", None), "frozen", False))
+
+
+def _field_names(kind: Any) -> tuple[str, ...]:
+    """Of a dataclass or a named tuple; empty of any other type."""
+    if dataclasses.is_dataclass(kind):
+        return tuple(field.name for field in dataclasses.fields(kind) if field.init)
+    return tuple(getattr(kind, "_fields", ()))
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return typing.get_type_hints(kind)
+
+
+def _members(kind: Any) -> tuple[Any, ...]:
+    """The types that a hint stands for."""
+    if get_origin(kind) is Annotated:
+        return _members(get_args(kind)[0])
+    if get_origin(kind) in (typing.Union, types.UnionType):
+        return tuple(part for member in get_args(kind) for part in _members(member))
+    return (kind,)
+
+
+def _first(members: tuple[Any, ...], container: type) -> Any:
+    """The member that is such a container."""
+    for member in members:
+        made = get_origin(member) or member
+        if isinstance(made, type) and issubclass(made, container) and not issubclass(made, str):
+            return member
+    return Any
+
+
+def _named(name: str, members: tuple[Any, ...]) -> Any:
+    for member in members:
+        if getattr(member, "__name__", "") == name:
+            return member
+    raise ValueError(f"holds a {name}")
+
+
+def _item_kind(kind: Any) -> Any:
+    """Of a list or a tuple of one type of items, or a deque."""
+    return (*get_args(kind), Any)[0]
+
+
+def _item_kinds(kind: Any, count: int) -> Sequence[Any]:
+    given = get_args(kind)
+    if len(given) == 2 and given[1] is Ellipsis:
+        return [given[0]] * count
+    return given if len(given) == count else [Any] * count
+
+
+def _made_of(items: list[Any], kind: Any) -> Any:
+    return tuple(items) if (get_origin(kind) or kind) is tuple else items
+
+
+def _scalar(node: Any, members: tuple[Any, ...]) -> Any:
+    enums = [member for member in members if isinstance(member, type) and issubclass(member, Enum)]
+    if enums and node is not None:
+        return enums[0](node)
+    real = float in members and int not in members and bool not in members
+    return float(node) if real and isinstance(node, int) else node
+
+
+# --------------------------------------------------------------------------------------------
+# State of parts
+
+
+@typing.runtime_checkable
+class Remade(Protocol):
+    """A part that makes something anew of its state when this is put back."""
+
+    def remake(self) -> None:
+        """Makes it."""
+        ...
+
+
+@cache
+def kept_hints(kind: Any) -> dict[str, Any]:
+    """What a class marks as its state, and the types of that; empty of one that has none."""
+    found: dict[str, Any] = {}
+    for one in reversed(kind.__mro__):
+        stated = vars(one).get("__annotations__", {})
+        marked = {n: hint for n, hint in stated.items() if str(hint).startswith("Kept[")}
+        if marked:  # the others may name what is imported for the type checker alone
+            own = types.SimpleNamespace(__annotations__=marked)
+            found |= typing.get_type_hints(own, vars(sys.modules[one.__module__]))
+    return found
+
+
+def has_state(part: Any) -> bool:
+    """Whether the state of a part can be taken."""
+    kind: Any = type(part)
+    return bool(kept_hints(kind)) or isinstance(part, Resumable)
+
+
+def state_of(part: Any) -> StateArrays:
+    """A snapshot of a part, which later changes leave alone."""
+    return pack(part)
+
+
+def restore(part: Any, state: StateArrays) -> None:
+    """Continues from :func:`state_of`, in a part made with the same settings.
+
+    Raises:
+        KeyError, ValueError, TypeError, IndexError: the state is another's.
+    """
+    _Unpacking(state).value(json.loads(str(state[TREE])), type(part), part)
