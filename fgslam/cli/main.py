@@ -345,7 +345,7 @@ def inspect(  # noqa: PLR0913 - each option is a parameter
     Exits with 0 whatever the report finds, with 2 where the recording cannot be opened at all.
     """
     from fgslam.cli.console import progress_bar
-    from fgslam.runs.inspection import inspect_recording
+    from fgslam.runs.inspect import inspect_recording
 
     chosen = options.of_recording(
         topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit

@@ -24,7 +24,7 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 
 if TYPE_CHECKING:
     from fgslam.core.recordings import Sequence
-    from fgslam.datasets.checks.clock import Judged
+    from fgslam.datasets.clock import Judged
 
 _SETTINGS = {each.kind: each for each in get_args(FileRecordingSettings)}
 
@@ -132,7 +132,7 @@ def has_odometry(sequence: Sequence) -> bool:
 
 def _judged_odometry(sequence: Sequence, overrides: tuple[str, ...]) -> Judged:
     """What the images say of the odometry; nothing where an override says more."""
-    from fgslam.datasets.checks.clock import Judged, judged_turns
+    from fgslam.datasets.clock import Judged, judged_turns
     from fgslam.datasets.recording import Recording
 
     asked = any(each.partition("=")[0].strip().startswith("odometry.") for each in overrides)

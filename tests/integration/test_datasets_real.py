@@ -11,8 +11,6 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
-from fgslam.datasets.checks.matches import check_epipolar
-from fgslam.datasets.checks.recording import Level
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -28,7 +26,9 @@ from fgslam.datasets.settings import (
 )
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.runs.inspection import check_sequence
+from fgslam.runs.findings import Level
+from fgslam.runs.inspect import check_sequence
+from fgslam.runs.inspect_matches import check_epipolar
 from fgslam.slam.factory import make_extractor
 from scripts.convert.light_field import convert
 

@@ -17,7 +17,7 @@ import pytest
 from fgslam.cli import main as cli
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
-from fgslam.runs.inspection import inspect_recording
+from fgslam.runs.inspect import inspect_recording
 
 WIDTH, HEIGHT, FRAMES = 240, 180, 6
 FAR, NEAR = 6, 15  # disparities of the back wall and of the board before it, pixels

@@ -8,7 +8,7 @@ import cv2
 import pytest
 
 from fgslam.core.errors import DatasetError
-from fgslam.runs.inspection import inspect_recording
+from fgslam.runs.inspect import inspect_recording
 
 pytestmark = pytest.mark.data
 

@@ -28,13 +28,13 @@ from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibrat
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.datasets.checks.motion import check_odometry
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.runs.bare_recording import bare_experiment
 from fgslam.runs.camera_files import Asked, convert_calibration
+from fgslam.runs.inspect import check_odometry
 
 KINDS = (".bag", ".db3", ".mcap")
 

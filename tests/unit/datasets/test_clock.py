@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OdometryError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, project, so3_exp, so3_log
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.checks.clock import (
+from fgslam.datasets.clock import (
     Judged,
     SeenTurns,
     _Look,

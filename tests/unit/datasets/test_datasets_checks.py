@@ -13,15 +13,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.checks.matches import check_epipolar
-from fgslam.datasets.checks.motion import check_odometry, check_odometry_against_truth, check_truth
-from fgslam.datasets.checks.recording import (
-    Finding,
-    Level,
-    check_calibration,
-    check_images,
-    check_timing,
-)
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -30,7 +21,18 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.runs.inspection import check_sequence, facts_of
+from fgslam.runs.findings import Finding, Level
+from fgslam.runs.inspect import (
+    check_calibration,
+    check_images,
+    check_odometry,
+    check_odometry_against_truth,
+    check_sequence,
+    check_timing,
+    check_truth,
+    facts_of,
+)
+from fgslam.runs.inspect_matches import check_epipolar
 
 
 def opened(root: Path, **settings: object) -> Recording:

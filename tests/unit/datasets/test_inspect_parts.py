@@ -11,7 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import pose
-from fgslam.datasets.checks.matches import (
+from fgslam.datasets.layouts import kitti_drives, recognise_layout
+from fgslam.datasets.opening import open_recording
+from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
+from fgslam.frontend.features.matching import mutual_nearest
+from fgslam.runs.findings import Finding, Level
+from fgslam.runs.inspect import check_clock, inspect_recording, render_report
+from fgslam.runs.inspect_matches import (
     LEFT_RIGHT,
     TOP_RIGHT,
     Pair,
@@ -23,13 +29,6 @@ from fgslam.datasets.checks.matches import (
     check_stereo_counts,
     fit_turn,
 )
-from fgslam.datasets.checks.motion import check_clock
-from fgslam.datasets.checks.recording import Finding, Level
-from fgslam.datasets.layouts import kitti_drives, recognise_layout
-from fgslam.datasets.opening import open_recording
-from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
-from fgslam.frontend.features.matching import mutual_nearest
-from fgslam.runs.inspection import inspect_recording, render_report
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -332,17 +331,17 @@ def test_sound_clock_and_straight_drive_give_no_finding(tmp_path: Path) -> None:
 
 def test_report_puts_facts_above_and_findings_below() -> None:
     findings = (
-        Finding(Level.PROBLEM, "images", "bad. " * 30),
-        Finding(Level.WARNING, "time", "gap"),
-        Finding(Level.INFO, "odometry", "covers all"),
-        Finding(Level.INFO, "epipolar", "fine"),
+        Finding("odometry_malformed", {"text": "bad. " * 30}),
+        Finding("note", {"text": "gap"}),
+        Finding("odometry_covers", {"share": "all"}),
+        Finding("disparities", {"count": 9, "median": 1.0, "percent": 60.0}),
     )
     blocks = render_report((("frames", "9"),), (("SIFT features", "many"),), findings).split("\n\n")
     assert blocks[0] == "frames         9"
-    assert blocks[1] == "odometry       covers all"
-    assert blocks[2] == "SIFT features  many\nepipolar       fine"
+    assert blocks[1] == "odometry       covers all steps"
+    assert blocks[2].startswith("SIFT features  many\nthree cameras  both disparities of 9")
     lines = blocks[3].splitlines()
-    assert lines[0].startswith("PROBLEM  images: bad.")
+    assert lines[0].startswith("PROBLEM  odometry: bad.")
     assert lines[1].startswith("         bad.")
-    assert lines[-1] == "WARNING  time: gap"
+    assert lines[-1] == "WARNING  recording: gap"
     assert blocks[4] == "1 problem and 1 warning: problems spoil a run, or the frames named."

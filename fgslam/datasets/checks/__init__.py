@@ -1,1 +1,0 @@
-"""Checks of recordings, as `fgslam inspect` reports them."""
