@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.evaluation.metrics import value_at
-from fgslam.report.tables import RESULT_COLUMNS
+from fgslam.runs.tables import RESULT_COLUMNS
 
 _FLOOR = 1e-6  # metres, degrees: less is rounding, whatever the ratio
 _ONE_IS_BEST = ("nees_", "nis_")

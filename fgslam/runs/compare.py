@@ -24,7 +24,6 @@ from fgslam.backend.homing.settings import (
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.report.content import TextTable
-from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import is_homing, load_config, load_homing, make_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingExperiment
 from fgslam.runs.engine import (
@@ -37,13 +36,13 @@ from fgslam.runs.engine import (
 )
 from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
 from fgslam.runs.homing_comparison import open_homing_comparison
-from fgslam.runs.metric_tables import ate_table
 from fgslam.runs.slam_comparison import (
     judged_apart,
     named,
     open_slam_comparison,
     with_odometry,
 )
+from fgslam.runs.tables import ate_table, write_comparison_csv
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"

@@ -32,8 +32,7 @@ from fgslam.report.results import (
 )
 from fgslam.runs.estimator_files import NOISE_TABLE
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.marks import SYNTHETIC, marked
-from fgslam.runs.metric_tables import page_tables
+from fgslam.runs.tables import SYNTHETIC, marked, page_tables
 from fgslam.runs.tasks.slam_metrics import LOOPS_FILE, read_closures
 
 _UP = np.array([0.0, -1.0, 0.0])

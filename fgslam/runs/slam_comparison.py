@@ -22,14 +22,18 @@ from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import read_metrics, write_metrics
 from fgslam.report.point_cloud import MapPoints, read_ply
-from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, RunResult, Status, Task
 from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, METRICS_FILE, RUN_MARKER, digest_of
-from fgslam.runs.marks import SYNTHETIC, with_marks
-from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.report import report_from_folder
+from fgslam.runs.tables import (
+    SYNTHETIC,
+    comparison_particulars,
+    comparison_tables,
+    with_marks,
+    write_comparison_csv,
+)
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.units import each_apart
 from fgslam.slam.replay import replay

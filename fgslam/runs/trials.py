@@ -19,7 +19,6 @@ from fgslam.evaluation.comparing import MeanInterval, PairedTest, mean_interval,
 from fgslam.evaluation.consistency import Consistency, judge
 from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
 from fgslam.report.content import write_metrics
-from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
@@ -33,10 +32,10 @@ from fgslam.runs.folder import (
     ExistingFolder,
     is_run_folder,
 )
-from fgslam.runs.metric_tables import TRIAL_COLUMNS, metrics_table
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.processes import worker_count
 from fgslam.runs.slam_comparison import named, with_odometry
+from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, trials_table, write_comparison_csv
 from fgslam.runs.tasks.homing_trials import open_trials
 from fgslam.runs.trial import Trial, TrialTask, perform_trial
 from fgslam.runs.units import Progress, Stopped, each_apart
@@ -167,7 +166,7 @@ def _result(
         folder,
         status,
         lines=tuple(pair.sentence for pair in summary.pairs),
-        tables=(metrics_table(heading, TRIAL_COLUMNS, values),),
+        tables=(trials_table(heading, values),),
         particulars=(*failed, ("results", str(folder))),
         failed=bool(failures),
     )

@@ -35,12 +35,12 @@ from recordings import experiment
 
 from fgslam.core import files
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.compare import Choice, compare_runs
 from fgslam.runs.config import make_experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder, create_run_folder
 from fgslam.runs.run import run_experiment
+from fgslam.runs.tables import write_comparison_csv
 from fgslam.runs.trials import Seeds, run_trials
 from tests.textured_room import SMALL_CAMERA, folder_of
 

@@ -14,7 +14,6 @@ from typing import Any
 from fgslam.core.errors import ConfigError, FgslamError
 from fgslam.evaluation.metrics import JsonValue, value_at
 from fgslam.report.content import plain, read_metrics
-from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS
 from fgslam.runs.compare import Choice, choose
 from fgslam.runs.config import make_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig
@@ -23,6 +22,7 @@ from fgslam.runs.engine import run_task
 from fgslam.runs.folder import METRICS_FILE, versions
 from fgslam.runs.run import opener_of
 from fgslam.runs.slam_comparison import judged_apart
+from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS
 from fgslam.runs.trial import TrialTask, perform_trial
 
 _ABOUT = ("name", "task", "status", "remarks", "estimators")

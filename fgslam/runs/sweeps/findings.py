@@ -16,9 +16,9 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.evaluation.comparing import MeanInterval, PairedTest, holm, mean_interval, paired_test
-from fgslam.runs.marks import measured_marks, with_marks
 from fgslam.runs.sweeps.grid import SEED, Grid
 from fgslam.runs.sweeps.table import ESTIMATOR, EXPERIMENT, FAILURE, Columns, SweepTable
+from fgslam.runs.tables import measured_marks, with_marks
 
 METRICS = ("ate_final_m", "ate_online_m", "end_error_final_m", "nees_pose_final_per_dof")
 """What is shown of a sweep where its table has it; the first one is tested, the smaller better."""

@@ -13,8 +13,8 @@ from fgslam.report.content import Column, Figure, Page, TextTable
 from fgslam.report.homing_figures import effect_figure, sorted_errors
 from fgslam.report.page import write_html
 from fgslam.runs.folder import versions
-from fgslam.runs.marks import measured_marks, with_marks
 from fgslam.runs.sweeps.findings import ALL_PAIRS_OF, Comparison, Findings, Variant
+from fgslam.runs.tables import measured_marks, with_marks
 
 _SERIES_SHOWN = 24
 _VARIANTS_SHOWN = 400

@@ -10,11 +10,11 @@ from typing import Any
 
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.crews import Failed
-from fgslam.runs.marks import measured_marks, with_marks
 from fgslam.runs.processes import WorkerEnded
 from fgslam.runs.sweeps.case import CaseResult
 from fgslam.runs.sweeps.findings import METRICS
 from fgslam.runs.sweeps.grid import SEED, Case, Grid
+from fgslam.runs.tables import measured_marks, with_marks
 
 _SHOWN = 16
 _EVERY_S = 0.5

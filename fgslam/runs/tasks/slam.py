@@ -17,14 +17,13 @@ from typing import Any, TypeAlias
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurements import Odometry
 from fgslam.evaluation.metrics import EstimatorMetrics
-from fgslam.report.tables import write_comparison_csv
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder
-from fgslam.runs.metric_tables import comparison_particulars, comparison_tables
 from fgslam.runs.owner import give_back
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.slam_comparison import judged_apart, named, replay_apart, with_odometry
+from fgslam.runs.tables import comparison_particulars, comparison_tables, write_comparison_csv
 from fgslam.runs.tasks import slam_map_entry as map_entry
 from fgslam.runs.tasks import slam_state as state
 from fgslam.runs.tasks.slam_metrics import located

@@ -32,8 +32,8 @@ from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.maps import map_points
-from fgslam.runs.marks import picture_title
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
+from fgslam.runs.tables import picture_title
 from fgslam.runs.tasks.slam_calibration import (
     calibration_note,
     calibration_numbers,

@@ -28,20 +28,21 @@ from fgslam.evaluation.judging import Answer, seen_often
 from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
 from fgslam.report.content import TextTable
 from fgslam.report.point_cloud import MapPoints
-from fgslam.report.tables import RESULT_COLUMNS, TIME_COLUMNS, write_comparison_csv
 from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.estimator_files import points_from_log
-from fgslam.runs.marks import marked
-from fgslam.runs.metric_tables import (
-    TRIAL_COLUMNS,
+from fgslam.runs.slam_comparison import judged_apart, named
+from fgslam.runs.tables import (
+    RESULT_COLUMNS,
+    TIME_COLUMNS,
     ate_table,
     comparison_particulars,
     comparison_tables,
-    metrics_table,
+    marked,
     page_tables,
+    trials_table,
+    write_comparison_csv,
 )
-from fgslam.runs.slam_comparison import judged_apart, named
 from fgslam.runs.tasks.truth import (
     at_edges,
     medians_of,
@@ -274,7 +275,7 @@ def test_tables_fit_120_columns_without_a_broken_cell() -> None:
     values = {"landmark_kalman": every}
     shown = (
         *comparison_tables("drive", 999, values),
-        metrics_table("trials", TRIAL_COLUMNS, values),
+        trials_table("trials", values),
     )
     console = Console(width=1000)
     for one in shown:

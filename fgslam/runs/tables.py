@@ -1,0 +1,472 @@
+"""One table of metrics: what metrics.json knows of an estimator, and where it is shown.
+
+A new metric is a row of ``_METRICS``; its name in a line of ``_SHOWN`` puts it into a table of the
+console or of the page. comparison.csv, trials.csv and sweeps have all that have a name.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fgslam.core.files import write_text
+from fgslam.evaluation.metrics import value_at
+from fgslam.report.content import Column, TextTable
+
+UNKNOWN = "-"
+_REMARKS_SHOWN = 3
+
+
+class Metric(NamedTuple):
+    """A metric: its name, dotted path in metrics.json, format, why it may be absent, meaning."""
+
+    name: str
+    path: str
+    text: str = ""
+    absent: str = ""
+    meaning: str = ""
+
+
+# Name, path, format, why it may be absent; below it, what it means where a page shows it.
+_METRICS = """
+kind                     kind
+odometry                 odometry
+frames                   frames
+predicted_frames         predicted_frames
+alignment                alignment
+matched_poses            matched_poses
+ate_final_m              ate_rmse_m                        cm       truth
+    absolute trajectory error of the final path: rms distance from the truth after SE3 alignment
+ate_online_m             online.ate_rmse_m                 cm       truth
+    the same of the path made of each pose as first estimated, at its own time
+ate_max_final_m          ate_max_m
+rpe_final_m              rpe_trans_m                       cm       truth
+    relative pose error from frame to frame, translation
+rpe_final_deg            rpe_rot_deg                       .3f      truth
+    relative pose error from frame to frame, rotation
+rpe_online_m             online.rpe_trans_m                cm       truth
+rpe_online_deg           online.rpe_rot_deg                .3f      truth
+end_error_final_m        end_error_m                       cm       truth
+    distance of the last pose from the true one, the first pose aligned
+end_error_final_deg      end_error_deg                     .3f      truth
+end_error_online_m       online.end_error_m
+end_error_online_deg     online.end_error_deg
+drift_percent            drift_percent                     .2f      truth
+    end error over the length of the true path
+path_length_m            path_length_m
+landmarks                landmarks                         ,.0f     frame
+    number of landmarks in the final map
+landmarks_with_truth     landmarks_with_truth
+landmark_rmse_m          landmark_rmse_m                   cm       landmarks
+    root mean square distance of the landmarks from their true positions
+landmark_median_m        landmark_median_m                 cm       landmarks
+landmark_truth_sigma_m   landmark_truth_sigma_m
+nees_pose_final_per_dof  nees_pose_per_dof                 ratio    truth
+    normalised error squared of the poses per degree of freedom: 1 is right, more overconfident
+nees_pose_band_lower     nees_pose.lower
+nees_pose_band_upper     nees_pose.upper
+nees_pose_final_verdict  nees_pose.verdict                 text     truth
+    whether the pose NEES lies in its 95 % chi-square band; one run counts as one sample
+nees_pose_online_per_dof online.nees_pose_per_dof          ratio    truth
+    NEES of each pose as first estimated, by its covariance of that time
+nees_pose_online_verdict online.nees_pose.verdict          text     truth
+coverage_final           coverage.all                      .0%      truth
+    pose errors within two sigma
+coverage_online          online.coverage.all               .0%      truth
+nees_landmark_per_dof    nees_landmark_per_dof             ratio    landmarks
+    normalised error squared of the landmarks per degree of freedom
+nees_landmark_verdict    nees_landmark.verdict             text     landmarks
+nis_per_dof              nis_per_dof                       ratio    innovation
+    normalised innovation squared of the measurements per degree of freedom
+last_pose_sigma_m        last_pose_sigma.position_m        cm       covariance
+    standard deviation of the last pose's position, as claimed
+last_pose_sigma_deg      last_pose_sigma.rotation_deg      .3f      covariance
+failure                  failure
+"""
+_TIMES = """
+update_median_ms         update_ms.median                  .2f      frame
+    time for a frame, median over the run
+update_p95_ms            update_ms.p95                     .2f      frame
+    time for a frame that 95 % stay below
+update_max_ms            update_ms.max                     .1f      frame
+    longest time for a frame
+solve_median_ms          solve_ms.median                   ratio    live
+final_estimate_ms        final_ms                          s        final
+update_growth_ratio      update_growth.ratio               ratio    few
+    median time of the last fifth of the frames over that of the second fifth: 1 is flat
+update_slope_ms_per_1000_frames update_growth.slope_ms_per_1000 +.2f few
+peak_memory_mib          peak_memory_mb                    ,.0f     system
+    largest resident memory of the process
+memory_before_mib        memory_before_mb
+"""
+# Not in comparison.csv.
+_FURTHER = """
+noise_factor             noise_factor                      .2f      weighed
+trials_ate_final         intervals.ate_rmse_m              cm3      truth
+trials_ate_online        intervals_online.ate_rmse_m       cm3      truth
+trials_landmark_median   intervals.landmark_median_m       cm2      landmarks
+trials_nees_pose         nees_pose                         pooled   truth
+trials_nees_landmark     nees_landmark                     pooled   landmarks
+"""
+_ABSENT = {
+    "truth": "no ground truth, or fewer than three poses matched",
+    "landmarks": "true landmark positions are not known, or none of them is in the map",
+    "weighed": "no landmark measurement is weighed: by it the stated deviations were multiplied",
+    "innovation": "the estimator forms no innovation",
+    "covariance": "its covariance is not known",
+    "frame": "no frame was processed",
+    "few": "fewer than 25 frames",
+    "live": "timed with the live front-end",
+    "final": "not timed apart in a live run",
+    "system": "this system does not tell",
+}
+# Headings (| ends a line) with the metrics of their cells; ! marks columns that stay where no
+# estimator fills them.
+_SHOWN = {
+    "accuracy": """
+        ATE|final cm            : ate_final_m
+        ATE|online cm           : ate_online_m
+        RPE final|cm deg        : rpe_final_m rpe_final_deg
+        RPE online|cm deg       : rpe_online_m rpe_online_deg
+        end error|cm deg        : end_error_final_m end_error_final_deg
+        landmarks cm|rms median : landmark_rmse_m landmark_median_m""",
+    "consistency": """
+        NEES pose|final           : nees_pose_final_per_dof nees_pose_final_verdict
+        NEES pose|online          : nees_pose_online_per_dof nees_pose_online_verdict
+        in 2 sigma|final          : coverage_final
+        in 2 sigma|online         : coverage_online
+        NEES|landmarks            : nees_landmark_per_dof nees_landmark_verdict
+        noise|factor              : noise_factor
+        NIS                       : nis_per_dof
+        sigma of last|pose cm deg : last_pose_sigma_m last_pose_sigma_deg""",
+    "cost": """
+        update ms|median p95 max : update_median_ms update_p95_ms update_max_ms
+        growth|1 is flat         : update_growth_ratio
+        slope ms /|1000 frames   : update_slope_ms_per_1000_frames
+        pose solve|median ms     : solve_median_ms
+        final|estimate s         : final_estimate_ms
+        memory|MiB               : peak_memory_mib
+        map|landmarks            : landmarks""",
+    "trials": """
+        ATE final cm        : trials_ate_final
+        ATE online cm       : trials_ate_online
+        landmarks median cm : trials_landmark_median
+        NEES pose           : trials_nees_pose
+        NEES landmarks      : trials_nees_landmark""",
+    "Accuracy": """
+        ATE (cm)!           : ate_final_m
+        ATE online (cm)     : ate_online_m
+        RPE (cm)!           : rpe_final_m
+        RPE (deg)!          : rpe_final_deg
+        end error (cm)!     : end_error_final_m
+        drift (%)!          : drift_percent
+        landmark error (cm) : landmark_rmse_m""",
+    "Consistency": """
+        NEES pose!      : nees_pose_final_per_dof
+        verdict!        : nees_pose_final_verdict
+        in 2 sigma      : coverage_final
+        NEES online     : nees_pose_online_per_dof
+        NEES landmarks! : nees_landmark_per_dof
+        NIS             : nis_per_dof
+        last sigma (cm) : last_pose_sigma_m""",
+    "Time and memory": """
+        landmarks!    : landmarks
+        median (ms)!  : update_median_ms
+        p95 (ms)!     : update_p95_ms
+        worst (ms)!   : update_max_ms
+        growth        : update_growth_ratio
+        memory (MiB)! : peak_memory_mib""",
+}
+_CONSOLE, _PAGE = (
+    ("accuracy", "consistency", "cost"),
+    ("Accuracy", "Consistency", "Time and memory"),
+)
+
+
+def _parsed(table: str) -> list[Metric]:
+    out: list[Metric] = []
+    for line in table.strip().splitlines():
+        if line.startswith(" "):
+            out[-1] = out[-1]._replace(meaning=line.strip())
+        else:
+            out.append(Metric(*line.split()))
+    return out
+
+
+_RESULTS = _parsed(_METRICS)
+_ALL = {metric.name: metric for table in (_METRICS, _TIMES, _FURTHER) for metric in _parsed(table)}
+RESULT_COLUMNS = tuple((metric.name, metric.path) for metric in _RESULTS)
+"""What the same measurements give to the byte: column, and where its value is in the metrics."""
+TIME_COLUMNS = tuple((metric.name, metric.path) for metric in _parsed(_TIMES))
+"""What differs from one execution to the next."""
+
+
+class _Column(NamedTuple):
+    """A column of a table that is shown: heading, what stands in it, whether it always stands."""
+
+    heading: str
+    metrics: tuple[Metric, ...]
+    always: bool
+
+    def cell(self, values: Mapping[str, Any]) -> str:
+        """The numbers of one estimator, or that they are not known."""
+        found = [value_at(values, metric.path) for metric in self.metrics]
+        if any(value is None for value in found):
+            return UNKNOWN
+        try:
+            texts = [_text(m.text, value) for m, value in zip(self.metrics, found, strict=True)]
+        except (TypeError, ValueError, KeyError):  # a metrics.json of another program
+            return " ".join(map(str, found))
+        return " ".join(texts)
+
+    def is_empty(self, estimators: Mapping[str, Any]) -> bool:
+        """Whether no estimator fills it."""
+        return all(self.cell(values) == UNKNOWN for values in estimators.values())
+
+
+def _columns(table: str) -> list[_Column]:
+    rows = [line.partition(":") for line in _SHOWN[table].strip().splitlines()]
+    return [
+        _Column(
+            heading.strip().rstrip("!").replace("|", "\n"),
+            tuple(_ALL[name] for name in names.split()),
+            heading.strip().endswith("!"),
+        )
+        for heading, _, names in rows
+    ]
+
+
+def _ratio(value: float) -> str:
+    return f"{value:,.0f}" if value >= 1000.0 else f"{value:.2f}"
+
+
+def _interval(digits: int) -> Callable[[Mapping[str, Any]], str]:
+    def text(found: Mapping[str, Any]) -> str:
+        mean, lower, upper = (found[name] for name in ("mean", "lower", "upper"))
+        ends = ""
+        if lower is not None:
+            ends = f"\n[{100.0 * lower:.{digits}f}, {100.0 * upper:.{digits}f}]"
+        return f"{100.0 * mean:.{digits}f}{ends}"
+
+    return text
+
+
+def _pooled(found: Mapping[str, Any]) -> str:
+    band = f"{found['lower']:.2f}-{found['upper']:.2f}"
+    return f"{_ratio(found['per_dof'])} {found['verdict']}\n{band}"
+
+
+_TEXTS: dict[str, Callable[..., str]] = {
+    "cm": lambda metres: f"{100.0 * metres:.2f}",
+    "s": lambda milliseconds: f"{milliseconds / 1e3:.2f}",
+    "ratio": _ratio,
+    "text": str,
+    "cm3": _interval(3),
+    "cm2": _interval(2),
+    "pooled": _pooled,
+}
+
+
+def _text(kind: str, value: Any) -> str:
+    return _TEXTS[kind](value) if kind in _TEXTS else format(float(value), kind)
+
+
+# --------------------------------------------------------------------------------------------
+# Tables
+
+
+def comparison_tables(name: str, frames: int, values: Mapping[str, Any]) -> tuple[TextTable, ...]:
+    """Accuracy, consistency, time and memory of estimators; ``values`` by title, of one run."""
+    headings = (
+        f"{name}: accuracy ({_alignment(values)})",
+        f"{name}: consistency (1 is right; {_band(values)})",
+        f"{name}: time and memory, {frames} frames",
+    )
+    known = marked(values)
+    tables = [_table(h, h, key, known) for h, key in zip(headings, _CONSOLE, strict=True)]
+    return tuple(table for table in tables if table.columns)
+
+
+def trials_table(heading: str, values: Mapping[str, Any]) -> TextTable:
+    """Means over trials with their intervals, by estimator."""
+    return _table(heading, heading, "trials", marked(values))
+
+
+def page_tables(values: Mapping[str, Any]) -> tuple[TextTable, ...]:
+    """The tables of the page, of metrics by marked title; values that are not known read `-`.
+
+    Three, for one of all columns is wider than a window.
+    """
+    return tuple(_table(key.partition(" ")[0].lower(), key, key, values) for key in _PAGE)
+
+
+def _table(key: str, heading: str, shown: str, values: Mapping[str, Any]) -> TextTable:
+    kept = [one for one in _columns(shown) if one.always or not one.is_empty(values)]
+    rows = tuple((title, tuple(one.cell(m) for one in kept)) for title, m in values.items())
+    columns = tuple(Column(one.heading, one.metrics[0].meaning) for one in kept)
+    return TextTable(key, heading, "estimator", columns, rows)
+
+
+def ate_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> TextTable:
+    """Final ATE of each estimator on each run, given by its name and metrics by title."""
+    rows = []
+    for title in dict.fromkeys(title for _, values in runs for title in values):
+        cells = []
+        for _, values in runs:
+            ate = value_at(values.get(title) or {}, "ate_rmse_m")
+            marks = list(marked(values))[list(values).index(title)] if title in values else title
+            known = "" if ate is None else f"{_text('cm', ate)}{marks.removeprefix(title)}"
+            cells.append(known or UNKNOWN)
+        rows.append((title, tuple(cells)))
+    columns = tuple(Column(name, "final ATE, cm") for name, _ in runs)
+    return TextTable("ate", "final ATE, cm, SE3 aligned", "estimator", columns, tuple(rows))
+
+
+def write_comparison_csv(
+    path: Path,
+    runs: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]],
+    columns: Sequence[tuple[str, str]] = RESULT_COLUMNS + TIME_COLUMNS,
+    key: str = "run",
+) -> None:
+    """Write the table atomically; a value that is not known is an empty cell.
+
+    Args:
+        path: the file.
+        runs: name of each run and its estimators' numbers of metrics.json by title.
+        columns: which, see above.
+        key: heading of the runs' names.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow([key, "estimator", *(name for name, _ in columns)])
+    for run, estimators in runs:
+        for title, values in estimators.items():
+            found = [value_at(values, where) for _, where in columns]
+            cells = ["" if v is None else f"{v:.9g}" if isinstance(v, float) else v for v in found]
+            writer.writerow([run, title, *cells])
+    write_text(path, buffer.getvalue())
+
+
+# --------------------------------------------------------------------------------------------
+# What is said beside them
+
+
+def comparison_particulars(values: Mapping[str, Any], out: Path) -> tuple[tuple[str, str], ...]:
+    """Label and text: why values are missing, failures, remarks, and where the results are."""
+    return (*_reasons(values), *_remarks(values), ("results", str(out))) if values else ()
+
+
+def _alignment(values: Mapping[str, Any]) -> str:
+    """How ATE and RPE were aligned and on how many poses, as the metrics say."""
+    known = [m for m in values.values() if value_at(m, "matched_poses")]
+    if not known:
+        return "no matched poses"
+    alignment = "/".join(dict.fromkeys(value_at(m, "alignment").upper() for m in known))
+    counts = sorted({value_at(m, "matched_poses") for m in known})
+    return f"{alignment} aligned, {' or '.join(map(str, counts))} matched poses"
+
+
+def _band(values: Mapping[str, Any]) -> str:
+    """The bands of the pose NEES; with the estimators of each where there are several."""
+    bands: dict[str, list[str]] = {}
+    for title, m in values.items():
+        if value_at(m, "nees_pose.lower") is not None:
+            band = f"{value_at(m, 'nees_pose.lower'):.2f}-{value_at(m, 'nees_pose.upper'):.2f}"
+            bands.setdefault(band, []).append(title)
+    if not bands:
+        return "no truth to judge by"
+    if len(bands) == 1:
+        return f"95 % band of the pose NEES {next(iter(bands))}"
+    each = "; ".join(f"{band} of {', '.join(titles)}" for band, titles in bands.items())
+    return f"95 % bands of the pose NEES: {each}"
+
+
+def _reasons(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Why values are missing, each reason once with the headings that it empties or leaves out."""
+    found: dict[tuple[str, str], list[str]] = {}
+    done = [m for m in values.values() if not value_at(m, "failure")]
+    for column in (one for key in _CONSOLE for one in _columns(key)):
+        if any(column.cell(m) == UNKNOWN for m in done):
+            label = "left out" if column.is_empty(values) else UNKNOWN
+            headings = found.setdefault((label, _ABSENT[column.metrics[0].absent]), [])
+            headings.append(column.heading.replace("\n", " "))
+    return [(label, f"{', '.join(headings)}: {why}") for (label, why), headings in found.items()]
+
+
+def _remarks(values: Mapping[str, Any]) -> list[tuple[str, str]]:
+    failures = {title: value_at(metrics, "failure") for title, metrics in values.items()}
+    lines = [("failed", f"{title}: {why}") for title, why in failures.items() if why]
+    for title, metrics in values.items():
+        remarks = [str(remark) for remark in value_at(metrics, "remarks") or ()]
+        lines += [("remark", f"{title}: {remark}") for remark in remarks[:_REMARKS_SHOWN]]
+        if len(remarks) > _REMARKS_SHOWN:
+            more = len(remarks) - _REMARKS_SHOWN
+            lines.append(("remark", f"{title}: and {more} more, see metrics.json"))
+    sigma = next((s for m in values.values() if (s := value_at(m, "landmark_truth_sigma_m"))), None)
+    if sigma is not None:
+        known = max(value_at(m, "landmarks_with_truth") or 0 for m in values.values())
+        lines.append(
+            (
+                "note",
+                f"{known:,} landmarks are judged, by a truth that itself is known to "
+                f"{1e3 * sigma:.1f} mm; of others, seen too seldom or where a surface ends before "
+                "another, no true point is known",
+            )
+        )
+    return lines
+
+
+# --------------------------------------------------------------------------------------------
+# What titles say of results that are not all there, or not all measured
+
+SYNTHETIC = "synthetic odometry"
+"""Said of all results whose odometry was made from the ground truth."""
+
+
+def with_marks(title: str, marks: Iterable[str]) -> str:
+    """The title with its marks in brackets; without any, as it is."""
+    said = ", ".join(filter(None, marks))
+    return f"{title} ({said})" if said else title
+
+
+def predicted_mark(count: int | None) -> str:
+    """Says that so many poses no landmark measured; empty for none."""
+    if not count:
+        return ""
+    return "1 pose predicted" if count == 1 else f"{count:,} poses predicted"
+
+
+def measured_marks(predicted: int | None, synthetic: bool) -> tuple[str, str]:
+    """What is not measured of results: poses, odometry."""
+    return predicted_mark(predicted), SYNTHETIC if synthetic else ""
+
+
+def picture_title(what: str, predicted: int, synthetic: bool) -> str:
+    """What a picture shows, and what of it is not measured: poses, odometry."""
+    return ", ".join(filter(None, (what, *measured_marks(predicted, synthetic))))
+
+
+def marked(values: Mapping[str, Any], remark: str = "", say_failed: bool = True) -> dict[str, Any]:
+    """The metrics of estimators under titles that say what is not all there.
+
+    That it failed (but for a page, which says so itself), how many of the frames it saw, how many
+    of its poses no landmark measured, and ``remark``, what all of a run's are marked with.
+    """
+    frames = max((value_at(m, "frames") or 0 for m in values.values()), default=0)
+    out = {}
+    for title, metrics in values.items():
+        own = value_at(metrics or {}, "frames")
+        marks = (
+            "failed" if say_failed and value_at(metrics or {}, "failure") else "",
+            f"{own} of {frames} frames" if own is not None and own < frames else "",
+            predicted_mark(value_at(metrics or {}, "predicted_frames")),
+            remark,
+        )
+        out[with_marks(title, marks)] = metrics or {}
+    return out
