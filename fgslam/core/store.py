@@ -36,6 +36,9 @@ Kept: TypeAlias = Annotated[T, _KEPT]
 TREE = "tree"
 """Name of the array with the structure."""
 
+UNFIT = (KeyError, ValueError, TypeError, IndexError, AttributeError)
+"""What :func:`unpack` and :func:`restore` raise for arrays of another value."""
+
 _SINGLE = 16
 """Numbers of a list that stand in the structure; more of them are an array."""
 
@@ -82,7 +85,7 @@ def unpack(arrays: StateArrays, kind: Any) -> Any:
     """The value of :func:`pack`, as the type ``kind``: a dataclass, a container or a union.
 
     Raises:
-        KeyError, ValueError, TypeError, IndexError: they are not those of such a value.
+        Exception: one of ``UNFIT``; they are not those of such a value.
     """
     return _Unpacking(arrays).value(json.loads(str(arrays[TREE])), kind)
 
@@ -404,6 +407,6 @@ def restore(part: Any, state: StateArrays) -> None:
     """Continues from :func:`state_of`, in a part made with the same settings.
 
     Raises:
-        KeyError, ValueError, TypeError, IndexError: the state is another's.
+        Exception: one of ``UNFIT``; the state is another's.
     """
     _Unpacking(state).value(json.loads(str(state[TREE])), type(part), part)

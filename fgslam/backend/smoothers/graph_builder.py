@@ -170,10 +170,6 @@ class GraphBuilder:
             self._remember_observed(new.sightings)
         return new
 
-    def start_at(self, prior: Prediction) -> None:
-        """Replaces the prior of the first pose, which is not there yet."""
-        self._prior = prior
-
     def take_out(self, variable: int) -> str:
         """Removes a landmark from the graph; it waits until it is known twice as well.
 

@@ -109,23 +109,6 @@ class Input(NamedTuple):
         return Input(self.increment, EgoMotion(*kept, noise=found.noise))
 
 
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class BegunIn:
-    """The map that a smoother began in, and the first pose in it."""
-
-    landmarks: LandmarkMap
-    hits: IntArray
-    prior: Prediction
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Given:
-    """All that a smoother was given: its state."""
-
-    inputs: list[Input]
-    begun_in: BegunIn | None
-
-
 class Smoother:
     """A smoothing estimator, on :class:`fgslam.backend.protocol.Estimator`."""
 
@@ -146,7 +129,6 @@ class Smoother:
         self.solver, self._segments = solver, segments
         self._map = TrackerMap(problem.sensor, problem.tracker, problem.builder.admission)
         self.inputs: list[Input] = []
-        self._begun_in: BegunIn | None = None
         self._smoothed = problem.prior
         self._answer: Solution | None = None
         self._takeovers = 0
@@ -260,16 +242,13 @@ class Smoother:
 
     def state(self) -> StateArrays:
         """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
-        return pack(Given([one.used for one in self.inputs], self._begun_in))
+        return pack([one.used for one in self.inputs])
 
     def restore(self, state: StateArrays) -> None:
         """Repeats all updates of :meth:`state`."""
         if len(self.inputs):
             raise EstimatorError("only a new estimator can be restored")
-        self._repeat(unpack(state, Given))
-
-    def _repeat(self, given: Given) -> None:
-        for increment, tracking in given.inputs:
+        for increment, tracking in unpack(state, list[Input]):
             self.update(increment, tracking)
 
     # -- its steps -----------------------------------------------------------------------------
@@ -417,13 +396,6 @@ class Smoother:
 class MapSmoother(Smoother):
     """A smoother that keeps its whole graph, and so can begin in a saved map (``MapUser``)."""
 
-    def __init__(
-        self, problem: GraphProblem, solver: GraphSolver, segments: Segments | None = None
-    ) -> None:
-        """As :class:`Smoother`."""
-        super().__init__(problem, solver, segments)
-        self._prior = problem.prior
-
     @property
     def keeps_maps(self) -> bool:
         """False: a smoother's landmarks are what it estimates."""
@@ -433,19 +405,6 @@ class MapSmoother(Smoother):
         """Takes a saved map over: a prior factor for each landmark that is seen again."""
         self.tracker.begin_in(landmarks, hits, fixed=False)
         self.builder.admission.know(landmarks)
-        self._begun_in = BegunIn(landmarks, hits, self._prior)
-
-    def _repeat(self, given: Given) -> None:
-        if (begun := given.begun_in) is not None:
-            self._start_at(begun.prior)
-            self.begin_in(begun.landmarks, begun.hits, fixed=False)
-        super()._repeat(given)
-
-    def _start_at(self, prior: Prediction) -> None:
-        """Another prior pose: who goes on with a run in a map does not know where that began."""
-        self._prior = self._smoothed = prior
-        self.builder.start_at(prior)
-        self.tracker.correct(prior, np.empty(0, np.int64), np.empty((0, 3)))
 
 
 def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:

