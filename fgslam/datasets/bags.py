@@ -41,6 +41,7 @@ from fgslam.datasets.bag_topics import (
     is_registered,
 )
 from fgslam.datasets.depth import (
+    DEPTH_SIGMA_M,
     Depth,
     camera_of_file,
     colour_and_depth_notes,
@@ -69,7 +70,7 @@ from fgslam.datasets.recording import (
     read_rig,
     recording_identity,
 )
-from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings, RgbdSettings
+from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.datasets.times import NANOSECONDS, Table, pair_all
 
 T = TypeVar("T")
@@ -116,7 +117,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
             return image, images.load_depth(depth), f"message {depth}"
 
         load = depth_images(read, rig, placed.cameras[1])
-        sigma = depth_sigma_px(settings.scale * rig.fx, RgbdSettings.depth_sigma_m)
+        sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
         unpaired = colour_and_depth_notes(unpaired)
     recording = image_recording(
         settings,

@@ -61,6 +61,9 @@ ReadPair: TypeAlias = Callable[[int], tuple[Image, Depth, str]]
 BASELINE_M = 0.08
 """Of the camera that is made up: about that of depth cameras, so that both see much the same."""
 
+DEPTH_SIGMA_M = 1.425e-3
+"""Noise of a depth of 1 m, growing with its square: Kinect's (Khoshelham and Elberink 2012)."""
+
 _FOUND_AGAIN_PX = 0.15  # by which SIFT finds a point again in a view made of the same image
 
 # --------------------------------------------------------------------------------------------
@@ -193,7 +196,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         if truth.is_file()
         else None,
         odometry_source=file_odometry(odometry_file, odometry),
-        disparity_sigma_px=depth_sigma_px(settings.scale * rig.fx, settings.depth_sigma_m),
+        disparity_sigma_px=depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M),
     )
 
 

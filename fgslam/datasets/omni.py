@@ -25,8 +25,8 @@ from fgslam.core.files import read_text, shown_in
 from fgslam.core.planar import wrap
 from fgslam.datasets.images import read_colour_image, require_folder
 from fgslam.datasets.layouts import IMAGE_SUFFIXES, natural
-from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.recording import recording_identity, select_frames
+from fgslam.datasets.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.times import finite_number, written_stamps
 from fgslam.datasets.video import VideoFrames, moments_of
 

@@ -13,8 +13,8 @@ from fgslam.cameras.rings import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.datasets.omni import OmniRecording
-from fgslam.datasets.omni_settings import OmniDatasetSettings
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.settings import OmniDatasetSettings
 
 _PICTURES = 3  # the rim may be as dark as its holder in one of them
 _CLEARLY_OFF = 0.025

@@ -27,7 +27,7 @@ from fgslam.datasets.settings import (
 
 if TYPE_CHECKING:
     from fgslam.datasets.omni import OmniRecording
-    from fgslam.datasets.omni_settings import OmniDatasetSettings
+    from fgslam.datasets.settings import OmniDatasetSettings
 
 READERS: Mapping[str, Callable[[], Any]] = {
     "image_folder": lambda: import_module("fgslam.datasets.folders").open_image_folder,

@@ -1,4 +1,4 @@
-"""Settings of every recording of SLAM and of its odometry, tagged unions over ``kind``.
+"""Settings of every recording and of its odometry, tagged unions over ``kind``.
 
 Reading this module imports no reader: a configuration is checked before OpenCV or Open3D is loaded.
 """
@@ -10,19 +10,26 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, FrameSelection, Positive
-from fgslam.datasets.odometry_settings import ConstantVelocitySettings as ConstantVelocitySettings
-from fgslam.datasets.odometry_settings import OdometrySettings as OdometrySettings
-from fgslam.datasets.odometry_settings import RecordedOdometrySettings as RecordedOdometrySettings
-from fgslam.datasets.odometry_settings import (
-    SyntheticOdometrySettings as SyntheticOdometrySettings,
+from fgslam.cameras.settings import (
+    BloggieSettings,
+    EquirectangularSettings,
+    HyperbolicMirrorSettings,
+    OmniCameraSettings,
 )
+from fgslam.core.settings import STRICT, FrameSelection, NonNegative, Positive
+from fgslam.worlds.settings import OmniHouseSettings as OmniHouseSettings
 from fgslam.worlds.settings import RenderedLabSettings as RenderedLabSettings
-from fgslam.worlds.settings import (
-    SimulatedMeasurementsSettings as SimulatedMeasurementsSettings,
-)
+from fgslam.worlds.settings import SimulatedBearingsSettings as SimulatedBearingsSettings
+from fgslam.worlds.settings import SimulatedMeasurementsSettings as SimulatedMeasurementsSettings
 
 Vector3: TypeAlias = tuple[float, float, float]
+PositiveVector3: TypeAlias = tuple[Positive, Positive, Positive]
+OdometryFile: TypeAlias = Annotated[
+    str | None,
+    Field(description="odometry inside the folder; null: odometry.txt, odom.txt or odom*.csv"),
+]
+FramesASecond: TypeAlias = Annotated[float, Field(gt=0.0, le=1e4)]
+Milliseconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1000.0)]
 
 # --------------------------------------------------------------------------------------------
 # Images on disk
@@ -76,52 +83,38 @@ class CalibratedSettings(RecordingSettings):
     )
 
 
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class PairedSettings(CalibratedSettings):
+    """What a recording has whose images of one moment are found by their times."""
+
+    pairing_tolerance_ms: Milliseconds = Field(
+        default=20.0, description="largest time between the two images of a pair, ms"
+    )
+
+
 @dataclass(frozen=True, config=STRICT)
 class ImageFolderSettings(CalibratedSettings):
     """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/image_folder.md."""
 
     kind: Literal["image_folder"] = "image_folder"
     use_top: bool = Field(default=True, description="use the third camera where the folder has one")
-    odometry_file: str | None = Field(
-        default=None,
-        description="odometry inside the folder: .csv (speed, yaw rate) or .txt (TUM poses of "
-        "the body)",
-    )
-
-
-OdometryFile = Annotated[
-    str | None,
-    Field(description="odometry inside the folder; null: odometry.txt, odom.txt or odom*.csv"),
-]
-PairingTolerance = Annotated[
-    float,
-    Field(gt=0.0, le=1000.0, description="largest time between the two images of a pair, ms"),
-]
+    odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class LooseImagesSettings(CalibratedSettings):
+class LooseImagesSettings(PairedSettings):
     """Folders of images with any names, with or without times (docs/datasets/loose_images.md)."""
 
     path: str = Field(min_length=1, description="the folder, or a pattern of file names in it")
     kind: Literal["loose_images"] = "loose_images"
-    fps: float | None = Field(
-        default=None,
-        gt=0.0,
-        le=1e4,
-        description="frames a second; null: by the list of times or by names, else 10",
-    )
-    pairing_tolerance_ms: float = Field(
-        default=20.0,
-        gt=0.0,
-        le=1000.0,
-        description="largest time between the images of a pair, where only times name them, ms",
+    fps: FramesASecond | None = Field(
+        default=None, description="frames a second; null: by the list of times or by names, else 10"
     )
     odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class VideoSettings(CalibratedSettings):
+class VideoSettings(PairedSettings):
     """Stereo films: one of both views, or one a camera (docs/datasets/video.md)."""
 
     path: str = Field(min_length=1, description="the film, a folder of one to three, or a pattern")
@@ -129,14 +122,13 @@ class VideoSettings(CalibratedSettings):
     views: Literal["side_by_side", "over_under"] | None = Field(
         default=None, description="how one film shows both views; null: by its size"
     )
-    fps: float | None = Field(
-        default=None, gt=0.0, le=1e4, description="frames a second, in place of the film's own rate"
+    fps: FramesASecond | None = Field(
+        default=None, description="frames a second, in place of the film's own rate"
     )
-    pairing_tolerance_ms: PairingTolerance = 20.0
 
 
 @dataclass(frozen=True, config=STRICT)
-class RgbdSettings(CalibratedSettings):
+class RgbdSettings(PairedSettings):
     """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md)."""
 
     kind: Literal["rgbd"] = "rgbd"
@@ -145,22 +137,11 @@ class RgbdSettings(CalibratedSettings):
         description="depth units in a metre; null: by the calibration's file, else 5000 (TUM), "
         "1000 (16 bits), 1 (floats)",
     )
-    depth_sigma_m: Positive = Field(
-        default=1.425e-3, description="noise of a depth of 1 m, growing with its square"
-    )
-    pairing_tolerance_ms: PairingTolerance = 20.0
     odometry_file: OdometryFile = None
 
 
-@dataclass(frozen=True, config=STRICT)
-class KittiRawSettings(CalibratedSettings):
-    """A synchronised and rectified drive of KITTI raw (docs/datasets/kitti.md)."""
-
-    kind: Literal["kitti_raw"] = "kitti_raw"
-
-
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class BagSettings(CalibratedSettings):
+class BagSettings(PairedSettings):
     """ROS 1 and ROS 2 bags: .bag, .db3, .mcap (docs/datasets/bags.md)."""
 
     path: str = Field(min_length=1, description="the bag, its folder, or a pattern of file names")
@@ -169,7 +150,13 @@ class BagSettings(CalibratedSettings):
         default=(),
         description="topics: left, right[, top] images, odometry; empty: by type and name",
     )
-    pairing_tolerance_ms: PairingTolerance = 20.0
+
+
+@dataclass(frozen=True, config=STRICT)
+class KittiRawSettings(CalibratedSettings):
+    """A synchronised and rectified drive of KITTI raw (docs/datasets/kitti.md)."""
+
+    kind: Literal["kitti_raw"] = "kitti_raw"
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -183,7 +170,7 @@ class KittiSettings(RecordingSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class EurocSettings(CalibratedSettings):
+class EurocSettings(PairedSettings):
     """EuRoC MAV in its native layout, rectified on reading (docs/datasets/euroc.md)."""
 
     kind: Literal["euroc"] = "euroc"
@@ -194,6 +181,17 @@ class EurocSettings(CalibratedSettings):
         description="largest time between the two images of a pair, ms",
     )
 
+
+FileRecordingSettings: TypeAlias = (
+    ImageFolderSettings
+    | LooseImagesSettings
+    | VideoSettings
+    | RgbdSettings
+    | BagSettings
+    | KittiSettings
+    | KittiRawSettings
+    | EurocSettings
+)
 
 # --------------------------------------------------------------------------------------------
 # Measurements without images
@@ -214,9 +212,6 @@ class StereoTracksSettings(FrameSelection):
         description="noise of one image coordinate, pixels (measured: docs/datasets/"
         "stereo_tracks.md)",
     )
-    frame_period_s: Positive = Field(
-        default=0.1, description="time between frames, which the files lack; KITTI's is 0.1 s"
-    )
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
@@ -230,24 +225,147 @@ class MeasurementFilesSettings(FrameSelection):
     kind: Literal["measurements"] = "measurements"
 
 
-# --------------------------------------------------------------------------------------------
-# Any of them
-
-
-FileRecordingSettings: TypeAlias = (
-    ImageFolderSettings
-    | LooseImagesSettings
-    | VideoSettings
-    | RgbdSettings
-    | BagSettings
-    | KittiSettings
-    | KittiRawSettings
-    | EurocSettings
-)
 MeasurementDatasetSettings: TypeAlias = (
     StereoTracksSettings | MeasurementFilesSettings | SimulatedMeasurementsSettings
 )
 DatasetSettings: TypeAlias = Annotated[
     RenderedLabSettings | FileRecordingSettings | MeasurementDatasetSettings,
+    Field(discriminator="kind"),
+]
+
+# --------------------------------------------------------------------------------------------
+# Pictures of an omnidirectional camera
+
+
+@dataclass(frozen=True, config=STRICT)
+class PanoramasSettings(RecordingSettings):
+    """A folder of panoramas, with or without ``poses.csv`` (docs/datasets/panoramas.md)."""
+
+    kind: Literal["panoramas"] = "panoramas"
+    camera: EquirectangularSettings = EquirectangularSettings()
+    width: int | None = Field(
+        default=None,
+        ge=64,
+        le=16384,
+        description="pictures are reduced to this width; null: as they are",
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniPathSettings(RecordingSettings):
+    """A folder of a mirror camera's pictures along a path (docs/datasets/mirror_images.md)."""
+
+    kind: Literal["omni_path"] = "omni_path"
+    camera: OmniCameraSettings = HyperbolicMirrorSettings()
+    pattern: str = Field(
+        default="*",
+        min_length=1,
+        pattern=r"^[^/\\]+$",
+        description="names of the pictures, ordered by the numbers in them",
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniVideoSettings(RecordingSettings):
+    """A mirror camera's video file; ``path`` is the file (docs/datasets/mirror_images.md)."""
+
+    kind: Literal["omni_video"] = "omni_video"
+    camera: OmniCameraSettings = BloggieSettings()
+    frame_rate_hz: float | None = Field(
+        default=None, gt=0.0, le=1000.0, description="frames a second; null: as the file says"
+    )
+
+
+OmniDatasetSettings: TypeAlias = Annotated[
+    PanoramasSettings | OmniPathSettings | OmniVideoSettings, Field(discriminator="kind")
+]
+
+# --------------------------------------------------------------------------------------------
+# Odometry
+
+
+@dataclass(frozen=True, config=STRICT)
+class ConstantVelocitySettings:
+    """No odometry: the camera is expected to keep its velocity, up to a random acceleration.
+
+    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``, more
+    while the camera is blind: ``sigma * T * dt``, T since the velocity was last measured. How large
+    the acceleration is, is estimated from the frames so far (docs/derivations/motion_noise.md);
+    the first frames are tracked with the values below. They are those of a flying or hand-held
+    camera, wide for any other (cars of KITTI: 12, 6, 8 degrees/s^2 and 0.35, 0.43, 2.3 m/s^2).
+    """
+
+    kind: Literal["constant_velocity"] = "constant_velocity"
+    rotation_sigma_dps2: PositiveVector3 = Field(
+        default=(100.0, 100.0, 100.0),
+        description="at first, about the camera's axes x, y, z, degrees/s^2",
+    )
+    translation_sigma_mps2: PositiveVector3 = Field(
+        default=(3.0, 3.0, 3.0), description="at first, along the camera's axes x, y, z, m/s^2"
+    )
+    start_speed_sigma_mps: Positive = Field(
+        default=15.0, description="speed per axis before the first motion is known, m/s"
+    )
+    start_rotation_sigma_dps: Positive = Field(
+        default=20.0, description="turn per axis before the first motion is known, deg/s"
+    )
+    adapt: bool = Field(default=True, description="estimate the acceleration from the frames")
+
+
+@dataclass(frozen=True, config=STRICT)
+class RecordedOdometrySettings:
+    """Use the recording's own odometry, with this noise.
+
+    The rates are taken as constant over one step, so each standard deviation is multiplied by the
+    step's duration. Defaults: measured on KITTI raw 2011_09_26 against its truth (step 0.206 s,
+    7.5 m/s), where truth's own noise is included; docs/datasets/image_folder.md has the numbers.
+    """
+
+    kind: Literal["recorded"] = "recorded"
+    gap: ConstantVelocitySettings = Field(
+        default=ConstantVelocitySettings(), description="what stands in over steps without odometry"
+    )
+    time_offset_s: float = Field(
+        default=0.0, ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds"
+    )
+    max_gap_s: Positive = Field(
+        default=0.5, description="longest gap in the odometry that is bridged"
+    )
+    track_m: Positive | None = Field(
+        default=None, description="speeds or ticks of two wheels: their distance, m"
+    )
+    metres_per_tick: Positive | None = Field(
+        default=None, description="ticks of two wheels: how far one of them goes, m"
+    )
+    speed_sigma_mps: Positive = Field(
+        default=0.10, description="speed and yaw rate: noise of the forward speed, m/s"
+    )
+    yaw_rate_sigma_dps: Positive = Field(
+        default=0.30, description="speed and yaw rate: noise of the yaw rate, degrees/s"
+    )
+    translation_sigma_fraction: NonNegative = Field(
+        default=0.02, description="poses: noise per axis as a fraction of the step's length"
+    )
+    rotation_sigma_fraction: NonNegative = Field(
+        default=0.05, description="poses: noise per axis as a fraction of the step's angle"
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class SyntheticOdometrySettings:
+    """Ground truth plus stated noise stands in for odometry; every output says so.
+
+    Independent normal noise per body axis on each step, drawn from the experiment's seed.
+    """
+
+    kind: Literal["synthetic"] = "synthetic"
+    translation_sigma_fraction: NonNegative = Field(
+        default=0.02, description="per axis, as a fraction of the step's length"
+    )
+    rotation_sigma_deg: NonNegative = Field(default=1.0, description="per axis and step, degrees")
+
+
+OdometrySettings: TypeAlias = Annotated[
+    RecordedOdometrySettings | ConstantVelocitySettings | SyntheticOdometrySettings,
     Field(discriminator="kind"),
 ]

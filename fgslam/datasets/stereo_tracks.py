@@ -36,6 +36,7 @@ _INSIDE = {"00s": "00s", "00": "00", "large": "_large"}
 _PREFIX = "VO_stereo_factors"
 _COLUMNS = ("pose", "landmark", "uL", "uR", "v", "X", "Y", "Z")
 _CALIBRATION = ("fx", "fy", "skew", "cx", "cy", "baseline")
+FRAME_PERIOD_S = 0.1  # of KITTI; the files lack times
 _NOT_RIGID = 1e-3  # the files give six digits
 
 
@@ -61,14 +62,14 @@ def open_stereo_tracks(
     numbers = np.unique(tracks.values[rows, 0]).astype(np.int64)
     numbers = numbers[select_of(len(numbers), settings, str(files.tracks))]
     rig = _read_rig(files.calibration, tracks.values[rows])
-    truth = _read_poses(files.poses, rig, numbers, settings.frame_period_s)
+    truth = _read_poses(files.poses, rig, numbers)
     if truth is not None:
         notes += ("the reference poses are estimates from the same images, not measured truth",)
     increments = make_increments(_frames(tracks.values[rows], numbers, settings))
     listed = [path for path in (files.tracks, files.calibration, files.poses) if path.exists()]
     return MeasurementRecording(
         name=f"stereo tracks {files.tracks.stem.removeprefix(_PREFIX).removeprefix('_')}",
-        identity=files_identity(listed, asdict(settings)),
+        identity=files_identity(listed, asdict(settings) | {"frame_period_s": FRAME_PERIOD_S}),
         log=make_log(rig, increments, odometry),
         ground_truth=truth,
         landmark_truth=None,
@@ -141,9 +142,7 @@ def _read_rig(path: Path, values: FloatArray) -> CameraRig:
     return CameraRig(width, height, fx, fy, cx, cy, baseline, None, bTc)
 
 
-def _read_poses(
-    path: Path, rig: CameraRig, numbers: IntArray, period_s: float
-) -> Trajectory | None:
+def _read_poses(path: Path, rig: CameraRig, numbers: IntArray) -> Trajectory | None:
     """Reference poses of the right camera at the frames, in the left one's first; None if absent.
 
     Lines hold the frame and the left camera's ``wTl``, row by row.
@@ -160,7 +159,7 @@ def _read_poses(
         if off > _NOT_RIGID or not np.array_equal(wTl[3], [0.0, 0.0, 0.0, 1.0]):
             raise DatasetError(f"{path}, line {table.lines[k]}: not a rigid pose; correct the line")
     rigid = np.array([reorthonormalise(wTl) for wTl in left]).reshape(-1, 4, 4)
-    stamps = table.values[chosen, 0] * period_s
+    stamps = table.values[chosen, 0] * FRAME_PERIOD_S
     return Trajectory(stamps, right_from_left_camera(rigid, rig.baseline))
 
 
@@ -183,7 +182,7 @@ def _frames(
         pixels[:, 1] = np.column_stack([left, row])
         yield MeasuredFrame(
             index=number,
-            timestamp=number * settings.frame_period_s,
+            timestamp=number * FRAME_PERIOD_S,
             odometry=None,
             ids=values[a:b, 1].astype(np.int64),
             measurement=np.column_stack([right, row, left - right]),

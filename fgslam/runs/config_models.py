@@ -15,16 +15,14 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
 from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.core.settings import Count, Index, NonNegative
-from fgslam.datasets.omni_settings import (
-    OmniDatasetSettings,
-    OmniHouseSettings,
-    SimulatedBearingsSettings,
-)
 from fgslam.datasets.settings import (
     DatasetSettings,
     MeasurementDatasetSettings,
     OdometrySettings,
+    OmniDatasetSettings,
+    OmniHouseSettings,
     RecordedOdometrySettings,
+    SimulatedBearingsSettings,
 )
 from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings

@@ -15,8 +15,8 @@ from fgslam.cameras.settings import OCamCalibSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni import OmniRecording
-from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 
 pytestmark = pytest.mark.data
 

@@ -12,8 +12,8 @@ from fgslam.cameras.rings import find_mirror_circle
 from fgslam.cameras.settings import HyperbolicMirrorSettings
 from fgslam.core.homing import FeatureKind, TwoViewVector
 from fgslam.datasets.images import read_colour_image
-from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.settings import OmniVideoSettings
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker

@@ -33,8 +33,8 @@ from fgslam.core.planar import wrap
 from fgslam.core.quantiles import chi_square_quantile
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.datasets.omni_settings import OmniDatasetSettings
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.settings import OmniDatasetSettings
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor

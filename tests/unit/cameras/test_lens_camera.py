@@ -14,7 +14,7 @@ from fgslam.cameras.omni import HyperbolicMirror, LensCamera, MirrorFrame, OmniC
 from fgslam.cameras.omni_files import camera_of, camera_values, load_camera
 from fgslam.core.errors import CalibrationError
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.datasets.omni_settings import OmniPathSettings
+from fgslam.datasets.settings import OmniPathSettings
 
 MEI = """%YAML:1.0
 ---

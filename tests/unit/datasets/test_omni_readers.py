@@ -27,8 +27,8 @@ from fgslam.cameras.settings import (
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.datasets.omni import OmniRecording, PanoramaReduction, ids_of
-from fgslam.datasets.omni_settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
 from fgslam.datasets.video import VideoFrames
 
 HEADER = "id,file,x_m,y_m,heading_deg,room\n"

@@ -87,9 +87,9 @@ def test_measurements_are_the_right_camera_s(tracks: Path) -> None:
 
 
 def test_frames_identities_and_times(tracks: Path) -> None:
-    log = opened(tracks, frame_period_s=0.2).log
+    log = opened(tracks).log
     assert [increment.index for increment in log] == [0, 1, 4]
-    assert [increment.timestamp for increment in log] == pytest.approx([0.0, 0.2, 0.8])
+    assert [increment.timestamp for increment in log] == pytest.approx([0.0, 0.1, 0.4])
     assert [i.observations.ids.tolist() for i in log] == [[3, 7, 15], [3, 7], [3, 15, 40]]
     assert [i.observations.is_new.tolist() for i in log] == [
         [True] * 3,

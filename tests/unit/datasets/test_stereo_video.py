@@ -22,10 +22,9 @@ from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import pose
 from fgslam.core.sides import camera_pairs, camera_trio
 from fgslam.datasets.layouts import recognise_layout
-from fgslam.datasets.omni_settings import OmniVideoSettings
 from fgslam.datasets.opening import open_omni, open_recording
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.settings import VideoSettings
+from fgslam.datasets.settings import OmniVideoSettings, VideoSettings
 from fgslam.datasets.video import VideoFrames
 from fgslam.runs.bare_recording import bare_experiment
 from tests import textured_wall

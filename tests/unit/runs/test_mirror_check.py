@@ -19,8 +19,8 @@ from fgslam.cameras.settings import (
 )
 from fgslam.core.arrays import Image
 from fgslam.datasets.omni_checks import camera_notes, open_checked
-from fgslam.datasets.omni_settings import OmniPathSettings, PanoramasSettings
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.settings import OmniPathSettings, PanoramasSettings
 from tests import textured_room
 
 SIZE = (320, 240)
