@@ -19,10 +19,13 @@ from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.homing import UprightFeatures
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.colour_moments import PatchColours
-from fgslam.frontend.features.settings import ColourMomentSettings, UprightSiftSettings
+from fgslam.frontend.features.settings import UprightSiftSettings
 
 SIGMA_PX = 1.2  # of a feature's position, pixels of its view (docs/derivations/omni_features.md)
 SIGMA_SCALES = 0.27  # scales of a feature, added in quadrature to its position's sigma
+MAX_FEATURES = 3000  # the strongest
+MIN_ELEVATION_DEG, MAX_ELEVATION_DEG = -60.0, 60.0
+"""Below: the floor at our feet, the tripod; above: the ceiling overhead."""
 _BASE_SIGMA_PX = 1.6  # Gaussian of the first level, doubled image
 _EDGE_THRESHOLD = 10.0  # ratio of principal curvatures above which edges go
 _OCTAVE_LAYERS = 3  # levels an octave; 3 in Lowe
@@ -94,7 +97,6 @@ class UprightSift:
         self,
         camera: OmniCamera,
         settings: UprightSiftSettings,
-        colour: ColourMomentSettings,
         seen: BoolArray | None = None,
     ) -> None:
         """Prepares detector, mask and the continuation over the seam.
@@ -102,10 +104,9 @@ class UprightSift:
         Args:
             camera: of the images, or of the view that they are unwrapped to.
             settings: of the detector.
-            colour: of the colour moments.
             seen: (height, width) where an unwrapped view has a picture; None for everywhere.
         """
-        self._camera, self._settings, self._colour = camera, settings, colour
+        self._camera = camera
         self._sift = cv2.SIFT.create(
             0,
             _OCTAVE_LAYERS,
@@ -128,23 +129,37 @@ class UprightSift:
         grey = np.asarray(cv2.cvtColor(colour, cv2.COLOR_RGB2GRAY), np.uint8)
         keypoints = self._sift.detect(grey, mask)
         table, octaves = _distinct(keypoints)
-        keep = self._chosen(table[:, :2] + offset, table)
+        strongest = np.argsort(-table[:, 3], kind="stable")
+        pixels = table[:, :2] + offset
+        keep = strongest[_once(pixels[strongest], table[strongest, 2], self._period)]
+        keep = keep[:MAX_FEATURES]
         table, octaves = table[keep], octaves[keep]
-        pixels = self._unwrapped(table[:, :2] + offset)
+        pixels = table[:, :2] + offset
+        if self._period is not None:
+            pixels = np.column_stack([pixels[:, 0] % self._period, pixels[:, 1]])
         up = up_in_image(self._camera, pixels)
         seen = np.all(np.isfinite(up), axis=1)
         table, octaves, pixels, up = table[seen], octaves[seen], pixels[seen], up[seen]
         if not len(table):
             return empty_features()
-        descriptors = self._describe(grey, table, octaves, up)
-        colours = PatchColours(colour, self._colour).around(table[:, :2], table[:, 2])
-        return self._measured(pixels, table[:, 2], up, descriptors, colours)
+        scale_px = table[:, 2]
+        sigma = np.hypot(SIGMA_PX, SIGMA_SCALES * scale_px)
+        bearing, elevation, covariance = measure(self._camera, pixels, 1.0)
+        return UprightFeatures(
+            pixels=pixels,
+            bearing=bearing,
+            elevation=elevation,
+            covariance=covariance * (sigma**2)[:, None, None],
+            scale=scale_px / np.hypot(up[:, 0], up[:, 1]),
+            descriptors=self._describe(grey, table, octaves, up),
+            colour=PatchColours(colour).around(table[:, :2], scale_px),
+        )
 
     def _seen_mask(self, given: BoolArray | None) -> ByteArray:
-        camera, settings = self._camera, self._settings
+        camera = self._camera
         columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
         rays = camera.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
-        low, high = np.sin(np.deg2rad([settings.min_elevation_deg, settings.max_elevation_deg]))
+        low, high = np.sin(np.deg2rad([MIN_ELEVATION_DEG, MAX_ELEVATION_DEG]))
         with np.errstate(invalid="ignore"):
             seen = (rays[:, 2] >= low) & (rays[:, 2] <= high)
         seen = seen.reshape(camera.height, camera.width)
@@ -168,18 +183,6 @@ class UprightSift:
         colour, mask = continued
         return colour, mask, offset
 
-    def _chosen(self, pixels: FloatArray, table: FloatArray) -> IntArray:
-        """Rows of the key points to keep: each feature once, the strongest first."""
-        order = np.argsort(-table[:, 3], kind="stable")
-        order = order[_once(pixels[order], table[order, 2], self._period)]
-        limit = self._settings.max_features
-        return order[:limit] if limit else order
-
-    def _unwrapped(self, pixels: FloatArray) -> FloatArray:
-        if self._period is None:
-            return pixels
-        return np.column_stack([pixels[:, 0] % self._period, pixels[:, 1]])
-
     def _describe(
         self, grey: Image, table: FloatArray, octaves: IntArray, up: FloatArray
     ) -> ByteArray:
@@ -194,26 +197,6 @@ class UprightSift:
         if len(described) != len(keypoints):
             raise RuntimeError("OpenCV dropped key points that it had found itself")
         return np.asarray(descriptors, np.uint8)
-
-    def _measured(
-        self,
-        pixels: FloatArray,
-        scale_px: FloatArray,
-        up: FloatArray,
-        descriptors: ByteArray,
-        colour: FloatArray,
-    ) -> UprightFeatures:
-        sigma = np.hypot(SIGMA_PX, SIGMA_SCALES * scale_px)
-        bearing, elevation, covariance = measure(self._camera, pixels, 1.0)
-        return UprightFeatures(
-            pixels=pixels,
-            bearing=bearing,
-            elevation=elevation,
-            covariance=covariance * (sigma**2)[:, None, None],
-            scale=scale_px / np.hypot(up[:, 0], up[:, 1]),
-            descriptors=descriptors,
-            colour=colour,
-        )
 
 
 def _distinct(keypoints: Many[cv2.KeyPoint]) -> tuple[FloatArray, IntArray]:

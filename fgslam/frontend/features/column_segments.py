@@ -24,7 +24,6 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.homing import ColumnSegments
 from fgslam.frontend.features.colour_moments import colour_from_means, moment_images
 from fgslam.frontend.features.colour_sift import inner_part, wrapping_period
-from fgslam.frontend.features.settings import ColourMomentSettings
 
 _SIGMA_PX = 1.8  # of an end, and of a run of one column (docs/derivations/omni_features.md)
 _SIGMA_RUN = 0.15  # part of a run's width added to the bearing's deviation
@@ -69,14 +68,12 @@ class ColumnSegmentFinder:
     def __init__(
         self,
         view: OmniCamera,
-        colour: ColourMomentSettings,
         seen: BoolArray | None = None,
     ) -> None:
         """Takes the view's camera: vertical columns, rows proportional to tan(elevation).
 
         ``seen`` (height, width) tells where the view has a picture; None for everywhere.
         """
-        self._colour = colour
         self._width, self._height = view.width, view.height
         self._period = wrapping_period(view) or view.width
         self._bearings, (self._tangent_0, self._tangent_step) = _axes(view)
@@ -90,7 +87,7 @@ class ColumnSegmentFinder:
         raw = self._segments(image)
         if not len(raw):
             return empty_segments()
-        sums = _ColumnSums(image, self._colour)
+        sums = _ColumnSums(image)
         means, contrast = sums.means(raw.column, raw.top, raw.bottom)
         keep = contrast >= _MIN_CONTRAST
         raw, means = raw.select(keep), means[keep]
@@ -186,7 +183,7 @@ class ColumnSegmentFinder:
         profile = profile - profile.mean(axis=1, keepdims=True)
         deviation = np.sqrt(np.mean(profile**2, axis=1, keepdims=True))
         intensity = profile / np.maximum(deviation, 1e-6) @ self._dct.T
-        colour = colour_from_means(means, self._colour)
+        colour = colour_from_means(means)
         pixel = 2.0 * np.pi / self._period
         sigma_end = _SIGMA_PX * abs(self._tangent_step)
         return ColumnSegments(
@@ -201,8 +198,8 @@ class ColumnSegmentFinder:
 class _ColumnSums:
     """Sums down the columns: exact means over any stretch of a column, ends in between pixels."""
 
-    def __init__(self, image: Image, colour: ColourMomentSettings) -> None:
-        parts = moment_images(image, colour.form == "correlation")
+    def __init__(self, image: Image) -> None:
+        parts = moment_images(image)
         grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
         luminance: Float32Array = grey.astype(np.float32)
         self._colours = len(parts)
@@ -211,7 +208,7 @@ class _ColumnSums:
     def means(
         self, column: IntArray, top: FloatArray, bottom: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """(n, 6 or 9) means of the colour products, (n,) deviation of the luminance."""
+        """(n, 6) means of the colour products, (n,) deviation of the luminance."""
         # The rows whose centres lie within; ``lower`` is the first beyond.
         upper, lower = (np.floor(end).astype(np.int64) + 1 for end in (top, bottom))
         count = (lower - upper).astype(np.float64)

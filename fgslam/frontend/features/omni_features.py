@@ -17,6 +17,8 @@ from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.frontend.features.colour_sift import (
+    MAX_ELEVATION_DEG,
+    MIN_ELEVATION_DEG,
     UprightSift,
     empty_features,
     up_in_image,
@@ -34,7 +36,6 @@ class View:
     """Another camera's picture of what one camera sees."""
 
     def __init__(self, source: OmniCamera, target: OmniCamera) -> None:
-        self.camera = target
         self._maps = unwrap_maps(source, target)
         seen = self._maps[0] > -1.0
         self.seen = None if seen.all() else seen
@@ -54,15 +55,21 @@ class OmniFeatureExtractor:
         """Prepares views and detectors; panoramas need no unwrapping for SIFT."""
         self._camera, self._kinds = camera, settings.kinds
         resolution = pixels_a_radian(camera)
-        self._sift_view = self._view_for_sift(settings, resolution)
-        described = self._sift_view.camera if self._sift_view else camera
-        seen = self._sift_view.seen if self._sift_view else None
-        self._sift = UprightSift(described, settings.sift, settings.colour, seen)
+        self._sift_view: View | None = None
+        if wrapping_period(camera) is None:
+            width = min(_MAX_VIEW_WIDTH, round(2.0 * np.pi * resolution))
+            high, low = np.deg2rad([MAX_ELEVATION_DEG, MIN_ELEVATION_DEG])
+            height = round((high - low) * width / (2.0 * np.pi)) + 1
+            view = Equirectangular(width, height, float(high), float(low))
+            self._sift_view = View(camera, view)
+            self._sift = UprightSift(view, settings.sift, self._sift_view.seen)
+        else:
+            self._sift = UprightSift(camera, settings.sift)
         width = min(_MAX_CYLINDER_WIDTH, round(2.0 * np.pi * resolution))
         height = round(2.0 * _MAX_TANGENT * width / (2.0 * np.pi)) + 1
         cylinder = Cylinder(width, height, -_MAX_TANGENT, _MAX_TANGENT)
         self._cylinder = View(camera, cylinder)
-        self._columns = ColumnSegmentFinder(cylinder, settings.colour, self._cylinder.seen)
+        self._columns = ColumnSegmentFinder(cylinder, self._cylinder.seen)
 
     def extract(self, image: Image) -> OmniFeatures:
         """Features of an image (height, width, 3) in R, G, B.
@@ -79,25 +86,6 @@ class OmniFeatureExtractor:
         if self._sift_view is None:
             return self._sift.extract(image)
         found = self._sift.extract(self._sift_view.of(image))
-        return self._in_given_image(found)
-
-    def extract_columns(self, image: Image) -> ColumnSegments:
-        """Column segments alone; none where the settings exclude them."""
-        require_own_image(self._camera, image)
-        if self._kinds == "sift":
-            return empty_segments()
-        return self._columns.extract(self._cylinder.of(image))
-
-    def _view_for_sift(self, settings: OmniFeatureSettings, resolution: float) -> View | None:
-        if wrapping_period(self._camera) is not None or settings.sift.view == "raw":
-            return None
-        width = min(_MAX_VIEW_WIDTH, round(2.0 * np.pi * resolution))
-        limits = np.deg2rad([settings.sift.max_elevation_deg, settings.sift.min_elevation_deg])
-        height = round((limits[0] - limits[1]) * width / (2.0 * np.pi)) + 1
-        view = Equirectangular(width, height, float(limits[0]), float(limits[1]))
-        return View(self._camera, view)
-
-    def _in_given_image(self, found: UprightFeatures) -> UprightFeatures:
         if not len(found):
             return found
         pixels = self._camera.pixels(unit_rays(found.bearing, found.elevation))
@@ -111,6 +99,13 @@ class OmniFeatureExtractor:
             found.descriptors[seen],
             found.colour[seen],
         )
+
+    def extract_columns(self, image: Image) -> ColumnSegments:
+        """Column segments alone; none where the settings exclude them."""
+        require_own_image(self._camera, image)
+        if self._kinds == "sift":
+            return empty_segments()
+        return self._columns.extract(self._cylinder.of(image))
 
 
 def pixels_a_radian(camera: OmniCamera) -> float:

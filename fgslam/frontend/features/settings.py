@@ -45,33 +45,11 @@ class AppearanceSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class ColourMomentSettings:
-    """Colour of a patch or segment: eq. 1 with centred bands."""
-
-    form: Literal["ratio", "correlation"] = Field(
-        default="ratio", description="`ratio`: blind to gain; `correlation`: to gain and offset"
-    )
-
-
-@dataclass(frozen=True, config=STRICT)
 class UprightSiftSettings:
     """Rotation-reduced SIFT (III-A1)."""
 
     contrast_threshold: NonNegative = Field(
         default=0.015, description="OpenCV's contrast threshold (its default is 0.04)"
-    )
-    max_features: int = Field(
-        default=3000, ge=0, le=1_000_000, description="keep the strongest so many; 0 keeps all"
-    )
-    min_elevation_deg: float = Field(
-        default=-60.0, ge=-90.0, lt=90.0, description="below it: the floor at our feet, the tripod"
-    )
-    max_elevation_deg: float = Field(
-        default=60.0, gt=-90.0, le=90.0, description="above it: the ceiling overhead"
-    )
-    view: Literal["unwrapped", "raw"] = Field(
-        default="unwrapped",
-        description="of mirrors and fisheyes: `raw` image, or `unwrapped` panorama",
     )
 
 
@@ -102,7 +80,6 @@ class OmniFeatureSettings:
     """All of the omnidirectional features."""
 
     sift: UprightSiftSettings = UprightSiftSettings()
-    colour: ColourMomentSettings = ColourMomentSettings()
     matching: OmniMatchingSettings = OmniMatchingSettings()
     kinds: Literal["both", "sift", "columns"] = Field(
         default="both", description="which features are sought; the paper uses both kinds together"

@@ -16,7 +16,6 @@ from fgslam.frontend.features.column_segments import (
     whitened,
 )
 from fgslam.frontend.features.settings import (
-    ColourMomentSettings,
     OmniMatchingSettings,
 )
 from fgslam.frontend.homing.matching import consistent_tangents, match_columns, nearest_segments
@@ -27,7 +26,7 @@ POST_WIDTH = 6
 
 
 def finder() -> ColumnSegmentFinder:
-    return ColumnSegmentFinder(VIEW, ColourMomentSettings())
+    return ColumnSegmentFinder(VIEW)
 
 
 def posts(distance: float = 1.0, seed: int = 4, shift: int = 0) -> tuple[Image, FloatArray]:
@@ -124,7 +123,7 @@ def test_unseen_parts_hold_no_segments() -> None:
     seen = np.ones((401, 401), np.bool_)
     seen[:, 200:] = False
     image[:, 200:] = 0
-    found = ColumnSegmentFinder(VIEW, ColourMomentSettings(), seen).extract(image)
+    found = ColumnSegmentFinder(VIEW, seen).extract(image)
     assert 0 < len(found) <= POSTS // 2
     assert np.all(found.bearing > 0.0)
 
