@@ -249,33 +249,24 @@ def specific(
         owners: the map's row of each view's landmark.
         landmarks: the map.
     """
-    features, rows, distances, places = [], [], [], []
+    found: list[tuple[int, int, int]] = []  # feature, landmark, places of the feature
+    distances: list[float] = []
     limits = np.where(keep, neighbours.distances, np.inf)
     for i in np.flatnonzero((limits <= MAX_DISTANCE).any(axis=1)):
         order = np.flatnonzero(keep[i])
         own, far = owners[neighbours.rows[i, order]], limits[i, order]
-        place = _places(landmarks.positions[own], _SAME_PLACE_M)
-        end, count = _gap(place, far)
-        first = _first_views(own[:end], far[:end], MAX_DISTANCE)
-        features.append(np.full(len(first), i))
-        rows.append(own[first])
-        distances.append(far[first])
-        places.append(np.full(len(first), count))
-    return _joined(features, rows, distances, places)
-
-
-def _places(positions: FloatArray, radius: float) -> IntArray:
-    """Each position's place: the index of the first one within ``radius`` of it."""
-    apart = np.linalg.norm(positions[:, None] - positions[None], axis=2)
-    return np.asarray(np.argmax(apart <= radius, axis=1))
-
-
-def _first_views(own: IntArray, far: FloatArray, limit: float) -> IntArray:
-    """The first view of each landmark within ``limit``, the nearest ones first."""
-    first: dict[int, int] = {}
-    for k in np.flatnonzero(far <= limit).tolist():
-        first.setdefault(int(own[k]), k)
-    return np.array(sorted(first.values(), key=lambda k: (far[k], own[k])), np.int64)
+        at = landmarks.positions[own]
+        # A candidate's place is the first candidate that lies so near.
+        near = np.linalg.norm(at[:, None] - at[None], axis=2) <= _SAME_PLACE_M
+        end, count = _gap(np.argmax(near, axis=1), far)
+        first: dict[int, int] = {}  # the first view of each landmark
+        for k in np.flatnonzero(far[:end] <= MAX_DISTANCE).tolist():
+            first.setdefault(int(own[k]), k)
+        for k in sorted(first.values(), key=lambda k: (far[k], own[k])):
+            found.append((int(i), int(own[k]), count))
+            distances.append(float(far[k]))
+    table = np.array(found, np.int64).reshape(-1, 3)
+    return Tentative(table[:, 0], table[:, 1], np.array(distances), table[:, 2])
 
 
 def _gap(place: IntArray, far: FloatArray) -> tuple[int, int]:
@@ -284,31 +275,10 @@ def _gap(place: IntArray, far: FloatArray) -> tuple[int, int]:
     for k, p in enumerate(place):
         if p in seen:
             continue
-        if seen and _last(far, place, seen, k) <= _RATIO * far[k]:
+        # Of a place the first view counts.
+        if seen and max(far[:k][place[:k] == p][0] for p in seen) <= _RATIO * far[k]:
             return k, len(seen)
         if len(seen) == _MOST_PLACES:
             return 0, 0
         seen.append(int(p))
     return len(place), len(seen)
-
-
-def _last(far: FloatArray, place: IntArray, seen: list[int], k: int) -> float:
-    """Distance of the last of the places before ``k``: the first view of each counts."""
-    return float(max(far[:k][place[:k] == p][0] for p in seen))
-
-
-def _joined(
-    features: list[IntArray],
-    rows: list[IntArray],
-    distances: list[FloatArray],
-    places: list[IntArray],
-) -> Tentative:
-    if not features:
-        none = np.empty(0, np.int64)
-        return Tentative(none, none, np.empty(0), none)
-    return Tentative(
-        np.concatenate(features),
-        np.concatenate(rows),
-        np.concatenate(distances),
-        np.concatenate(places),
-    )

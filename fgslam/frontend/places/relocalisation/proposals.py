@@ -68,20 +68,18 @@ class Evidence:
         a vague pose gains little from many matches.
         """
         out = np.empty(len(poses))
+        of_feature = np.flatnonzero(np.diff(self.tentative.features, prepend=-1))
         step = max(1, _AT_ONCE // max(1, len(self.pairs)))
         for start in range(0, len(poses), step):
-            part = slice(start, start + step)
-            out[part] = self._scores(poses[part], covariances[part])
+            some = poses[start : start + step]
+            h, k = len(some), len(self.pairs)
+            rows, match = np.repeat(np.arange(h), k), np.tile(np.arange(k), h)
+            found = residuals(self.rig, some, self.pairs.select(match), rows)
+            logs = log_likelihoods(found, covariances[start : start + step][rows])
+            gain = logs.reshape(h, k) - self.log_chance
+            best = np.maximum.reduceat(gain, of_feature, axis=1)
+            out[start : start + step] = np.maximum(best, 0.0).sum(axis=1)
         return out
-
-    def _scores(self, poses: FloatArray, covariances: FloatArray) -> FloatArray:
-        h, k = len(poses), len(self.pairs)
-        rows, match = np.repeat(np.arange(h), k), np.tile(np.arange(k), h)
-        found = residuals(self.rig, poses, self.pairs.select(match), rows)
-        gain = log_likelihoods(found, covariances[rows]).reshape(h, k) - self.log_chance
-        starts = np.flatnonzero(np.diff(self.tentative.features, prepend=-1))
-        best = np.maximum.reduceat(gain, starts, axis=1)
-        return np.asarray(np.maximum(best, 0.0).sum(axis=1))
 
     def agreeing(self, wTc: FloatArray, covariance: FloatArray) -> BoolArray:
         """Matches (k,) that are likelier right than chance at a pose with its covariance."""
@@ -124,46 +122,35 @@ def propose_by_samples(evidence: Evidence, floor: Floor, rng: np.random.Generato
     size, found, drawn = sample_size(floor), Proposals.none(), 0
     if len(np.unique(evidence.tentative.features)) < size:
         return found
-    odds = _odds(evidence)
+    weight = 1.0 / evidence.tentative.places  # a feature's say is shared by its places
+    odds = weight / weight.sum()
+    pairs = evidence.pairs
+    noise = pairs.seen.position_covariance + rounded(pairs.point_covariances)
     for _ in range(_ROUNDS):
-        samples = _draw(evidence, odds, size, _SAMPLES, rng)
-        rigid_ones = samples[_rigid(evidence, samples, floor)]
+        samples = _draw(evidence, odds, size, rng)
+        here, there = pairs.seen.position[samples], pairs.points[samples]
+        rigid_ones = samples[rigid(here, there, noise[samples], floor)]
         used = rigid_ones[:_HYPOTHESES]
         share = 1.0 if len(rigid_ones) <= len(used) else len(used) / len(rigid_ones)
         drawn += int(len(samples) * share)
         if len(used):
             found = found.join(_poses(evidence, used, floor))
-        if len(found) and drawn >= _needed(evidence, found, odds, size, _CONFIDENCE):
+        if len(found) and drawn >= _needed(evidence, found, odds, size):
             break
     return found
 
 
-def _odds(evidence: Evidence) -> FloatArray:
-    """Probability of drawing each match: a feature's say is shared by its places."""
-    weight = 1.0 / evidence.tentative.places
-    return np.asarray(weight / weight.sum())
-
-
-def _draw(
-    evidence: Evidence, odds: FloatArray, size: int, count: int, rng: np.random.Generator
-) -> IntArray:
+def _draw(evidence: Evidence, odds: FloatArray, size: int, rng: np.random.Generator) -> IntArray:
     """Samples (c, size) of matches without a feature or landmark twice."""
     edges = np.cumsum(odds)
-    drawn = np.searchsorted(edges, rng.random((count, size)) * edges[-1], side="right")
+    drawn = np.searchsorted(edges, rng.random((_SAMPLES, size)) * edges[-1], side="right")
     drawn = np.minimum(drawn, len(odds) - 1)
-    keep = np.ones(count, np.bool_)
+    keep = np.ones(_SAMPLES, np.bool_)
     for a in range(size):
         for b in range(a):
             for column in (evidence.tentative.features, evidence.tentative.landmarks):
                 keep &= column[drawn[:, a]] != column[drawn[:, b]]
     return np.asarray(drawn[keep])
-
-
-def _rigid(evidence: Evidence, samples: IntArray, floor: Floor) -> BoolArray:
-    pairs = evidence.pairs
-    here, there = pairs.seen.position[samples], pairs.points[samples]
-    noise = pairs.seen.position_covariance + rounded(pairs.point_covariances)
-    return np.asarray(rigid(here, there, noise[samples], floor))
 
 
 def _poses(evidence: Evidence, samples: IntArray, floor: Floor) -> Proposals:
@@ -179,9 +166,7 @@ def _poses(evidence: Evidence, samples: IntArray, floor: Floor) -> Proposals:
     return Proposals(poses[order], covariances[order], scores[order])
 
 
-def _needed(
-    evidence: Evidence, found: Proposals, odds: FloatArray, size: int, confidence: float
-) -> float:
+def _needed(evidence: Evidence, found: Proposals, odds: FloatArray, size: int) -> float:
     """Samples after which one was clean, if the best pose's matches are all that are right."""
     agreeing = evidence.agreeing(found.poses[0], found.covariances[0])
     chance = float(odds[agreeing].sum()) ** size
@@ -189,4 +174,4 @@ def _needed(
         return np.inf
     if chance >= 1.0:
         return 1.0
-    return float(np.log(1.0 - confidence) / np.log1p(-chance))
+    return float(np.log(1.0 - _CONFIDENCE) / np.log1p(-chance))

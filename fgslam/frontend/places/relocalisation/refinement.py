@@ -127,9 +127,11 @@ class Refiner:
             _Search(wTc, covariance)
             for wTc, covariance in zip(proposals.poses, proposals.covariances, strict=True)
         ]
+        tentative = self.evidence.tentative
+        proposed = tentative.features, tentative.landmarks, tentative.distances
         for guided in (False, True):
             for one in searches:
-                one.candidates = self._around(one.wTc) if guided else self._proposed()
+                one.candidates = self._around(one.wTc, proposed) if guided else proposed
             searches = self._rested(searches)
         return [self._finish(one.wTc, one.covariance, one.chosen) for one in searches]
 
@@ -139,29 +141,20 @@ class Refiner:
         moving = searches
         for _ in range(_ROUNDS):
             for one in moving:
-                before, one.chosen = one.chosen, self._choose(one)
-                one.rests = _same(before, one.chosen)
+                i, j, cost = one.candidates
+                pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
+                off = squared_distances(residuals(self.rig, one.wTc, pairs), one.covariance)
+                near = off <= _GATE_SIGMAS**2
+                before, one.chosen = one.chosen, _one_to_one(i[near], j[near], cost[near])
+                one.rests = all(map(np.array_equal, before, one.chosen))
                 one.lost = len(one.chosen[0]) < least
             moving = [one for one in moving if not one.lost]
             self._solve(moving)
             moving = [one for one in moving if not one.lost and not one.rests]
         return [one for one in searches if not one.lost]
 
-    def _choose(self, search: _Search) -> Matches:
-        """One-to-one matches (features, landmarks) that agree with the pose."""
-        i, j, cost = search.candidates
-        pairs = Pairs.of(self.seen, i, self.known.landmarks, j)
-        squared = squared_distances(residuals(self.rig, search.wTc, pairs), search.covariance)
-        near = squared <= _GATE_SIGMAS**2
-        return _one_to_one(i[near], j[near], cost[near])
-
-    def _proposed(self) -> Candidates:
-        """The tentative matches: features, landmarks, distances."""
-        tentative = self.evidence.tentative
-        return tentative.features, tentative.landmarks, tentative.distances
-
-    def _around(self, wTc: FloatArray) -> Candidates:
-        """Pairs of features and landmarks in view that look alike, with their distances."""
+    def _around(self, wTc: FloatArray, proposed: Candidates) -> Candidates:
+        """Pairs of features and landmarks in view that look alike, then those proposed."""
         farthest = _BEYOND * float(np.abs(self.features.position[:, 2]).max())
         rows, _ = self.known.in_view(self.rig, wTc, farthest)
         views, _ = self.known.views_of(rows)
@@ -171,12 +164,8 @@ class Refiner:
         looks = (self.known.views, self.known.owners)
         keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor)
         found = i[keep], self.known.owners[v[keep]], cost[keep]
-        first = self._proposed()
-        return (
-            np.concatenate([found[0], first[0]]),
-            np.concatenate([found[1], first[1]]),
-            np.concatenate([found[2], first[2]]),
-        )
+        i, j, cost = (np.concatenate(both) for both in zip(found, proposed, strict=True))
+        return i, j, cost
 
     def _solve(self, searches: list[_Search]) -> None:
         """Least squares; landmarks of one piece of the map err together and share their weight."""
@@ -272,10 +261,6 @@ def _distances(a: ByteArray, b: ByteArray) -> FloatArray:
     x, y = a.astype(np.float32), b.astype(np.float32)
     squared = np.einsum("ij,ij->i", x, x)[:, None] + np.einsum("ij,ij->i", y, y)
     return np.asarray(np.sqrt((squared - 2.0 * (x @ y.T)).astype(np.float64)))
-
-
-def _same(a: Matches, b: Matches) -> bool:
-    return np.array_equal(a[0], b[0]) and np.array_equal(a[1], b[1])
 
 
 def _one_to_one(i: IntArray, j: IntArray, cost: FloatArray) -> Matches:

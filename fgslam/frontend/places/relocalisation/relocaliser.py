@@ -74,10 +74,13 @@ class Relocaliser:
         """
         tentative = self.tentative(features)
         seen = SeenPoints.of(features, self._rig, VIEW_SIGMA_PX)
-        evidence = self._evidence(seen, tentative)
+        landmarks = self._known.landmarks
+        pairs = Pairs.of(seen, tentative.features, landmarks, tentative.landmarks)
+        chance = log_uniform(self._rig, pairs.seen, _MAX_DISPARITY_PX, self._known.room)
+        evidence = Evidence(self._rig, tentative, pairs, chance)
         proposals = propose_by_samples(evidence, self._floor, rng)
         refined = self._refine(features, seen, evidence, proposals)
-        return accept(tentative, refined, self._known.landmarks, self._settings)
+        return accept(tentative, refined, landmarks, self._settings)
 
     def tentative(self, features: StereoFeatures) -> Tentative:
         """Matches of the features with landmarks anywhere in the map."""
@@ -89,12 +92,6 @@ class Relocaliser:
         keep = np.zeros(found.rows.shape, np.bool_)
         keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor)
         return specific(found, keep, known.owners, known.landmarks)
-
-    def _evidence(self, seen: SeenPoints, tentative: Tentative) -> Evidence:
-        landmarks = self._known.landmarks
-        pairs = Pairs.of(seen, tentative.features, landmarks, tentative.landmarks)
-        chance = log_uniform(self._rig, pairs.seen, _MAX_DISPARITY_PX, self._known.room)
-        return Evidence(self._rig, tentative, pairs, chance)
 
     def _refine(
         self,

@@ -209,16 +209,21 @@ def refine(
 
     A pose that its matches do not fix keeps its place and gets an infinite covariance.
     """
-    poses = poses.copy()
     for _ in range(iterations):
         hessians, gradients = _normal_equations(rig, poses, pairs, pose_rows, kernel_width)
-        bases = _bases(floor, poses)
-        inverses = _inverses(bases, hessians)
-        steps = np.einsum("hij,hj->hi", inverses, gradients)
+        steps = np.einsum("hij,hj->hi", _inverses(floor, poses, hessians), gradients)
         steps[~np.isfinite(steps).all(axis=1)] = 0.0
-        poses = _moved(poses, _limited(steps))
+        # No step turns by over half a radian or moves by over a metre: all is linear no more.
+        turn = np.linalg.norm(steps[:, :3], axis=1) / 0.5
+        way = np.linalg.norm(steps[:, 3:], axis=1) / 1.0
+        steps = steps / np.maximum(1.0, np.maximum(turn, way))[:, None]
+        moved = poses.copy()
+        for k, step in enumerate(steps):  # turn and move apart: planar motion stays planar
+            moved[k, :3, 3] += poses[k, :3, :3] @ step[3:]
+            moved[k, :3, :3] = poses[k, :3, :3] @ so3_exp(step[:3])
+        poses = moved
     hessians, _ = _normal_equations(rig, poses, pairs, pose_rows, None)
-    return poses, _inverses(_bases(floor, poses), hessians)
+    return poses, _inverses(floor, poses, hessians)
 
 
 def _normal_equations(
@@ -250,13 +255,9 @@ def _summed(values: FloatArray, rows: IntArray, count: int) -> FloatArray:
     return np.asarray(sums.reshape(count, d), np.float64)
 
 
-def _bases(floor: Floor, poses: FloatArray) -> FloatArray:
-    """(h, 6, dof) tangent directions that the floor allows at each pose."""
-    return np.array([floor.basis(pose) for pose in poses]).reshape(len(poses), 6, -1)
-
-
-def _inverses(bases: FloatArray, hessians: FloatArray) -> FloatArray:
-    """Inverses (h, 6, 6) on the allowed directions; infinite where undetermined."""
+def _inverses(floor: Floor, poses: FloatArray, hessians: FloatArray) -> FloatArray:
+    """Inverses (h, 6, 6) on the directions that the floor allows; infinite where undetermined."""
+    bases = np.array([floor.basis(pose) for pose in poses]).reshape(len(poses), 6, -1)
     reduced = np.swapaxes(bases, 1, 2) @ hessians @ bases
     size = np.sqrt(np.maximum(np.diagonal(reduced, axis1=1, axis2=2), 1e-300))
     scaled = reduced / (size[:, :, None] * size[:, None, :])
@@ -269,19 +270,3 @@ def _inverses(bases: FloatArray, hessians: FloatArray) -> FloatArray:
     out = bases @ inverted @ np.swapaxes(bases, 1, 2)
     out[~good] = np.inf
     return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
-
-
-def _limited(steps: FloatArray) -> FloatArray:
-    """No step turns by over half a radian or moves by over a metre: all is linear no more."""
-    turn = np.linalg.norm(steps[:, :3], axis=1) / 0.5
-    way = np.linalg.norm(steps[:, 3:], axis=1) / 1.0
-    return np.asarray(steps / np.maximum(1.0, np.maximum(turn, way))[:, None])
-
-
-def _moved(poses: FloatArray, steps: FloatArray) -> FloatArray:
-    """Rotation and translation apart: planar motion stays planar."""
-    out = poses.copy()
-    for k, step in enumerate(steps):
-        out[k, :3, 3] += poses[k, :3, :3] @ step[3:]
-        out[k, :3, :3] = poses[k, :3, :3] @ so3_exp(step[:3])
-    return out
