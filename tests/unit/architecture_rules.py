@@ -445,7 +445,6 @@ PRIVATE_IN_TESTS = frozenset(
     {
         "tests/integration/test_lab_sequence.py",
         "tests/unit/backend/test_error_columns.py",
-        "tests/unit/backend/test_landmark_kalman.py",
         "tests/unit/backend/test_recorded_inputs.py",
         "tests/unit/backend/test_rig_doubt.py",
         "tests/unit/backend/test_sampled_errors.py",

@@ -18,8 +18,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filters.filtered import FilteredTrajectory, moved, placed
+from fgslam.backend.filters.filtered import FilteredTrajectory, moved
 from fgslam.backend.filters.landmark_rows import LandmarkRows
+from fgslam.backend.filters.landmark_update import (
+    MISS_GROWTH_M,
+    FrameUpdate,
+    Landmarks,
+    UpdateKind,
+    average_weight,
+)
 from fgslam.backend.filters.loop_correction import (
     Chain,
     DriveRecord,
@@ -37,15 +44,7 @@ from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
-from fgslam.core.geometry import (
-    congruence,
-    inverse,
-    inverse_spd3,
-    point_pose_jacobian,
-    project,
-    projection_jacobian,
-    transform_to_camera,
-)
+from fgslam.core.geometry import inverse, inverse_spd3
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import Kept
@@ -55,7 +54,6 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 _CONTRADICTED = 2.0
 """Sigmas of a measured disparity by which landmarks are off, rms, where a change of the rig's
 correction contradicts them: there the ego-motion's kernel bends."""
-_MISS_GROWTH_M = 0.0001  # added to a landmark's deviation on a miss (6.4, which gives no number)
 
 
 class LandmarkKalman:
@@ -63,6 +61,7 @@ class LandmarkKalman:
 
     kind: ClassVar[str] = "landmark_kalman"
     supports: ClassVar[frozenset[MeasurementType]] = frozenset(MeasurementType)
+    updates: ClassVar[type[FrameUpdate]] = FrameUpdate
     _current: Kept[Prediction]
     _past: Kept[FilteredTrajectory]
     _rows: Kept[LandmarkRows]
@@ -134,12 +133,13 @@ class LandmarkKalman:
         shared = self._settings.pose_covariance and not guessed(increment, tracking)
         # With the stated noise, like all that landmarks are weighed by.
         self._by_pose = tracking.covariance / tracking.noise if shared else None
-        matched = increment.observations.select(~increment.observations.is_new)
-        used = matched.select(tracking.inliers)
+        new = increment.observations.is_new
+        used = increment.observations.select(~new).select(tracking.inliers)
         self._errors.track(step, used, self._rows.map())
-        nis, dof = self._update_matched(used)
-        self._grow(increment.missed_ids)
-        self._add(increment.observations.select(increment.observations.is_new), len(self._past))
+        nis = self._update_matched(used)  # type III
+        missed = self._rows.rows(increment.missed_ids)  # type II
+        self._rows.covariances[missed] += MISS_GROWTH_M**2 * np.eye(3)
+        self._add(increment.observations.select(new), len(self._past))  # type IV
         self._record(increment, tracking, step.before, used.ids)
         self._rows.remove(increment.pruned_ids)
         self._errors.forget(increment.pruned_ids)
@@ -150,7 +150,9 @@ class LandmarkKalman:
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         current = self._errors.pose(self._current)
         self._past.covariances[-1] = current.covariance
-        return UpdateStats(current.wTc, current.covariance, len(self._rows), nis, dof, closed)
+        return UpdateStats(
+            current.wTc, current.covariance, len(self._rows), nis, 3 * len(used), closed
+        )
 
     @property
     def homes(self) -> IntArray:
@@ -255,111 +257,46 @@ class LandmarkKalman:
         self._errors.close(loop, self._rows.map(), poses[-1], moved)
         return True
 
-    def _update_matched(self, observed: Observations) -> tuple[float, int]:
-        """Updates matched landmarks (type III); innovation squared and its degrees of freedom."""
+    @property
+    def _frame(self) -> FrameUpdate:
+        """The updates by the last frame."""
+        return self.updates(self._rig, self._current.wTc, self._by_pose)
+
+    def _update_matched(self, observed: Observations) -> float:
+        """Updates matched landmarks; their innovation squared."""
         if not len(observed):
-            return float("nan"), 0
-        rows = self._rows.rows(observed.ids)
-        self._rows.lasts[rows] = len(self._past)
-        before = self._rows.positions[rows], self._rows.covariances[rows]
-        if self._settings.update == "pixel":
-            nis = self._pixel_update(rows, observed)
-        elif self._settings.update == "world":
-            nis = self._world_update(rows, observed)
-        else:
-            nis = self._average(rows, observed)
-        if self._fixed:
-            self._rows.positions[rows], self._rows.covariances[rows] = before
-        else:
-            self._errors.filter(self._share(rows, before[1]))
-            self._rows.counts[rows] += 1
-        return nis, 3 * len(rows)
-
-    def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
-        """Kalman update on (column, row, disparity), linearised at the landmark.
-
-        With H the Jacobian by the landmark, S its covariance and R that of the measurement (plus
-        the pose's, ``J P J^T``): K = S H^T (H S H^T + R)^-1, and S becomes
-        (I - K H) S (I - K H)^T + K R K^T (Joseph's form). Se et al. 6.4 update in world axes.
-        """
-        wTc = self._current.wTc
-        points = transform_to_camera(wTc, self._rows.positions[rows])
-        jacobian = projection_jacobian(self._rig, points)
-        noise = observed.covariance
-        if self._by_pose is not None:
-            by_pose = jacobian @ point_pose_jacobian(points)
-            noise = noise + congruence(by_pose, self._by_pose)
-        expected = project(self._rig, points)
-        innovation = observed.measurement - expected
-        return self._kalman(rows, jacobian @ wTc[:3, :3].T, innovation, noise)
-
-    def _world_update(self, rows: IntArray, observed: Observations) -> float:
-        """Kalman fusion of the observed 3-D position with the landmark's (6.4): H = I above."""
-        positions, noise = self._observed_positions(observed)
-        identity = np.broadcast_to(np.eye(3), noise.shape)
-        return self._kalman(rows, identity, positions - self._rows.positions[rows], noise)
-
-    def _kalman(
-        self, rows: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
-    ) -> float:
-        before = self._rows.covariances[rows]
-        precision = inverse_spd3(congruence(jacobian, before) + noise)
-        gain = before @ np.swapaxes(jacobian, 1, 2) @ precision
-        self._rows.positions[rows] += np.einsum("kij,kj->ki", gain, innovation)
-        keep = np.eye(3) - gain @ jacobian
-        self._rows.covariances[rows] = congruence(keep, before) + congruence(gain, noise)
-        return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
-
-    def _average(self, rows: IntArray, observed: Observations) -> float:
-        """Averaging of Se et al. 4.1: a running mean of all sightings, or half old and half new.
-
-        The position becomes (1 - w) s + w s', the covariance (1 - w)^2 S + w^2 S', with w one over
-        the number of sightings, or one half.
-        """
-        positions, noise = self._observed_positions(observed)
-        before = self._rows.positions[rows]
-        innovation = positions - before
-        precision = inverse_spd3(self._rows.covariances[rows] + noise)
-        weight = self._weight(rows)
-        self._rows.positions[rows] = before + weight * innovation
-        squared = (weight**2)[:, :, None]
-        kept = ((1.0 - weight) ** 2)[:, :, None]
-        self._rows.covariances[rows] = kept * self._rows.covariances[rows] + squared * noise
-        return float(np.einsum("ki,kij,kj->", innovation, precision, innovation))
-
-    def _weight(self, rows: IntArray) -> FloatArray:
-        """(k, 1) of a sighting in the averages of 4.1."""
-        if self._settings.update == "half":
-            return np.full((len(rows), 1), 0.5)
-        return np.asarray(1.0 / (self._rows.counts[rows, None] + 1.0))
-
-    def _share(self, rows: IntArray, before: FloatArray) -> FloatArray:
-        """(k, 3, 3) of the way to where the frame has them that landmarks have moved.
-
-        Of a Kalman filter's K H, from the covariances (k, 3, 3) before and after: (I - K H) S.
-        """
-        if self._settings.update in ("running_mean", "half"):
-            return self._weight(rows)[:, :, None] * np.eye(3)
-        extra = lacking(before)
-        after = self._rows.covariances[rows] + extra
-        return np.asarray(np.eye(3) - after @ inverse_spd3(before + extra))
-
-    def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
-        """World positions (k, 3) of single observations, and covariances (k, 3, 3)."""
-        measurement, noise = observed.measurement, observed.covariance
-        return placed(self._rig, self._current.wTc, measurement, noise, self._by_pose)
-
-    def _grow(self, ids: IntArray) -> None:
-        """Expands the ellipsoids of missed landmarks (type II, Se et al. 6.4)."""
-        if len(ids):
-            rows = self._rows.rows(ids)
-            self._rows.covariances[rows] += _MISS_GROWTH_M**2 * np.eye(3)
+            return float("nan")
+        held, kind = self._rows, self._settings.update
+        rows = held.rows(observed.ids)
+        held.lasts[rows] = len(self._past)
+        known = Landmarks(held.positions[rows], held.covariances[rows])
+        counts = held.counts[rows].astype(np.float64)
+        found = self._frame.update(kind, known, counts, observed)
+        if not self._fixed:
+            held.positions[rows], held.covariances[rows] = found.positions, found.covariances
+            share = moved_share(kind, known.covariances, found.covariances, counts)
+            self._errors.filter(share)
+            held.counts[rows] += 1
+        return found.nis
 
     def _add(self, observed: Observations, frame: int) -> None:
         """Adds new landmarks (type IV) where this frame sees them."""
         if not len(observed):
             return
-        positions, covariances = self._observed_positions(observed)
+        positions, covariances = self._frame.place(observed)
         self._rows.add(observed.ids, positions, covariances, frame)
         placed = PoseProblem(positions, covariances, observed.measurement, observed.covariance)
         self._errors.add(observed.ids, placed, self._current.wTc)
+
+
+def moved_share(
+    kind: UpdateKind, before: FloatArray, after: FloatArray, counts: FloatArray
+) -> FloatArray:
+    """(k, 3, 3) of the way to where the frame has them that landmarks have moved.
+
+    Of a Kalman filter's K H, from the covariances (k, 3, 3) before and after: (I - K H) S.
+    """
+    if kind in ("running_mean", "half"):
+        return average_weight(kind, counts)[:, :, None] * np.eye(3)
+    extra = lacking(before)
+    return np.asarray(np.eye(3) - (after + extra) @ inverse_spd3(before + extra))

@@ -16,8 +16,9 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_update import FrameUpdate, Landmarks, UpdateKind
 from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.floor import Floor
@@ -30,7 +31,7 @@ from fgslam.core.geometry import (
     transform_to_world,
     triangulate,
 )
-from fgslam.core.measurements import Increment, MeasurementType, Observations
+from fgslam.core.measurements import Increment, Observations
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
@@ -281,13 +282,69 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(directions[:, kept] * np.sqrt(variances[kept]))
 
 
+class EliminatedUpdate(FrameUpdate):
+    """The updates by elimination, of one graph for each landmark."""
+
+    def update_by_pixels(self, known: Landmarks, observed: Observations) -> Landmarks:
+        """Stereo factor and prior of each landmark, linearised at the landmark."""
+        return _moved(known, self._eliminated(known.positions, known.covariances, observed))
+
+    def update_by_positions(self, known: Landmarks, observed: Observations) -> Landmarks:
+        """Two priors on each landmark: what was known, and the position observed."""
+        positions, noise = self.place(observed)
+        return _moved(known, fused(known.covariances, positions - known.positions, noise))
+
+    def update_average(
+        self, known: Landmarks, observed: Observations, kind: UpdateKind, counts: FloatArray
+    ) -> Landmarks:
+        """Equal weights: what was known counts as its sightings (or as one), the new one as one.
+
+        The minimum's curvature is then the weights', not the errors'. The elimination gives the
+        gain, which carries the errors' covariances; the innovation is weighed by these.
+        """
+        positions, noise = self.place(observed)
+        offsets = positions - known.positions
+        one = np.tile(np.eye(3), (len(offsets), 1, 1))
+        weights = counts if kind == "running_mean" else np.ones(len(offsets))
+        mean = fused(one / weights[:, None, None], offsets, one)
+        gain = mean.covariances  # the new sighting's information is the identity
+        return Landmarks(
+            known.positions + mean.steps,
+            congruence(one - gain, known.covariances) + congruence(gain, noise),
+            fused(known.covariances, offsets, noise).misfit,
+        )
+
+    def place(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
+        """A stereo factor alone, eliminated where it is met exactly."""
+        points = triangulate(self.rig, observed.measurement)
+        positions = transform_to_world(self.wTc, points)
+        return positions, self._eliminated(positions, None, observed).covariances
+
+    def _eliminated(
+        self, positions: FloatArray, priors: FloatArray | None, observed: Observations
+    ) -> Eliminated:
+        factors = StereoFactors(self.rig, Whitening())
+        values = gtsam.Values()
+        values.insert(_POSE, gtsam.Pose3(self.wTc))
+        values.insert(_LANDMARK, np.zeros(3))
+        linear = []
+        for position, measured, noise in zip(
+            positions, observed.measurement, observed.covariance, strict=True
+        ):
+            values.update(_LANDMARK, position)
+            linear.append(factors.factor(_POSE, _LANDMARK, measured, noise).linearize(values))
+        return LandmarkElimination(self.pose_covariance).observed(linear, priors)
+
+
+def _moved(known: Landmarks, found: Eliminated) -> Landmarks:
+    return Landmarks(known.positions + found.steps, found.covariances, found.misfit)
+
+
 class LandmarkKalmanGraph(LandmarkKalman):
     """Estimator of kind ``landmark_kalman_graph``; all but the updates is the closed form's."""
 
     kind: ClassVar[str] = "landmark_kalman_graph"
-    supports: ClassVar[frozenset[MeasurementType]] = frozenset(
-        {MeasurementType.ODOMETRY, MeasurementType.STEREO, MeasurementType.LOOP}
-    )
+    updates: ClassVar[type[FrameUpdate]] = EliminatedUpdate
 
     def __init__(
         self,
@@ -310,7 +367,6 @@ class LandmarkKalmanGraph(LandmarkKalman):
         )
         super().__init__(rig, closed_form, prior, ego_motion)
         self._pose_graph = FixedMapPose(rig, ego_motion)
-        self._cameras = rig
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """As the closed form, with the frame's pose from its graph.
@@ -329,66 +385,6 @@ class LandmarkKalmanGraph(LandmarkKalman):
             )
             tracking = dataclasses.replace(tracking, wTc=found.wTc, covariance=found.covariance)
         return super().update(increment, tracking)
-
-    # -- the landmarks' algebra, by elimination ------------------------------------------------
-
-    def _pixel_update(self, rows: IntArray, observed: Observations) -> float:
-        """Stereo factor and prior of each landmark, linearised at the landmark."""
-        known = self._rows
-        found = self._eliminated(known.positions[rows], known.covariances[rows], observed)
-        return self._apply(rows, found)
-
-    def _world_update(self, rows: IntArray, observed: Observations) -> float:
-        """Two priors on each landmark: what was known, and the position observed."""
-        positions, noise = self._observed_positions(observed)
-        offsets = positions - self._rows.positions[rows]
-        return self._apply(rows, fused(self._rows.covariances[rows], offsets, noise))
-
-    def _average(self, rows: IntArray, observed: Observations) -> float:
-        """Equal weights: what was known counts as its sightings (or as one), the new one as one.
-
-        The minimum's curvature is then the weights', not the errors'. The elimination gives the
-        gain, which carries the errors' covariances; the innovation is weighed by these.
-        """
-        positions, noise = self._observed_positions(observed)
-        known = self._rows.covariances[rows]
-        offsets = positions - self._rows.positions[rows]
-        one = np.tile(np.eye(3), (len(rows), 1, 1))
-        counts = np.ones(len(rows))
-        if self._settings.update == "running_mean":
-            counts = self._rows.counts[rows].astype(np.float64)
-        mean = fused(one / counts[:, None, None], offsets, one)
-        gain = mean.covariances  # the new sighting's information is the identity
-        self._rows.positions[rows] += mean.steps
-        self._rows.covariances[rows] = congruence(one - gain, known) + congruence(gain, noise)
-        return fused(known, offsets, noise).misfit
-
-    def _observed_positions(self, observed: Observations) -> tuple[FloatArray, FloatArray]:
-        """A stereo factor alone, eliminated where it is met exactly."""
-        points = triangulate(self._cameras, observed.measurement)
-        positions = transform_to_world(self._current.wTc, points)
-        return positions, self._eliminated(positions, None, observed).covariances
-
-    def _eliminated(
-        self, positions: FloatArray, priors: FloatArray | None, observed: Observations
-    ) -> Eliminated:
-        by_pose = self._by_pose
-        factors = StereoFactors(self._cameras, Whitening())
-        values = gtsam.Values()
-        values.insert(_POSE, gtsam.Pose3(self._current.wTc))
-        values.insert(_LANDMARK, np.zeros(3))
-        linear = []
-        for position, measured, noise in zip(
-            positions, observed.measurement, observed.covariance, strict=True
-        ):
-            values.update(_LANDMARK, position)
-            linear.append(factors.factor(_POSE, _LANDMARK, measured, noise).linearize(values))
-        return LandmarkElimination(by_pose).observed(linear, priors)
-
-    def _apply(self, rows: IntArray, found: Eliminated) -> float:
-        self._rows.positions[rows] += found.steps
-        self._rows.covariances[rows] = found.covariances
-        return found.misfit
 
 
 def _require_depth(increment: Increment, inliers: BoolArray, world: bool) -> None:

@@ -23,6 +23,7 @@ from simulated import (
 )
 
 from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.landmark_update import MISS_GROWTH_M
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
@@ -279,10 +280,7 @@ def test_trace_falls_on_a_hit(
         assert (np.trace(difference, axis1=1, axis2=2) > 0).all()
 
 
-def test_a_miss_grows_the_missed_ones_by_the_stated_amount(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("fgslam.backend.filters.landmark_kalman._MISS_GROWTH_M", 0.02)
+def test_a_miss_grows_the_missed_ones_by_the_stated_amount(rng: np.random.Generator) -> None:
     estimator, _ = started(6, rng)
     before = estimator.estimate().landmarks
     missed = frame(1, NO_IDS, np.empty((0, 3)), False, missed=np.array([1, 4]))
@@ -291,7 +289,7 @@ def test_a_miss_grows_the_missed_ones_by_the_stated_amount(
     np.testing.assert_array_equal(after.positions, before.positions)
     grown = after.covariances - before.covariances
     for i in (1, 4):
-        np.testing.assert_allclose(grown[i], 0.02**2 * np.eye(3), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(grown[i], MISS_GROWTH_M**2 * np.eye(3), rtol=0, atol=1e-15)
     for i in (0, 2, 3, 5):
         np.testing.assert_array_equal(grown[i], 0.0)
 
