@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, moved, placed
+from fgslam.backend.filters.filtered import FilteredTrajectory, moved, placed, triangulated
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
@@ -96,7 +96,7 @@ class DeadReckoning:
 
     def _add(self, observed: Observations) -> None:
         """Adds new landmarks (type IV): their own noise and the pose's, at this frame."""
-        observed = FirstSights.of(self._sensor, observed).observed
+        observed = triangulated(self._sensor, observed)[0]
         wTc, covariance = self._current.wTc, self._current.covariance
         new, around = placed(
             self._sensor, wTc, observed.measurement, observed.covariance, covariance

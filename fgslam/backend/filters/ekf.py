@@ -2,41 +2,47 @@
 
 The costly alternative that Se, Lowe and Little (2001, 6) name and set aside; Smith, Self and
 Cheeseman (1990). In the graph's terms a smoother that marginalises every past pose and never
-linearises a measurement anew. Derivation: docs/derivations/ekf.md.
+linearises a measurement anew. With F the motion's Jacobian and Q its noise, H the measurements' and
+R theirs, a frame is
+
+    x = f(x),    P = F P F^T + Q                                      (FullEkf.predict)
+    S = H P H^T + R,    K = P H^T S^-1,    x + K v,    P - K S K^T    (correct)
+
+and new landmarks are correlated with all there is through the pose. Derivation:
+docs/derivations/ekf.md.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
 
-from fgslam.backend.filters.ekf_update import (
-    Correction,
-    DivergedError,
-    FloorMeasurement,
-    Matches,
-    Sightings,
-    correct,
-    correct_anew,
-)
-from fgslam.backend.filters.filtered import FilteredTrajectory, FirstSights, require_finite
-from fgslam.backend.filters.growing_covariance import BLOCK, FRONT, GrowingCovariance, rows_of
+from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.filters.loop_correction import within_gate
 from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.settings import EkfSettings
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
     congruence,
+    in_front,
     inverse,
     moved_apart,
     point_pose_jacobian,
+    project,
+    projection_jacobian,
     reorthonormalise,
     se3_exp,
+    se3_log_jacobian,
+    so3_log,
+    transform_to_camera,
     transform_to_world,
 )
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
@@ -44,8 +50,107 @@ from fgslam.core.quantiles import chi_square_quantile
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import Kept
 
+FRONT = 6
+"""The pose's rows and columns come first."""
+BLOCK = 3
+"""Rows and columns of a landmark."""
 _UNKNOWN = 100.0  # by which a pose found without a prior is less certain before its landmarks count
 _ADMITTED = 0.999  # quantile of an innovation squared beyond which the covariance is contradicted
+_ITERATIONS = 30
+_SETTLED = 1e-5  # radians and metres: far below what any measurement resolves
+_NEGATIVE = 1e-10  # of the largest variance: rounding of a pose covariance that is singular
+_SLAB = 192  # rows updated at once: large enough for the product's speed, small enough for cache
+_GROWTH = 1.2
+
+
+def correct(
+    covariance: GrowingCovariance,
+    front: FloatArray,
+    matches: Matches,
+    floor: FloorMeasurement,
+    gate_sigmas: float,
+) -> Correction:
+    """One Kalman correction by all matches within the gate, and the floor, at once.
+
+    S = H P H^T + R, K = P H^T S^-1, step K v, and P loses K S K^T (docs/derivations/ekf.md). Only
+    the pose's columns and those of the observed landmarks enter; with n rows of state and m of
+    measurement the gain costs ``n m^2``, the covariance's update ``n^2 m``.
+
+    Args:
+        covariance: of the state before the frame.
+        front: (n, 6) the predicted pose's columns, which replace those in ``covariance``.
+        matches: linearised at the predicted state.
+        floor: linearised there, too.
+        gate_sigmas: largest Mahalanobis distance of a match's own innovation; 0: any.
+
+    Raises:
+        DivergedError: the state's covariance is, or would become, not finite or not definite.
+    """
+    cross, innovation_covariance = _with_landmarks(covariance, front, matches)
+    kept = _within_gate(matches, innovation_covariance, gate_sigmas)
+    rows = np.flatnonzero(np.repeat(kept, 3))
+    cross, s = cross[:, rows], innovation_covariance[np.ix_(rows, rows)]
+    innovation = np.concatenate([matches.innovation[kept].ravel(), floor.innovation])
+    cross, s = _with_floor(cross, s, front, floor)
+    root = _root(s, "an innovation's covariance")
+    gain = cho_solve((root, True), cross.T, check_finite=False).T
+    step = gain @ innovation
+    half = cross - 0.5 * (gain @ s)
+    _require_definite(covariance, front, gain, half)
+    count = len(rows)
+    whitened = solve_triangular(
+        root[:count, :count], innovation[:count], lower=True, check_finite=False
+    )
+    nis = float(whitened @ whitened) if count else float("nan")
+    return Correction(step, gain, half, nis, count, len(matches))
+
+
+def correct_iterated(
+    covariance: GrowingCovariance, matches_at: Callable[[FloatArray], Matches], fixed: bool
+) -> Correction:
+    """One correction by all matches, linearised at its own result, for large innovations.
+
+    The iterated Kalman filter (Bell and Cathey 1993), Gauss-Newton on state and measurement at
+    once; without gate and floor.
+
+    Args:
+        covariance: of the state.
+        matches_at: from a step (n,) to the matches linearised there, their innovation as of the
+            state before it.
+        fixed: landmarks are not to change.
+
+    Raises:
+        DivergedError: as :func:`correct`, or it does not settle.
+    """
+    front = covariance.front()
+    step = np.zeros(len(front))
+    nowhere = FloorMeasurement(np.empty(0), np.empty((0, FRONT)), np.empty(0))
+    for _ in range(_ITERATIONS):
+        found = correct(covariance, front, matches_at(step), nowhere, gate_sigmas=0.0)
+        if fixed:
+            found = found.of_the_pose_alone()
+        change = float(np.abs(found.step - step).max())
+        if change < _SETTLED:
+            return found
+        step = found.step
+    raise DivergedError(f"the correction does not settle ({change:.2g} after {_ITERATIONS} steps)")
+
+
+def _with_landmarks(
+    covariance: GrowingCovariance, front: FloatArray, matches: Matches
+) -> tuple[FloatArray, FloatArray]:
+    """``P H^T`` (n, 3k) and ``H P H^T + R`` (3k, 3k) of the matches."""
+    n, k = len(front), len(matches)
+    rows = rows_of(matches.blocks)
+    columns = covariance.columns(rows.ravel())
+    columns[:FRONT] = front[rows.ravel()].T
+    by_block = columns.reshape(n, k, 3).swapaxes(0, 1) @ matches.by_landmark.swapaxes(1, 2)
+    by_pose = matches.by_pose.reshape(-1, FRONT)
+    cross = by_block.swapaxes(0, 1).reshape(n, 3 * k) + front @ by_pose.T
+    s = by_pose @ cross[:FRONT] + (matches.by_landmark @ cross[rows]).reshape(3 * k, 3 * k)
+    s = 0.5 * (s + s.T)
+    s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] += matches.noise
+    return cross, s
 
 
 class FullEkf:
@@ -127,10 +232,15 @@ class FullEkf:
             self._past.require_later(increment)
         else:
             self._past.require_step(increment)
-        first = self._first_sights(increment)
-        self._require_room(increment, len(first.points))
-        require_finite(increment)
         seen = increment.observations
+        # What is begun and merged away in one frame is not begun at all.
+        merged = seen.is_new & np.isin(seen.ids, increment.pruned_ids)
+        new = seen.select(seen.is_new & ~merged & ~np.isin(seen.ids, self._ids))
+        first = triangulated(self._sensor, new)
+        leaving = int(np.isin(self._ids, increment.pruned_ids).sum())
+        count = len(self._ids) - leaving + len(first[0])
+        self._require_space(f"frame {increment.index}", count)
+        require_finite(increment)
         if increment.relocalised:
             wTc, front = self._at_tracked_pose(tracking)
             seen = seen.select(np.flatnonzero(~seen.is_new)[tracking.inliers])
@@ -139,14 +249,14 @@ class FullEkf:
         found = self._correction(increment, seen, wTc, front)
         found = found.of_the_pose_alone() if self._fixed else found
         # Nothing below can fail.
-        self._take_over(found, wTc, front)
-        used = found.matched + len(first.points)
-        every = increment.observations
-        merged = every.is_new & np.isin(every.ids, increment.pruned_ids)
-        self._skipped += len(every) - used - int(merged.sum())
+        self._apply(found, wTc, front)
+        self._matched += found.matched
+        self._gated += found.matched - found.nis_dof // BLOCK
+        left_out = len(increment.observations) - found.matched - len(first[0])
+        self._skipped += left_out - int(merged.sum())
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         self._drop(increment)
-        self._add(first)
+        self._add(*first)
         self._doubt.observe(increment, self._wTc)
         current = self._doubt.pose(Prediction(self._wTc, self._covariance.front()[:FRONT]))
         self._past.append(increment.timestamp, current)
@@ -189,17 +299,6 @@ class FullEkf:
         self._map = None
 
     # -- what may fail, before anything is changed ---------------------------------------------
-
-    def _first_sights(self, increment: Increment) -> FirstSights:
-        seen = increment.observations
-        # What is begun and merged away in one frame, as in older logs, is not begun at all.
-        known = np.concatenate([self._ids, increment.pruned_ids])
-        new = seen.is_new & ~np.isin(seen.ids, known)
-        return FirstSights.of(self._sensor, increment.observations.select(new))
-
-    def _require_room(self, increment: Increment, new: int) -> None:
-        leaving = int(np.isin(self._ids, increment.pruned_ids).sum())
-        self._require_space(f"frame {increment.index}", len(self._ids) - leaving + new)
 
     def _require_space(self, where: str, count: int) -> None:
         if count > self._settings.max_landmarks:
@@ -264,10 +363,19 @@ class FullEkf:
         if not len(seen):
             self._remarks.append(f"{what} left out: none of its landmarks is held any more")
             return False
-        blocks, at = self._blocks(seen.ids), self._positions
-        again = Sightings(self._sensor, blocks, at[blocks], seen, self._retracted, self._fixed)
+        blocks = self._blocks(seen.ids)
+
+        def matches_at(step: FloatArray) -> Matches:
+            moved = step[FRONT:].reshape(-1, 3)[blocks]
+            there = self._retracted(self._wTc, step[:FRONT])
+            positions = self._positions[blocks] + moved
+            found = Matches.of(self._sensor, there, np.arange(len(moved)), positions, seen)
+            since = found.by_pose @ step[:FRONT]
+            since += np.einsum("kij,kj->ki", found.by_landmark, moved[found.blocks])
+            return replace(found, blocks=blocks[found.blocks], innovation=found.innovation + since)
+
         try:
-            found = correct_anew(self._covariance, self._wTc, again)
+            found = correct_iterated(self._covariance, matches_at, self._fixed)
         except DivergedError as cause:
             self._remarks.append(f"{what} left out: {cause}")
             return False
@@ -282,11 +390,6 @@ class FullEkf:
         return True
 
     # -- the change itself ---------------------------------------------------------------------
-
-    def _take_over(self, found: Correction, wTc: FloatArray, front: FloatArray) -> None:
-        self._apply(found, wTc, front)
-        self._matched += found.matched
-        self._gated += found.matched - found.nis_dof // BLOCK
 
     def _apply(self, found: Correction, wTc: FloatArray, front: FloatArray) -> None:
         self._covariance.set_front(front)
@@ -321,20 +424,20 @@ class FullEkf:
             remaining = self._covariance.drop(gone)
             self._ids, self._positions = self._ids[remaining], self._positions[remaining]
 
-    def _add(self, first: FirstSights) -> None:
+    def _add(self, observed: Observations, points: FloatArray, covariances: FloatArray) -> None:
         """New landmarks, correlated with all there is through the pose they were seen from."""
-        if not len(first.points):
+        if not len(points):
             return
-        by_pose = -self._wTc[:3, :3] @ point_pose_jacobian(first.points)
+        by_pose = -self._wTc[:3, :3] @ point_pose_jacobian(points)
         flat = by_pose.reshape(-1, FRONT)
         front = self._covariance.front()
         square = congruence(flat, front[:FRONT])
-        own = congruence(self._wTc[:3, :3], first.covariances)
+        own = congruence(self._wTc[:3, :3], covariances)
         at = BLOCK * np.arange(len(own))[:, None] + np.arange(BLOCK)
         square[at[:, :, None], at[:, None, :]] += own
         self._covariance.append(front @ flat.T, square)
-        self._ids = np.concatenate([self._ids, first.observed.ids])
-        positions = transform_to_world(self._wTc, first.points)
+        self._ids = np.concatenate([self._ids, observed.ids])
+        positions = transform_to_world(self._wTc, points)
         self._positions = np.concatenate([self._positions, positions])
 
     def _blocks(self, ids: IntArray) -> IntArray:
@@ -342,3 +445,318 @@ class FullEkf:
         order = np.argsort(self._ids, kind="stable")
         known = LandmarkMap(self._ids[order], self._positions, np.empty(0))
         return order[known.rows(ids)]
+
+
+# --------------------------------------------------------------------------------------------
+# What a correction is made of
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """Observations of known landmarks, linearised at a pose.
+
+    Attributes:
+        blocks: (k,) landmark blocks of the covariance.
+        innovation: (k, 3) measured less expected.
+        by_pose: (k, 3, 6) d(measurement)/d(tangent of the pose).
+        by_landmark: (k, 3, 3) d(measurement)/d(position in the world).
+        noise: (k, 3, 3) covariance of the measurement.
+    """
+
+    blocks: IntArray
+    innovation: FloatArray
+    by_pose: FloatArray
+    by_landmark: FloatArray
+    noise: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.blocks)
+
+    @staticmethod
+    def of(
+        sensor: CameraRig,
+        wTc: FloatArray,
+        blocks: IntArray,
+        positions: FloatArray,
+        observed: Observations,
+    ) -> Matches:
+        """Linearises at the landmarks' positions (k, 3); those not before the sensor drop out."""
+        points = transform_to_camera(wTc, positions)
+        usable = in_front(points)
+        points, observed = points[usable], observed.select(usable)
+        jacobian = projection_jacobian(sensor, points)
+        return Matches(
+            blocks[usable],
+            observed.measurement - project(sensor, points),
+            jacobian @ point_pose_jacobian(points),
+            jacobian @ wTc[:3, :3].T,
+            observed.covariance,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorMeasurement:
+    """A soft floor as a measurement of the pose, which is zero up to the floor's deviations.
+
+    Height along the vertical, and for 3 degrees of freedom the tilt about the nearest upright
+    rotation, as the graphs' floor factors have it.
+
+    Attributes:
+        innovation: (m,) metres, radians; m is 0 without a soft floor, else 1 or 3.
+        jacobian: (m, 6) by the tangent of the pose.
+        variance: (m,) of it.
+    """
+
+    innovation: FloatArray
+    jacobian: FloatArray
+    variance: FloatArray
+
+    @staticmethod
+    def of(floor: Floor, wTc: FloatArray) -> FloorMeasurement:
+        """At a predicted pose."""
+        if floor.hard or floor.dof == 6:
+            return FloorMeasurement(np.empty(0), np.empty((0, 6)), np.empty(0))
+        height, by_height = floor.down @ wTc[:3, 3], np.zeros((1, 6))
+        by_height[0, 3:] = floor.down @ wTc[:3, :3]
+        variance = np.array([floor.height_sigma_m**2])
+        if floor.dof == 5:
+            return FloorMeasurement(np.array([-height]), by_height, variance)
+        upright = floor.constrain(wTc)[:3, :3]
+        turned = np.zeros(6)
+        turned[:3] = so3_log(upright.T @ wTc[:3, :3])
+        axes = floor.horizontal.T @ upright
+        by_tilt = np.zeros((2, 6))
+        by_tilt[:, :3] = axes @ se3_log_jacobian(turned)[:3, :3]
+        return FloorMeasurement(
+            np.array([-height, *(-axes @ turned[:3])]),
+            np.concatenate([by_height, by_tilt]),
+            np.array([*variance, *[floor.tilt_sigma_rad**2] * 2]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Correction:
+    """What a frame's measurements do to the state.
+
+    Attributes:
+        step: (n,) change of the state, the pose's in its tangent space.
+        gain: (n, m) Kalman gain K.
+        half: (n, m) ``P H^T - K S / 2``: the covariance loses ``K half^T + half K^T``, which is
+            Joseph's form for any K.
+        nis, nis_dof: innovation squared of the matches that passed the gate.
+        matched: matches before the gate.
+    """
+
+    step: FloatArray
+    gain: FloatArray
+    half: FloatArray
+    nis: float
+    nis_dof: int
+    matched: int
+
+    def of_the_pose_alone(self) -> Correction:
+        """The same for landmarks that are not to change (Schmidt's filter).
+
+        With the landmarks' rows of K zero, ``K S`` keeps the pose's rows alone. Since K is that of
+        the least variance, ``K S = P H^T`` and ``half = P H^T / 2``: the landmarks' rows of the new
+        half are the whole ``P H^T``. Their uncertainty still counts, and so does what the pose has
+        in common with it.
+        """
+        step, gain, half = self.step.copy(), self.gain.copy(), self.half.copy()
+        step[FRONT:], gain[FRONT:] = 0.0, 0.0
+        half[FRONT:] *= 2.0
+        return replace(self, step=step, gain=gain, half=half)
+
+
+class DivergedError(Exception):
+    """A matrix that is no covariance any more, named; the filter makes an EstimatorError of it."""
+
+
+def _within_gate(matches: Matches, s: FloatArray, gate_sigmas: float) -> BoolArray:
+    """Mask (k,) of matches whose own innovation is within the gate of its own covariance."""
+    k = len(matches)
+    if gate_sigmas == 0.0 or not k:
+        return np.ones(k, np.bool_)
+    own = s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+    roots = _root(own, "an innovation's covariance")
+    whitened = np.linalg.solve(roots, matches.innovation[:, :, None])[:, :, 0]
+    return np.asarray((whitened**2).sum(axis=1) <= gate_sigmas**2)
+
+
+def _with_floor(
+    cross: FloatArray, s: FloatArray, front: FloatArray, floor: FloorMeasurement
+) -> tuple[FloatArray, FloatArray]:
+    """The same with the floor's rows after the matches'."""
+    if not len(floor.innovation):
+        return cross, s
+    joint = floor.jacobian @ cross[:FRONT]
+    by_floor = front @ floor.jacobian.T
+    own = floor.jacobian @ by_floor[:FRONT] + np.diag(floor.variance)
+    return np.hstack([cross, by_floor]), np.block([[s, joint.T], [joint, own]])
+
+
+def _require_definite(
+    covariance: GrowingCovariance, front: FloatArray, gain: FloatArray, half: FloatArray
+) -> None:
+    """Raises DivergedError where the pose's block, or a landmark's, would not be a covariance."""
+    pose = front[:FRONT] - gain[:FRONT] @ half[:FRONT].T - half[:FRONT] @ gain[:FRONT].T
+    if not np.isfinite(pose).all():
+        raise DivergedError("the pose's covariance is not finite")
+    variances = np.linalg.eigvalsh(pose)
+    if variances[0] < -_NEGATIVE * max(variances[-1], 1e-300):
+        raise DivergedError("the pose's covariance is not positive")
+    count, m = (len(gain) - FRONT) // 3, gain.shape[1]
+    lost = gain[FRONT:].reshape(count, 3, m) @ half[FRONT:].reshape(count, 3, m).swapaxes(1, 2)
+    before = covariance.diagonal_blocks(np.arange(count))
+    _root(before - lost - lost.swapaxes(1, 2), "a landmark's covariance")
+
+
+def _root(matrices: FloatArray, what: str) -> FloatArray:
+    """Cholesky's lower factors (..., n, n)."""
+    try:
+        root = np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        raise DivergedError(f"{what} is not positive definite") from None
+    if not np.isfinite(root).all():
+        raise DivergedError(f"{what} is not finite")
+    return np.asarray(root)
+
+
+# --------------------------------------------------------------------------------------------
+# The joint covariance
+
+
+class GrowingCovariance:
+    """Joint covariance (n, n), n = 6 + 3 landmarks, which are blocks numbered from 0.
+
+    Only the lower triangle is kept, so the matrix is symmetric by construction, an update costs
+    half of a full product, and a landmark comes or goes by touching its own rows and columns alone.
+    """
+
+    def __init__(self, front: FloatArray) -> None:
+        """Starts with the pose's block (6, 6) alone."""
+        self._buffer = np.zeros((FRONT, FRONT))
+        self._size = 0
+        self.reserve(20)
+        self._size = FRONT
+        self._buffer[:FRONT, :FRONT] = front
+
+    @property
+    def blocks(self) -> int:
+        """Number of landmarks."""
+        return (self._size - FRONT) // BLOCK
+
+    def reserve(self, blocks: int) -> None:
+        """Makes room for so many landmarks, and some more; may raise MemoryError."""
+        needed = FRONT + BLOCK * blocks
+        if needed <= len(self._buffer):
+            return
+        n, room = self._size, int(_GROWTH * needed)
+        # Never read above the diagonal, yet a slab's update takes it along: memory as it comes may
+        # hold signalling NaNs.
+        larger = np.zeros((room, room))
+        larger[:n, :n] = self._buffer[:n, :n]
+        self._buffer = larger
+        self._scratch = np.empty(_SLAB * room)
+
+    def front(self) -> FloatArray:
+        """(n, 6) the pose's columns."""
+        out = self._buffer[: self._size, :FRONT].copy()
+        out[:FRONT] = _mirrored(out[:FRONT])
+        return out
+
+    def columns(self, index: IntArray) -> FloatArray:
+        """(n, k) the columns of these rows."""
+        n = self._size
+        below, above = self._buffer[:n].take(index, axis=1), self._buffer[index, :n].T
+        return np.where(np.arange(n)[:, None] >= index, below, above)
+
+    def diagonal_blocks(self, blocks: IntArray) -> FloatArray:
+        """(k, 3, 3) the landmarks' own covariances."""
+        at = rows_of(blocks)
+        return _mirrored(self._buffer[at[:, :, None], at[:, None, :]])
+
+    def square(self, index: IntArray) -> FloatArray:
+        """(k, k) the rows and columns of these indices, in their order."""
+        low, high = np.minimum(index, index[:, None]), np.maximum(index, index[:, None])
+        return np.asarray(self._buffer[high, low])
+
+    def set_front(self, front: FloatArray) -> None:
+        """Replaces the pose's columns (n, 6), and so its rows."""
+        self._buffer[: self._size, :FRONT] = front
+
+    def subtract(self, a: FloatArray, b: FloatArray) -> None:
+        """Takes ``a b^T + b a^T`` off, of (n, m) each: BLAS's syr2k, slab by slab."""
+        left, right = np.hstack([a, b]), np.hstack([b, a])
+        for start in range(0, self._size, _SLAB):
+            stop = min(start + _SLAB, self._size)
+            product = self._scratch[: (stop - start) * stop].reshape(stop - start, stop)
+            np.matmul(left[start:stop], right[:stop].T, out=product)
+            self._buffer[start:stop, :stop] -= product
+
+    def append(self, cross: FloatArray, square: FloatArray) -> None:
+        """Adds landmarks: covariances with all so far (n, k) and with each other (k, k)."""
+        n, k = self._size, len(square)
+        self.reserve((n + k - FRONT) // BLOCK)
+        self._buffer[n : n + k, :n] = cross.T
+        self._buffer[n : n + k, n : n + k] = square
+        self._size = n + k
+
+    def append_independent(self, blocks: FloatArray) -> None:
+        """Adds landmarks (k, 3, 3) that are correlated with nothing."""
+        n, k = self._size, BLOCK * len(blocks)
+        self.reserve((n + k - FRONT) // BLOCK)
+        self._buffer[n : n + k, : n + k] = 0.0
+        at = n + BLOCK * np.arange(len(blocks))[:, None] + np.arange(BLOCK)
+        self._buffer[at[:, :, None], at[:, None, :]] = blocks
+        self._size = n + k
+
+    def drop(self, blocks: IntArray) -> IntArray:
+        """Removes landmarks; the last ones move into their places.
+
+        Returns:
+            (m,) for each remaining block, the number that it had before.
+        """
+        number = np.arange(self.blocks)
+        for hole in sorted(blocks.tolist(), reverse=True):
+            self._size -= BLOCK
+            number[hole] = number[self.blocks]
+            self._move(self._size, FRONT + BLOCK * hole)
+        return number[: self.blocks]
+
+    def _move(self, old: int, new: int) -> None:
+        """Copies the last block, at row ``old``, over the one at row ``new``."""
+        if old == new:
+            return
+        matrix, end = self._buffer, new + BLOCK
+        source = matrix[old : old + BLOCK]
+        matrix[new:end, :new] = source[:, :new]
+        matrix[new:end, new:end] = source[:, old : old + BLOCK]
+        matrix[end:old, new:end] = source[:, end:old].T
+
+    def packed(self) -> FloatArray:
+        """The lower triangle, row after row."""
+        return np.concatenate([self._buffer[i, : i + 1] for i in range(self._size)])
+
+    @staticmethod
+    def unpacked(packed: FloatArray) -> GrowingCovariance:
+        """Back from :meth:`packed`."""
+        size = (int(np.sqrt(8 * len(packed) + 1)) - 1) // 2
+        out = GrowingCovariance(np.zeros((FRONT, FRONT)))
+        out.reserve((size - FRONT) // BLOCK)
+        out._size = size
+        ends = np.cumsum(np.arange(1, size + 1))
+        for i, end in enumerate(ends.tolist()):
+            out._buffer[i, : i + 1] = packed[end - i - 1 : end]
+        return out
+
+
+def rows_of(blocks: IntArray) -> IntArray:
+    """(k, 3) rows of landmark blocks (k,)."""
+    return np.asarray(FRONT + BLOCK * np.asarray(blocks)[:, None] + np.arange(BLOCK))
+
+
+def _mirrored(lower: FloatArray) -> FloatArray:
+    """Square matrices (..., k, k) of which the lower triangles count."""
+    strict = np.tril(lower, -1)
+    return np.asarray(np.tril(lower) + np.swapaxes(strict, -1, -2))

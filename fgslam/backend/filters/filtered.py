@@ -123,29 +123,19 @@ def placed(
     return transform_to_world(wTc, points), congruence(wTc[:3, :3], local)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstSights:
-    """Landmarks placed by a single observation each.
+def triangulated(
+    rig: CameraRig, observed: Observations
+) -> tuple[Observations, FloatArray, FloatArray]:
+    """Those observations that fix a point before the camera, and the points with covariances.
 
-    Attributes:
-        observed: those of the given observations that fix a point before the sensor.
-        points: (k, 3) in the sensor's frame, metres.
-        covariances: (k, 3, 3) of the points, the sensor's pose taken as exact.
+    Points (k, 3) in the camera's frame and covariances (k, 3, 3), the camera's pose taken as exact.
     """
-
-    observed: Observations
-    points: FloatArray
-    covariances: FloatArray
-
-    @staticmethod
-    def of(sensor: CameraRig, observed: Observations) -> FirstSights:
-        """Triangulates; what lies at infinity or behind the sensor is left out."""
-        finite = np.isfinite(observed.measurement).all(axis=1)
-        disparity = np.where(finite, observed.measurement[:, 2], 0.0)
-        # Far below any disparity that a camera can tell from zero, far above one that overflows.
-        observed = observed.select(disparity > 1e-6)
-        points = triangulate(sensor, observed.measurement)
-        kept = in_front(points)
-        observed, points = observed.select(kept), points[kept]
-        covariances = triangulation_covariance(sensor, observed.measurement, observed.covariance)
-        return FirstSights(observed, points, covariances)
+    finite = np.isfinite(observed.measurement).all(axis=1)
+    disparity = np.where(finite, observed.measurement[:, 2], 0.0)
+    # Far below any disparity that a camera can tell from zero, far above one that overflows.
+    observed = observed.select(disparity > 1e-6)
+    points = triangulate(rig, observed.measurement)
+    kept = in_front(points)
+    observed, points = observed.select(kept), points[kept]
+    covariances = triangulation_covariance(rig, observed.measurement, observed.covariance)
+    return observed, points, covariances

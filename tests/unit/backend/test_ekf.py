@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, assert_same_bits, play, simulate, tracked_at
 
-from fgslam.backend.filters.ekf import FullEkf
-from fgslam.backend.filters.ekf_update import DivergedError, FloorMeasurement, Matches, correct
-from fgslam.backend.filters.growing_covariance import GrowingCovariance
+from fgslam.backend.filters.ekf import (
+    DivergedError,
+    FloorMeasurement,
+    FullEkf,
+    GrowingCovariance,
+    Matches,
+    correct,
+)
 from fgslam.backend.settings import EkfSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray

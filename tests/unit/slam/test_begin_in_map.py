@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.backend.filters.ekf_update import FRONT, FloorMeasurement, Matches, correct
-from fgslam.backend.filters.growing_covariance import GrowingCovariance, rows_of
+from fgslam.backend.filters.ekf import (
+    FRONT,
+    FloorMeasurement,
+    GrowingCovariance,
+    Matches,
+    correct,
+    rows_of,
+)
 from fgslam.backend.protocol import Estimator, MapUser
 from fgslam.backend.settings import (
     BatchSettings,
