@@ -1,16 +1,24 @@
-"""The factor of one landmark observation by stereo or trinocular cameras.
+"""Landmark observations by stereo or trinocular cameras: GTSAM's factor of one, and many in arrays.
 
 Derivation: docs/derivations/factors.md.
 """
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
+from fgslam.core.geometry import (
+    in_front,
+    project,
+    projection_jacobian,
+    skew,
+)
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.noise import Whitening
 
@@ -26,8 +34,8 @@ class StereoFactors:
     factor as the sensor's place on the body. GTSAM measures (u_left, u_right, v), which is linear
     in ours: ``u_left = c + d, u_right = c, v = r``; its covariance follows exactly.
 
-    A landmark behind the camera has a constant residual and no Jacobian, as GTSAM does it; who
-    builds graphs keeps such landmarks out.
+    A landmark behind the camera has a constant residual and no Jacobian, as GTSAM has it:
+    graph builders keep such landmarks out.
     """
 
     def __init__(self, rig: CameraRig, whitening: Whitening) -> None:
@@ -57,3 +65,107 @@ class StereoFactors:
         return gtsam.GenericStereoFactor3D(
             measured, model, pose, landmark, self._calibration, False, False, self._rTl
         )
+
+
+# --------------------------------------------------------------------------------------------
+# Many observations at once, for solvers that eliminate landmarks themselves.
+#
+# One of a point behind the camera pulls nothing and costs as much as GTSAM's factor then does.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinearRows(Rows):
+    """Linearised observations, whitened and weighed: ``residual + by_pose dx + by_point dl``.
+
+    Attributes:
+        residual: (k, 3).
+        by_pose: (k, 3, 6) by the tangent of ``wTc``.
+        by_point: (k, 3, 3) by the world point.
+    """
+
+    residual: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+
+
+def whitening(covariances: FloatArray) -> FloatArray:
+    """(k, 3, 3) that turn residuals of covariances (k, 3, 3) into ones of unit covariance."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariances)))
+
+
+def in_cameras(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """World points (k, 3) in the frames of poses ``wTc`` (k, 4, 4), one each."""
+    offset = points - poses[:, :3, 3]
+    return np.asarray(np.einsum("kji,kj->ki", poses[:, :3, :3], offset))
+
+
+def residuals(
+    rig: CameraRig,
+    poses: FloatArray,
+    points: FloatArray,
+    measurement: FloatArray,
+    roots: FloatArray,
+) -> FloatArray:
+    """Whitened residuals (k, 3), predicted minus measured; arguments of :func:`linearised`."""
+    return products(roots, _off(rig, in_cameras(poses, points), measurement)[0])
+
+
+def linearised(
+    rig: CameraRig,
+    poses: FloatArray,
+    points: FloatArray,
+    measurement: FloatArray,
+    roots: FloatArray,
+) -> LinearRows:
+    """Whitened observations, predicted minus measured.
+
+    Args:
+        rig: the cameras.
+        poses: (k, 4, 4) ``wTc`` of each observation.
+        points: (k, 3) of its landmark, world.
+        measurement: (k, 3).
+        roots: (k, 3, 3) of :func:`whitening`.
+    """
+    local = in_cameras(poses, points)
+    off, seen = _off(rig, local, measurement)
+    jacobian = roots @ projection_jacobian(rig, np.where(seen[:, None], local, 1.0))
+    jacobian[~seen] = 0.0
+    by_pose = np.empty((len(local), 3, 6))
+    by_pose[:, :, :3], by_pose[:, :, 3:] = jacobian @ skew(local), -jacobian
+    by_point = jacobian @ np.swapaxes(poses[:, :3, :3], 1, 2)
+    return LinearRows(products(roots, off), by_pose, by_point)
+
+
+def _off(
+    rig: CameraRig, local: FloatArray, measurement: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Residuals (k, 3) of points in the camera's frame, and which are in front (k,)."""
+    seen = in_front(local)
+    predicted = project(rig, np.where(seen[:, None], local, 1.0))
+    off = predicted - measurement
+    # As GTSAM's factor has it: both columns and the row are two focal lengths off.
+    off[~seen] = [2.0 * rig.fx, 2.0 * rig.fx, 0.0]
+    return off, seen
+
+
+def weighed(rows: LinearRows, weight: FloatArray) -> LinearRows:
+    """The rows with weights (k,) of their squares."""
+    root = np.sqrt(weight)[:, None]
+    return LinearRows(
+        root * rows.residual, root[:, :, None] * rows.by_pose, root[:, :, None] * rows.by_point
+    )
+
+
+def products(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
+    """(k, i) products of matrices (k, i, j) and vectors (k, j)."""
+    return np.asarray(np.einsum("kij,kj->ki", matrices, vectors))
+
+
+def summed(index: IntArray, values: FloatArray, size: int) -> FloatArray:
+    """(size, ...) sums of values (k, ...) by their index (k,)."""
+    shape = values.shape[1:]
+    flat = values.reshape(len(values), math.prod(shape))
+    out = np.empty((size, flat.shape[1]))
+    for column in range(flat.shape[1]):
+        out[:, column] = np.bincount(index, flat[:, column], size)
+    return out.reshape(size, *shape)

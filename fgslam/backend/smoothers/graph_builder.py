@@ -24,10 +24,9 @@ from fgslam.core.measurements import Observations, Odometry
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, pose_key
-from fgslam.factors.landmark import StereoFactors
+from fgslam.factors.landmark import StereoFactors, whitening
 from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
 from fgslam.factors.noise import Whitening, scaled
-from fgslam.factors.stacked import whitening
 
 WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a weak prior
 _WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md

@@ -20,7 +20,7 @@ from fgslam.backend.smoothers.stretches import Stretch
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import inverse_spd3
-from fgslam.factors.stacked import summed
+from fgslam.factors.landmark import summed
 
 _POSES_A_LANDMARK = 4
 """How many times more numbers landmarks have than the poses that cut a long chain: cuts make each

@@ -1,6 +1,6 @@
 """Landmark observations of a whole graph in arrays: whitened residuals and their derivatives.
 
-A rig's stereo factors are linearised all at once (:mod:`fgslam.factors.stacked`).
+A rig's stereo factors are linearised all at once (:mod:`fgslam.factors.landmark`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import is_pose
-from fgslam.factors.landmark import FROM_MEASUREMENT
-from fgslam.factors.stacked import LinearRows, linearised, residuals
+from fgslam.factors.landmark import FROM_MEASUREMENT, LinearRows, linearised, residuals
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,8 +21,8 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import adjoint, compose_covariance, inverse
 from fgslam.core.measurements import BiasEffect, Odometry
+from fgslam.factors.landmark import whitening
 from fgslam.factors.noise import positive_definite
-from fgslam.factors.stacked import whitening
 
 _MOST_NODES = 17  # a bound for the work: every two minutes in a drive of half an hour
 _NO_WALK = 0.01  # of the time after which the walk counts: less than 1e-4 of the variance is its

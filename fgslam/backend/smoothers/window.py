@@ -46,8 +46,7 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
-from fgslam.factors.noise import kernel_weights
-from fgslam.factors.stacked import (
+from fgslam.factors.landmark import (
     LinearRows,
     linearised,
     products,
@@ -55,6 +54,7 @@ from fgslam.factors.stacked import (
     weighed,
     whitening,
 )
+from fgslam.factors.noise import kernel_weights
 
 _SHORT = 0.01
 """Radians and metres of a pose, iSAM2's threshold of linearising anew: covariances are those of

@@ -12,7 +12,7 @@ from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.landmark_elimination import Eliminated
 from fgslam.core.arrays import FloatArray, IntArray, Rows
 from fgslam.factors.graphs import landmark_key
-from fgslam.factors.stacked import LinearRows
+from fgslam.factors.landmark import LinearRows
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 from fgslam.backend.smoothers.dense_cholesky import scaled_cholesky
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse_spd3
-from fgslam.factors.stacked import LinearRows, products, summed
+from fgslam.factors.landmark import LinearRows, products, summed
 
 _UNCOUPLED = 1e-9  # of a landmark's own information: a coupling that changes it by less is none
 
