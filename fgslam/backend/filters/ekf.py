@@ -2,8 +2,8 @@
 
 The costly alternative that Se, Lowe and Little (2001, 6) name and set aside; Smith, Self and
 Cheeseman (1990). In the graph's terms a smoother that marginalises every past pose and never
-linearises a measurement anew. With F the motion's Jacobian and Q its noise, H the measurements' and
-R theirs, a frame is
+relinearises a measurement. With F the motion's Jacobian and Q its noise, H the measurements' and R
+theirs, a frame is
 
     x = f(x),    P = F P F^T + Q                                      (FullEkf.predict)
     S = H P H^T + R,    K = P H^T S^-1,    x + K v,    P - K S K^T    (correct)
@@ -222,7 +222,7 @@ class FullEkf:
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Predicts, corrects by all matches at once, drops the pruned, adds the new.
 
-        ``tracking`` is used only of a frame that was found without a prior: it says where to
+        ``tracking`` is used only of a frame that was found without a prior: it is where to
         linearise, and which matches hold. A loop closure is a further correction, by the old
         landmarks that the frame sees; correlations take the map along, past poses stay. Raises
         EstimatorError where time does not increase, the map outgrows `max_landmarks`, a number is
@@ -290,7 +290,7 @@ class FullEkf:
         return self._doubt.landmarks(held.select(held.rows(ids))).covariances
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance of the last pose and the named landmarks, and the rig's doubt."""
+        """Joint covariance of the last pose and the named landmarks, the rig's terms included."""
         rows = rows_of(self._blocks(ids)).ravel()
         return self._doubt.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
 
@@ -379,13 +379,13 @@ class FullEkf:
         except DivergedError as cause:
             self._remarks.append(f"{what} left out: {cause}")
             return False
-        said = f"(innovation squared {found.nis:.0f}, {found.nis_dof} expected)"
+        squared = f"(innovation squared {found.nis:.0f}, {found.nis_dof} expected)"
         if not within_gate(found.nis - found.nis_dof):
-            self._remarks.append(f"{what} refused: the covariance does not admit it {said}")
+            self._remarks.append(f"{what} refused: the covariance does not admit it {squared}")
             return False
         admitted = found.nis <= chi_square_quantile(_ADMITTED, found.nis_dof)
         though = "" if admitted else ", though the covariance does not admit it"
-        self._remarks.append(f"{what} taken{though} {said}")
+        self._remarks.append(f"{what} taken{though} {squared}")
         self._apply(found, self._wTc, self._covariance.front())
         return True
 

@@ -89,14 +89,14 @@ class FieldSize:
         normal = self._normal[self._rows > self._normal.shape[1]]
         if len(normal) < _LEAST_GROUPS:
             return 0.0, np.inf
-        told, pull = self._of_field(normal)
-        whole = told.sum(axis=0)
+        information, pull = self._of_field(normal)
+        whole = information.sum(axis=0)
         # Modes count by how they show, each as far as it stands out of the noise.
         shrunk = np.linalg.inv(whole + np.eye(len(whole)))
         weighed = shrunk @ whole @ shrunk
         found = _Pairs(pull @ weighed @ pull.T)
-        by_group = weighed @ told
-        unit = _Pairs(np.einsum("gij,hji->gh", by_group, told))
+        by_group = weighed @ information
+        unit = _Pairs(np.einsum("gij,hji->gh", by_group, information))
         without = found.without() / unit.without()
         spread = ((without - without.mean()) ** 2).sum() * (len(normal) - 1) / len(normal)
         return found.all() / unit.all(), float(np.sqrt(spread))

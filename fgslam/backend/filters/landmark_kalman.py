@@ -31,10 +31,10 @@ from fgslam.backend.filters.loop_correction import (
     Chain,
     DriveRecord,
     changes,
-    founds_anew,
     guessed,
     home_changes,
     rotated,
+    starts_new_part,
     transported,
 )
 from fgslam.backend.filters.rig_change import RigChange
@@ -174,7 +174,7 @@ class LandmarkKalman:
         self._rows.positions[self._rows.rows(ids)] = positions
 
     def restart(self, observed: Observations) -> None:
-        """Starts known landmarks anew from one observation each in the last frame: they moved."""
+        """Restarts known landmarks from one observation each in the last frame: they moved."""
         if len(observed):
             self._rows.remove(observed.ids)
             self._errors.forget(observed.ids)
@@ -235,7 +235,7 @@ class LandmarkKalman:
     ) -> None:
         """Keeps the step to this frame, for later loops, and which old landmarks placed it."""
         step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
-        free = increment.relocalised or founds_anew(increment, tracking)
+        free = increment.relocalised or starts_new_part(increment, tracking)
         self._drive.step(step, tracking, increment.odometry, free)
         homes = self._rows.homes[self._rows.rows(used)]
         self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)

@@ -43,7 +43,7 @@ _EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a 
 _SMALL = 1e-3  # radians: below, the formula's differences lose their digits
 _STILL = 1e-12  # of a change's tangent vector: what is not to be spread
 FREE_RAD, FREE_M = 3.0, 30.0
-"""Deviations of a step that nobody measured, as of a robot that was carried off: it pulls nothing
+"""Deviations of a step that was not measured, as of a robot that was carried off: it pulls nothing
 (a frame's own landmarks know the pose a thousand times better), yet the graph stays solvable."""
 FREE = np.diag([FREE_RAD**2] * 3 + [FREE_M**2] * 3)
 """(6, 6) covariance of such a step."""
@@ -59,7 +59,7 @@ below 5 true closures are taken for impossible (docs/results)."""
 def guessed(increment: Increment, tracking: EgoMotion) -> bool:
     """Whether nothing measured a frame's pose: neither landmarks nor odometry, after the first.
 
-    What it starts is one piece, whose place among the rest nobody knows. A filter has no
+    What it starts is one piece, whose place among the rest is not known. A filter has no
     correlations: with the guess's covariance on each landmark none would tell where the next frame
     is, though together they do.
     """
@@ -67,11 +67,11 @@ def guessed(increment: Increment, tracking: EgoMotion) -> bool:
     return not tracking.status.measured and odometry is not None and not odometry.measured
 
 
-def founds_anew(increment: Increment, tracking: EgoMotion) -> bool:
+def starts_new_part(increment: Increment, tracking: EgoMotion) -> bool:
     """Whether a frame begins another part of the map: its step is as free as of one carried off.
 
     It sees enough, and nothing of what its guess made expect: the guess is refuted, and with it
-    what it said of its own uncertainty.
+    its stated uncertainty.
     """
     return guessed(increment, tracking) and int(increment.observations.is_new.sum()) >= _PART
 
@@ -85,7 +85,7 @@ class Constraint:
         motion: (4, 4) pose of ``after`` in ``before``.
         covariance: (6, 6) in the tangent space at it.
         doubted: it may be wrong: the farther off, the less it pulls (Cauchy's kernel).
-        matches: landmarks that agree on it; 0 where nobody counted.
+        matches: landmarks that agree on it; 0 where they were not counted.
     """
 
     before: int
@@ -203,7 +203,8 @@ def _minimum(
     poses: FloatArray, errors: FloatArray, constraints: list[Constraint], every: int
 ) -> tuple[dict[int, FloatArray], float]:
     """Poses (4, 4) at which submaps begin, by frame, at the least cost; and that cost."""
-    begins = _beginnings(len(poses), constraints, every)
+    ends = {frame for known in constraints for frame in (known.before, known.after)}
+    begins = sorted({*range(0, len(poses), every), len(poses) - 1, *ends})
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     graph.add(pose_prior(pose_key(0), Prediction(poses[0], np.zeros((6, 6)))))
     for frame in begins:
@@ -245,11 +246,6 @@ def _motions(twists: FloatArray) -> FloatArray:
     along = np.eye(3) + second * cross + third * square
     out[:, :3, 3] = np.einsum("nij,nj->ni", along, twists[:, 3:])
     return out
-
-
-def _beginnings(count: int, constraints: list[Constraint], every: int) -> list[int]:
-    ends = {frame for known in constraints for frame in (known.before, known.after)}
-    return sorted({*range(0, count, every), count - 1, *ends})
 
 
 def as_motions_of_the_world(poses: FloatArray, steps: FloatArray) -> FloatArray:
@@ -307,7 +303,7 @@ def refusal(what: str, squared: float) -> str:
 class DriveRecord:
     """The chain of steps of a filter's drive, the constraints on it, and which loops were accepted.
 
-    The filter's own covariance of a pose says how well it is known relative to the map around it,
+    The filter's own covariance of a pose is relative to the map around it,
     and never grows: drift is not in it. What drifts is the chain of steps, each as uncertain as its
     frame was tracked; where no landmark was matched, as uncertain as the odometry; where the robot
     was carried off, unknown.
@@ -344,7 +340,7 @@ class DriveRecord:
             motion: the frame's pose as tracked, in the last one's.
             tracking: how the frame was tracked.
             known: what the frame was predicted with.
-            free: nobody knows the step: the frame was found without a prior.
+            free: the step is not known: the frame was found without a prior.
         """
         before, self._coherent = self._coherent, tracking.coherent
         if free:
@@ -372,7 +368,7 @@ class DriveRecord:
         homes = np.maximum(homes, 0)  # a saved map's landmarks stay, and so does the first pose
         old = homes[homes < (frame if free else frame - _OLD * every)]
         due = self._coherent and (self._tied < 0 or frame - self._tied >= every)
-        # A few old ones among many new, far ones as a rule, do not say where the frame is.
+        # A few old ones among many new, far ones as a rule, do not tell where the frame is.
         if len(old) < _TIED_BY or 2 * len(old) < len(homes) or not (free or due):
             return
         self._tied = frame

@@ -1,4 +1,4 @@
-"""What the doubt about a rig's calibration adds to poses and landmarks, frame by frame.
+"""Consider covariance: what a rig's calibration adds to poses and landmarks, frame by frame.
 
 The Schmidt-Kalman filter's cross terms (Schmidt 1966), as derivatives: how the newest pose and each
 landmark of the map follow the terms that all cameras share, and the field that no term follows,
@@ -11,11 +11,12 @@ docs/derivations/measurement_noise.md.
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 
 import numpy as np
 
 from fgslam.backend.filters.error_columns import ErrorColumns
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray, Rows
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
@@ -46,7 +47,7 @@ _NONE = np.zeros((6, 6))
 class RigTerms:
     """The terms in SHARED of a rig that calibrates itself, then the modes of its field: unknown.
 
-    Of a rig that is exact, or that is taken as stated, there is no doubt.
+    Of a rig that is exact, or that is taken as stated, none is unknown.
     """
 
     deviations: Kept[FloatArray | None]
@@ -59,22 +60,22 @@ class RigTerms:
         self.count = len(SHARED) + (0 if self.rig is None else field_modes(self.rig))
         """How many there are, q."""
         self.deviations = None
-        """(q, q) lower root of their covariance; None: no doubt."""
+        """(q, q) lower root of their covariance; None: they are known."""
         self._applied = np.empty(0)
         self._field_px = 0.0
 
     @property
     def covariance(self) -> FloatArray | None:
-        """(q, q) of the terms; None: no doubt."""
+        """(q, q) of the terms; None: they are known."""
         return None if self.deviations is None else self.deviations @ self.deviations.T
 
-    def hear(self, increment: Increment) -> None:
-        """Of the correction that a frame's measurements contain, and what was known beside it."""
+    def update(self, increment: Increment) -> None:
+        """Takes in the correction that a frame's measurements contain, and the field's size."""
         known = increment.settled_rig
         self._hear(increment.rig_correction, 0.0 if known is None else known.field_px)
 
     def shifts(self, measured: FloatArray) -> FloatArray:
-        """(k, 3, q) by which a unit of each displaces measurements (k, 3); zero without doubt."""
+        """(k, 3, q) by which a unit of each displaces measurements (k, 3); zero where known."""
         if self.rig is None or self.deviations is None:
             return np.zeros((len(measured), 3, self.count))
         pixels = pixels_of(self.rig, measured)
@@ -97,7 +98,7 @@ class RigTerms:
 class OnlineDoubt(ErrorColumns):
     """Derivatives of the newest pose and of the landmarks by what is unknown of the rig.
 
-    Of a rig that is exact, or that is taken as stated, there is no doubt: nothing is added.
+    Of a rig that is exact, or that is taken as stated, nothing is added.
     """
 
     _terms: Kept[RigTerms]
@@ -118,44 +119,44 @@ class OnlineDoubt(ErrorColumns):
 
     @property
     def present(self) -> bool:
-        """Whether there is any doubt."""
+        """Whether any term is unknown."""
         return self._terms.deviations is not None
 
     def observe(self, increment: Increment, wTc: FloatArray) -> None:
         """Takes in a frame: its accepted measurements and its pose as estimated."""
-        self._terms.hear(increment)
+        self._terms.update(increment)
         rig = self._terms.rig
         if rig is None or not self.present:
             return
         if self._wTc is not None:
             self._gain = adjoint(inverse(inverse(self._wTc) @ wTc)) @ self._gain
-        seen = increment.observations.select(~increment.rejected)
-        near = seen.measurement[:, 2] > _LEAST_DISPARITY_PX
-        look = _Look(rig, self._terms, seen.select(near), wTc)
-        rows, known = self._rows(look.ids)
+        kept = increment.observations.select(~increment.rejected)
+        near = kept.measurement[:, 2] > _LEAST_DISPARITY_PX
+        seen = _Linearised.of(rig, self._terms, kept.select(near), wTc)
+        rows, known = self._rows(seen.ids)
         if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
             basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
-            self._gain = look.select(known).pose_gain(*self._at(rows[known]), basis)
-        self._update(look.select(known), rows[known])
-        self._add(look.select(~known))
+            self._gain = seen.select(known).pose_gain(*self._at(rows[known]), basis)
+        self._update(seen.select(known), rows[known])
+        self._add(seen.select(~known))
         self.forget(increment.pruned_ids)
         self._wTc = wTc
 
     def of_pose(self) -> FloatArray:
-        """(6, 6) what the doubt adds to the newest pose's covariance; zero without any."""
+        """(6, 6) what the terms add to the newest pose's covariance; zero where they are known."""
         if self._terms.deviations is None:
-            return _NONE  # one for all frames: a smoother keeps what it is told of each
+            return _NONE  # one for all frames: a smoother keeps that of each
         root = self._gain @ self._terms.deviations
         return np.asarray(root @ root.T)
 
     def pose(self, newest: Prediction) -> Prediction:
-        """The newest pose with what the doubt adds to its covariance."""
+        """The newest pose with what the terms add to its covariance."""
         if not self.present:
             return newest
         return Prediction(newest.wTc, newest.covariance + self.of_pose())
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
-        """Landmarks with what the doubt adds to their covariances."""
+        """Landmarks with what the terms add to their covariances."""
         covariance = self._terms.covariance
         if covariance is None or self._held:
             return known
@@ -176,48 +177,47 @@ class OnlineDoubt(ErrorColumns):
     def _at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
         return self._map["gain"][rows], self._map["information"][rows]
 
-    def _update(self, look: _Look, rows: IntArray) -> None:
+    def _update(self, seen: _Linearised, rows: IntArray) -> None:
         gain, information = self._at(rows)
-        pull, told = look.landmarks()
-        information = information + told
-        off = look.off(self._gain) - look.by_point @ gain
+        pull, added = seen.landmark_information()
+        information = information + added
+        off = seen.off(self._gain) - seen.by_point @ gain
         self._map["gain"][rows] = gain + np.linalg.solve(information, pull @ off)
         self._map["information"][rows] = information
 
-    def _add(self, look: _Look) -> None:
+    def _add(self, seen: _Linearised) -> None:
         """Landmarks where their first measurement has them; identities ascend."""
-        if len(look.ids):
-            gain = np.linalg.solve(look.by_point, look.off(self._gain))
-            self._append({"ids": look.ids, "gain": gain, "information": look.landmarks()[1]})
+        if len(seen.ids):
+            gain = np.linalg.solve(seen.by_point, seen.off(self._gain))
+            information = seen.landmark_information()[1]
+            self._append({"ids": seen.ids, "gain": gain, "information": information})
 
 
-class _Look:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class _Linearised(Rows):
     """Measurements (k) of a frame, linearised where they have their points."""
 
-    def __init__(
-        self, rig: CameraRig, terms: RigTerms, seen: Observations, wTc: FloatArray
-    ) -> None:
+    ids: IntArray
+    shift: FloatArray
+    by_pose: FloatArray
+    by_point: FloatArray
+    covariance: FloatArray
+
+    @staticmethod
+    def of(rig: CameraRig, terms: RigTerms, seen: Observations, wTc: FloatArray) -> _Linearised:
         points = triangulate(rig, seen.measurement)
         projection = projection_jacobian(rig, points)
-        self.ids = seen.ids
-        self.shift = terms.shifts(seen.measurement)
-        self.by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
-        self.by_point = projection @ wTc[:3, :3].T
-        self.covariance = seen.covariance
-
-    def select(self, rows: BoolArray) -> _Look:
-        """Some of them."""
-        out = object.__new__(_Look)
-        for name, values in vars(self).items():
-            setattr(out, name, values[rows])
-        return out
+        by_pose = np.concatenate([projection @ skew(points), -projection], axis=2)
+        by_point = projection @ wTc[:3, :3].T
+        shift = terms.shifts(seen.measurement)
+        return _Linearised(seen.ids, shift, by_pose, by_point, seen.covariance)
 
     def off(self, pose_gain: FloatArray) -> FloatArray:
         """(k, 3, q) what of the measurements' shifts the pose does not follow."""
         return np.asarray(self.shift - self.by_pose @ pose_gain)
 
-    def landmarks(self) -> tuple[FloatArray, FloatArray]:
-        """What residuals pull landmarks by (k, 3, 3), and tell of them (k, 3, 3)."""
+    def landmark_information(self) -> tuple[FloatArray, FloatArray]:
+        """What residuals pull landmarks by (k, 3, 3), and their information (k, 3, 3)."""
         pull = np.swapaxes(self.by_point, 1, 2) @ np.linalg.inv(self.covariance)
         return pull, pull @ self.by_point
 

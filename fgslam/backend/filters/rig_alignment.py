@@ -1,4 +1,4 @@
-"""What a few frames say about a rig's correction: their poses and points are eliminated.
+"""The evidence of a few frames on a rig's correction: their poses and points are eliminated.
 
 Bundle adjustment of one short window with errors in all images at both ends of every track. The
 residuals are linear in the correction; poses and points are minimised over, then eliminated by
@@ -147,7 +147,7 @@ class RigAlignment:
         order = np.lexsort((frame, ids))
         self._landmark, self._frame = ids[order], frame[order]
         self._pixels = pixels[order]
-        # What one image does not show says little of the rig, and would take a model of its own.
+        # What one image does not show is little evidence, and would take a model of its own.
         self._keep(np.isfinite(self._pixels).all(axis=(1, 2)))
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
@@ -155,7 +155,7 @@ class RigAlignment:
         self._fuse = rig_map(rig)
 
     def evidence(self, correction: FloatArray, prior: FloatArray) -> RigEvidence | None:
-        """What the window says of the correction; None where it shows too little.
+        """The window's evidence on the correction; None where it shows too little.
 
         Args:
             correction: (p,) as known so far; the minimisation starts and is held there.
@@ -250,7 +250,7 @@ class RigAlignment:
     def _minimise(self, state: _State, around: FloatArray, prior: FloatArray) -> _State | None:
         damping, best = 1e-6, self._cost(state, around, prior)
         for _ in range(_ITERATIONS):
-            normal = self._linearise(state)
+            normal = self._normal(self._predicted(state))
             moved = self._step(state, normal, around, prior, damping)
             if moved is None:
                 return None
@@ -270,9 +270,6 @@ class RigAlignment:
         modes = field_displacements(self._rig, found.exact)
         unit = np.concatenate([found.unit, modes], axis=2)
         return self._normal(dataclasses.replace(found, unit=unit))
-
-    def _linearise(self, state: _State) -> _Normal:
-        return self._normal(self._predicted(state))
 
     def _normal(self, found: _Prediction) -> _Normal:
         state = found.state

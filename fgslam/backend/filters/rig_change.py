@@ -35,14 +35,14 @@ class RigChange:
     values: FloatArray
 
     def measured(self, measurement: FloatArray) -> FloatArray:
-        """Measurements (k, 3) (column, row, disparity) of all images, corrected anew."""
+        """Measurements (k, 3) (column, row, disparity) of all images, by the new correction."""
         ratio, cameras = vertical_to_horizontal(self.rig), self.rig.cameras
         pixels = measurement @ pixel_model(cameras, ratio).T
         moved = displacements(self.rig, pixels.reshape(-1, cameras, 2)) @ self.values
         return np.asarray(measurement - moved @ rig_map(self.rig).T)
 
     def moved(self, poses: FloatArray, positions: FloatArray) -> tuple[FloatArray, float]:
-        """Landmarks (k, 3) in the world, each measured anew from a pose (k, 4, 4) that saw it.
+        """Landmarks (k, 3) in the world, each measured again from a pose (k, 4, 4) that saw it.
 
         Returns:
             Where they are then, one that its pose does not see where it was; and by how many
@@ -56,11 +56,11 @@ class RigChange:
         size = np.array([self.rig.width, self.rig.height])
         seen = ahead & ((before[:, :2] >= 0.0) & (before[:, :2] < size)).all(axis=1)
         seen &= after[:, 2] > _LEAST_SHARE * before[:, 2]
-        anew = triangulate(self.rig, np.where(seen[:, None], after, before))
-        anew = np.einsum("kij,kj->ki", turn, anew) + place
+        again = triangulate(self.rig, np.where(seen[:, None], after, before))
+        again = np.einsum("kij,kj->ki", turn, again) + place
         off = (after - before)[seen, 2]
         rms = float(np.sqrt(np.mean(off**2))) if len(off) else 0.0
-        return np.where(seen[:, None], anew, positions), rms
+        return np.where(seen[:, None], again, positions), rms
 
 
 @dataclass(slots=True, eq=False)
@@ -68,7 +68,7 @@ class KnownCorrections:
     """Which correction the measurements of which frames contain, and what became known later.
 
     Attributes:
-        begins: first frame of each stretch with one correction and one rig, ascending.
+        begins: first frame of each segment with one correction and one rig, ascending.
         applied: (p,) of each, the correction that its measurements contain.
         knocks: of each, how often the rig was found to have moved before.
         settled: after so many knocks, what was known last for all frames alike, if anything.
@@ -82,7 +82,7 @@ class KnownCorrections:
     field_px: float = 0.0
 
     def note(self, frame: int, increment: Increment) -> None:
-        """Takes in one more frame; one without a correction says nothing."""
+        """Takes in one more frame; one without a correction changes nothing."""
         applied, known = increment.rig_correction, increment.settled_rig
         if applied is None:
             return
@@ -96,15 +96,15 @@ class KnownCorrections:
             self.knocks.append(knocks)
 
     def recalibrate(self, change: RigChange) -> None:
-        """All measurements so far were corrected anew by a change."""
+        """All measurements so far were corrected by a change."""
         self.applied = [then + change.values for then in self.applied]
 
     def settle(self, rig: CameraRig, frames: IntArray, measurement: FloatArray) -> FloatArray:
         """Measurements (k, 3) of frames (k,) by what was known last of the rig as it was then."""
         out = measurement.copy()
-        stretch = np.searchsorted(self.begins, frames, side="right") - 1
+        segment = np.searchsorted(self.begins, frames, side="right") - 1
         for k, (applied, knocks) in enumerate(zip(self.applied, self.knocks, strict=True)):
-            settled, rows = self.settled.get(knocks), stretch == k
+            settled, rows = self.settled.get(knocks), segment == k
             if settled is not None and rows.any():
                 out[rows] = RigChange(rig, settled - applied).measured(measurement[rows])
         return out

@@ -1,6 +1,6 @@
-"""An information filter over a rig's correction: what windows of a drive say of it, added up.
+"""An information filter over a rig's correction: the evidence of windows of a drive, added up.
 
-The noise of what windows say is estimated from how far they lie from what is known. Terms that the
+The noise of that evidence is estimated from how far they lie from what is known. Terms that the
 filter does not free stay at zero, as uncertain as before the drive. Derived in
 docs/derivations/self_calibration.md.
 """
@@ -56,20 +56,20 @@ class _Field(NamedTuple):
         q = field_modes(rig)
         return _Field(np.zeros((terms, q)), np.zeros((q, q)), np.zeros(q))
 
-    def after(self, told: RigEvidence, before: FloatArray, covariance: FloatArray) -> _Field:
+    def after(self, evidence: RigEvidence, before: FloatArray, covariance: FloatArray) -> _Field:
         """With a window of the noise that it states.
 
         Args:
-            told: what the window says.
+            evidence: of the window.
             before: (p,) the correction known before it.
             covariance: (p, p) of the correction known after it.
         """
-        off = told.at - before
-        score = told.score + told.information @ off
-        mixed = told.information @ self.lean + told.lean
+        off = evidence.at - before
+        score = evidence.score + evidence.information @ off
+        mixed = evidence.information @ self.lean + evidence.lean
         gain = covariance @ mixed
-        own = self.lean.T @ mixed + told.lean.T @ self.lean + told.field
-        pull = told.pull + told.lean.T @ off + self.lean.T @ score
+        own = self.lean.T @ mixed + evidence.lean.T @ self.lean + evidence.field
+        pull = evidence.pull + evidence.lean.T @ off + self.lean.T @ score
         return _Field(
             self.lean - gain,
             self.information + own - mixed.T @ gain,
@@ -112,7 +112,7 @@ class RigFilter:
 
     @property
     def noise_factor(self) -> float:
-        """Variance of what windows say, as multiple of what their pixels alone would give."""
+        """Variance of the windows' evidence, as multiple of what their pixels alone would give."""
         stated = TRUSTED_WINDOWS * int(self.free.sum())
         usual = _KERNEL_FACTOR[self.known.rig.cameras]
         return max((usual * stated + self.misfit) / (stated + self.freedom), 1e-3)
@@ -127,7 +127,7 @@ class RigFilter:
     def judged(self, evidence: RigEvidence) -> tuple[bool, RigFilter]:
         """Whether what is known cannot explain a window; and the filter that knows its noise.
 
-        Judged in the window's own principal directions, those in which it says anything: how far
+        Judged in the window's own principal directions, those in which it has evidence: how far
         it lies from what is known, in units of its own noise and of what is known.
         """
         size, axes = np.linalg.eigh(evidence.information)
@@ -141,18 +141,18 @@ class RigFilter:
         likely = chi_square_quantile(1.0 - _KNOCK_PROBABILITY, len(score))
         unlikely = bool(squared.sum() / self.noise_factor > likely)
         noisy = known_share < 1.0  # elsewhere it is the prior that is judged
-        booked = dataclasses.replace(
+        counted = dataclasses.replace(
             self,
             misfit=self.misfit + float(squared[noisy].sum()),
             freedom=self.freedom + float(np.count_nonzero(noisy)),
         )
-        return unlikely, booked
+        return unlikely, counted
 
     def after(self, evidence: RigEvidence) -> RigFilter:
-        """With what a window says."""
-        factor, told = self.noise_factor, evidence.information
-        score = evidence.score + told @ (evidence.at - self.known.values)
-        covariance = np.asarray(np.linalg.inv(self.information + told / factor), np.float64)
+        """With the evidence of a window."""
+        factor, added = self.noise_factor, evidence.information
+        score = evidence.score + added @ (evidence.at - self.known.values)
+        covariance = np.asarray(np.linalg.inv(self.information + added / factor), np.float64)
         covariance = (covariance + covariance.T) / 2.0
         values = self.known.values + covariance @ (score / factor)
         known = dataclasses.replace(self.known, values=values, covariance=covariance)
@@ -166,17 +166,17 @@ class RigFilter:
         """
         if field_px == 0.0:
             return self.known
-        known, lean, told, score = self.known, *self.field
-        modes = np.linalg.inv(told + np.eye(len(score)) / field_px**2)
+        known, lean, information, score = self.known, *self.field
+        modes = np.linalg.inv(information + np.eye(len(score)) / field_px**2)
         return dataclasses.replace(
             known,
             values=known.values + lean @ (modes @ score),
             covariance=known.covariance + lean @ modes @ lean.T,
         )
 
-    def heard(
+    def evidence_of(
         self, rig: CameraRig, frames: Sequence[tuple[FloatArray, Observations]], sigma_px: float
     ) -> RigEvidence | None:
-        """What a window (wTc, what the ego-motion accepted) says of the free terms, if anything."""
+        """Of a window (wTc, what the ego-motion accepted) on the free terms; None without any."""
         alignment = RigAlignment(rig, frames, sigma_px, self.free)
         return alignment.evidence(self.known.values, self.information)

@@ -5,15 +5,14 @@ of its errors. That follows the same gains with the true noise (sensitivity of s
 Gelb 1974, 7.2): exactly, it takes a joint matrix whose size and cost grow with the square of the
 map. Here a fixed number of drawn samples stands for it, as in the ensemble of Evensen (1994): a
 landmark costs as much whatever the map. The terms of the rig's calibration go the same way, one
-column each (Schmidt 1966). The noise is drawn as large as the drive's residuals so far say, as a
-smoother weighs it. Estimates stay as they are. docs/derivations/landmark_filter.md.
+column each (Schmidt 1966). The noise is drawn as large as the drive's residuals so far have it, as
+a smoother weighs it. Estimates stay as they are. docs/derivations/landmark_filter.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -23,11 +22,11 @@ from fgslam.backend.filters.loop_correction import (
     FREE,
     Chain,
     as_motions_of_the_world,
-    founds_anew,
+    starts_new_part,
 )
 from fgslam.backend.filters.online_doubt import RigTerms
 from fgslam.backend.persistence import Persistence, learn_from
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray, Rows
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.geometry import (
     adjoint,
@@ -105,13 +104,14 @@ class Step:
         The latter is the covariance (6, 6) that the step adds.
         """
         carried = adjoint(inverse(inverse(self.before.wTc) @ self.tracking.wTc))
-        if founds_anew(self.increment, self.tracking):
+        if starts_new_part(self.increment, self.tracking):
             return carried, FREE
         pose = self.expected if self.measured else self.tracking
         return carried, pose.covariance - congruence(carried, self.before.covariance)
 
 
-class Sights(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class ObservedColumns(Rows):
     """Measurements (k) of landmarks in a frame, linearised at the landmarks: error columns."""
 
     by_pose: FloatArray
@@ -157,7 +157,7 @@ class SampledErrors(ErrorColumns):
         self._noise = Persistence(solver.sensor)
         self._random = np.random.default_rng(_STREAM)
         self._taken = 1.0  # variance over the stated one that the newest pose took
-        self._seen: tuple[IntArray, Sights, FloatArray] | None = None
+        self._seen: tuple[IntArray, ObservedColumns, FloatArray] | None = None
         """Matches of the newest frame: rows of their landmarks, and the columns of these before."""
 
     # -- what the filter does, done to the columns ---------------------------------------------
@@ -167,29 +167,29 @@ class SampledErrors(ErrorColumns):
         if self._off:
             return
         self._random = np.random.default_rng((_STREAM, step.frame))
-        self._terms.hear(step.increment)
+        self._terms.update(step.increment)
         learn_from(self._noise, step.frame, step.increment, step.tracking, step.before.wTc)
         self._taken = step.tracking.noise
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
         moved = carried @ self._gain
         moved[:, self._count :] += _root(noise) @ self._signs(1, 6)[0]
-        sights = self._sights(wTc, problem)
-        self._enter(used.ids, sights, problem.point_covariances, moved)
+        columns = self._columns(wTc, problem)
+        self._enter(used.ids, columns, problem.point_covariances, moved)
         rows, _ = self._rows(used.ids)
-        self._seen = rows, sights, self._map["gain"][rows].astype(np.float64)
+        self._seen = rows, columns, self._map["gain"][rows].astype(np.float64)
         self._gain = self._on_floor(wTc, moved)
         if step.measured:
             by_prediction, by_measurement = self._solver.gain(
                 wTc, step.expected, problem, self._taken
             )
-            self._gain = by_prediction @ moved + sights.following(by_measurement, self._seen[2])
+            self._gain = by_prediction @ moved + columns.following(by_measurement, self._seen[2])
 
     def filter(self, share: FloatArray) -> None:
         """Matched landmarks move to where the frame has them by the share (k, 3, 3) of the way."""
         if self._seen is not None:
-            rows, sights, before = self._seen
-            self._map["gain"][rows] = before + share @ (sights.placed(self._gain) - before)
+            rows, columns, before = self._seen
+            self._map["gain"][rows] = before + share @ (columns.placed(self._gain) - before)
 
     def add(self, ids: IntArray, placed: PoseProblem, wTc: FloatArray) -> None:
         """New landmarks, where the frame at ``wTc`` has them."""
@@ -197,7 +197,7 @@ class SampledErrors(ErrorColumns):
             points = transform_to_camera(wTc, placed.points)
             near = in_front(points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
             gain = np.zeros((len(ids), 3, self._count + SAMPLES))
-            gain[near] = self._sights(wTc, placed.select(near)).placed(self._gain)
+            gain[near] = self._columns(wTc, placed.select(near)).placed(self._gain)
             self._append({"ids": ids, "gain": gain})
 
     def close(
@@ -263,14 +263,14 @@ class SampledErrors(ErrorColumns):
 
     # ----------------------------------------------------------------------------------------
 
-    def _sights(self, wTc: FloatArray, seen: PoseProblem) -> Sights:
+    def _columns(self, wTc: FloatArray, seen: PoseProblem) -> ObservedColumns:
         points = transform_to_camera(wTc, seen.points)
         projection = projection_jacobian(self._sensor, points)
         shift = np.zeros((len(seen), 3, self._count + SAMPLES))
         shift[:, :, : self._count] = self._terms.shifts(seen.measurement)
         shift[:, :, self._count :] = self._drawn(self._noise.power * seen.measurement_covariance)
         by_pose = projection @ point_pose_jacobian(points)
-        return Sights(by_pose, projection @ wTc[:3, :3].T, shift)
+        return ObservedColumns(by_pose, projection @ wTc[:3, :3].T, shift)
 
     def _signs(self, k: int, d: int) -> FloatArray:
         """(k, d, SAMPLES) random signs.
@@ -286,7 +286,7 @@ class SampledErrors(ErrorColumns):
         return np.asarray(np.linalg.cholesky(definite) @ self._signs(len(covariances), 3))
 
     def _enter(
-        self, ids: IntArray, sights: Sights, covariances: FloatArray, pose: FloatArray
+        self, ids: IntArray, columns: ObservedColumns, covariances: FloatArray, pose: FloatArray
     ) -> None:
         """Landmarks of a saved map seen for the first time: independent, as the filter has them.
 
@@ -294,7 +294,7 @@ class SampledErrors(ErrorColumns):
         """
         new = ~self._rows(ids)[1]
         if new.any():
-            gain = Sights(*(each[new] for each in sights)).placed(pose)
+            gain = columns.select(new).placed(pose)
             gain[:, :, self._count :] = self._drawn(covariances[new])
             self._append({"ids": ids[new], "gain": gain})
 
@@ -311,9 +311,9 @@ class SampledErrors(ErrorColumns):
             gain[:, self._count :] += _root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
         problem = problem.select(ahead)
-        sights = self._sights(wTc, problem)
+        columns = self._columns(wTc, problem)
         by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
-        return sights.following(by_measurement, self._of("gain", seen.ids[ahead]))
+        return columns.following(by_measurement, self._of("gain", seen.ids[ahead]))
 
     def _of_place(self, frame: int, landmarks: LandmarkMap, homes: IntArray) -> FloatArray:
         """Errors (6, m) of a frame's place as a motion of the world, by landmarks first seen there.

@@ -1,6 +1,6 @@
 """A rig that calibrates itself from the drive: an information filter over its correction.
 
-Windows of frames that share no image say what they show (:mod:`.rig_alignment`); their evidence is
+Windows of frames that share no image give evidence (:mod:`.rig_alignment`), which is
 added up, with the noise that the windows themselves show by how far they disagree. Nothing is
 known of the truth. Derived in docs/derivations/self_calibration.md.
 """
@@ -94,7 +94,7 @@ class SelfCalibration:
 
     @property
     def noise_factor(self) -> float:
-        """Variance of what windows say, as multiple of what their pixels alone would give."""
+        """Variance of the windows' evidence, as multiple of what their pixels alone would give."""
         return self._whole.noise_factor
 
     @property
@@ -107,10 +107,6 @@ class SelfCalibration:
         """What all frames since the rig was moved last are best corrected by, as known now."""
         settled = self.found.settled
         return SettledRig(None if settled is None else settled.values, self.knocks, self.field_px)
-
-    @property
-    def _priors(self) -> tuple[FloatArray, FloatArray]:
-        return self._whole.prior, self._early.prior
 
     def observe(self, increment: Increment, wTc: FloatArray) -> WeighedCorrection:
         """Takes in a frame as measured and its pose; returns the correction as known now."""
@@ -128,12 +124,12 @@ class SelfCalibration:
         since = 0.0 if self._last_time is None else timestamp - self._last_time
         self._last_time = timestamp
         filters = [of.grown(since / _DRIFT_S) for of in (self._early, self._whole)]
-        evidence = [of.heard(self._rig, frames, self._sigma) for of in filters]
-        said = [(of, what) for of, what in zip(filters, evidence, strict=True) if what is not None]
-        if len(said) < len(filters):
+        found = [of.evidence_of(self._rig, frames, self._sigma) for of in filters]
+        evidence = [one for one in found if one is not None]
+        if len(evidence) < len(filters):
             return
         self.windows += 1
-        judged = [of.judged(what) for of, what in said]
+        judged = [of.judged(one) for of, one in zip(filters, evidence, strict=True)]
         if judged[0][0] and self.windows > TRUSTED_WINDOWS:
             if not self._suspected:  # once is something that passed through the view
                 self._suspected = True
@@ -143,10 +139,9 @@ class SelfCalibration:
         else:
             filters = [of for _, of in judged]
         self._suspected = False
-        pairs = zip(filters, said, strict=True)
-        self._early, self._whole = (of.after(what) for of, (_, what) in pairs)
-        found = self._weighed()
-        self.found = self._held(found)
+        pairs = zip(filters, evidence, strict=True)
+        self._early, self._whole = (of.after(one) for of, one in pairs)
+        self.found = self._held(self._weighed())
         self._applied = self.found.applied.values
         self.steps.append(CalibrationStep.of(timestamp, self.found, self.knocks))
 
@@ -163,7 +158,7 @@ class SelfCalibration:
     def _weighed(self) -> WeighedCorrection:
         """As known now, under the field found so far."""
         whole, early = self._whole.under(self.field_px), self._early.under(self.field_px)
-        return weighed(whole, early, self._priors)
+        return weighed(whole, early, (self._whole.prior, self._early.prior))
 
     def _held(self, found: WeighedCorrection) -> WeighedCorrection:
         """With the old correction where the new one is no farther from it than noise goes.

@@ -24,7 +24,7 @@ from fgslam.backend.filters.loop_correction import (
     CLOSURE_FACTOR,
     FREE,
     Constraint,
-    founds_anew,
+    starts_new_part,
 )
 from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.persistence import learn_from
@@ -164,7 +164,7 @@ class Smoother:
             EstimatorError: a number is not finite, or time does not increase; the state is then as
                 before. Or the solver failed beyond repair; the estimator is then at its end.
         """
-        free = increment.relocalised or founds_anew(increment, tracking)
+        free = increment.relocalised or starts_new_part(increment, tracking)
         if free and len(self.inputs):
             step = self._unknown_step(increment, tracking)
             increment = dataclasses.replace(increment, odometry=step)

@@ -133,14 +133,16 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
     update: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All samples are one known error of all measurements, none of the odometry."""
-    original = SampledErrors._sights
+    original = SampledErrors._columns
 
-    def known(self: SampledErrors, wTc: FloatArray, seen: PoseProblem) -> sampled_errors.Sights:
+    def known(
+        self: SampledErrors, wTc: FloatArray, seen: PoseProblem
+    ) -> sampled_errors.ObservedColumns:
         sights = original(self, wTc, seen)
         sights.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
         return sights
 
-    monkeypatch.setattr(SampledErrors, "_sights", known)
+    monkeypatch.setattr(SampledErrors, "_columns", known)
     monkeypatch.setattr(sampled_errors, "_root", lambda covariance: np.zeros((6, 6)))
     increments = drawn(2, noise=0.0).increments
     size = 1e-4
