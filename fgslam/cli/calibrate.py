@@ -1,4 +1,4 @@
-"""`fgslam calibrate`: cameras from images of a board, mirrors from one of rings."""
+"""`fgslam calibrate`, cameras from images of a board or of rings; `fgslam camera`, their files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from fgslam.core.files import require_output
 
 if TYPE_CHECKING:
     from fgslam.cameras.boards import Board as CalibrationBoard
-    from fgslam.runs.calibrating import Calibrated
 
 app = typer.Typer(
     help="Calibrate cameras from images of a board, a mirror from one of rings.",
@@ -45,20 +44,6 @@ CameraOut = Annotated[
     typer.Option(
         metavar="FILE", help="where to write it, .yaml, for --camera; numbers in *_lens.json"
     ),
-]
-
-
-def _refuse_rings(given: str | None) -> None:
-    """Options that `omni` had while it was the command for mirrors and rings."""
-    if given is not None:
-        raise ConfigError(
-            "calibrate omni is of images of a board; a mirror from an image of rings (--elevations "
-            "and --inner) is now `fgslam calibrate rings`"
-        )
-
-
-OfRings = Annotated[
-    str | None, typer.Option(hidden=True, is_eager=True, callback=_refuse_rings, help="of rings")
 ]
 Out = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .json, for --camera")]
 MirrorOut = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .yaml")]
@@ -122,8 +107,6 @@ def omni(  # noqa: PLR0913 - each option is a parameter
     lens: WideLens = "omni",
     mount: Mount = "mirror",
     out: CameraOut = Path("camera.yaml"),
-    elevations: OfRings = None,
-    inner: OfRings = None,
     overwrite: options.Overwrite = False,
 ) -> None:
     """Calibrate one fisheye, or a camera below a mirror, from images of a board."""
@@ -131,13 +114,11 @@ def omni(  # noqa: PLR0913 - each option is a parameter
     from fgslam.runs import calibrating
 
     known = _board(target, board, square, spacing, dictionary)
-    wide = calibrating.WideLens(lens, mount)
-    del elevations, inner  # refused before
     require_output(out, overwrite, [images])
     _require_outputs(calibrating.numbers_beside(out), overwrite, [images])
     with progress_bar() as progress:
-        found = calibrating.calibrate_wide_camera(images, known, wide, out, progress)
-    _tell(found)
+        lines = calibrating.calibrate_wide_camera(images, known, lens, mount, out, progress)
+    _show(lines)
 
 
 @app.command()
@@ -165,8 +146,7 @@ def rings(
             f"--elevations {elevations}: give degrees as --elevations=-15,-5,5,15"
         ) from None
     require_output(out, overwrite, [image])
-    for line in calibrate_mirror(image, degrees, inner, out):
-        typer.echo(line)
+    _show(calibrate_mirror(image, degrees, inner, out))
 
 
 def _calibrate(
@@ -182,8 +162,8 @@ def _calibrate(
     known = _board(*board)
     _require_outputs(out, overwrite, folders)
     with progress_bar() as progress:
-        found = calibrate_cameras(folders, known, lens, out, progress)
-    _tell(found)
+        lines = calibrate_cameras(folders, known, lens, out, progress)
+    _show(lines)
 
 
 def _require_outputs(numbers: Path, overwrite: bool, images: Sequence[Path]) -> None:
@@ -204,7 +184,95 @@ def _board(
     return KnownBoard(kind, int(counted[1]), int(counted[2]), square, spacing, dictionary)
 
 
-def _tell(found: Calibrated) -> None:
-    for line in found.lines:
+def _show(lines: Sequence[str]) -> None:
+    for line in lines:
         typer.echo(line)
-    typer.echo(f"calibration {found.file}, with {', '.join(str(path) for path in found.others)}")
+
+
+# --------------------------------------------------------------------------------------------
+# Calibration files
+
+camera = typer.Typer(help="Calibration files: what one says, and the same in another format.")
+
+_FILE = "calibration file, or the folder that holds one"
+File = Annotated[Path, typer.Argument(metavar="FILE", help=_FILE)]
+Second = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="the second of two files: the right camera's, extrinsics"),
+]
+Size = Annotated[
+    str | None, typer.Option(metavar="WxH", help="size of the images, where the file has none")
+]
+Scale = Annotated[
+    bool, typer.Option("--scale", help="the images were resized: scale the calibration to --size")
+]
+Unit = Annotated[
+    float, typer.Option(metavar="METRES", help="one unit of the file's lengths, 0.001: millimetres")
+]
+Fov = Annotated[
+    float | None, typer.Option(metavar="DEGREES", help="horizontal angle of the rectified view")
+]
+Cameras = Annotated[
+    str | None, typer.Option(metavar="N,N", help="which of the file's cameras, as 0,1")
+]
+
+
+@camera.command()
+def show(  # noqa: PLR0913 - each option is a parameter
+    file: File,
+    second: Second = None,
+    size: Size = None,
+    scale: Scale = False,
+    unit: Unit = 1.0,
+    fov: Fov = None,
+    cameras: Cameras = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="the picture; default none")
+    ] = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Say what a calibration file says: cameras, fields of view, baselines, rectified view."""
+    from fgslam.runs.calibrating import Asked, show_calibration
+
+    asked = Asked(file, second, size, scale, unit, fov, cameras)
+    if out is not None:
+        require_output(out, overwrite, [file, *([] if second is None else [second])])
+    _show(show_calibration(asked, out))
+
+
+@camera.command()
+def convert(  # noqa: PLR0913 - each option is a parameter
+    file: File,
+    out: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help=".json is fgslam's, .yml or .xml OpenCV's, .yaml Kalibr's, no ending a folder "
+            "with left.yaml and right.yaml of ROS",
+        ),
+    ],
+    form: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            metavar="NAME",
+            help="the format, if not that of OUT's ending: fgslam, opencv, kalibr, ros",
+        ),
+    ] = None,
+    second: Second = None,
+    size: Size = None,
+    scale: Scale = False,
+    unit: Unit = 1.0,
+    fov: Fov = None,
+    cameras: Cameras = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Write a calibration in another tool's format, number by number."""
+    from fgslam.runs.calibrating import Asked, convert_calibration
+
+    asked = Asked(file, second, size, scale, unit, fov, cameras)
+    # Of a folder, which may hold a recording, the files that it gets.
+    parts = [*out.glob("*.yaml"), *out.glob("*/sensor.yaml")] if out.is_dir() else [out]
+    for path in parts:
+        require_output(path, overwrite, [file, *([] if second is None else [second])])
+    _show(convert_calibration(asked, out, form))

@@ -12,7 +12,7 @@ import typer
 
 from fgslam.cli import options, routes, signals
 from fgslam.cli.calibrate import app as calibrate_app
-from fgslam.cli.camera import app as camera_app
+from fgslam.cli.calibrate import camera as camera_app
 from fgslam.cli.filming import film
 from fgslam.cli.performing import (
     EXIT_FAULT,

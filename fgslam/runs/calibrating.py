@@ -1,9 +1,12 @@
-"""Calibrates cameras from images of a board, mirrors from one of rings: `fgslam calibrate`."""
+"""`fgslam calibrate` and `fgslam camera`: calibrations from images, shown, and in other formats.
+
+Cameras are calibrated from images of a board, mirrors from one of rings.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,26 +15,44 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.boards import Board, Corners, find_corners, find_corners_of_wide, sizes_that_fit
-from fgslam.cameras.calibrate import View, calibrate, held_out, held_out_alone
-from fgslam.cameras.lenses import Calibration
+from fgslam.cameras.calibrate import (
+    DEPTH_SHARE,
+    INTRINSICS,
+    NAMES,
+    PARAMETERS,
+    BoardCalibration,
+    HeldOut,
+    HeldOutAlone,
+    View,
+    calibrate,
+    coverage,
+    coverage_of_circle,
+    farthest_from_axis,
+    held_out,
+    held_out_alone,
+)
+from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
 from fgslam.cameras.omni import MirrorFrame
-from fgslam.cameras.rig import assembled
+from fgslam.cameras.rig import (
+    StereoRig,
+    assembled,
+    at_size,
+    chosen_cameras,
+    in_metres,
+    read_calibration_file,
+    require_options,
+    rig_of,
+)
 from fgslam.cameras.rings import calibrate_from_rings, find_mirror_circle
-from fgslam.cameras.write_formats import raw_values
-from fgslam.core.arrays import Image
+from fgslam.cameras.write_formats import raw_values, write_calibration
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.files import write_text
+from fgslam.core.sensors import CAMERA_NAMES
 from fgslam.datasets.images import bits_of, read_grey_image
 from fgslam.datasets.layouts import find_cameras, images_in
 from fgslam.datasets.times import pair_files
-from fgslam.runs.calibration_report import (
-    Files,
-    draw_coverage,
-    fit_lines,
-    rig_verdict,
-    wide_verdict,
-    write_tables,
-)
+from fgslam.report.content import write_csv
 
 _WITHIN_RIM = 0.98  # of a mirror's radius: its edge is a border of two bands, too
 _SEED = 0  # of the search for a mirror's circle: the same image gives the same calibration
@@ -46,39 +67,17 @@ MOUNTS = {
 """How an omnidirectional camera may be mounted: where the image's middle looks, whether bearings
 grow clockwise in it, and that in words."""
 
+Files = Sequence[tuple[Path, ...]]
+"""Images of each moment, in the cameras' order."""
 Progress = Callable[[str, int, int], None]
 Finder = Callable[[Image], Corners | None]
 
-
-@dataclass(frozen=True, slots=True)
-class Calibrated:
-    """What came out: the calibration, what else was written, and what to tell, a line each."""
-
-    file: Path
-    others: tuple[Path, ...]
-    lines: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class WideLens:
-    """Model of a single wide camera, and how it is mounted.
-
-    Raises:
-        ConfigError: one of them is not known.
-    """
-
-    model: str = "omni"
-    mount: str = "mirror"
-
-    def __post_init__(self) -> None:
-        _require_model(self.model, WIDE_MODELS)
-        if self.mount not in MOUNTS:
-            raise ConfigError(f"mount {self.mount!r} is not known; use {', '.join(MOUNTS)}")
-
-    def camera_file(self, numbers: str) -> dict[str, str | bool]:
-        """Keys of a camera file that names the calibration beside it."""
-        middle, clockwise, _ = MOUNTS[self.mount]
-        return {"kind": "lens", "file": numbers, "middle": middle, "clockwise": clockwise}
+_OFF_PX = 0.5  # stereo matching takes rows that agree to 1.5; half a pixel leaves it room
+_SQUARE = 0.01  # of the square's side: what a tape measure is good for
+_COVERAGE = 0.5
+_VIEWS = 10
+_TURNS = ("turn_x", "turn_y", "turn_z", "x", "y", "z")
+_MORE_IMAGES = "take more images: tilted, near and far, in each corner, with a sharp and flat board"
 
 
 def numbers_beside(out: Path) -> Path:
@@ -93,8 +92,8 @@ def _require_model(model: str, known: Sequence[str]) -> None:
 
 def calibrate_cameras(
     folders: Sequence[Path], board: Board, model: str, out: Path, progress: Progress
-) -> Calibrated:
-    """Writes the calibration of a rig, a picture of how its images are covered, and tables.
+) -> list[str]:
+    """Writes the calibration of a rig, a picture of its coverage, and tables; lines about it.
 
     Args:
         folders: one folder with the images of a pair, or one folder for each of two or three
@@ -120,20 +119,22 @@ def calibrate_cameras(
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
     remarks = assembled(calibration).remarks
     write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
-    others = (draw_coverage(out, found), *write_tables(out, files, views, found))
-    lines = (*fit_lines(files, views, found), *rig_verdict(board, found, checked), *remarks)
-    return Calibrated(out, others, (*notes, *held, *lines))
+    others = _write_beside(out, files, views, found)
+    fit = _fit_lines(files, views, found)
+    lines = [*notes, *held, *fit, *_rig_verdict(board, found, checked), *remarks]
+    return [*lines, f"calibration {out}, with {', '.join(map(str, others))}"]
 
 
 def calibrate_wide_camera(
-    folder: Path, board: Board, lens: WideLens, out: Path, progress: Progress
-) -> Calibrated:
-    """Writes the calibration of one fisheye or mirror, a picture of its coverage, and tables.
+    folder: Path, board: Board, model: str, mount: str, out: Path, progress: Progress
+) -> list[str]:
+    """Writes the calibration of one fisheye or mirror, a picture, and tables; lines about it.
 
     Args:
         folder: of the images.
         board: what they show.
-        lens: how the camera is modelled and mounted.
+        model: of the lens, one of :data:`WIDE_MODELS`.
+        mount: of the camera, one of :data:`MOUNTS`.
         out: the camera file, .yaml, for :func:`fgslam.load_camera`, `teach` and `follow`; the
             calibration that it names is written beside it: of camera.yaml camera_lens.json.
         progress: called with what is done, how far, of how much.
@@ -142,28 +143,33 @@ def calibrate_wide_camera(
         FgslamError: the images are not found, show no such board or too few, or a file cannot be
             written.
     """
+    _require_model(model, WIDE_MODELS)
+    if mount not in MOUNTS:
+        raise ConfigError(f"mount {mount!r} is not known; use {', '.join(MOUNTS)}")
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a camera file is written as .yaml; give such a name")
     files = _files_of_one(folder)
     bits, held = bits_of([moment[0] for moment in files])
-    finder = partial(find_corners_of_wide, board, mirrored=lens.mount == "mirror")
+    finder = partial(find_corners_of_wide, board, mirrored=mount == "mirror")
     views, size = _views(files, bits, finder, progress)
     _require_found(views, files, bits, board)
-    found = calibrate(board, views, size, lens.model)
-    checked = held_out_alone(board, views, size, lens.model)
+    found = calibrate(board, views, size, model)
+    checked = held_out_alone(board, views, size, model)
     # Not rig.json of rig.yaml, which may be the calibration of a rig, with a picture and tables.
     numbers = numbers_beside(out)
     calibration = Calibration(str(numbers), "fgslam calibrate", found.cameras)
     write_text(numbers, json.dumps(raw_values(calibration), indent=2) + "\n")
-    write_text(out, yaml.safe_dump(lens.camera_file(numbers.name), sort_keys=False))
-    tables = write_tables(numbers, files, views, found)
-    lines = (
+    middle, clockwise, words = MOUNTS[mount]
+    keys = {"kind": "lens", "file": numbers.name, "middle": middle, "clockwise": clockwise}
+    write_text(out, yaml.safe_dump(keys, sort_keys=False))
+    others = (numbers, *_write_beside(numbers, files, views, found))
+    return [
         *held,
-        *fit_lines(files, views, found),
+        *_fit_lines(files, views, found),
         *wide_verdict(files, found, checked),
-        f"mount       {lens.mount}: {MOUNTS[lens.mount][-1]}; if not, give --mount",
-    )
-    return Calibrated(out, (numbers, draw_coverage(numbers, found), *tables), lines)
+        f"mount       {mount}: {words}; if not, give --mount",
+        f"calibration {out}, with {', '.join(map(str, others))}",
+    ]
 
 
 def _files_of_one(folder: Path) -> list[tuple[Path, ...]]:
@@ -245,6 +251,159 @@ def _require_found(views: Sequence[View], files: Files, bits: int, board: Board)
 
 
 # --------------------------------------------------------------------------------------------
+# What came out, and how good it is
+
+
+def _fit_lines(files: Files, views: Sequence[View], found: BoardCalibration) -> Iterator[str]:
+    """Corners used, all parameters with standard deviations, and the worst image."""
+    total = sum(len(corners) for view in views for corners in view if corners is not None)
+    names = _names(found)
+    yield (
+        f"corners     {total - found.left_out} used, {found.left_out} left out that do not fit, "
+        f"rms {found.rms:.3f} px"
+    )
+    for k, camera in enumerate(found.cameras):
+        seen = sum(view[k] is not None for view in views)
+        covered = coverage(found.kept, k, camera.size)
+        sigmas, at = found.sigmas[k], len(INTRINSICS)
+        yield (
+            f"{names[k]:11} {seen} of {len(views)} images, {covered:.0%} of the image; "
+            f"{_with_sigmas(INTRINSICS, camera.intrinsics, sigmas[:at], 2)} px"
+        )
+        own = _with_sigmas(PARAMETERS[camera.model], camera.distortion, sigmas[at:], 5)
+        yield f"            {camera.model}: {own}"
+    for k in range(1, len(found.cameras)):
+        length = float(np.linalg.norm(found.cameras[k].bTc[:3, 3]))
+        turn, shift = found.turn_sigmas[k, :3], found.turn_sigmas[k, 3:]
+        yield (
+            f"{names[0]}-{names[k]:6} {1e3 * length:.2f} +- {1e3 * shift.max():.2f} mm apart, "
+            f"turned to +- {np.degrees(turn.max()):.3f} deg"
+        )
+    worst = np.unravel_index(int(np.nanargmax(found.errors)), found.errors.shape)
+    name = files[int(worst[0])][int(worst[1])].name
+    yield f"worst       {name}: {found.errors[worst]:.2f} px"
+
+
+def _with_sigmas(names: Sequence[str], values: FloatArray, sigmas: FloatArray, digits: int) -> str:
+    return ", ".join(
+        f"{name} {value:.{digits}f} +- {sigma:.{digits}f}"
+        for name, value, sigma in zip(names, values, sigmas, strict=True)
+    )
+
+
+def _rig_verdict(
+    board: Board,
+    found: BoardCalibration,
+    checked: Sequence[HeldOut | None],
+) -> Iterator[str]:
+    """How the rig does on images that it was not calibrated with, and what to mend."""
+    faults = []
+    for k, held in enumerate(checked, start=1):
+        if held is None:
+            yield "held out    not known: half of the images are not enough to calibrate with"
+            continue
+        off = held.square / board.square - 1.0
+        yield (
+            f"held out    {NAMES[0]}-{NAMES[k]}, {held.views} images: rows agree to "
+            f"{held.rows_px:.2f} px, squares of {1e3 * held.square:.2f} mm ({off:+.1%}); depth to "
+            f"{DEPTH_SHARE:.0%} up to {held.reach_m:.1f} m"
+        )
+        if held.rows_px > _OFF_PX:
+            faults.append(f"rows agree to {held.rows_px:.2f} px only")
+        if abs(off) > _SQUARE:
+            faults.append(f"squares come out {off:+.1%}")
+    least = min(coverage(found.kept, k, camera.size) for k, camera in enumerate(found.cameras))
+    if least < _COVERAGE:
+        faults.append(f"a camera shows the board in {least:.0%} of its image only")
+    both = sum(all(corners is not None for corners in view) for view in found.kept)
+    if both < _VIEWS:
+        faults.append(f"only {both} moments show it to all cameras")
+    yield _verdict(faults, None not in checked)
+
+
+def wide_verdict(files: Files, found: BoardCalibration, held: HeldOutAlone | None) -> Iterator[str]:
+    """How a single camera does on images that it was not calibrated with, and what to mend."""
+    camera, faults = found.cameras[0], []
+    angle, covered = farthest_from_axis(found.kept, camera), coverage_of_circle(found.kept, camera)
+    across, down, _ = np.degrees(camera.field_of_view())
+    yield (
+        f"view        {across:.0f} x {down:.0f} degrees; corners up to {np.degrees(angle):.0f} "
+        f"degrees from the axis, in {covered:.0%} of the widest circle in the image"
+    )
+    if held is None:
+        yield "held out    not known: half of the images are not enough to calibrate with"
+    else:
+        worst = int(np.argmax(held.each_px))
+        direction = np.degrees(held.off_px / camera.focal_px)
+        yield (
+            f"held out    {len(held.views)} images: corners to {held.off_px:.2f} px, directions to "
+            f"{direction:.3f} deg; worst {files[held.views[worst]][0].name}: "
+            f"{held.each_px[worst]:.2f} px"
+        )
+        if held.off_px > _OFF_PX:
+            faults.append(f"corners agree to {held.off_px:.2f} px only")
+    if covered < _COVERAGE:
+        faults.append(f"the board is seen in {covered:.0%} of the circle only")
+    seen = sum(view[0] is not None for view in found.kept)
+    if seen < _VIEWS:
+        faults.append(f"only {seen} images show it")
+    yield _verdict(faults, held is not None)
+
+
+def _verdict(faults: Sequence[str], checked: bool) -> str:
+    if faults or not checked:
+        said = "; ".join(faults or ["not checked"])
+        return f"verdict     doubtful: {said}; {_MORE_IMAGES}"
+    return "verdict     good for mapping"
+
+
+def _write_beside(
+    out: Path, files: Files, views: Sequence[View], found: BoardCalibration
+) -> tuple[Path, Path, Path]:
+    """Writes a picture of where corners were used, a table of images, one of parameters; paths.
+
+    Of each image: its camera, the corners found, those left out, and the residual of the others.
+    Of each parameter: its value and standard deviation. Turns and shifts take coordinates of the
+    first camera to a camera's own, radians and metres.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from fgslam.report.pictures.board import draw_corners
+
+    picture = out.with_suffix(".png")
+    images = out.with_name(f"{out.stem}_images.csv")
+    parameters = out.with_name(f"{out.stem}_parameters.csv")
+    names = _names(found)
+    corners = [
+        np.concatenate([corners.pixels for view in found.kept if (corners := view[k]) is not None])
+        for k in range(len(names))
+    ]
+    draw_corners(picture, found.cameras[0].size, corners, names)
+    of_images = []
+    for v, view in enumerate(views):
+        for c, seen in enumerate(view):
+            count, used = 0 if seen is None else len(seen), len(found.off[v][c])
+            rms = float(found.errors[v, c])
+            of_images.append((files[v][c].name, names[c], count, count - used, rms))
+    write_csv(images, ("image", "camera", "corners", "left_out", "rms_px"), of_images)
+    rows: list[tuple[str, str, float, float]] = []
+    for k, camera in enumerate(found.cameras):
+        named = (*INTRINSICS, *PARAMETERS[camera.model], *(_TURNS if k else ()))
+        values = [*camera.intrinsics, *camera.distortion, *(found.turn(k) if k else ())]
+        sigmas = [*found.sigmas[k], *(found.turn_sigmas[k] if k else ())]
+        for name, value, sigma in zip(named, values, sigmas, strict=True):
+            rows.append((names[k], name, float(value), float(sigma)))
+    write_csv(parameters, ("camera", "parameter", "value", "sigma"), rows)
+    return picture, images, parameters
+
+
+def _names(found: BoardCalibration) -> tuple[str, ...]:
+    """Of the cameras; of a single one `camera`."""
+    return NAMES[: len(found.cameras)] if len(found.cameras) > 1 else ("camera",)
+
+
+# --------------------------------------------------------------------------------------------
 # Mirrors
 
 
@@ -288,3 +447,185 @@ def calibrate_mirror(
         f"fit         worst ring off by {np.degrees(found.fit.worst):.2f} deg",
         f"calibration {out}",
     ]
+
+
+# --------------------------------------------------------------------------------------------
+# Calibration files
+
+_EDGE_STEPS = 60
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """Which calibration, and what it leaves open; see :func:`fgslam.load_rig`."""
+
+    path: Path
+    second: Path | None = None
+    size: str | None = None
+    scale: bool = False
+    unit_m: float = 1.0
+    fov_deg: float | None = None
+    cameras: str | None = None
+
+    def read(self) -> Calibration:
+        """The calibration. Raises CalibrationError, or ConfigError for an option that is none."""
+        size = None if self.size is None else _whole_numbers(self.size, "x", "--size", "640x480")
+        chosen = None
+        if self.cameras is not None:
+            chosen = _whole_numbers(self.cameras, ",", "--cameras", "0,1")
+        pair = None if size is None else (size[0], size[1]) if len(size) == 2 else size
+        require_options(pair, self.unit_m, self.fov_deg)
+        found = read_calibration_file(self.path, self.second, pair)  # type: ignore[arg-type]
+        found = in_metres(chosen_cameras(found, chosen), self.unit_m)
+        return at_size(found, pair, self.scale)  # type: ignore[arg-type]
+
+
+def _whole_numbers(text: str, separator: str, option: str, example: str) -> tuple[int, ...]:
+    words = text.lower().split(separator)
+    if not all(word.strip().isdecimal() for word in words):
+        raise ConfigError(f"{option} {text}: give whole numbers, as {option} {example}")
+    return tuple(int(word) for word in words)
+
+
+# --------------------------------------------------------------------------------------------
+# In another format
+
+
+def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> list[str]:
+    """Writes the calibration in a format, None: the one that the name of ``out`` says; lines.
+
+    Raises:
+        CalibrationError: it cannot be read, or that format has no such cameras.
+        OutputError: the file cannot be written.
+    """
+    found = asked.read()
+    lacking = [camera.name for camera in found.cameras if camera.width == 0]
+    if lacking:
+        raise CalibrationError(
+            f"{found.source} does not state the images' size; give it: --size 640x480"
+        )
+    for_ros = form == "ros" or (form is None and not out.suffix)
+    view = _view(found, asked.fov_deg) if for_ros and len(found.cameras) == 2 else None
+    words = write_calibration(found, out, view, form)
+    return [f"{out}: {words}, {len(found.cameras)} cameras of {found.source}", *found.notes]
+
+
+def _view(found: Calibration, fov_deg: float | None) -> StatedView:
+    """The rectification of a pair, left camera first."""
+    if found.view is not None and fov_deg is None:
+        return found.view
+    made = assembled(found, fov_deg)
+    if made.sources != (1, 0):
+        raise CalibrationError(
+            f"{found.source}: its first camera is the right one, and ROS wants the left one first; "
+            "choose them in that order: --cameras 1,0"
+        )
+    rig = made.rig
+    axes = rig.bTc[:3, :3].T
+    rotations = tuple(axes @ camera.bTc[:3, :3] for camera in found.cameras)
+    matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
+    return StatedView((rotations[0], rotations[1]), matrix, (rig.width, rig.height))
+
+
+# --------------------------------------------------------------------------------------------
+# In words, and as a picture
+
+
+def show_calibration(asked: Asked, picture: Path | None) -> list[str]:
+    """What was understood, in lines; the picture as well, where one is wanted.
+
+    Raises:
+        CalibrationError: the calibration cannot be read.
+        OutputError: the picture cannot be written.
+    """
+    found = asked.read()
+    many = f"{len(found.cameras)} camera{'s' if len(found.cameras) > 1 else ''}"
+    lines = [f"{found.source}: {found.format}, {many}", *_table(found)]
+    rig = None
+    if len(found.cameras) > 1:
+        rig = rig_of(found, asked.fov_deg)
+        lines += _about(rig, found)
+    if picture is not None:
+        _draw(found, rig, picture)
+        lines.append(f"picture: {picture}")
+    return lines
+
+
+_HEAD = ("camera", "image", "model", "focal px", "view deg (h x v x d)", "place mm", "turned deg")
+
+
+def _table(found: Calibration) -> list[str]:
+    rows = [_HEAD, *(_row(found, k) for k in range(len(found.cameras)))]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+
+
+def _row(found: Calibration, k: int) -> tuple[str, ...]:
+    camera, place = found.cameras[k], found.offset(k, 0)
+    angles = np.degrees(camera.field_of_view()) if camera.width else np.full(3, np.nan)
+    cosine = 0.5 * (float(np.trace(place[:3, :3])) - 1.0)
+    return (
+        f"{k}: {camera.name}",
+        f"{camera.width}x{camera.height}" if camera.width else "unknown",
+        camera.model,
+        f"{camera.focal_px:.1f}",
+        " x ".join(f"{angle:.0f}" for angle in angles),
+        " ".join(f"{1e3 * v:+.1f}" for v in place[:3, 3]),
+        f"{np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.2f}",
+    )
+
+
+def _about(rig: StereoRig, found: Calibration) -> list[str]:
+    names = [found.cameras[k].name for k in rig.sources]
+    parts = [f"{side} = {name}" for side, name in zip(CAMERA_NAMES, names, strict=False)]
+    lines = [f"rig: {', '.join(parts)}; baseline {1e3 * rig.baseline:.2f} mm"]
+    if rig.vertical_baseline is not None:
+        lines[0] += f", vertical baseline {1e3 * rig.vertical_baseline:.2f} mm"
+    view = rig.angles_deg
+    what = "rectified already" if rig.rectifier is None else "rectified view"
+    lines.append(
+        f"{what}: {rig.width}x{rig.height}, focal length {rig.fx:.1f} px, {view[0]:.0f} x "
+        f"{view[1]:.0f} degrees, {100.0 * _overlap(rig):.1f} % of it seen by all cameras; 1 px of "
+        f"disparity at {rig.fx * rig.baseline:.1f} m"
+    )
+    return [*lines, *rig.remarks]
+
+
+def _overlap(rig: StereoRig) -> float:
+    """Share of the rectified pixels that every camera sees."""
+    if rig.rectifier is None:
+        return 1.0
+    return float(np.logical_and.reduce(rig.rectifier.masks).mean())
+
+
+def _draw(found: Calibration, rig: StereoRig | None, path: Path) -> None:
+    from fgslam.report.pictures.cameras import CameraDrawing, draw_cameras
+
+    reference = found.cameras[0]
+    drawings = []
+    for k, camera in enumerate(found.cameras):
+        place = found.offset(k, 0)
+        size = camera.size if camera.width else _guessed_size(camera)
+        outline = np.empty((0, 2))
+        if rig is not None and k in rig.sources and rig.rectifier is not None:
+            outline = _outline(rig.rectifier.maps[rig.sources.index(k)])
+        half = 0.5 * float(camera.field_of_view()[0]) if camera.width else 0.5
+        drawings.append(
+            CameraDrawing(camera.name, size, camera.matrix[:2, 2], outline, place, half)
+        )
+    draw_cameras(path, f"{found.format}, {reference.model}", drawings)
+
+
+def _guessed_size(camera: RawCamera) -> tuple[int, int]:
+    width, height = np.round(2.0 * camera.matrix[:2, 2]).astype(int).tolist()
+    return max(width, 1), max(height, 1)
+
+
+def _outline(maps: Sequence[FloatArray] | tuple[object, ...]) -> FloatArray:
+    """Where the border of the rectified view lies in the raw image, (n, 2) pixels."""
+    both = np.stack([np.asarray(one, np.float64) for one in maps], axis=2)
+    height, width = both.shape[:2]
+    across = np.linspace(0, width - 1, _EDGE_STEPS).astype(int)
+    down = np.linspace(0, height - 1, _EDGE_STEPS).astype(int)
+    border = [both[0, across], both[down, -1], both[-1, across[::-1]], both[down[::-1], 0]]
+    return np.concatenate(border)

@@ -12,7 +12,7 @@ from numpy.polynomial import polynomial
 
 from fgslam.datasets.odometry import file_odometry
 from fgslam.datasets.settings import RecordedOdometrySettings
-from fgslam.runs.camera_files import Asked, convert_calibration
+from fgslam.runs.calibrating import Asked, convert_calibration
 from fgslam.runs.named_experiments import experiment_names, experiments_folder
 from scripts.fuzz.damage import ODD, Rng, damaged_bytes, damaged_text, written
 

@@ -16,7 +16,7 @@ import yaml
 
 import fgslam as fg
 from fgslam.cameras.lenses import Calibration
-from fgslam.runs.camera_files import Asked, convert_calibration
+from fgslam.runs.calibrating import Asked, convert_calibration
 from fgslam.runs.config import load_experiment
 from fgslam.runs.named_experiments import experiment_names, experiments_folder
 from scripts.fuzz.damage import Rng, written

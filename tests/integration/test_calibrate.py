@@ -259,15 +259,6 @@ def test_a_fisheye_is_calibrated_from_images_of_a_board(
     assert all((tmp_path / name).read_text(encoding="utf-8") == "a rig" for name in siblings)
 
 
-def test_rings_are_pointed_to_their_command(
-    tmp_path: Path, monkeypatch: Patch, capfd: Capture
-) -> None:
-    """`calibrate omni` was the command for them before."""
-    for options in (("--elevations=-15,-5,5", "--inner", "20"), ("--inner", "20")):
-        arguments = ("calibrate", "omni", tmp_path / "x.png", *options)
-        assert "is now `fgslam calibrate rings`" in mistake(capfd, monkeypatch, *arguments)
-
-
 def test_mistakes_of_calibrate_omni(
     drawn_boards: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

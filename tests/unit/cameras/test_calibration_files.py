@@ -13,7 +13,7 @@ import pytest
 from fgslam.cameras.lenses import Calibration
 from fgslam.cameras.rig import read_calibration_file
 from fgslam.core.arrays import FloatArray
-from fgslam.runs.camera_files import Asked, show_calibration
+from fgslam.runs.calibrating import Asked, show_calibration
 
 pytestmark = pytest.mark.data
 

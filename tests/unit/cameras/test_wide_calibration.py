@@ -24,7 +24,7 @@ from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import so3_exp
-from fgslam.runs.calibration_report import wide_verdict
+from fgslam.runs.calibrating import wide_verdict
 
 BOARD = Board("chessboard", 9, 6, 0.04)
 NOISE_PX = 0.1

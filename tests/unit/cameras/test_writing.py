@@ -14,7 +14,7 @@ from fgslam.cameras.rig import read_calibration_file
 from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.runs.camera_files import Asked, convert_calibration, show_calibration
+from fgslam.runs.calibrating import Asked, convert_calibration, show_calibration
 
 SIZE = (64, 48)
 STEP = pose(so3_exp(np.array([0.013, -0.021, 0.007])), np.array([0.1101, 0.0012, -0.0023]))

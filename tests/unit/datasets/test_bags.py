@@ -33,7 +33,7 @@ from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.runs.bare_recording import bare_experiment
-from fgslam.runs.camera_files import Asked, convert_calibration
+from fgslam.runs.calibrating import Asked, convert_calibration
 from fgslam.runs.inspect import check_odometry
 
 KINDS = (".bag", ".db3", ".mcap")
