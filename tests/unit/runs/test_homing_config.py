@@ -62,7 +62,7 @@ def test_configuration_class_follows_from_the_task(tmp_path: Path) -> None:
         (TRIALS, ("trial=3",), "unknown key trial; did you mean trials?"),
         (TRIALS, ("dataset.feature=3",), "unknown key dataset.feature; did you mean features?"),
         (TRIALS, ("homing_vector.sample=3",), "unknown key homing_vector.sample; did you"),
-        (TRIALS, ("estimator.kind=homing_graf",), "use one of homing_ekf, homing_graph"),
+        (TRIALS, ("estimator.kind=homing_graf",), "use one of homing_ekf, paper_ekf, homing_graph"),
         (TRIALS, ("estimator.solvr=batch",), "unknown key estimator.solvr; did you mean solver?"),
         (TRIALS, ("compare=[homing_ekf, isam2]",), "compare[1].kind is 'isam2'; use one of"),
         (TRIALS, ("outliers=[0.1, 1.0]",), "outliers[1] = 1.0 is not usable"),
