@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from fgslam.core.trajectories import Trajectory
     from fgslam.evaluation.comparing import compare
     from fgslam.homing.api import HomingVector, PathFollower, teach
-    from fgslam.homing.command import DriveCommand
-    from fgslam.homing.path_memory import PathMemory
-    from fgslam.homing.route_map import RouteMap
+    from fgslam.homing.route import PathMemory
+    from fgslam.homing.steering import DriveCommand
+    from fgslam.homing.topological_map import RouteMap
     from fgslam.report.figures import plot
     from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
     from fgslam.runs.live import Result, Slam
@@ -83,7 +83,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "DriveCommand": "fgslam.homing.command",
+    "DriveCommand": "fgslam.homing.steering",
     "Estimator": "fgslam.backend.protocol",
     "FeatureExtractor": "fgslam.slam.feature_stream",
     "Features": "fgslam.core.features",
@@ -94,10 +94,10 @@ _HOMES = {
     "NewestFrame": "fgslam.slam.newest_frame",
     "Odometry": "fgslam.core.measurements",
     "PathFollower": "fgslam.homing.api",
-    "PathMemory": "fgslam.homing.path_memory",
+    "PathMemory": "fgslam.homing.route",
     "Refusal": "fgslam.core.homing",
     "Result": "fgslam.runs.live",
-    "RouteMap": "fgslam.homing.route_map",
+    "RouteMap": "fgslam.homing.topological_map",
     "Slam": "fgslam.runs.live",
     "Step": "fgslam.slam.results",
     "StereoRig": "fgslam.cameras.rig",

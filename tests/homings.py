@@ -8,9 +8,9 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray
 from fgslam.core.homing import HomingStart, HomingTruth, TrackedBearings, TwoViewVector
-from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_view_geometry import make_local_map
+from fgslam.frontend.homing.two_view import make_local_map
+from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import NO_OUTLIERS, HomingOutliers, simulate_homing
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingEstimatorSettings
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.homing import (
@@ -27,10 +27,9 @@ from fgslam.core.homing import (
 )
 from fgslam.core.planar import bearings, compose, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.homing.active_homing import Sighting
-from fgslam.homing.closed_loop import Driver, follow
-from fgslam.homing.drive_record import DriveRecord
-from fgslam.homing.path_following import HomingChain
+from fgslam.homing.active import Sighting
+from fgslam.homing.closed_loop import Driver, DriveRecord, follow
+from fgslam.homing.controller import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, ObstacleAvoider, Steering
 from fgslam.runs.tasks.homing_trials import start_from_matches

@@ -20,11 +20,10 @@ from fgslam.core.homing import OmniFeatures, TwoViewVector
 from fgslam.core.planar import between, wrap
 from fgslam.datasets.simulated_homing import open_house
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.homing.view_pairs import pair_generator
+from fgslam.frontend.homing.vector import pair_generator
 from fgslam.homing.front_end import compare_views
-from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.route import PathMemory, with_neighbours_votes
 from fgslam.homing.settings import DRIVING
-from fgslam.homing.teaching import with_neighbours_votes
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 LEGS, SPACING_M = 10, 2.0

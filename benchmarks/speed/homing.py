@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.speed.drives import cpu_seconds, interleaved
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import (
     HomingEkfSettings,
     HomingEstimatorSettings,

@@ -19,13 +19,11 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.frontend.homing.bearing_tracking import BearingTracker
-from fgslam.frontend.homing.homing_vector import estimate_homing_vector, paired_anew
-from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.trackable_points import move_to_trackable
-from fgslam.frontend.homing.two_view_geometry import make_local_map, triangulable
-from fgslam.homing.active_homing import Sighting
-from fgslam.homing.compact import best_all_around
+from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable
+from fgslam.frontend.homing.two_view import make_local_map, match_features, triangulable
+from fgslam.frontend.homing.vector import estimate_homing_vector, paired_anew
+from fgslam.homing.active import Sighting
+from fgslam.homing.features import best_all_around
 from fgslam.homing.settings import FrontEndSettings
 
 

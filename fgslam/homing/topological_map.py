@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -15,20 +16,30 @@ from fgslam.cameras.omni import OmniCamera
 from fgslam.core.array_files import ArrayFile, Items, of_rows, rows_of
 from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
-from fgslam.core.errors import StoredMapError
-from fgslam.core.homing import OmniFeatures
-from fgslam.homing.feature_files import VERSIONS
-from fgslam.homing.link_consistency import (
+from fgslam.core.errors import CalibrationError, StoredMapError
+from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason
+from fgslam.frontend.features.images import colour_image
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.homing.features import VERSIONS
+from fgslam.homing.front_end import unusable
+from fgslam.homing.links import (
     UNORDERED,
+    Answer,
     InlierRows,
+    Link,
     LinkConsistency,
+    Pair,
     ThirdViewConsistency,
+    VisualWords,
     Walks,
+    candidate_pairs,
+    link_pairs,
+    sift_inliers,
 )
-from fgslam.homing.links import Answer, Link, Pair, link_pairs
-from fgslam.homing.path_memory import PathMemory, load_images, save_images
-from fgslam.homing.retrieval import VisualWords, candidate_pairs
-from fgslam.homing.settings import TopologicalMapSettings
+from fgslam.homing.route import PathMemory, load_images, save_images
+from fgslam.homing.settings import DRIVING, TopologicalMapSettings
 
 FILE = ArrayFile(
     name="fgslam topological map",
@@ -272,3 +283,306 @@ def _require_links(arrays: Mapping[str, Any], count: int, where: str) -> None:
     if len(np.unique(ends, axis=0)) < len(ends):
         raise FILE.damaged("link_ends", where)
     require_covariances(FILE, "link_covariances", covariances[~turn].reshape(-1, 2, 2), where)
+
+
+# --------------------------------------------------------------------------------------------
+# Routes taught on several days, joined where their views match: one map, with crossroads
+#
+# All path images are nodes of one topological map. Images that follow each other on a route are
+# linked, as the way between them was driven; images of different routes, and of one that comes by
+# again, where homing vectors agree there and back and third views confirm them. An image from
+# anywhere finds its place as one more node would. After Goedemé et al. (2005), section I.
+
+
+FEATURES = DRIVING.features
+VECTOR = HomingVectorSettings(samples=1000, confidence=0.999999, second_look=False)
+"""As of images that are only compared: stricter than for driving. There is no second look, as most
+pairs share nothing, and those that do not follow each other must convince by more than one."""
+
+_ALL = 60  # images of a map that are tried against all others
+_CANDIDATES = 40
+"""Otherwise so many, the most alike: of the 60 school corridors' views, from day to night, that is
+what keeps all connected (docs/results/topological_maps.md)."""
+
+_NO_WAY = 0.01  # cost between two images of one place; a leg has more than 1
+_STREAM = 10  # of the seed's random numbers
+_UNDECIDED = (RefusalReason.AMBIGUOUS, RefusalReason.UNCERTAIN, RefusalReason.AT_TARGET)
+
+Answered: TypeAlias = tuple[Answer, IntArray | None]
+"""The homing vector of a pair, and (k, 2) SIFT features of both images that are its inliers."""
+
+Asker: TypeAlias = Callable[[tuple[OmniFeatures, ...], Sequence[Pair]], Mapping[Pair, Answered]]
+"""Homing vectors between images, by their numbers, with :data:`FEATURES` and :data:`VECTOR`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapPlace:
+    """Where an image was taken.
+
+    Attributes:
+        name: of the place that it was taken at, else of the one that it has most in common with.
+        at: it was taken at that place.
+        inliers: features in common with it.
+        links: to all places that it was recognised from; ``b`` is the image, ``back`` the direction
+            of the place as seen from it.
+    """
+
+    name: str
+    at: bool
+    inliers: int
+    links: tuple[Link, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RouteMap:
+    """Several routes as one map.
+
+    Attributes:
+        topology: the map; its nodes are called ``route/image``.
+    """
+
+    topology: TopologicalMap
+
+    @staticmethod
+    def join(
+        routes: Mapping[str, PathMemory], *, seed: int = 0, ask: Asker | None = None
+    ) -> RouteMap:
+        """Joins routes where their views match.
+
+        Args:
+            routes: by name, each with its path images in the order in which they were driven.
+            seed: of everything random.
+            ask: finds homing vectors, in processes say; None: one after the other.
+
+        Raises:
+            StoredMapError: no route, an empty one, or one with two images of one name.
+        """
+        ask = ask or asked_in_turn(seed)
+        memory, walks = _memory_of(routes)
+        count = len(memory)
+        settings = TopologicalMapSettings(candidates=0 if count <= _ALL else _CANDIDATES)
+        there = map_candidates(
+            memory.images, settings, np.random.default_rng((seed, _STREAM)), walks
+        )
+        answers, rows = _both_ways(ask, memory.images, there)
+        joined = map_of_answers(memory.images, answers, walks=walks, names=memory.names, rows=rows)
+        return RouteMap(_with_driven_steps(joined, walks, memory.camera))
+
+    def __len__(self) -> int:
+        return len(self.topology)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the places."""
+        return self.topology.names
+
+    def knows(self, name: str) -> bool:
+        """Whether a place or a route is called so."""
+        return name in self.names or name in map(route_of, self.names)
+
+    def link(self, start: str, end: str) -> Link:
+        """From one place to another, by their names. Raises StoredMapError where they have none."""
+        a, b = self._node(start), self._node(end)
+        for link in self.topology.links:
+            if (link.a, link.b) == (min(a, b), max(a, b)):
+                return link if a < b else link.reversed()
+        raise StoredMapError(f"map: {start} and {end} are not linked")
+
+    @property
+    def crossroads(self) -> tuple[str, ...]:
+        """Names of places that are linked with more than two others."""
+        degree = np.zeros(len(self), np.int64)
+        for link in self.topology.links:
+            degree[[link.a, link.b]] += 1
+        return tuple(name for name, links in zip(self.names, degree, strict=True) if links > 2)
+
+    def locate(
+        self, image: npt.ArrayLike, camera: OmniCamera | None = None, *, seed: int = 0
+    ) -> MapPlace | Refusal:
+        """Where an image was taken; false where no place is recognised in it.
+
+        Args:
+            image: (height, width, 3) RGB or (height, width) grey uint8.
+            camera: that took it; None: the routes' own.
+            seed: of RANSAC's samples.
+
+        Raises:
+            CalibrationError: the routes were taught with several cameras, and none is given.
+            FrameError: the image is not the camera's.
+        """
+        camera = camera or self.topology.camera
+        if camera is None:
+            raise CalibrationError(
+                "map: its routes were taught with several cameras; give the image's, --camera FILE"
+            )
+        picture = colour_image(image, (camera.width, camera.height))
+        features = OmniFeatureExtractor(camera, FEATURES).extract(picture)
+        refusal = unusable(picture, features)
+        return self._placed(features, asked_in_turn(seed)) if refusal is None else refusal
+
+    def way(self, start: str | MapPlace, goal: str) -> PathMemory:
+        """The path images of the shortest way, ready to be followed.
+
+        Args:
+            start: name of a place, or what :meth:`locate` found.
+            goal: name of a place; that of a route is its last image.
+
+        Raises:
+            StoredMapError: there is no such place, or no way.
+        """
+        end = self._node(goal)
+        if isinstance(start, MapPlace):
+            nodes = self._with_image(start.links).route(len(self), end)[1:]
+        else:
+            nodes = self.topology.route(self._node(start), end)
+        return self.topology.path(nodes)
+
+    def save(self, path: str | Path) -> float:
+        """Writes the map atomically; kilobytes a path image. Raises OutputError."""
+        return self.topology.save(path)
+
+    @staticmethod
+    def load(path: str | Path) -> RouteMap:
+        """Reads a map. Raises StoredMapError where the file is no sound map."""
+        return RouteMap(TopologicalMap.load(path))
+
+    # ----------------------------------------------------------------------------------------
+
+    def _node(self, name: str) -> int:
+        ends = {route_of(one): k for k, one in enumerate(self.names)}
+        found = {one: k for k, one in enumerate(self.names)}.get(name, ends.get(name))
+        if found is None:
+            raise StoredMapError(
+                f"map: no place {name}; its routes are {', '.join(ends)}, their places "
+                f"{self.names[0]} to {self.names[-1]}"
+            )
+        return found
+
+    def _placed(self, features: OmniFeatures, ask: Asker) -> MapPlace | Refusal:
+        """The place of an image as the node that it would be."""
+        here, known = len(self), [link for link in self.topology.links if link.support]
+        pairs = [(node, here) for node in self._alike(features)]
+        answers, _ = _both_ways(ask, (*self.topology.images, features), pairs)
+        links, _ = link_pairs(answers)
+        checks = LinkConsistency(here + 1, [*known, *links])
+        accepted, _ = checks.accepted({(link.a, link.b) for link in known})
+        mine = tuple(link for link in accepted if link.b == here)
+        if not mine:
+            best = max((link.support for link in links), default=0)
+            text = f"no place of the map is recognised in it (best: {best} features in common)"
+            return Refusal(RefusalReason.TOO_FEW_INLIERS, text)
+        nearest = max(mine, key=lambda link: (_at_one_place(link), link.support))
+        return MapPlace(self.names[nearest.a], _at_one_place(nearest), nearest.support, mine)
+
+    def _alike(self, features: OmniFeatures) -> list[int]:
+        """Nodes that an image is tried against."""
+        if len(self) <= _ALL:
+            return list(range(len(self)))
+        words = VisualWords(self.topology.images, np.random.default_rng(_STREAM))
+        order = np.argsort(-words.likeness(features), kind="stable")
+        return sorted(order[:_CANDIDATES].tolist())
+
+    def _with_image(self, links: Iterable[Link]) -> TopologicalMap:
+        """The map with one more node, whose features nobody needs."""
+        old, mine = self.topology, tuple(links)
+        usual = _usual_support(old.links)
+        costs = [*old.costs.tolist(), *(_undriven_cost(link, usual) for link in mine)]
+        images, names = (*old.images, old.images[0]), (*old.names, "the image")
+        return TopologicalMap(images, names, (*old.links, *mine), np.array(costs), {})
+
+
+def route_of(name: str) -> str:
+    """The route's name in a place's."""
+    return name.split("/", 1)[0]
+
+
+def asked_in_turn(seed: int) -> Asker:
+    """Homing vectors one after the other, in this process."""
+
+    def ask(images: tuple[OmniFeatures, ...], pairs: Sequence[Pair]) -> Mapping[Pair, Answered]:
+        return {(a, b): _answered(images[a], images[b], (seed, a, b)) for a, b in pairs}
+
+    return ask
+
+
+def _answered(first: OmniFeatures, second: OmniFeatures, draw: tuple[int, int, int]) -> Answered:
+    rng = pair_generator(*draw)
+    answer, matches = vector_between(first, second, FEATURES.matching, VECTOR, rng)
+    return answer, sift_inliers(answer, matches)
+
+
+def _both_ways(
+    ask: Asker, images: tuple[OmniFeatures, ...], there: Sequence[Pair]
+) -> tuple[dict[Pair, Answer], dict[Pair, IntArray]]:
+    """Answers there and, where they leave a chance of a link, back; and their inliers."""
+    found = dict(ask(images, there))
+    hopeful = [(b, a) for (a, b), (answer, _) in found.items() if _may_link(answer)]
+    found |= ask(images, hopeful)
+    rows = {pair: inliers for pair, (_, inliers) in found.items() if inliers is not None}
+    return {pair: answer for pair, (answer, _) in found.items()}, rows
+
+
+def _may_link(answer: Answer) -> bool:
+    return not isinstance(answer, Refusal) or answer.reason in _UNDECIDED
+
+
+def _memory_of(routes: Mapping[str, PathMemory]) -> tuple[PathMemory, Walks]:
+    """All path images, one route after the other."""
+    if not routes or not all(map(len, routes.values())):
+        raise StoredMapError("map: no route, or one without path images; teach them first")
+    if any("/" in route for route in routes):
+        raise StoredMapError("map: a route's name holds a slash; call it otherwise")
+    names = [f"{route}/{name}" for route, path in routes.items() for name in path.names]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise StoredMapError(f"map: two path images are called {twice[0]}; give each its own name")
+    images = tuple(image for path in routes.values() for image in path.images)
+    first, *others = [path.camera for path in routes.values()]
+    camera = first if all(other == first for other in others) else None
+    walks = Walks(tuple(len(path) for path in routes.values()))
+    return PathMemory(images, tuple(names), camera), walks
+
+
+def _with_driven_steps(
+    joined: TopologicalMap, walks: Walks, camera: OmniCamera | None
+) -> TopologicalMap:
+    """With links along the routes also where there is no homing vector: the way was driven.
+
+    They cost as much as a dozen legs, so that they are gone where there is nothing else.
+    """
+    steps = walks.steps()
+    missing = steps - {(link.a, link.b) for link in joined.links}
+    nowhere, unknown = np.full((2, 2), np.nan), float("nan")
+    driven = [
+        Link(a, b, unknown, unknown, unknown, nowhere, nowhere, 0) for a, b in sorted(missing)
+    ]
+    links = tuple(sorted([*joined.links, *driven], key=_ends))
+    usual = _usual_support(link for link in links if _ends(link) in steps)
+    costs = [
+        link_cost(link) if _ends(link) in steps else _undriven_cost(link, usual) for link in links
+    ]
+    return TopologicalMap(
+        joined.images, joined.names, links, np.array(costs), joined.rejected, camera
+    )
+
+
+def _undriven_cost(link: Link, usual: float) -> float:
+    """Of a way that nobody drove: the fewer of the usual inliers, the longer it probably is."""
+    if _at_one_place(link):
+        return _NO_WAY
+    return link_cost(link) * max(1.0, usual / max(link.support, 1))
+
+
+def _at_one_place(link: Link) -> bool:
+    """Whether both images were taken there: a turn, without a direction."""
+    return link.support > 0 and not np.isfinite(link.direction)
+
+
+def _usual_support(links: Iterable[Link]) -> float:
+    """Median inliers of links that have a homing vector."""
+    found = [link.support for link in links if link.support]
+    return float(np.median(found)) if found else 1.0
+
+
+def _ends(link: Link) -> Pair:
+    return link.a, link.b

@@ -16,7 +16,7 @@ from fgslam.runs.config_models import Experiment
 
 if TYPE_CHECKING:
     from fgslam.homing.links import Link
-    from fgslam.homing.route_map import MapPlace, RouteMap
+    from fgslam.homing.topological_map import MapPlace, RouteMap
 
 _NOT_IN_NAMES = re.compile(r"[^\w.-]+")
 
@@ -99,7 +99,7 @@ def way_said(
     Raises:
         FgslamError: file, picture or place cannot be used, or there is no way.
     """
-    from fgslam.homing.route_map import RouteMap  # loads arrays
+    from fgslam.homing.topological_map import RouteMap  # loads arrays
 
     if out is not None:
         require_output(out, overwrite, (stored, Path(start)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.bearing_log import BearingLog

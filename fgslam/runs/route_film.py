@@ -14,7 +14,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, StoredMapError
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.opening import open_omni
-from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.route import PathMemory
 from fgslam.report.pictures.route_film import PathPicture, RouteCanvas, RouteMoment
 from fgslam.runs.config import as_task, load_experiment
 from fgslam.runs.config_models import FollowConfig, TeachConfig

@@ -19,10 +19,10 @@ from fgslam.core.homing import HomingStart, TwoViewVector
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_view_geometry import make_local_map
-from fgslam.homing.path_memory import MetricPoses
+from fgslam.frontend.homing.two_view import make_local_map
+from fgslam.frontend.homing.vector import estimate_homing_vector
+from fgslam.homing.route import MetricPoses
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import simulate_homing
 from scripts.fuzz.damage import Arrays, Rng, damaged_arrays, damaged_bytes, written

@@ -1,4 +1,4 @@
-"""What every homing estimator promises (fgslam/backend/homing/estimator.py)."""
+"""What every homing estimator promises (fgslam/backend/homing/parts.py)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
-from fgslam.backend.homing.estimator import HomingEstimator
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
+from fgslam.backend.homing.parts import HomingEstimator
 from fgslam.backend.homing.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,

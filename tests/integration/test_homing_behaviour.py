@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.planar import compose
-from fgslam.homing.drive_record import (
+from fgslam.homing.closed_loop import (
     DriveRecord,
     cross_track,
     pass_distances,

@@ -15,9 +15,15 @@ from landmark_world import drive_path, make_follower, winding_path
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.homing import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
-from fgslam.homing.closed_loop import Driver, follow
-from fgslam.homing.drive_record import DriveRecord, cross_track, pass_distances, truly_arrived
-from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.closed_loop import (
+    Driver,
+    DriveRecord,
+    cross_track,
+    follow,
+    pass_distances,
+    truly_arrived,
+)
+from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, Steering
 from fgslam.runs.config import make_experiment

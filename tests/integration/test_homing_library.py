@@ -14,14 +14,13 @@ import yaml
 import fgslam as fg
 from fgslam.cli.main import app
 from fgslam.datasets.simulated_homing import open_house
-from fgslam.homing.command import Drive, DriveCommand
 from fgslam.homing.settings import (
     DRIVING,
     AvoidanceSettings,
     HomingBehaviourSettings,
     SteeringSettings,
 )
-from fgslam.homing.steering import RangeScan, make_avoider
+from fgslam.homing.steering import Drive, DriveCommand, RangeScan, make_avoider
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.settings import HouseCameraSettings, HousePathSettings, OmniHouseSettings
 

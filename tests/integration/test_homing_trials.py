@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import (
     HomingEkfSettings,
     HomingEstimatorSettings,

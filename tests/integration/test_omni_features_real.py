@@ -15,8 +15,13 @@ from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import between
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings
-from fgslam.frontend.homing.matching import PLAIN_MATCHING, match_features, match_sift, plain_sift
-from fgslam.frontend.homing.two_view_geometry import EpipolarTest
+from fgslam.frontend.homing.two_view import (
+    PLAIN_MATCHING,
+    EpipolarTest,
+    match_features,
+    match_sift,
+    plain_sift,
+)
 
 pytestmark = pytest.mark.data
 

@@ -10,9 +10,8 @@ from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.bearing_tracking import BearingTracker
-from fgslam.frontend.homing.matching import match_features
-from fgslam.frontend.homing.trackable_points import move_to_trackable
+from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable
+from fgslam.frontend.homing.two_view import match_features
 from fgslam.worlds.house import CAMERA_HEIGHT_M, OmniWorld
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 

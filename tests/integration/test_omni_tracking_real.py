@@ -16,10 +16,10 @@ from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniVideoSettings
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker
-from fgslam.frontend.homing.homing_vector import estimate_homing_vector
-from fgslam.frontend.homing.matching import match_features
 from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.tracking import ReplenishedTracker
+from fgslam.frontend.homing.two_view import match_features
+from fgslam.frontend.homing.vector import estimate_homing_vector
 
 pytestmark = pytest.mark.data
 

@@ -17,7 +17,7 @@ import pytest
 
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.planar import wrap
-from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.route import PathMemory
 from fgslam.runs.bare_routes import following, teaching
 from fgslam.runs.run import run_experiment
 

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import lapack
 
-from fgslam.backend.homing.estimator import TrackedFeatures
+from fgslam.backend.homing.parts import TrackedFeatures
 from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError

@@ -2,8 +2,8 @@
 
 Start, target and every image on the way are planar poses, landmarks points. The start's and the
 target's bearings enter once, with the landmark; scale is the leg from start to target. Here is what
-each image adds, with first guesses; :mod:`fgslam.backend.homing.schur_solver` and
-:mod:`fgslam.backend.homing.graph_gtsam` solve it. Derivation: docs/derivations/homing_graph.md.
+each image adds, with first guesses; :mod:`fgslam.backend.homing.schur` and
+:mod:`fgslam.backend.homing.gtsam` solve it. Derivation: docs/derivations/homing_graph.md.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from fgslam.backend.homing.estimator import TrackedFeatures
-from fgslam.backend.homing.graph_gtsam import BatchSolver, Isam2Solver
-from fgslam.backend.homing.graph_parts import (
+from fgslam.backend.homing.gtsam import BatchSolver, Isam2Solver
+from fgslam.backend.homing.parts import (
     FORWARD,
     SIDEWAYS,
     TARGET,
@@ -28,8 +27,9 @@ from fgslam.backend.homing.graph_parts import (
     Pair,
     Sight,
     Solver,
+    TrackedFeatures,
 )
-from fgslam.backend.homing.schur_solver import SchurSolver
+from fgslam.backend.homing.schur import SchurSolver
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.gauss_newton import GaussNewton, Linearised
@@ -316,7 +316,7 @@ _SOLVERS: dict[str, Callable[[], Solver]] = {
 class HomingGraph:
     """Estimator of kind ``homing_graph``.
 
-    On :class:`fgslam.backend.homing.estimator.HomingEstimator`. Lost features simply get no more
+    On :class:`fgslam.backend.homing.parts.HomingEstimator`. Lost features simply get no more
     factors; what they taught stays.
     """
 

@@ -16,8 +16,8 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import StoredMapError
 from fgslam.datasets.simulated_homing import OmniWorld
 from fgslam.homing.api import teach
-from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.route_map import RouteMap
+from fgslam.homing.route import PathMemory
+from fgslam.homing.topological_map import RouteMap
 from fgslam.runs.config_models import CrossroadsConfig
 from fgslam.runs.engine import Opening, RunResult, Task
 from fgslam.runs.tasks.homing_drives import Opened, drives_task, open_house_front_end

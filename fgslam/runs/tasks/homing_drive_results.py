@@ -13,8 +13,7 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import HomingTruth
 from fgslam.core.planar import between, wrap
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.homing.command import HomingState
-from fgslam.homing.drive_record import (
+from fgslam.homing.closed_loop import (
     ARRIVED_M,
     STAGES,
     DriveRecord,
@@ -27,6 +26,7 @@ from fgslam.homing.drive_record import (
     slope_by_leg,
     truly_arrived,
 )
+from fgslam.homing.steering import HomingState
 from fgslam.report.content import Cell, Column, TextTable, write_csv
 from fgslam.report.homing_figures import PASS_RADIUS_M, Drive
 from fgslam.runs.homing_comparison import save_bearing_logs

@@ -14,27 +14,28 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.core.arrays import ByteArray, FloatArray
 from fgslam.core.errors import OutputError
 from fgslam.core.files import make_subfolder
 from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import between
 from fgslam.datasets.simulated_homing import OmniWorld, open_house
-from fgslam.homing.active_homing import ActiveHoming
+from fgslam.homing.active import ActiveHoming
 from fgslam.homing.api import teach
-from fgslam.homing.closed_loop import Driver, World, follow
-from fgslam.homing.command import Command
-from fgslam.homing.drive_record import (
+from fgslam.homing.closed_loop import (
     ARRIVED_M,
+    Driver,
     DriveRecord,
+    World,
+    follow,
     pass_distances,
 )
+from fgslam.homing.controller import HomingChain
 from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd, make_front_end
-from fgslam.homing.path_following import HomingChain
-from fgslam.homing.path_memory import PathMemory
+from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import FrontEndSettings
-from fgslam.homing.steering import Steering, make_avoider
+from fgslam.homing.steering import Command, Steering, make_avoider
 from fgslam.report.content import Figure, Picture
 from fgslam.report.homing_figures import (
     Line,

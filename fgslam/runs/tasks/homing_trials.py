@@ -17,9 +17,9 @@ from fgslam.datasets.simulated_homing import open_simulated_homing
 from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.homing import HomingErrors
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_view_geometry import make_local_map
+from fgslam.frontend.homing.two_view import make_local_map
+from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.report.content import Cell, Figure, TextTable, write_csv
 from fgslam.report.homing_figures import sorted_errors
 from fgslam.runs.config_models import HomingTrialsConfig

@@ -14,7 +14,7 @@ from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.evaluation.metrics import JsonValue, UpdateTime
-from fgslam.frontend.homing.bearing_tracking import ReplenishedTracker, TrackedImage, VideoState
+from fgslam.frontend.homing.tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import OmniVideoConfig

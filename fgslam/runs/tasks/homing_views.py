@@ -39,13 +39,11 @@ from fgslam.evaluation.metrics import JsonValue
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.matching import PLAIN_MATCHING, plain_sift
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
-from fgslam.homing.link_consistency import UNORDERED, Walks, sift_inliers
-from fgslam.homing.links import Answer, Link, Pair
-from fgslam.homing.localisation import Localiser
-from fgslam.homing.retrieval import VisualWords
+from fgslam.frontend.homing.two_view import PLAIN_MATCHING, plain_sift
+from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.homing.links import UNORDERED, Answer, Link, Pair, VisualWords, Walks, sift_inliers
+from fgslam.homing.places import Localiser
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.content import Cell, Column, Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import (

@@ -19,10 +19,10 @@ from fgslam.datasets.omni_checks import camera_notes
 from fgslam.datasets.opening import open_omni
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.api import PathFollower
-from fgslam.homing.command import SURE, DriveCommand, MetricPlace
-from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.picture_sides import PictureSides
+from fgslam.homing.places import PictureSides
+from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import DRIVING, HomingBehaviourSettings
+from fgslam.homing.steering import SURE, DriveCommand, MetricPlace
 from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import FollowConfig

@@ -13,8 +13,8 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.homing import OmniFeatures
 from fgslam.evaluation.metrics import JsonValue
 from fgslam.homing.links import Pair
-from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.route_map import FEATURES, VECTOR, Answered, Asker, RouteMap, route_of
+from fgslam.homing.route import PathMemory
+from fgslam.homing.topological_map import FEATURES, VECTOR, Answered, Asker, RouteMap, route_of
 from fgslam.report.content import Column, TextTable
 from fgslam.runs.config_models import JoinConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, write_document, write_page

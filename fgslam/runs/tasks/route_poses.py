@@ -12,7 +12,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.times import covered, interpolate_poses, nearest_rows
-from fgslam.homing.path_memory import MetricPoses
+from fgslam.homing.route import MetricPoses
 
 COVARIANCES = "covariance.csv"
 _LONGEST_GAP_S = 1.0  # between two frames: beyond, the way between them is not a straight line

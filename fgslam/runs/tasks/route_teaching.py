@@ -18,8 +18,8 @@ from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.evaluation.metrics import JsonValue
+from fgslam.homing.route import FULL, GAP, Taught, TaughtImage, Teacher
 from fgslam.homing.settings import DRIVING
-from fgslam.homing.teaching import FULL, GAP, Taught, TaughtImage, Teacher
 from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import TeachConfig

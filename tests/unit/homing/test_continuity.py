@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.homing import BearingMatches, Refusal, RefusalReason
-from fgslam.homing.continuity import Continuity, in_common
+from fgslam.homing.places import Continuity, in_common
 
 CHANCE, MOST = 0.02, 400
 

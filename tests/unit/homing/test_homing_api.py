@@ -21,7 +21,7 @@ from fgslam.core.errors import (
     StoredMapError,
 )
 from fgslam.core.homing import RefusalReason
-from fgslam.homing.command import HomingState
+from fgslam.homing.steering import HomingState
 
 CAMERA = fg.load_camera("equirectangular", size=(256, 128))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
@@ -29,14 +29,13 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.core.planar import bearings, between, unit, wrap
-from fgslam.homing.active_homing import (
+from fgslam.homing.active import (
     _MAX_ACROSS,
     _MIN_TRACKS,
     ActiveHoming,
     Sighting,
     surely_left,
 )
-from fgslam.homing.command import Command, HomingState
 from fgslam.homing.controller import (
     _BLIND_S,
     _FARTHER_S,
@@ -47,6 +46,7 @@ from fgslam.homing.controller import (
     HomingController,
 )
 from fgslam.homing.settings import HomingControlSettings
+from fgslam.homing.steering import Command, HomingState
 from tests.homing import make_matches
 from tests.landmark_world import DARK, Setting, winding_path
 

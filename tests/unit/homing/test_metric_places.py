@@ -10,8 +10,8 @@ import pytest
 import fgslam as fg
 from fgslam.core.errors import StoredMapError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.homing.metric_places import LEFT_SIGMA, metric_place
-from fgslam.homing.path_memory import MetricPoses, PathMemory
+from fgslam.homing.places import LEFT_SIGMA, metric_place
+from fgslam.homing.route import MetricPoses, PathMemory
 
 
 def three_poses(sigma: float = 0.1) -> MetricPoses:

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
 from fgslam.core.errors import ConfigError, EstimatorError
 from fgslam.core.planar import between
-from fgslam.homing.command import Drive, HomingState
-from fgslam.homing.drive_record import (
+from fgslam.homing.closed_loop import (
     STAGES,
     DriveRecord,
     corners,
@@ -20,13 +19,13 @@ from fgslam.homing.drive_record import (
     pass_distances,
     slope_by_leg,
 )
-from fgslam.homing.path_following import HomingChain
+from fgslam.homing.controller import HomingChain
 from fgslam.homing.settings import (
     ClosedLoopSettings,
     HomingBehaviourSettings,
     HomingControlSettings,
 )
-from fgslam.homing.steering import RangeScan
+from fgslam.homing.steering import Drive, HomingState, RangeScan
 from tests.landmark_world import DARK, drive_path, make_follower, winding_path
 
 

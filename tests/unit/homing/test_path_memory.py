@@ -21,8 +21,8 @@ from fgslam.cameras.omni import (
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
-from fgslam.homing.feature_files import pack_features
-from fgslam.homing.path_memory import FILE, PathMemory
+from fgslam.homing.features import pack_features
+from fgslam.homing.route import FILE, PathMemory
 from tests.landmark_world import no_columns
 
 

@@ -16,11 +16,11 @@ from fgslam.core.homing import (
     TwoViewVector,
 )
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.homing import path_places
-from fgslam.homing.command import PathPlace
-from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.path_places import PathPlaces
+from fgslam.homing import places as path_places
+from fgslam.homing.places import PathPlaces
+from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import DRIVING
+from fgslam.homing.steering import PathPlace
 from tests import textured_room
 
 ALONG = ((540, 278, 5, 0, 5, 33), (388, 380, 49, 0, 78, 87), (239, 418, 85, 54, 219, 137),

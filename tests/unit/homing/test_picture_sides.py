@@ -17,8 +17,8 @@ from fgslam.cameras.omni import (
     OmniCamera,
 )
 from fgslam.core.arrays import Image
-from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.picture_sides import PictureSides
+from fgslam.homing.places import PictureSides
+from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import DRIVING
 from tests import textured_room
 

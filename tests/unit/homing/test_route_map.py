@@ -14,7 +14,7 @@ import fgslam as fg
 from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, StoredMapError
-from fgslam.homing.route_map import RouteMap, route_of
+from fgslam.homing.topological_map import RouteMap, route_of
 from tests import textured_room
 
 FINE = textured_room.CAMERA

@@ -16,12 +16,16 @@ from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import BearingMatches, OmniFeatures
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
-from fgslam.homing.command import HomingState
-from fgslam.homing.compact import MOST_COLUMNS, MOST_SIFT, Votes, best_all_around, compacted
-from fgslam.homing.feature_files import pack_features
-from fgslam.homing.path_places import PathPlaces
-from fgslam.homing.settings import DRIVING
-from fgslam.homing.teaching import (
+from fgslam.homing.features import (
+    MOST_COLUMNS,
+    MOST_SIFT,
+    Votes,
+    best_all_around,
+    compacted,
+    pack_features,
+)
+from fgslam.homing.places import PathPlaces
+from fgslam.homing.route import (
     BEND,
     COMMON,
     END,
@@ -32,6 +36,8 @@ from fgslam.homing.teaching import (
     Taught,
     Teacher,
 )
+from fgslam.homing.settings import DRIVING
+from fgslam.homing.steering import HomingState
 from tests import textured_room
 
 FINE = textured_room.CAMERA

@@ -9,7 +9,6 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import to_robot, wrap
-from fgslam.homing.command import Command, Drive, HomingState
 from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings, SteeringSettings
 from fgslam.homing.steering import (
     _BLIND_SHARE,
@@ -18,7 +17,10 @@ from fgslam.homing.steering import (
     _TURN_IN_PLACE_DEG,
     ACCELERATION_MPS2,
     TURN_ACCELERATION_DEG_S2,
+    Command,
     CorridorAvoidance,
+    Drive,
+    HomingState,
     NoAvoidance,
     RangeScan,
     Steering,

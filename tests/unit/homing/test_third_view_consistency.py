@@ -7,8 +7,7 @@ import pytest
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.homing import OmniFeatures, TwoViewVector
-from fgslam.homing.link_consistency import ThirdViewConsistency, Walks
-from fgslam.homing.links import Answer, Link, Pair
+from fgslam.homing.links import Answer, Link, Pair, ThirdViewConsistency, Walks
 from fgslam.homing.settings import TopologicalMapSettings
 from fgslam.homing.topological_map import TopologicalMap, map_of_answers
 from tests.landmark_world import landmark_features
@@ -98,7 +97,7 @@ def test_consecutive_images_confirm_links_of_a_few_steps_but_not_across_a_gap() 
 
 def test_map_of_a_walk_has_confirmed_far_links_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few inliers are enough where third views confirm them; many do not help where they do not."""
-    monkeypatch.setattr("fgslam.homing.link_consistency._LONE_SUPPORT", THINGS + 1)
+    monkeypatch.setattr("fgslam.homing.links._LONE_SUPPORT", THINGS + 1)
 
     def built(seed: int | None) -> TopologicalMap:
         walk = [(k, k + 1) for k in range(COUNT - 1)]

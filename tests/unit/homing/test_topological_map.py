@@ -13,26 +13,25 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import between, wrap
-from fgslam.frontend.homing.homing_vector import estimate_homing_vector
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.homing.link_consistency import (
-    _LONE_SUPPORT,
-    LinkConsistency,
-    Walks,
-    between_misfit,
-    heading_residuals,
-)
+from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.homing.links import (
+    _LONE_SUPPORT,
     _MIN_SUPPORT,
     _MUTUAL_DEG,
     _ONE_WAY_SUPPORT,
     Answer,
     Link,
+    LinkConsistency,
     Pair,
+    VisualWords,
+    Walks,
+    between_misfit,
+    candidate_pairs,
+    heading_residuals,
     link_pair,
 )
-from fgslam.homing.localisation import Localiser
-from fgslam.homing.retrieval import VisualWords, candidate_pairs
+from fgslam.homing.places import Localiser
 from fgslam.homing.settings import LocalisationSettings, TopologicalMapSettings
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from tests.landmark_world import landmark_features, match_landmarks, numbers

@@ -9,8 +9,8 @@ import pytest
 from homings import trial
 
 from fgslam.backend.homing import ekf
-from fgslam.backend.homing.baselines import AverageDisplacement, AverageLandmarkVector
 from fgslam.backend.homing.ekf import FilterState, HomingEkf, motion
+from fgslam.backend.homing.estimators import AverageDisplacement, AverageLandmarkVector
 from fgslam.backend.homing.paper_ekf import PaperEkf
 from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.errors import EstimatorError

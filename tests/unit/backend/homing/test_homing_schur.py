@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from homings import Trial, trial
 
-from fgslam.backend.homing.factory import make_homing_estimator
+from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.graph import HomingGraph
-from fgslam.backend.homing.schur_model import State
-from fgslam.backend.homing.schur_solver import Factored, SchurSolver
+from fgslam.backend.homing.schur import Factored, SchurSolver, State
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
@@ -27,8 +26,8 @@ EXACT = HomingGraphSettings()
 @pytest.fixture(autouse=True)
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every image is solved to convergence, and no match is doubted."""
-    monkeypatch.setattr("fgslam.backend.homing.schur_solver.STEPS", 30)
-    monkeypatch.setattr("fgslam.backend.homing.schur_solver.MATCH_LIMIT", np.inf)
+    monkeypatch.setattr("fgslam.backend.homing.schur.STEPS", 30)
+    monkeypatch.setattr("fgslam.backend.homing.schur.MATCH_LIMIT", np.inf)
 
 
 @cache
@@ -47,9 +46,9 @@ def estimated(settings: HomingGraphSettings) -> HomingEstimate:
 
 def test_the_same_optimum_and_covariance_as_gtsams_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both driven to convergence, which reweighting reaches slowly: hundredths of a deviation."""
-    monkeypatch.setattr("fgslam.backend.homing.schur_solver.STILL", 1e-7)
-    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam.RELATIVE_TOLERANCE", 1e-14)
-    monkeypatch.setattr("fgslam.backend.homing.graph_gtsam.MAX_ITERATIONS", 200)
+    monkeypatch.setattr("fgslam.backend.homing.schur.STILL", 1e-7)
+    monkeypatch.setattr("fgslam.backend.homing.gtsam.RELATIVE_TOLERANCE", 1e-14)
+    monkeypatch.setattr("fgslam.backend.homing.gtsam.MAX_ITERATIONS", 200)
     own = estimated(EXACT)
     batch = estimated(replace(EXACT, solver="batch"))
     deviations = np.sqrt(np.diagonal(batch.covariance))

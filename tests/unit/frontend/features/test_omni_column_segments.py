@@ -18,7 +18,7 @@ from fgslam.frontend.features.column_segments import (
 from fgslam.frontend.features.settings import (
     OmniMatchingSettings,
 )
-from fgslam.frontend.homing.matching import consistent_tangents, match_columns, nearest_segments
+from fgslam.frontend.homing.two_view import consistent_tangents, match_columns, nearest_segments
 
 VIEW = Cylinder(401, 401, -1.0, 1.0)
 POSTS = 16

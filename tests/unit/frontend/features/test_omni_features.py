@@ -25,7 +25,7 @@ from fgslam.frontend.features.settings import (
     OmniFeatureSettings,
     OmniMatchingSettings,
 )
-from fgslam.frontend.homing.matching import PLAIN_MATCHING, match_features, match_sift, plain_sift
+from fgslam.frontend.homing.two_view import PLAIN_MATCHING, match_features, match_sift, plain_sift
 
 PANORAMA = Equirectangular(513, 257)
 MIRROR = HyperbolicMirror.with_view((400, 400), 0.96, (np.radians(-55), np.radians(30)))

@@ -11,10 +11,10 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import wrap
-from fgslam.frontend.homing.bearing_tracking import BearingTracker, ReplenishedTracker
+from fgslam.frontend.homing.tracking import BearingTracker, ReplenishedTracker
 from tests.textured_room import CAMERA, angles, hits, picture
 
-_MODULE = "fgslam.frontend.homing.bearing_tracking"
+_MODULE = "fgslam.frontend.homing.tracking"
 START = np.array([-1.2, 0.4, 0.3])
 
 

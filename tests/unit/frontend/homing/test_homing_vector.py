@@ -11,15 +11,16 @@ from scipy.stats import chi2, norm
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import BearingMatches, LocalMap, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import bearings, wrap
-from fgslam.frontend.homing.homing_vector import HomingSearch, _cells, estimate_homing_vector
-from fgslam.frontend.homing.refinement import HomingRefinement, Refined
 from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_view_geometry import (
+from fgslam.frontend.homing.two_view import (
     EpipolarTest,
+    HomingRefinement,
+    Refined,
     make_local_map,
     triangulable,
     triangulate,
 )
+from fgslam.frontend.homing.vector import HomingSearch, _cells, estimate_homing_vector
 from tests.homing import TwoViews, make_matches, two_views
 
 HALF_DEGREE = np.deg2rad(0.5)

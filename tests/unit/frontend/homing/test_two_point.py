@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import unit, wrap
-from fgslam.frontend.homing.two_view_geometry import (
+from fgslam.frontend.homing.two_view import (
     TwoPointSamples,
     TwoPointSolutions,
     solve_two_point,

@@ -12,17 +12,22 @@ from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector, UprightFeat
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.settings import OmniMatchingSettings
-from fgslam.frontend.homing.candidates import (
+from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.homing.two_view import (
+    EpipolarTest,
+    Refined,
+    match_sift,
+    planar_distances,
+    spread_over,
+)
+from fgslam.frontend.homing.vector import (
     Candidates,
     GuidedScore,
     candidate_matches,
     edge_likeness,
+    pair_generator,
+    vector_between,
 )
-from fgslam.frontend.homing.matching import match_sift, planar_distances
-from fgslam.frontend.homing.refinement import Refined, spread_over
-from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.homing.two_view_geometry import EpipolarTest
-from fgslam.frontend.homing.view_pairs import pair_generator, vector_between
 
 MATCHING = OmniMatchingSettings()
 SETTINGS = HomingVectorSettings(samples=1000, confidence=0.999999)

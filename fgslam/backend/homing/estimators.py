@@ -1,29 +1,90 @@
-"""Homing by averages of bearings: no map, no distance, no covariance.
-
-Both compare the bearings of now with those from the target, feature by feature, once the target's
-have been turned by the heading of the target relative to the present one. The methods take that
-from a compass. Without one (*compass-free*) it is the circular mean of the differences of both
-bearings: exact where features lie all around at equal distances, biased elsewhere, which is part
-of what the methods assume and what the comparison shows.
-"""
+"""Homing estimators by their kind, and the two that average bearings."""
 
 from __future__ import annotations
 
+from difflib import get_close_matches
 from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.homing.estimator import TrackedFeatures
+from fgslam.backend.homing.ekf import HomingEkf
+from fgslam.backend.homing.graph import HomingGraph
+from fgslam.backend.homing.paper_ekf import PaperEkf
+from fgslam.backend.homing.parts import HomingEstimator, TrackedFeatures
+from fgslam.backend.homing.settings import (
+    AverageLandmarkVectorSettings,
+    HomingEkfSettings,
+    HomingEstimatorKind,
+    HomingGraphSettings,
+    PaperEkfSettings,
+    SnapshotSettings,
+)
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import EstimatorError
+from fgslam.core.errors import ConfigError, EstimatorError
 from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.core.planar import unit, wrap
+
+_KINDS: dict[str, type[HomingEstimatorKind]] = {
+    kind.kind: kind
+    for kind in (
+        HomingGraphSettings,
+        HomingEkfSettings,
+        PaperEkfSettings,
+        AverageLandmarkVectorSettings,
+        SnapshotSettings,
+    )
+}
+
+
+def homing_settings_of(estimator: str | HomingEstimatorKind) -> HomingEstimatorKind:
+    """Settings of an estimator that is called by its kind; settings are returned as they are.
+
+    Raises:
+        ConfigError: there is no such estimator.
+    """
+    if isinstance(estimator, HomingEstimatorKind):
+        return estimator
+    kind = _KINDS.get(estimator) if isinstance(estimator, str) else None
+    if kind is None:
+        close = get_close_matches(str(estimator), _KINDS, n=1)
+        hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(_KINDS)}"
+        raise ConfigError(f"there is no homing estimator {estimator!r}; {hint}")
+    return kind()
+
+
+def make_homing_estimator(start: HomingStart, settings: HomingEstimatorKind) -> HomingEstimator:
+    """The estimator, at the start.
+
+    Raises:
+        EstimatorError: the start's parts do not belong together, or cannot be solved.
+    """
+    match settings:
+        case HomingEkfSettings():
+            return HomingEkf(start, settings)
+        case PaperEkfSettings():
+            return PaperEkf(start, settings)
+        case HomingGraphSettings():
+            return HomingGraph(start, settings)
+        case AverageLandmarkVectorSettings():
+            return AverageLandmarkVector(start)
+        case SnapshotSettings():
+            return AverageDisplacement(start)
+
+
+# --------------------------------------------------------------------------------------------
+# Homing by averages of bearings: no map, no distance, no covariance
+#
+# Both compare the bearings of now with those from the target, feature by feature, once the target's
+# have been turned by the heading of the target relative to the present one. The methods take that
+# from a compass. Without one (*compass-free*) it is the circular mean of the differences of both
+# bearings: exact where features lie all around at equal distances, biased elsewhere, which is part
+# of what the methods assume and what the comparison shows.
 
 
 class BearingAverage:
     """What both methods share.
 
-    On :class:`fgslam.backend.homing.estimator.HomingEstimator`; the frame of its estimates is not
+    On :class:`fgslam.backend.homing.parts.HomingEstimator`; the frame of its estimates is not
     the start's but the present robot's own, at the origin, with the target at distance 1 in the
     home direction: where the robot is, neither method knows. Covariances are NaN.
     """

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from fgslam.backend.homing.estimator import HomingEstimator
+from fgslam.backend.homing.parts import HomingEstimator
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import (

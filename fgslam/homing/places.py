@@ -9,26 +9,28 @@ so images may be far apart, or the robot's motion somebody else's.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
+from scipy.sparse import csr_matrix, diags
 from scipy.stats import norm
+from scipy.stats import t as student
 
-from fgslam.core.arrays import FloatArray
+from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialCamera
+from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.homing.active_homing import CONTRADICTION_DEG, parallax
-from fgslam.homing.command import SURE, PathPlace
-from fgslam.homing.compact import compacted
-from fgslam.homing.continuity import Continuity, in_common
+from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.homing.active import CONTRADICTION_DEG, parallax
+from fgslam.homing.features import compacted
 from fgslam.homing.front_end import compare_views
-from fgslam.homing.links import Answer
-from fgslam.homing.localisation import Localiser, inliers_of
-from fgslam.homing.metric_places import metric_place
-from fgslam.homing.path_memory import PathMemory
-from fgslam.homing.retrieval import VisualWords
+from fgslam.homing.links import Answer, VisualWords
+from fgslam.homing.route import MetricPoses, PathMemory
 from fgslam.homing.settings import FrontEndSettings, LocalisationSettings
+from fgslam.homing.steering import SURE, MetricPlace, PathPlace
 
 LIKELY = 0.5  # below this there is no homing vector either
 _CANDIDATES = 6  # path images that an image is matched with, half of them because they look alike
@@ -364,3 +366,378 @@ def _across(vector: TwoViewVector) -> float:
 def _away(one: float, other: float) -> float:
     """Absolute difference of two angles; NaN where one is not known."""
     return abs(float(wrap(np.array(one - other)))) if np.isfinite(one + other) else float("nan")
+
+
+# --------------------------------------------------------------------------------------------
+# Localisation in a topological map: a Bayes filter over its nodes (I)
+#
+# Images are compared as nodes are: by how many of their features agree on one homing. The belief is
+# a distribution over nodes; between two images it stays, moves along an edge, or, rarely, leaps
+# anywhere, so that a robot that was carried off finds itself again.
+
+
+Linker: TypeAlias = Callable[[OmniFeatures, int], Answer]
+"""The homing vector from an image's place to that of a node, by its number."""
+
+_BACKGROUND = 4.0  # inliers that a wrong place may get, on average
+
+_AT_NODE = 100.0  # inliers, at least, of an image that was taken at the node itself
+
+_STAY = 0.5  # chance to be still at the node of the last image
+
+Weigher: TypeAlias = Callable[[Mapping[int, Answer]], Mapping[int, float]]
+"""What speaks for each node, in inliers, of the answers of those that were matched."""
+
+
+class Places(Protocol):
+    """Images as nodes, a map's or a path's."""
+
+    def __len__(self) -> int: ...
+
+    def graph(self) -> csr_matrix:
+        """(n, n) costs of going from one node to another."""
+        ...
+
+
+class Localiser:
+    """Probability of each node to be where the robot is, or nearest to it.
+
+    Attributes:
+        belief: (n,) probabilities; uniform before the first image.
+        likelihood: (n,) of the last image at each node, up to a factor.
+        answers: homing vectors of the last image to those nodes that it was matched with.
+        leap: chance to be anywhere at all by the next image; the settings' unless it is set.
+    """
+
+    def __init__(
+        self,
+        topology: Places,
+        words: VisualWords,
+        linker: Linker,
+        settings: LocalisationSettings,
+        weigh: Weigher | None = None,
+        transition: FloatArray | None = None,
+        power: float = 1.0,
+    ) -> None:
+        """Begins with a uniform belief.
+
+        Args:
+            topology: the map.
+            words: of the map's images, in their order.
+            linker: homing vector from the robot's image to a node's.
+            settings: chances and the number of nodes to match with.
+            weigh: evidence of answers; None: their inliers.
+            transition: (n, n) chances to go from row to column between two images, without leaps;
+                None: along the links, those that cost less sooner.
+            power: of the likelihood of an image: how much it counts.
+        """
+        self._map = topology
+        self._words = words
+        self._linker = linker
+        self._settings = settings
+        self._weigh = weigh or inliers_of
+        self._transition = _transition(topology) if transition is None else transition
+        self._power = power
+        self.leap = settings.leap
+        self.belief: FloatArray = np.full(len(topology), 1.0 / max(len(topology), 1))
+        self.answers: dict[int, Answer] = {}
+        self.likelihood: FloatArray = np.ones(len(topology))
+        self._fresh = True
+
+    def update(self, image: OmniFeatures, also: Collection[int] = ()) -> FloatArray:
+        """The belief after one more image.
+
+        Args:
+            image: its features.
+            also: nodes that it is matched with in any case.
+
+        Returns:
+            (n,) the belief, a copy.
+        """
+        expected = self.expected()
+        self._fresh = False
+        self.likelihood = likelihoods(self._supports(image, expected, also), _BACKGROUND)
+        posterior = expected * (self.likelihood / self.likelihood.max()) ** self._power
+        self.belief = posterior / posterior.sum()
+        return self.belief.copy()
+
+    def expected(self) -> FloatArray:
+        """(n,) the belief before the next image is seen."""
+        return self.belief if self._fresh else self._moved()
+
+    def best(self) -> tuple[int, float]:
+        """The most probable node and its probability."""
+        node = int(np.argmax(self.belief))
+        return node, float(self.belief[node])
+
+    def _moved(self) -> FloatArray:
+        moved = self.belief @ self._transition
+        return (1.0 - self.leap) * moved + self.leap / len(self.belief)
+
+    def _supports(
+        self, image: OmniFeatures, expected: FloatArray, also: Collection[int]
+    ) -> FloatArray:
+        """(n,) evidence of the nodes that are worth a match; 0 for the others."""
+        nodes = np.union1d(self._candidates(image, expected), np.array([*also], dtype=np.int64))
+        self.answers = {node: self._linker(image, node) for node in nodes.tolist()}
+        out = np.zeros(len(self._map))
+        for node, evidence in self._weigh(self.answers).items():
+            out[node] = evidence
+        return out
+
+    def _candidates(self, image: OmniFeatures, expected: FloatArray) -> IntArray:
+        """Nodes that look alike, and those that the belief expects, half and half."""
+        most = self._settings.candidates
+        if most == 0 or most >= len(self._map):
+            return np.arange(len(self._map))
+        alike = np.argsort(-self._words.likeness(image), kind="stable")
+        likely = np.argsort(-expected, kind="stable")[: most // 2]
+        rest = alike[~np.isin(alike, likely)][: most - len(likely)]
+        return np.sort(np.concatenate([likely, rest]))
+
+
+def inliers_of(answers: Mapping[int, Answer]) -> dict[int, float]:
+    """Inliers of each node; where an image was taken at a node itself, as many as any other has."""
+    out = {node: float(answer.support if answer else 0) for node, answer in answers.items()}
+    best = max([*out.values(), _AT_NODE])
+    at = (n for n, a in answers.items() if not a and a.reason is RefusalReason.AT_TARGET)
+    return out | dict.fromkeys(at, best)
+
+
+def likelihoods(supports: FloatArray, background: float) -> FloatArray:
+    """(n,) of an image at each node, up to a factor: its inliers and those of a wrong place.
+
+    Linear, not exponential as independent inliers would have it: features of one image stand and
+    fall together (a poster that hangs in two rooms brings all of its own), and a single image must
+    not decide.
+    """
+    return np.asarray(supports, dtype=np.float64) + background
+
+
+def _transition(topology: Places) -> FloatArray:
+    """(n, n) chances to go from row to column between two images, without leaps."""
+    graph = topology.graph()
+    graph.data = 1.0 / graph.data
+    out = np.asarray(graph.sum(axis=1)).ravel()
+    alone = out == 0.0
+    moves = diags(np.where(alone, 0.0, (1.0 - _STAY) / np.where(alone, 1.0, out))) @ graph
+    stay = np.where(alone, 1.0, _STAY)
+    return np.asarray(moves.toarray() + np.diag(stay))
+
+
+# --------------------------------------------------------------------------------------------
+# Whether a robot went on from its last image or was carried off: what two images have in common
+#
+# Neighbouring images of one drive share most of their features, about as many each time; from one
+# place to another they share few. How many are usual, and how widely that varies, is learned from
+# the drive itself, so that images far apart or in dim light are no alarm where they are the rule,
+# nor for long where they become the rule.
+
+
+_STEPS = 20
+"""Last steps that tell what is usual. With the one of the prior they vary by a fifth at least: a
+robot that stood and drives on (0.6 of the features left) is none that was carried off."""
+
+_OFF = 0.5  # from this probability on a step does not count as usual
+_AGAIN = 5
+"""Steps within which nobody is carried off twice: what seems so is a drive that has changed, as it
+went faster, in dimmer light, or on after a long stand."""
+
+_SPREAD = 1.0  # prior, in one step's weight: of the logarithm, a factor e
+_HERE = (RefusalReason.AT_TARGET, RefusalReason.AMBIGUOUS, RefusalReason.UNCERTAIN)
+
+
+class Continuity:
+    """What two neighbouring images of a drive had in common so far.
+
+    Attributes:
+        chance: to be carried off from one image to the next, before they are seen.
+    """
+
+    def __init__(self, chance: float) -> None:
+        """Begins before the first step.
+
+        Args:
+            chance: to be carried off from one image to the next, before they are seen.
+        """
+        self.chance = chance
+        self._logs: deque[float] = deque(maxlen=_STEPS)
+        self._since: list[float] = []
+
+    def carried_off(self, common: int, most: int) -> float:
+        """Probability that the robot was carried off between two images.
+
+        Where it went on, the logarithm of the common features is as in the steps before
+        (Student's t, the prediction for unknown mean and variance); where it was carried off,
+        anything from none to ``most`` is as likely. A second such step soon after the first is
+        reported too, but what is usual is learned anew from the first one on.
+
+        Args:
+            common: features of both images that agree on one motion.
+            most: that could have been.
+        """
+        log = float(np.log1p(common))
+        off = self.chance / max(float(np.log1p(most)), log, 1.0)
+        if not self._logs:
+            self._logs.append(log)
+            return self.chance
+        usual = np.array(self._logs)
+        n, mean = len(usual), float(usual.mean())
+        scatter = (_SPREAD**2 + float(np.sum((usual - mean) ** 2))) / (n + 1.0)
+        on = student.pdf(min(log - mean, 0.0), n, scale=np.sqrt(scatter * (1.0 + 1.0 / n)))
+        probability = float(off / (off + (1.0 - self.chance) * on))
+        self._learn(log, probability >= _OFF)
+        return probability
+
+    def _learn(self, log: float, off: bool) -> None:
+        """Takes a step as usual; one that is not, from the second on."""
+        if off and self._since:
+            self._logs.clear()
+            self._logs.extend([*self._since, log])
+            self._since = []
+            return
+        if not off:
+            self._logs.append(log)
+        if off or self._since:
+            self._since.append(log)
+        if len(self._since) >= _AGAIN:
+            self._since = []
+
+
+def in_common(answer: Answer, matches: BearingMatches) -> int:
+    """Features of two images that agree on one motion; all matches where there was next to none."""
+    if answer:
+        return answer.support
+    return len(matches) if answer.reason in _HERE else 0
+
+
+# --------------------------------------------------------------------------------------------
+# Metres on a path whose images carry poses of SLAM on the same drive
+
+
+LEFT_SIGMA = 0.12
+"""Of the part of a leg that is left, as parallax tells it, legs: at 45 places on legs of 2 m in the
+rendered house it was off by 0.11 (root mean square; 0.34 at most)."""
+
+
+def metric_place(metric: MetricPoses | None, target: int, left: float) -> MetricPlace | None:
+    """The place on the straight line from the path image before a target to the target.
+
+    Args:
+        metric: of the path; None where it has none.
+        target: number of the path image that is next.
+        left: part of the leg that is left; NaN where it is not known.
+
+    Returns:
+        None where anything of it is not known.
+    """
+    if metric is None or target < 1 or not np.isfinite(left):
+        return None
+    before, after = metric.poses[target - 1 : target + 1, :3, 3]
+    leg = float(np.linalg.norm(after - before))
+    if not np.isfinite(leg):
+        return None
+    variance = metric.covariances[target - 1 : target + 1, 3:, 3:].trace(axis1=1, axis2=2)
+    parts = np.array([left, 1.0 - left])
+    sigma = float(np.sqrt((LEFT_SIGMA * leg) ** 2 + parts @ np.nan_to_num(variance)))
+    return MetricPlace(left * before + (1.0 - left) * after, sigma, left * leg)
+
+
+# --------------------------------------------------------------------------------------------
+# Whether pictures fit a route only when they are mirrored or turned over
+#
+# Descriptors of a mirrored picture fit nothing, or what looks alike by chance, and homing vectors
+# then point anywhere. So the first pictures are compared with the route both as they are and as
+# they would be if a side was mistaken: what they have in common with a path image tells which is
+# right.
+
+
+Turn: TypeAlias = Callable[[Image], Image]
+
+_SIDE_CANDIDATES = 6  # path images that a picture is compared with: those that look most alike
+_CLEARLY = 2.0  # times the features in common; what looks alike by chance varies by its root
+_SIDES_AGREEING = 3  # pictures that tell the same
+_SIDE_STREAM = 10  # of the seed's random numbers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mistaken:
+    """A way in which pictures may be other than stated.
+
+    Attributes:
+        said: what is wrong, and the mend.
+        camera: with which they would be right.
+        turn: that makes them right.
+    """
+
+    said: str
+    camera: OmniCamera
+    turn: Turn
+
+
+class PictureSides:
+    """Compares pictures with a route until it is clear which way they fit.
+
+    Attributes:
+        settled: whether a picture fits as it is, so that there is nothing more to ask.
+    """
+
+    def __init__(
+        self, camera: OmniCamera, path: PathMemory, settings: FrontEndSettings, seed: int = 0
+    ) -> None:
+        """``camera`` is that of the pictures, as stated."""
+        self._path, self._settings = path, settings
+        self._rng = np.random.default_rng((seed, _SIDE_STREAM))
+        self._words = VisualWords(path.images, self._rng)
+        stated = Mistaken("", camera, lambda image: image)
+        self._ways = [stated, *_mistakes(camera)]
+        self._extractors = [OmniFeatureExtractor(w.camera, settings.features) for w in self._ways]
+        self._votes = np.zeros(len(self._ways), np.int64)
+        self.settled = False
+
+    def look(self, image: Image) -> str | None:
+        """What is wrong with the pictures, once enough of them agree; None until then."""
+        common = np.array([self._common(k, image) for k in range(len(self._ways))])
+        best = int(np.argmax(common))
+        if best == 0:
+            self.settled = bool(common[0] > 0)
+        elif common[best] > _CLEARLY * common[0]:
+            self._votes[best] += 1
+        return self._ways[best].said if self._votes[best] >= _SIDES_AGREEING else None
+
+    def _common(self, way: int, image: Image) -> int:
+        """Features in common with the path image that has most of them, on one homing vector."""
+        turned = np.ascontiguousarray(self._ways[way].turn(image))
+        features = self._extractors[way].extract(turned)
+        alike = np.argsort(-self._words.likeness(features), kind="stable")[:_SIDE_CANDIDATES]
+        return max(self._inliers(features, self._path.images[k]) for k in alike)
+
+    def _inliers(self, features: OmniFeatures, target: OmniFeatures) -> int:
+        answer, matches = compare_views(features, target, self._settings, self._rng)
+        return in_common(answer, matches)
+
+
+def _mistakes(camera: OmniCamera) -> list[Mistaken]:
+    """What may be wrong with pictures of this camera."""
+    mirrored = "mirrored left to right: mirror them back"
+    out = [Mistaken(mirrored, camera, lambda image: image[:, ::-1])]
+    if isinstance(camera, Equirectangular):
+        over = "upside down: turn them by 180 degrees"
+        out.append(Mistaken(over, camera, lambda image: image[::-1, ::-1]))
+        flipped = "turned over top to bottom: turn them over again"
+        out.append(Mistaken(flipped, camera, lambda image: image[::-1]))
+    if isinstance(camera, LensCamera):
+        other: OmniCamera = replace(camera, up=not camera.up)
+        over = "of a camera that looks the other way: change its key middle"
+        out.append(Mistaken(over, other, lambda image: image))
+    if isinstance(camera, LensCamera | RadialCamera):
+        otherwise = f"{mirrored}, or change the camera's key clockwise"
+        out.append(Mistaken(otherwise, _turning_otherwise(camera), lambda image: image))
+    return out
+
+
+def _turning_otherwise(camera: LensCamera | RadialCamera) -> OmniCamera:
+    if isinstance(camera, LensCamera):
+        return replace(camera, clockwise=not camera.clockwise)
+    frame = replace(camera.frame, clockwise=not camera.frame.clockwise)
+    return cast(OmniCamera, replace(cast(Any, camera), frame=frame))

@@ -10,7 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.homing.graph_parts import (
+from fgslam.backend.homing.parts import (
     FIRST_SPEEDS,
     KERNEL,
     KERNEL_WIDTH,

@@ -8,18 +8,22 @@ back to where it came from, when it no longer looks as it did when its tracking 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import next_fast_len
 
-from fgslam.cameras.omni import OmniCamera
+from fgslam.cameras.omni import Equirectangular, Float32, OmniCamera, require_own_image, unwrap_maps
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.checks import later_time
-from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import TrackedBearings
+from fgslam.core.errors import EstimatorError, FrameError
+from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures, TrackedBearings
+from fgslam.core.planar import wrap
+from fgslam.frontend.features.colour_sift import wrapping_period
+from fgslam.frontend.features.omni_features import pixels_a_radian
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
-from fgslam.frontend.homing.stabilised_view import StabilisedImage, StabilisedView
 
 _MAX_VIEW_WIDTH = 720  # columns: half a degree; coarser cameras get fewer
 SIGMA_PX = 0.2  # of a tracked point, in pixels of the view
@@ -45,8 +49,6 @@ _MAX_BACK_PX = 1.0  # a point tracked back that misses its origin by more is los
 _PRECISION_PX = 0.03  # a smaller step ends the iteration
 _ITERATIONS = 15  # of Newton's method on each level
 _PYRAMID_LEVELS = 2  # halvings of the view above the view itself
-
-Float32 = npt.NDArray[np.float32]
 
 _GAIN = (0.2, 5.0)  # from one exposure to the next
 _SAME_GAIN, _SAME_LEVEL = 0.02, 1.0  # less is left as it is: rounding would be worse
@@ -329,3 +331,310 @@ class ReplenishedTracker:
             blockSize=WINDOW_PX,
         )  # fmt: skip
         return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64)
+
+
+# --------------------------------------------------------------------------------------------
+# The view that points are tracked in: unwrapped, continued over its seam, and held stabilised
+#
+# On an unwrapped view a turn of the robot is a shift of the whole picture. It is measured from the
+# picture as a whole and undone, so that what is left for the tracker are the small motions of
+# parallax; and since columns then stand still, hardly a point ever crosses the seam.
+
+
+_BANDS = 8  # of rows, averaged, from which the common shift is estimated
+_PROBED = np.deg2rad(np.arange(-89.0, 90.0, 1.0))
+_HIGHEST = np.deg2rad(60.0)  # beyond, a panorama's rows are stretched many times
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StabilisedImage:
+    """One image's view.
+
+    Attributes:
+        grey: (height, period + 2 margin) view, its rows continued on both sides.
+        bands: (bands, period) complex spectra of bands of rows, of the view *before* any shift.
+        shift: columns by which the view was moved to the right, modulo the period.
+        light: mean and standard deviation of the grey values.
+    """
+
+    grey: Image
+    bands: npt.NDArray[np.complex128]
+    shift: int
+    light: tuple[float, float]
+
+
+class StabilisedView:
+    """Makes views of one camera's images."""
+
+    def __init__(self, camera: OmniCamera, max_width: int, window: int, levels: int) -> None:
+        self._camera = camera
+        resolution = pixels_a_radian(camera)
+        width = _fast_period(min(max_width, round(2.0 * np.pi * resolution)) - 1) + 1
+        bottom, top = _seen_elevations(camera)
+        height = max(round((top - bottom) * (width - 1) / (2.0 * np.pi)) + 1, 2)
+        self.view = Equirectangular(width, height, top, bottom)
+        self.margin = window * 2**levels
+        self.period = width - 1
+        self._maps = cv2.convertMaps(*_period_maps(camera, self.view), cv2.CV_16SC2)
+        wraps = wrapping_period(camera) is not None
+        self._border = cv2.BORDER_WRAP if wraps else cv2.BORDER_CONSTANT
+
+    def grey(self, image: Image) -> Image:
+        """(height, period) grey view of an image (h, w, 3) in R, G, B; not shifted.
+
+        Raises:
+            FrameError: the image is not the camera's.
+        """
+        require_own_image(self._camera, image)
+        grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        view = cv2.remap(grey, *self._maps, cv2.INTER_LINEAR, borderMode=self._border)
+        return np.asarray(view, dtype=np.uint8)
+
+    def make(
+        self, image: Image, before: StabilisedImage | None, max_shift: float
+    ) -> StabilisedImage:
+        """The view of an image, shifted as the image before was, and by the turn since.
+
+        Args:
+            image: (h, w, 3).
+            before: what came before, or None.
+            max_shift: largest turn, in columns.
+        """
+        grey = self.grey(image)
+        bands = _spectra(grey)
+        shift = 0
+        if before is not None:
+            turned = _common_shift(before.bands, bands, self.period, max_shift)
+            # The picture moved right by `turned` columns: undo it on top of what was undone before.
+            shift = (before.shift - turned) % self.period
+        view = self._continued(grey, (-shift - self.margin) % self.period)
+        mean, spread = cv2.meanStdDev(view)
+        return StabilisedImage(view, bands, shift, (float(mean[0, 0]), float(spread[0, 0])))
+
+    def _continued(self, grey: Image, first: int) -> Image:
+        """(height, period + 2 margin) columns from the ``first`` on, the view over and over."""
+        wanted, parts = self.period + 2 * self.margin, []
+        while wanted > 0:
+            parts.append(grey[:, first : first + wanted])
+            wanted -= parts[-1].shape[1]
+            first = 0
+        return np.concatenate(parts, axis=1)
+
+    def to_stabilised(self, pixels: FloatArray, image: StabilisedImage) -> FloatArray:
+        """(n, 2) places in the padded view of places (n, 2) in the view itself."""
+        columns = (pixels[:, 0] + image.shift) % self.period + self.margin
+        return np.column_stack([columns, pixels[:, 1]])
+
+    def from_stabilised(self, places: FloatArray, image: StabilisedImage) -> FloatArray:
+        """The inverse of :meth:`to_stabilised`."""
+        columns = (places[:, 0] - self.margin - image.shift) % self.period
+        return np.column_stack([columns, places[:, 1]])
+
+
+def _seen_elevations(camera: OmniCamera) -> tuple[float, float]:
+    """Lowest and highest elevation that the camera sees all around, radians."""
+    around = np.linspace(-np.pi, np.pi, 16, endpoint=False)
+    level = np.cos(_PROBED)[:, None]
+    rays = np.stack(
+        [
+            level * np.cos(around),
+            level * np.sin(around),
+            np.broadcast_to(np.sin(_PROBED)[:, None], (len(_PROBED), len(around))),
+        ],
+        axis=-1,
+    )
+    seen = np.isfinite(camera.pixels(rays.reshape(-1, 3))[:, 0]).reshape(len(_PROBED), -1)
+    whole = _PROBED[np.all(seen, axis=1) & (np.abs(_PROBED) <= _HIGHEST)]
+    if len(whole) < 2:
+        raise FrameError("the camera sees no elevation all around; check its model and centre")
+    return float(whole[0]), float(whole[-1])
+
+
+def _fast_period(longest: int) -> int:
+    """A period that Fourier transforms are fast for, at most a few columns shorter."""
+    return next(n for n in range(longest, 0, -1) if next_fast_len(n) == n)
+
+
+def _period_maps(camera: OmniCamera, view: Equirectangular) -> tuple[Float32, Float32]:
+    """Maps of the view without its last column, which shows what the first does."""
+    columns, rows = unwrap_maps(camera, view)
+    return columns[:, :-1].copy(), rows[:, :-1].copy()
+
+
+def _spectra(grey: Image) -> npt.NDArray[np.complex128]:
+    """(bands, frequencies) spectra of the mean rows of bands, without their own means."""
+    bands = min(_BANDS, len(grey))
+    edges = [len(grey) * k // bands for k in range(bands + 1)]
+    means = [
+        cv2.reduce(grey[low:high], 0, cv2.REDUCE_AVG, dtype=cv2.CV_32F)
+        for low, high in pairwise(edges)
+    ]
+    spectra = np.fft.rfft(np.concatenate(means).astype(np.float64), axis=1)
+    spectra[:, 0] = 0.0
+    return np.asarray(spectra)
+
+
+def _common_shift(
+    before: npt.NDArray[np.complex128],
+    now: npt.NDArray[np.complex128],
+    period: int,
+    max_shift: float,
+) -> int:
+    """Columns by which the picture moved to the right, by phase correlation of all bands."""
+    cross = now * np.conj(before)
+    # Half-way between plain and phase correlation: blur and noise have no say, edges keep theirs.
+    cross = np.sum(cross / np.sqrt(np.maximum(np.abs(cross), 1e-9)), axis=0)
+    score = np.fft.irfft(cross, n=period)
+    most = min(int(max_shift), (period - 1) // 2)
+    score[most + 1 : period - most] = -np.inf
+    best = int(np.argmax(score))
+    return best if best <= most else best - period
+
+
+# --------------------------------------------------------------------------------------------
+# From wide-baseline features to points that can be tracked (Goedemé et al. IV-A)
+#
+# Features that are recognised from afar are rarely the points that are tracked best. Near each one
+# the point is chosen whose gradient matrix (eq. 2, summed over the window) has the largest smaller
+# eigenvalue. In the target image that point was not looked for: it lies where the own frame of the
+# feature puts it, as if its surroundings were a plane seen alike from both places.
+
+
+_PLANE_ERROR = 0.2
+"""Part of the offset from the feature's centre by which its place in the target view is uncertain:
+features are not flat, nor seen head on."""
+
+_SEARCH_PX = 3.0
+"""The best trackable point is sought within the feature's scale, at least this far from its centre
+and at most three times as far."""
+
+
+def move_to_trackable(
+    grey: Image,
+    view: Equirectangular,
+    matches: BearingMatches,
+    features: tuple[OmniFeatures, OmniFeatures],
+) -> tuple[IntArray, FloatArray, BearingMatches]:
+    """Replaces features by trackable points.
+
+    Args:
+        grey: (height, width - 1) view of the start image; its rows continue over the seam.
+        view: its camera.
+        matches: of start and target.
+        features: of start and target, those that the matches index.
+
+    Returns:
+        Rows (m,) of ``matches`` that have such a point, the points (m, 2) in the view, and the
+        matches (m) of the points.
+    """
+    if not len(matches):
+        return np.empty(0, dtype=np.int64), np.empty((0, 2)), matches
+    radius = _search_radius(matches, features[0], view)
+    centres = _in_view(matches, view)
+    strength = _strength(grey, WINDOW_PX)
+    points, strongest = _best_near(strength, centres, radius)
+    rim = max(WINDOW_PX, PATCH_PX) / 2.0
+    good = (strongest >= MIN_EIGENVALUE) & (points[:, 1] >= rim)
+    good &= points[:, 1] <= view.height - 1 - rim
+    good &= _distinct(points, strongest, DISTINCT_PX)
+    rows = np.flatnonzero(good)
+    ratio = _scale_ratio(matches, *features)
+    moved = _moved(matches, points - centres, ratio, view)
+    chosen = points[rows]
+    chosen[:, 0] %= view.width - 1
+    return rows, chosen, moved.select(rows)
+
+
+def _search_radius(
+    matches: BearingMatches, features: OmniFeatures, view: Equirectangular
+) -> FloatArray:
+    """(n,) pixels: a feature's own size, within bounds."""
+    a_radian = (view.width - 1) / (2.0 * np.pi)
+    size = np.zeros(len(matches))
+    sift = matches.kind == int(FeatureKind.SIFT)
+    size[sift] = features.sift.scale[matches.index_a[sift]] * a_radian
+    return np.clip(size, _SEARCH_PX, 3.0 * _SEARCH_PX)
+
+
+def _in_view(matches: BearingMatches, view: Equirectangular) -> FloatArray:
+    """(n, 2) pixels of the features in the start's view."""
+    columns = (np.pi - matches.bearing_a) * (view.width - 1) / (2.0 * np.pi)
+    a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
+    return np.column_stack([columns, (view.top_elevation - matches.elevation_a) / a_row])
+
+
+def _strength(grey: Image, window: int) -> FloatArray:
+    """(h, w) smaller eigenvalue of eq. 2, a pixel of the window; the seam is continued."""
+    padded = cv2.copyMakeBorder(grey, 0, 0, window, window, cv2.BORDER_WRAP)
+    strength = cv2.cornerMinEigenVal(padded, window, ksize=3)
+    return np.asarray(strength[:, window:-window], dtype=np.float64)
+
+
+def _best_near(
+    strength: FloatArray, centres: FloatArray, radius: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Strongest whole pixel within a radius of each centre, and its strength; -1 where none is."""
+    height, period = strength.shape
+    reach = int(np.ceil(np.max(radius)))
+    down, across = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    nearest = np.rint(centres).astype(np.int64)
+    rows = nearest[:, 1, None] + down.ravel()
+    columns = nearest[:, 0, None] + across.ravel()
+    distance = np.hypot(columns - centres[:, :1], rows - centres[:, 1:])
+    inside = (rows >= 0) & (rows < height) & (distance <= radius[:, None])
+    value = strength[np.clip(rows, 0, height - 1), columns % period]
+    value = np.where(inside, value, -1.0)
+    best = np.argmax(value, axis=1)
+    at = np.arange(len(centres))
+    points = np.column_stack([columns[at, best], rows[at, best]]).astype(np.float64)
+    return points, value[at, best]
+
+
+def _distinct(points: FloatArray, strength: FloatArray, apart: float) -> BoolArray:
+    """(n,) the strongest of each cluster of points; of equals the first."""
+    kept = np.zeros(len(points), dtype=np.bool_)
+    free = np.ones(len(points), dtype=np.bool_)
+    near = np.hypot(*(points[:, None] - points).transpose(2, 0, 1)) < apart
+    for k in np.argsort(-strength, kind="stable"):
+        if free[k]:
+            kept[k] = True
+            free &= ~near[k]
+    return kept
+
+
+def _scale_ratio(matches: BearingMatches, a: OmniFeatures, b: OmniFeatures) -> FloatArray:
+    """(n,) size of a feature in the target over its size in the start image."""
+    ratio = np.ones(len(matches))
+    sift = matches.kind == int(FeatureKind.SIFT)
+    of_a, of_b = matches.index_a[sift], matches.index_b[sift]
+    ratio[sift] = b.sift.scale[of_b] / a.sift.scale[of_a]
+    of_a, of_b = matches.index_a[~sift], matches.index_b[~sift]
+    length_a, length_b = np.ptp(a.columns.tangents[of_a], 1), np.ptp(b.columns.tangents[of_b], 1)
+    ratio[~sift] = length_b / length_a
+    return ratio
+
+
+def _moved(
+    matches: BearingMatches,
+    offset: FloatArray,
+    ratio: FloatArray,
+    view: Equirectangular,
+) -> BearingMatches:
+    """Matches of points at pixel offsets (n, 2) from the features."""
+    a_column = 2.0 * np.pi / (view.width - 1)
+    a_row = (view.top_elevation - view.bottom_elevation) / (view.height - 1)
+    left, up = -offset[:, 0] * a_column, -offset[:, 1] * a_row
+    # The point is a pixel of the start image, known as well as a track; in the target it has the
+    # feature's own uncertainty, and that of its offset.
+    off_plane = _PLANE_ERROR * ratio * np.hypot(left, up)
+    sigma = matches.sigma.copy()
+    sigma[:, 0], sigma[:, 1] = SIGMA_PX * a_column, SIGMA_PX * a_row
+    sigma[:, 2:] = np.hypot(sigma[:, 2:], off_plane[:, None])
+    return replace(
+        matches,
+        bearing_a=wrap(matches.bearing_a + left),
+        elevation_a=matches.elevation_a + up,
+        bearing_b=wrap(matches.bearing_b + ratio * left),
+        elevation_b=matches.elevation_b + ratio * up,
+        sigma=sigma,
+    )
