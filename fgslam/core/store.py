@@ -122,9 +122,9 @@ class _Packing:
         if isinstance(value, Mapping):
             keys = self.column(list(value), _below(at, "keys"))
             return {"keys": keys, "values": self.column(list(value.values()), at)}
-        if isinstance(value, Compact):
+        if _offers(value, Compact):
             return {"compact": self.node(value.packed(), at)}
-        if isinstance(value, Resumable):
+        if _offers(value, Resumable):
             own = value.state().items()
             return {"own": {n: self._stored(a, _below(at or "own", n)) for n, a in own}}
         kind: Any = type(value)
@@ -281,7 +281,7 @@ class _Unpacking:
         if set(hints) != set(parts):
             raise ValueError(f"no state of {type(now).__name__}")
         values = {n: self.value(parts[n], hints[n], getattr(now, n)) for n in parts}
-        if _is_frozen(now):
+        if _is_frozen(kind):
             return dataclasses.replace(now, **values)
         for name, value in values.items():
             setattr(now, name, value)
@@ -301,8 +301,19 @@ def _below(at: str, name: str) -> str:
     return f"{at}/{name.strip('_')}" if at else name.strip("_")
 
 
-def _is_frozen(value: Any) -> bool:
-    return bool(getattr(getattr(value, "__dataclass_params__", None), "frozen", False))
+def _is_frozen(kind: Any) -> bool:
+    return bool(getattr(getattr(kind, "__dataclass_params__", None), "frozen", False))
+
+
+def _offers(value: Any, protocol: Any) -> bool:
+    """Whether a value has a protocol's members: asked once a type, much faster than of each."""
+    kind: Any = type(value)
+    return _has_members(kind, protocol)
+
+
+@cache
+def _has_members(kind: Any, protocol: Any) -> bool:
+    return issubclass(kind, protocol)
 
 
 def _field_names(kind: Any) -> tuple[str, ...]:
@@ -395,7 +406,7 @@ def kept_hints(kind: Any) -> dict[str, Any]:
 def has_state(part: Any) -> bool:
     """Whether the state of a part can be taken."""
     kind: Any = type(part)
-    return bool(kept_hints(kind)) or isinstance(part, Resumable)
+    return bool(kept_hints(kind)) or _offers(part, Resumable)
 
 
 def state_of(part: Any) -> StateArrays:
@@ -410,3 +421,39 @@ def restore(part: Any, state: StateArrays) -> None:
         Exception: one of ``UNFIT``; the state is another's.
     """
     _Unpacking(state).value(json.loads(str(state[TREE])), type(part), part)
+
+
+def snapshot(part: Any) -> Any:
+    """What a part keeps, for :func:`put_back` within a frame: a fifth of a millisecond at most.
+
+    Containers are copied, arrays are not: for parts that replace theirs and write into none.
+    """
+    if isinstance(part, np.ndarray):
+        return part
+    if isinstance(part, list):
+        return [snapshot(one) for one in part]
+    if isinstance(part, tuple) and not _field_names(type(part)):
+        return tuple(snapshot(one) for one in part)
+    if isinstance(part, dict | deque):
+        return part.copy()
+    kind: Any = type(part)
+    if _offers(part, Resumable):
+        return part.state()
+    names = () if _is_frozen(kind) else kept_hints(kind)
+    return {name: snapshot(getattr(part, name)) for name in names} if names else part
+
+
+def put_back(part: Any, kept: Any) -> None:
+    """Makes a part what it was at its :func:`snapshot`."""
+    if _offers(part, Resumable):
+        part.restore(kept)
+        return
+    for name, value in kept.items():
+        now = getattr(part, name)
+        if isinstance(now, list) and now and has_state(now[0]):
+            for one, was in zip(now, value, strict=True):
+                put_back(one, was)
+        elif has_state(now) and not _is_frozen(type(now)):
+            put_back(now, value)
+        else:
+            setattr(part, name, value)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
 import numpy as np
 
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
-from fgslam.core.arrays import IntArray, StateArrays
+from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import (
     EgoMotion,
     EgoMotionStatus,
@@ -25,7 +25,7 @@ from fgslam.core.estimates import (
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.store import Kept, has_state, restore, state_of
+from fgslam.core.store import Kept, has_state, put_back, snapshot
 from fgslam.frontend.camera_watch import CameraWatch
 from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import unmeasured
@@ -91,7 +91,7 @@ def timed(stage: str) -> Callable[[Step], Step]:
     return decorate
 
 
-Snapshot: TypeAlias = list[tuple[Any, StateArrays]]
+Snapshot: TypeAlias = list[tuple[Any, Any]]
 """Parts, and their states before a frame, for the rollback where its features cannot be found."""
 
 
@@ -143,7 +143,7 @@ class SlamPipeline:
             body: the robot's motion since the last frame; None where none was measured.
         """
         self.watch_of_frame = Stopwatch()
-        snapshot = self._snapshot(frame)
+        before = self._before(frame)
         frame = self._check_cameras(frame, index)  # late, frozen, swapped images are not used
         odometry, prediction = self._predict(timestamp, body)  # 3.1
         landmarks = self._current_map()
@@ -152,7 +152,7 @@ class SlamPipeline:
             stereo, features = carried.carried.features, None
             matched = Matched(carried.tracked.ego_motion, self.key_frames.record(carried))
         else:
-            frame = self._find_features(frame, carried, snapshot)  # 2.1
+            frame = self._find_features(frame, carried, before)  # 2.1
             every = self._match_stereo(frame)  # 2.2
             measured = odometry is None or odometry.measured
             every, matched = self._track(prediction, frame, every, landmarks, carried, measured)
@@ -175,9 +175,9 @@ class SlamPipeline:
         if frame.frame is None:
             return False
         if self.watch is not None:
-            before = state_of(self.watch)
+            before = snapshot(self.watch)
             refused = self._check_cameras(frame, frame.i).refused
-            restore(self.watch, before)  # the frame comes again
+            put_back(self.watch, before)  # the frame comes again
             if refused:
                 return False
         first = self._find_features(dataclasses.replace(frame, i=0), None, [])
@@ -196,13 +196,13 @@ class SlamPipeline:
 
     # -- the steps, in their order -------------------------------------------------------------
 
-    def _snapshot(self, frame: FeatureFrame) -> Snapshot:
+    def _before(self, frame: FeatureFrame) -> Snapshot:
         """What a frame that comes without features changes before these are found."""
         self.rewound = False
         if self.describe is None or frame.frame is None or frame.features:
             return []
         parts = self.watch, self.motion, self.key_frames
-        return [(part, state_of(part)) for part in parts if has_state(part)]
+        return [(part, snapshot(part)) for part in parts if has_state(part)]
 
     @timed("watch")
     def _check_cameras(self, frame: FeatureFrame, index: int) -> FeatureFrame:
@@ -250,7 +250,7 @@ class SlamPipeline:
 
     @timed("sift")
     def _find_features(
-        self, frame: FeatureFrame, carried: CarriedFrame | None, snapshot: Snapshot
+        self, frame: FeatureFrame, carried: CarriedFrame | None, before: Snapshot
     ) -> FeatureFrame:
         """The frame with features; of its reference image where tracked patches locate it.
 
@@ -264,8 +264,8 @@ class SlamPipeline:
         try:
             return find(frame)
         except BaseException:
-            for part, state in snapshot:
-                restore(part, state)
+            for part, kept in before:
+                put_back(part, kept)
             self.rewound = True
             raise
 

@@ -16,7 +16,17 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as stn
 
 from fgslam.core.arrays import FloatArray, GrowingColumns, StateArrays
-from fgslam.core.store import TREE, Kept, has_state, pack, restore, state_of, unpack
+from fgslam.core.store import (
+    TREE,
+    Kept,
+    has_state,
+    pack,
+    put_back,
+    restore,
+    snapshot,
+    state_of,
+    unpack,
+)
 
 
 class Colour(Enum):
@@ -242,3 +252,16 @@ def test_the_state_of_another_class_and_a_part_of_one_are_refused() -> None:
                 restore(part, {k: v for k, v in state_of(part).items() if k != name})
     assert has_state(part)
     assert not has_state(object())
+
+
+@given(st.integers(0, 20), st.integers(0, 20))
+def test_a_part_is_what_it_was_at_its_snapshot(before: int, after: int) -> None:
+    part, other = Part(3), Part(3)
+    part._rows = other._rows = GrowingColumns(ids=np.empty(0, np.int64))  # written to in place
+    for _ in range(before):
+        part.go()
+    told, kept = part.told()[1:], snapshot(part)
+    for _ in range(after):
+        part.go()
+    put_back(part, kept)
+    assert part.told()[1:] == told
