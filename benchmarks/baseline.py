@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from fgslam.evaluation.metrics import value_at
+from fgslam.evaluation.statistics import value_at
 from fgslam.runs.tables import RESULT_COLUMNS
 
 _FLOOR = 1e-6  # metres, degrees: less is rounding, whatever the ratio

@@ -15,7 +15,7 @@ import cv2
 from fgslam.core.arrays import Image
 from fgslam.core.estimates import EgoMotionStatus, Trajectory
 from fgslam.core.recordings import Frame, Sequence
-from fgslam.evaluation.trajectory import Alignment, TrajectoryError, evaluate_trajectory
+from fgslam.evaluation.statistics import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import EDGE_THRESHOLD, OCTAVE_LAYERS
 from fgslam.frontend.settings import FrontendSettings

@@ -30,7 +30,7 @@ from fgslam.core.geometry import (
     rotation_from_quaternion,
 )
 from fgslam.datasets.bag_messages import calibration_of, grey_of, motion_of
-from fgslam.report.ros_bag import pose_message
+from fgslam.report.formats import pose_message
 
 SIDES = ("left", "right")
 TOLERANCE_S = 0.005  # between the stamps of one pair

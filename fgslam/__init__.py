@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from fgslam.core.measurement_log import MeasurementLog
     from fgslam.core.measurements import Odometry
     from fgslam.core.trajectories import Trajectory
-    from fgslam.evaluation.comparing import compare
+    from fgslam.evaluation.judging import compare
     from fgslam.homing.api import HomingVector, PathFollower, teach
     from fgslam.homing.route import PathMemory
     from fgslam.homing.steering import DriveCommand
@@ -103,7 +103,7 @@ _HOMES = {
     "StereoRig": "fgslam.cameras.rig",
     "Trajectory": "fgslam.core.trajectories",
     "TwoViewVector": "fgslam.core.homing",
-    "compare": "fgslam.evaluation.comparing",
+    "compare": "fgslam.evaluation.judging",
     "load_camera": "fgslam.cameras.omni_files",
     "load_rig": "fgslam.cameras.rig",
     "open_recording": "fgslam.runs.library",

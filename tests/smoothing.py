@@ -25,7 +25,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.estimates import Estimate, Prediction, UpdateStats
 from fgslam.core.measurements import Increment
-from fgslam.evaluation.consistency import Nees, judge, landmark_nees, pose_nees
+from fgslam.evaluation.statistics import Nees, judge, landmark_nees, pose_nees
 from fgslam.factors import graphs
 from fgslam.factors.noise import plain
 from fgslam.frontend.settings import EgoMotionSettings

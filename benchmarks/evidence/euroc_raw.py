@@ -20,7 +20,7 @@ from benchmarks.runs import (
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.trajectory import align, associate, moved
+from fgslam.evaluation.statistics import align, associate, moved
 
 SEEDS = range(3)
 """Of the synthetic odometry; both sets get errors of the same draws."""

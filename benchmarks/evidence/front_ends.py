@@ -21,7 +21,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.estimates import Trajectory
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
 
 ESTIMATOR = "isam2"

@@ -15,7 +15,7 @@ from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.recordings import Sequence
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
 from fgslam.slam.factory import make_extractor

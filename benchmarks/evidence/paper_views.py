@@ -11,7 +11,7 @@ from benchmarks.runs import EVERY_FRAME, experiment, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, Trajectory
-from fgslam.evaluation.trajectory import end_pose
+from fgslam.evaluation.statistics import end_pose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher

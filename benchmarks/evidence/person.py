@@ -19,7 +19,7 @@ from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
 from fgslam.datasets.rendered_lab import RenderedLabSequence
-from fgslam.evaluation.trajectory import to_estimate_world
+from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.worlds.people import WALK_FRAMES
 from fgslam.worlds.settings import RenderedLabSettings

@@ -16,7 +16,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.estimates import Trajectory
 from fgslam.core.rig_correction import RigCorrection, term_names
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 
 SEEDS = range(6)
 LIGHTS = {

@@ -20,7 +20,7 @@ from fgslam.backend.settings import (
 )
 from fgslam.core.estimates import Estimate
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 
 KEYFRAMES = Isam2Settings(keyframe_every=4, update_every=40, ordering_window=10)
 WINDOW = 500

@@ -25,7 +25,7 @@ from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.trajectory import align, moved, position_errors
+from fgslam.evaluation.statistics import align, moved, position_errors
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.session import Session

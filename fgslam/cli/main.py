@@ -277,7 +277,7 @@ def export(  # noqa: PLR0913 - each option is a parameter
 
     Of a saved map alone it lists what is in it.
     """
-    from fgslam.runs.exporting import Wanted, export_run
+    from fgslam.runs.export import Wanted, export_run
 
     wanted = Wanted(
         map=map_file,
@@ -319,7 +319,7 @@ def view(
     overwrite: options.Overwrite = False,
 ) -> None:
     """Open a run in the rerun viewer, where that extra is installed."""
-    from fgslam.runs.viewing import view_run
+    from fgslam.runs.view import view_run
 
     typer.echo(view_run(run_folder, save, overwrite))
 

@@ -40,7 +40,7 @@ def watched_by(config: Experiment, live: bool, file: Path | None) -> Iterator[Wa
     if not live and file is None:
         yield None
         return
-    from fgslam.runs.watching import watched
+    from fgslam.runs.view import watched
 
     with watched(config, live, file) as watch:
         yield watch

@@ -15,7 +15,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import HomingEstimate, HomingTruth, home_vector_jacobian
 from fgslam.core.planar import wrap
-from fgslam.evaluation.consistency import Consistency, Nees, judge, nees
+from fgslam.evaluation.statistics import Consistency, Nees, judge, nees
 
 DIVERGED_RAD = float(np.deg2rad(30.0))
 """A home direction further off than this leads away, not home."""

@@ -9,8 +9,7 @@ import numpy as np
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.geometry import inverse
 from fgslam.core.quantiles import chi_square_quantile
-from fgslam.evaluation.consistency import pose_nees
-from fgslam.evaluation.trajectory import rotation_angles
+from fgslam.evaluation.statistics import pose_nees, rotation_angles
 
 _HELD = 0.95
 

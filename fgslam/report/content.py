@@ -20,7 +20,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import replacing, write_text
 from fgslam.core.geometry import congruence
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
+from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 
 if TYPE_CHECKING:
     from plotly import graph_objects as go

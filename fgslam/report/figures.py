@@ -18,9 +18,8 @@ from plotly.subplots import make_subplots
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import Estimate, Trajectory
-from fgslam.evaluation.comparing import Comparable, require_named
-from fgslam.evaluation.judging import Answer
-from fgslam.evaluation.trajectory import to_estimate_world
+from fgslam.evaluation.judging import Answer, Comparable, require_named
+from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.report.content import (
     COLOURS,
     GREY,
@@ -774,7 +773,7 @@ def plot(answers: Mapping[str, Comparable], truth: Trajectory | None = None) -> 
     hide and show an estimator.
 
     Args:
-        answers: results by name, as for :func:`fgslam.evaluation.comparing.compare`.
+        answers: results by name, as for :func:`fgslam.evaluation.judging.compare`.
         truth: true poses of the reference camera, in any world frame.
 
     Returns:

@@ -13,10 +13,12 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
-from fgslam.evaluation.consistency import chi_square_band, judge, pose_nees
-from fgslam.evaluation.trajectory import (
+from fgslam.evaluation.statistics import (
     Alignment,
+    chi_square_band,
     evaluate_trajectory,
+    judge,
+    pose_nees,
     position_errors,
     to_estimate_world,
 )

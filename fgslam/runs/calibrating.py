@@ -369,7 +369,7 @@ def _write_beside(
     Raises:
         OutputError: a file cannot be written.
     """
-    from fgslam.report.pictures.board import draw_corners
+    from fgslam.report.pictures import draw_corners
 
     picture = out.with_suffix(".png")
     images = out.with_name(f"{out.stem}_images.csv")
@@ -599,7 +599,7 @@ def _overlap(rig: StereoRig) -> float:
 
 
 def _draw(found: Calibration, rig: StereoRig | None, path: Path) -> None:
-    from fgslam.report.pictures.cameras import CameraDrawing, draw_cameras
+    from fgslam.report.pictures import CameraDrawing, draw_cameras
 
     reference = found.cameras[0]
     drawings = []

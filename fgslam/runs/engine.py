@@ -17,7 +17,7 @@ from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import Page, TextTable, read_metrics, write_json
 from fgslam.report.page import write_html
 from fgslam.runs.config import load_experiment

@@ -18,7 +18,7 @@ from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import write_covariances
 from fgslam.report.content import write_csv
-from fgslam.report.point_cloud import MapPoints, write_ply
+from fgslam.report.formats import MapPoints, write_ply
 from fgslam.slam.noise_in_use import FrameNoise
 from fgslam.slam.replay import Replay, ReplayRow
 

@@ -17,14 +17,13 @@ from fgslam.core.bearing_log import BearingLog
 from fgslam.core.errors import DatasetError, EstimatorError
 from fgslam.core.files import make_subfolder
 from fgslam.core.homing import HomingEstimate, HomingStart, HomingTruth, TrackedBearings
-from fgslam.evaluation.consistency import Consistency
 from fgslam.evaluation.homing import (
     HomingErrors,
     HomingSummary,
     homing_errors,
     summarise_homings,
 )
-from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.evaluation.statistics import Consistency, JsonValue, UpdateTime
 from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure, local_map_figure
 from fgslam.runs.config_models import HomingExperiment

@@ -24,7 +24,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.report.point_cloud import MapPoints, write_map
+from fgslam.report.formats import MapPoints, write_map
 from fgslam.slam.choices import chosen_frontend
 from fgslam.slam.factory import make_describer, make_relocaliser, make_stereo
 from fgslam.slam.inputs import checked_images

@@ -21,8 +21,8 @@ from fgslam.core.sensors import vertical_of
 from fgslam.core.trajectories import read_covariances
 from fgslam.core.yaml_text import plain_values
 from fgslam.report.content import Picture, read_metrics
+from fgslam.report.formats import MapPoints, read_ply
 from fgslam.report.page import write_report
-from fgslam.report.point_cloud import MapPoints, read_ply
 from fgslam.report.results import (
     EstimatorReport,
     ReportData,

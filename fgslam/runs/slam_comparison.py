@@ -18,10 +18,10 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LANDMARK_TRUTH_FILE, read_landmark_truth
 from fgslam.core.trajectories import Trajectory
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
+from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import read_metrics, write_metrics
-from fgslam.report.point_cloud import MapPoints, read_ply
+from fgslam.report.formats import MapPoints, read_ply
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, RunResult, Status, Task
 from fgslam.runs.estimator_files import write_replay

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fgslam.core.files import write_text
-from fgslam.evaluation.metrics import value_at
+from fgslam.evaluation.statistics import value_at
 from fgslam.report.content import Column, TextTable
 
 UNKNOWN = "-"

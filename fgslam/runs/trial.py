@@ -10,9 +10,8 @@ from pathlib import Path
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import judge_replay
-from fgslam.evaluation.metrics import EstimatorMetrics
+from fgslam.evaluation.statistics import EstimatorMetrics, Nees
 from fgslam.runs.config_models import ExperimentConfig
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import LOG_FILE

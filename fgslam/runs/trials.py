@@ -15,9 +15,8 @@ from fgslam.backend.settings import EstimatorSettings, family_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsSettings
-from fgslam.evaluation.comparing import MeanInterval, PairedTest, mean_interval, paired_test
-from fgslam.evaluation.consistency import Consistency, judge
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, value_at
+from fgslam.evaluation.judging import MeanInterval, PairedTest, mean_interval, paired_test
+from fgslam.evaluation.statistics import Consistency, EstimatorMetrics, JsonValue, judge, value_at
 from fgslam.report.content import write_metrics
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
 from fgslam.runs.config import load_experiment

@@ -15,7 +15,7 @@ from running import Finished, run_values, units_in_this_process
 def _coarse_pictures() -> Iterator[None]:
     """What pictures look like is tested elsewhere; here few and coarse ones, drawn faster."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fgslam.report.pictures.style.DPI", 50)
+        patch.setattr("fgslam.report.pictures.DPI", 50)
         patch.setattr("fgslam.runs.tasks.slam_outputs.SHOWN", (0.0,))
         yield
 

@@ -31,7 +31,7 @@ _STEPS = {
     "fgslam.runs.tasks.homing_trials.TRIALS_A_BLOCK": 1,
     "fgslam.runs.tasks.homing_video.SAVE_EVERY_S": 0.0,
     "fgslam.runs.tasks.localisation_queries.SAVE_EVERY_S": 0.0,
-    "fgslam.report.pictures.style.DPI": 50,
+    "fgslam.report.pictures.DPI": 50,
 }
 
 

@@ -20,7 +20,7 @@ import yaml
 from fgslam.cli import main as cli
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
-from fgslam.report.point_cloud import read_ply
+from fgslam.report.formats import read_ply
 from fgslam.runs.config import make_config
 from fgslam.runs.crews import Here
 from fgslam.runs.engine import run_task

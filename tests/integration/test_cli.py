@@ -33,7 +33,7 @@ from running import (
 
 import fgslam
 from fgslam.core.trajectories import Trajectory
-from fgslam.report.point_cloud import read_ply
+from fgslam.report.formats import read_ply
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.named_experiments import experiment_names

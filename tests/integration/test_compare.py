@@ -27,8 +27,8 @@ from running import (
 from fgslam.backend.settings import DeadReckoningSettings, Isam2Settings
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
-from fgslam.evaluation.metrics import EstimatorMetrics
-from fgslam.report.point_cloud import read_ply
+from fgslam.evaluation.statistics import EstimatorMetrics
+from fgslam.report.formats import read_ply
 from fgslam.runs.config import load_config, make_config
 from fgslam.runs.run import run_experiment
 

@@ -9,7 +9,7 @@ import pytest
 
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, path_length
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory, path_length
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 pytestmark = pytest.mark.data

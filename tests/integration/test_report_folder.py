@@ -17,10 +17,10 @@ from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import rotation_from_quaternion
 from fgslam.core.trajectories import read_covariances
-from fgslam.evaluation.trajectory import to_estimate_world
+from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.report.results import EstimatorReport
 from fgslam.runs.report import load_report, report_from_folder
-from fgslam.runs.viewing import ellipsoids, view_run
+from fgslam.runs.view import ellipsoids, view_run
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

@@ -22,7 +22,7 @@ from benchmarks.runs import (
     trajectory_error,
 )
 from benchmarks.tables import Table, shown
-from fgslam.evaluation.trajectory import Alignment
+from fgslam.evaluation.statistics import Alignment
 
 # ----------------------------------------------------------------------------------------------
 # The instruments themselves: fast

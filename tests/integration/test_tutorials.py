@@ -153,7 +153,7 @@ def test_a_tutorial_is_short_and_its_pictures_are_small(name: str) -> None:
 @pytest.mark.usefixtures("in_this_process")
 def test_every_command_runs_and_the_pictures_are_made(tmp_path: Path, monkeypatch: Patch) -> None:
     pytest.importorskip("rerun", reason="the extra `viewer` is not installed")
-    monkeypatch.setattr("fgslam.report.pictures.style.DPI", 100)
+    monkeypatch.setattr("fgslam.report.pictures.DPI", 100)
     for name, make in DATA.items():
         folder = tmp_path / name
         folder.mkdir()

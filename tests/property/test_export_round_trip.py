@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as nps
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory, umeyama
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory, umeyama
 
 UNIT = st.floats(-1.0, 1.0, allow_subnormal=False)
 ANGLES = st.one_of(

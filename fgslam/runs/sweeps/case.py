@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.core.errors import ConfigError, FgslamError
-from fgslam.evaluation.metrics import JsonValue, value_at
+from fgslam.evaluation.statistics import JsonValue, value_at
 from fgslam.report.content import plain, read_metrics
 from fgslam.runs.compare import Choice, choose
 from fgslam.runs.config import make_experiment

@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.evaluation.comparing import MeanInterval, PairedTest, holm, mean_interval, paired_test
+from fgslam.evaluation.judging import MeanInterval, PairedTest, holm, mean_interval, paired_test
 from fgslam.runs.sweeps.grid import SEED, Grid
 from fgslam.runs.sweeps.table import ESTIMATOR, EXPERIMENT, FAILURE, Columns, SweepTable
 from fgslam.runs.tables import measured_marks, with_marks

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.evaluation.comparing import MeanInterval, mean_interval
+from fgslam.evaluation.judging import MeanInterval, mean_interval
 from fgslam.report.content import Column, Figure, Page, TextTable
 from fgslam.report.homing_figures import effect_figure, sorted_errors
 from fgslam.report.page import write_html

@@ -12,7 +12,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import HomingTruth
 from fgslam.core.planar import between, wrap
-from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.evaluation.statistics import JsonValue, UpdateTime
 from fgslam.homing.closed_loop import (
     ARRIVED_M,
     STAGES,

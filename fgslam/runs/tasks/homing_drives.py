@@ -316,7 +316,7 @@ def finish_drives(
 
 def draw_leg_views(folder: Path, seed: int, views: Sequence[LegView]) -> tuple[Picture, ...]:
     """A picture for each view. Raises OutputError."""
-    from fgslam.report.pictures.image_overlays import draw_view_tracks  # Matplotlib takes a second
+    from fgslam.report.pictures import draw_view_tracks  # Matplotlib takes a second
 
     pictures = []
     for view in views:

@@ -14,9 +14,8 @@ from fgslam.core.arrays import IntArray
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import BearingMatches, HomingStart, Refusal
 from fgslam.datasets.simulated_homing import open_simulated_homing
-from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.homing import HomingErrors
-from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.evaluation.statistics import JsonValue, Nees, UpdateTime
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector

@@ -13,7 +13,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.evaluation.metrics import JsonValue, UpdateTime
+from fgslam.evaluation.statistics import JsonValue, UpdateTime
 from fgslam.frontend.homing.tracking import ReplenishedTracker, TrackedImage, VideoState
 from fgslam.report.content import Column, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure
@@ -150,7 +150,7 @@ def _draw(
     tracks: _Tracks, tracker: ReplenishedTracker, recording: OmniRecording, folder: Path
 ) -> None:
     """The last frame with the ways of its points."""
-    from fgslam.report.pictures.image_overlays import draw_view_tracks  # Matplotlib takes a second
+    from fgslam.report.pictures import draw_view_tracks  # Matplotlib takes a second
 
     i = len(tracks.frames) - 1
     name, _, points, added, _ = tracks.frames[i]

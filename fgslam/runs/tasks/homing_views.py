@@ -35,7 +35,7 @@ from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniDatasetSettings
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.frontend.features.column_segments import empty_segments
 from fgslam.frontend.features.omni_features import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
@@ -909,7 +909,7 @@ def draw_pair(
     folder: Path, views: OmniRecording, search: PairSearch, answer: PairAnswer
 ) -> Picture:
     """One pair: its accepted matches on both views."""
-    from fgslam.report.pictures.image_overlays import MatchedPixels, draw_view_matches
+    from fgslam.report.pictures import MatchedPixels, draw_view_matches
 
     vector, matches = _vector(search, answer.a, answer.b)
     if isinstance(vector, TwoViewVector):

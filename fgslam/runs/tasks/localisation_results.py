@@ -23,7 +23,7 @@ from fgslam.evaluation.localisation import (
     localisation_errors,
     score,
 )
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv, write_json
 from fgslam.report.homing_figures import Located, located_figure
 from fgslam.runs.config_models import LocalisationConfig
@@ -290,7 +290,7 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
     bounds = bounds_of(result.config)
     figures = {one.frames: _figure(given, one, bounds) for one in judged}
     if output.pictures:
-        from fgslam.report.pictures.on_paper import draw_figure  # Matplotlib takes a second
+        from fgslam.report.pictures import draw_figure  # Matplotlib takes a second
 
         pictures = make_subfolder(folder, "pictures")
         for frames, figure in figures.items():

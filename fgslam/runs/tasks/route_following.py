@@ -17,7 +17,7 @@ from fgslam.core.planar import wrap
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import camera_notes
 from fgslam.datasets.opening import open_omni
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.homing.api import PathFollower
 from fgslam.homing.places import PictureSides
 from fgslam.homing.route import PathMemory

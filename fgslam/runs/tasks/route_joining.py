@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.homing import OmniFeatures
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.homing.links import Pair
 from fgslam.homing.route import PathMemory
 from fgslam.homing.topological_map import FEATURES, VECTOR, Answered, Asker, RouteMap, route_of

@@ -17,7 +17,7 @@ from fgslam.core.errors import FrameError
 from fgslam.core.files import make_subfolder
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.homing.route import FULL, GAP, Taught, TaughtImage, Teacher
 from fgslam.homing.settings import DRIVING
 from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
@@ -226,7 +226,7 @@ def _sheet(
     """The path images side by side; none where pictures are not wanted."""
     if most == 0:
         return ()
-    from fgslam.report.pictures.image_overlays import draw_sheet  # Matplotlib takes a second
+    from fgslam.report.pictures import draw_sheet  # Matplotlib takes a second
 
     titles = [
         f"{k}: {row.name}" + ("" if row.reason == FULL else f" ({row.reason})")

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 
 from fgslam.core.errors import DatasetError
 from fgslam.core.measurements import Odometry
-from fgslam.evaluation.metrics import EstimatorMetrics
+from fgslam.evaluation.statistics import EstimatorMetrics
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import COMPARISON_FILE, ExistingFolder, is_run_folder

@@ -14,7 +14,7 @@ from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.files import read_text, write_text
 from fgslam.core.rig_correction import IMPLAUSIBLE_PX, RigCorrection, term_names
 from fgslam.datasets.settings import MeasurementDatasetSettings
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import write_csv
 from fgslam.runs.config_models import Experiment, ExperimentConfig
 from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE

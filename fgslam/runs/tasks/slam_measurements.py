@@ -19,9 +19,9 @@ from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.judging import predicted_poses
-from fgslam.evaluation.metrics import JsonValue
+from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import StageTime, write_timing
-from fgslam.report.point_cloud import read_ply
+from fgslam.report.formats import read_ply
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.estimator_files import FRAMES_FILE, read_frames

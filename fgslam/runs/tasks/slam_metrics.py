@@ -14,9 +14,15 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import EgoMotionStatus, Estimate, Trajectory, correlation
-from fgslam.evaluation.closures import JudgedClosure, judge_closures
-from fgslam.evaluation.judging import Answer, Truth, judge_answer, predicted_poses
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue, UpdateTime
+from fgslam.evaluation.judging import (
+    Answer,
+    JudgedClosure,
+    Truth,
+    judge_answer,
+    judge_closures,
+    predicted_poses,
+)
+from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, UpdateTime
 from fgslam.report.content import Cell, Column, TextTable, write_csv
 from fgslam.runs.engine import LocatedShare
 from fgslam.slam.part_remarks import located_frames

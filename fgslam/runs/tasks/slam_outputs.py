@@ -17,7 +17,7 @@ from fgslam.core.measurements import moved_pixels
 from fgslam.core.recordings import LANDMARK_TRUTH_FILE, Sequence, write_landmark_truth
 from fgslam.core.sensors import vertical_of
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
-from fgslam.evaluation.metrics import EstimatorMetrics, JsonValue
+from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 from fgslam.report.content import Column, StageTime, TextTable, write_metrics, write_timing
 from fgslam.report.figures import (
     LANDMARK_ELLIPSES,
@@ -338,7 +338,7 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     """Features (Fig. 1), disparities (Fig. 2) and flow from the frame before (Fig. 3)."""
     if report.found.frame is None:
         return
-    from fgslam.report.pictures.image_overlays import draw_disparities, draw_features, draw_flow
+    from fgslam.report.pictures import draw_disparities, draw_features, draw_flow
 
     folder = make_subfolder(outputs.folder, FOLDER)
     images = report.found.frame.images
@@ -406,7 +406,7 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
 
 def draw_run(run: Path, figures: RunFigures) -> list[Path]:
     """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
-    from fgslam.report.pictures.on_paper import draw_figure, draw_views
+    from fgslam.report.pictures import draw_figure, draw_views
 
     folder = make_subfolder(run, FOLDER)
     results = _results(figures)

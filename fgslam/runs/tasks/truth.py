@@ -18,7 +18,7 @@ from fgslam.core.recordings import LandmarkTruth, Sequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import RenderedLabSettings
-from fgslam.evaluation.trajectory import align, associate
+from fgslam.evaluation.statistics import align, associate
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.database import LandmarkDatabase
 from fgslam.runs.config import ExperimentConfig

@@ -31,7 +31,7 @@ from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.errors import EstimatorError
 from fgslam.core.store import restore, state_of
-from fgslam.evaluation.consistency import judge
+from fgslam.evaluation.statistics import judge
 
 METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
 

@@ -13,7 +13,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Prediction
-from fgslam.evaluation.consistency import judge, nees, pose_nees
+from fgslam.evaluation.statistics import judge, nees, pose_nees
 
 DRIVE = Drive(frames=10, points=60, odometry_sigma=(1e-3,) * 3 + (2e-3,) * 3)
 PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2

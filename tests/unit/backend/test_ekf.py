@@ -26,7 +26,7 @@ from fgslam.core.estimates import Prediction, UpdateStats
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.store import state_of
-from fgslam.evaluation.consistency import judge, landmark_nees, pose_nees
+from fgslam.evaluation.statistics import judge, landmark_nees, pose_nees
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior

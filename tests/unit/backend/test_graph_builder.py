@@ -32,7 +32,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.measurements import Increment, Odometry
-from fgslam.evaluation.consistency import judge, landmark_nees
+from fgslam.evaluation.statistics import judge, landmark_nees
 from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 
 ORIGIN = Prediction(np.eye(4), np.zeros((6, 6)))

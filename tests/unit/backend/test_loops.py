@@ -42,7 +42,7 @@ from fgslam.core.errors import EstimatorError
 from fgslam.core.estimates import Estimate
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.store import restore, state_of
-from fgslam.evaluation.consistency import pose_nees
+from fgslam.evaluation.statistics import pose_nees
 from fgslam.factors.graphs import landmark_key, poses_of_frame
 
 CLOSING: dict[str, EstimatorSettings] = {

@@ -43,7 +43,7 @@ from fgslam.core.rig_correction import (
 from fgslam.core.rig_field import field_modes
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import restore, state_of
-from fgslam.evaluation.consistency import pose_errors, pose_nees, within
+from fgslam.evaluation.statistics import pose_errors, pose_nees, within
 from fgslam.slam.factory import make_estimator
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))

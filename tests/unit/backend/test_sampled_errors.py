@@ -20,7 +20,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.measurements import Increment
-from fgslam.evaluation.consistency import landmark_nees, nees, pose_errors, pose_nees, within
+from fgslam.evaluation.statistics import landmark_nees, nees, pose_errors, pose_nees, within
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem
 

@@ -26,7 +26,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.measurements import Increment
 from fgslam.core.rig_correction import term_names
-from fgslam.evaluation.consistency import pose_nees
+from fgslam.evaluation.statistics import pose_nees
 
 SHORT = SlidingWindowSettings(window=6, update_every=2)
 ROUND = 40

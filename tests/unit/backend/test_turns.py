@@ -31,8 +31,8 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import BiasEffect, Increment, LoopClosure, Odometry
 from fgslam.core.store import restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.evaluation.consistency import judge
-from fgslam.evaluation.consistency import nees as normalised
+from fgslam.evaluation.statistics import judge
+from fgslam.evaluation.statistics import nees as normalised
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.factory import made_or_given

@@ -22,7 +22,7 @@ from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, StereoTracksSettings
-from fgslam.evaluation.trajectory import evaluate_trajectory
+from fgslam.evaluation.statistics import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion

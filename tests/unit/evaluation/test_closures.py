@@ -15,7 +15,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
-from fgslam.evaluation.closures import judge_closures
+from fgslam.evaluation.judging import judge_closures
 from fgslam.runs.tasks.slam_metrics import (
     LOOPS_FILE,
     closures_of,

@@ -13,8 +13,7 @@ from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import Estimate, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.evaluation.comparing import COLUMNS, compare
-from fgslam.evaluation.judging import Answer
+from fgslam.evaluation.judging import COLUMNS, Answer, compare
 from fgslam.runs.library import replay
 
 

@@ -9,10 +9,8 @@ from scipy import stats
 from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.geometry import inverse, se3_exp, transform_to_world
 from fgslam.core.recordings import LandmarkTruth
-from fgslam.evaluation.comparing import mean_interval, paired_test
-from fgslam.evaluation.judging import landmark_errors
-from fgslam.evaluation.metrics import time_growth
-from fgslam.evaluation.trajectory import estimate_from_truth
+from fgslam.evaluation.judging import landmark_errors, mean_interval, paired_test
+from fgslam.evaluation.statistics import estimate_from_truth, time_growth
 
 ALIGNED = se3_exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, -3.0]))
 

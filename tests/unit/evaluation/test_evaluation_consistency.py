@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from fgslam.core.geometry import se3_exp
-from fgslam.evaluation.consistency import (
+from fgslam.evaluation.statistics import (
     Nees,
     chi_square_band,
     judge,

@@ -8,7 +8,7 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
-from fgslam.evaluation.trajectory import (
+from fgslam.evaluation.statistics import (
     Alignment,
     align,
     associate,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError
-from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime
+from fgslam.evaluation.statistics import EstimatorMetrics, UpdateTime
 from fgslam.report.content import StageTime, read_metrics, write_metrics, write_timing
 
 CONTRACT = {

@@ -15,14 +15,14 @@ from fgslam.core.errors import OutputError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_exp
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.report.graph_file import (
+from fgslam.report.formats import (
     EXACT_SIGMA,
     PoseLandmarkGraph,
     g2o_information,
     information_of,
     write_g2o,
 )
-from fgslam.runs.exporting import build_graph
+from fgslam.runs.export import build_graph
 
 Lines = dict[str, list[list[float]]]
 

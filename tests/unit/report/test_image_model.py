@@ -15,9 +15,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import OutputError
 from fgslam.core.estimates import Trajectory
 from fgslam.core.measurement_log import MeasurementLog
-from fgslam.report.image_model import ImageModel, write_colmap
-from fgslam.report.point_cloud import MapPoints
-from fgslam.runs.exporting_images import Tints, build_model, with_normals
+from fgslam.report.formats import ImageModel, MapPoints, write_colmap
+from fgslam.runs.export import Tints, build_model, with_normals
 
 
 def map_of(positions: FloatArray) -> MapPoints:

@@ -29,14 +29,14 @@ from fgslam.report.figures import (
     matches_over_time,
 )
 from fgslam.report.homing_figures import Located, located_figure
-from fgslam.report.pictures import style
-from fgslam.report.pictures.image_overlays import (
+from fgslam.report.pictures import (
     draw_disparities,
     draw_features,
+    draw_figure,
     draw_flow,
+    draw_views,
     oriented_squares,
 )
-from fgslam.report.pictures.on_paper import draw_figure, draw_views
 from fgslam.report.results import ReportData, judged_report
 from fgslam.runs.tasks.slam_outputs import RunFigures
 
@@ -46,7 +46,7 @@ YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few dots an inch: the same drawing, several times faster."""
-    monkeypatch.setattr(style, "DPI", 50)
+    monkeypatch.setattr("fgslam.report.pictures.DPI", 50)
 
 
 def features(n: int, seed: int = 1) -> Features:
@@ -147,7 +147,7 @@ def test_same_input_same_bytes_whatever_the_users_style(tmp_path: Path, name: st
 
 
 def test_pictures_need_no_display_and_no_pyplot() -> None:
-    code = "import sys, fgslam.report.pictures.on_paper; print('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, fgslam.report.pictures; print('matplotlib.pyplot' in sys.modules)"
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )

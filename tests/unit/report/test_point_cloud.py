@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.report.point_cloud import (
-    MapPoints,
-    read_ply,
-    write_map,
-    write_pcd,
-    write_ply,
-)
+from fgslam.report.formats import MapPoints, read_ply, write_map, write_pcd, write_ply
 
 
 def a_map(n: int = 200, seed: int = 1) -> MapPoints:

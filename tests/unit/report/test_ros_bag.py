@@ -9,7 +9,7 @@ from rosbags.highlevel import AnyReader
 
 from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
-from fgslam.report.ros_bag import FRAME, TOPIC, write_mcap
+from fgslam.report.formats import FRAME, TOPIC, write_mcap
 
 
 def test_poses_are_in_the_axes_of_ros(tmp_path: Path) -> None:

@@ -23,11 +23,10 @@ from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import LandmarkTruth, read_landmark_truth, write_landmark_truth
-from fgslam.evaluation.consistency import Nees
 from fgslam.evaluation.judging import Answer, seen_often
-from fgslam.evaluation.metrics import EstimatorMetrics, UpdateTime, value_at
+from fgslam.evaluation.statistics import EstimatorMetrics, Nees, UpdateTime, value_at
 from fgslam.report.content import TextTable
-from fgslam.report.point_cloud import MapPoints
+from fgslam.report.formats import MapPoints
 from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.estimator_files import points_from_log

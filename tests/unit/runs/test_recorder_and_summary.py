@@ -25,7 +25,7 @@ from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import restore, state_of
 from fgslam.evaluation.judging import Truth
-from fgslam.evaluation.metrics import value_at
+from fgslam.evaluation.statistics import value_at
 from fgslam.runs.tasks.slam_metrics import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.noise_in_use import FrameNoise

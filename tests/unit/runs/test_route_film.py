@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.runs.film import frame_rate
-from fgslam.runs.route_film import Row, command_text, follow_rows
+from fgslam.runs.film import Row, command_text, follow_rows, frame_rate
 
 ROW = {
     "image": "3",

@@ -11,7 +11,7 @@ import pandas
 import pytest
 
 from fgslam.core.errors import ConfigError
-from fgslam.evaluation.comparing import holm
+from fgslam.evaluation.judging import holm
 from fgslam.runs.sweeps.case import CaseResult, Row
 from fgslam.runs.sweeps.findings import find
 from fgslam.runs.sweeps.grid import Case, Grid, Source, read_axes

@@ -9,8 +9,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.geometry import rotation_from_quaternion
 from fgslam.core.measurements import Increment, Observations, moved_pixels
-from fgslam.runs.viewing import half_axes
-from fgslam.runs.watching import ChangedBlocks, seen_pixels
+from fgslam.runs.view import ChangedBlocks, half_axes, seen_pixels
 
 
 def landmarks(ids: list[int], positions: FloatArray) -> LandmarkMap:

@@ -20,7 +20,7 @@ from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     MeasurementFilesSettings,
 )
-from fgslam.evaluation.trajectory import evaluate_trajectory
+from fgslam.evaluation.statistics import evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.motion import ConstantVelocityMotion

@@ -20,7 +20,7 @@ from fgslam.core.recordings import MeasurementRecording
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, SyntheticOdometrySettings
-from fgslam.evaluation.trajectory import Alignment, evaluate_trajectory
+from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, load_experiment, make_config

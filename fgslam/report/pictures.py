@@ -1,0 +1,981 @@
+"""Pictures and the frames of films, by matplotlib."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import shorten, wrap
+from typing import Any
+
+import matplotlib
+import matplotlib.style
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, LogNorm, Normalize, hsv_to_rgb
+from matplotlib.figure import Figure as Canvas
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
+from matplotlib.transforms import Bbox
+
+from fgslam.core.arrays import BoolArray, FloatArray, Image
+from fgslam.core.features import Features
+from fgslam.core.files import replacing
+from fgslam.report.content import Figure, bulk_limits
+
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+ORANGE = "#E69F00"
+SKY = "#56B4E9"
+YELLOW = "#F0E442"
+VERMILLION = "#D55E00"
+INK = "#222222"
+FAINT = "#DDDDDD"
+
+MAP_COLOURS = "viridis"
+"""Perceptually uniform, readable without colour vision and in grey print."""
+
+DPI = 160
+
+_NO_METADATA: dict[str, Any] = {"Software": None}
+_PACKING: dict[str, Any] = {"compress_level": 3}  # half the time of 6, the same size within a tenth
+# On the screen whites become this grey, so that bright marks stand out on windows and posters.
+_WHITE = 0.78
+
+PICTURE_STYLE: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 12.0,
+    "axes.titlesize": 14.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 12.0,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.8,
+    "axes.axisbelow": True,
+    "axes.xmargin": 0.01,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.unicode_minus": True,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 11.0,
+    "ytick.labelsize": 11.0,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.8,
+    "legend.fontsize": 11.0,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "path.simplify": False,
+}
+
+
+@contextmanager
+def picture(path: Path, width: float, height: float) -> Iterator[Canvas]:
+    """A figure of the given size in inches, written to ``path`` when the block ends well.
+
+    Neither the user's matplotlibrc nor the state of pyplot has a say, and no date or version
+    enters the file, so that the bytes depend on the input only.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
+        figure = Canvas(figsize=(width, height), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        with replacing(path) as partial:
+            figure.savefig(
+                partial,
+                format="png",
+                bbox_inches="tight",
+                pad_inches=0.1,
+                metadata=_NO_METADATA,
+                pil_kwargs=_PACKING,
+            )
+
+
+def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
+    """An image, dimmed so that bright marks stand out (in colour: as it is), without axes."""
+    height, width = image.shape[:2]
+    darkest, brightest = np.percentile(image, [0.5, 99.5])
+    span = max(float(brightest - darkest), 32.0) / _WHITE
+    axes.imshow(
+        image,
+        cmap="gray",
+        vmin=darkest,
+        vmax=darkest + span,
+        interpolation="bicubic",
+        interpolation_stage="data",
+    )
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_title(title)
+    if note:
+        axes.set_title(note, loc="right", fontweight="normal", fontsize=12.0)
+
+
+def colour_bar(axes: Axes, colours: ScalarMappable, label: str, extend: str = "neither") -> None:
+    """A colour bar exactly as tall as the axes, whatever their aspect."""
+    inset = axes.inset_axes((1.02, 0.0, 0.022, 1.0))
+    figure = axes.get_figure(root=True)
+    if figure is None:
+        raise ValueError("these axes belong to no figure")
+    bar = figure.colorbar(colours, cax=inset, label=label, extend=extend)
+    bar.outline.set_visible(False)
+
+
+def add_segments(axes: Axes, segments: FloatArray, width: float, **colours: Any) -> LineCollection:
+    """Polylines (n, k, 2) with a dark rim, visible on bright and dark ground alike.
+
+    ``colours`` are those of a LineCollection (`color`, or `array`, `cmap` and `norm`).
+    """
+    # Two collections: as an effect of its path each line would be drawn by itself, and ten times
+    # as long.
+    ends: dict[str, Any] = {"capstyle": "round", "joinstyle": "round"}
+    paths = list(segments)
+    rims = LineCollection(paths, linewidths=width + 1.4, color="black", alpha=0.55, **ends)
+    lines = LineCollection(paths, linewidths=width, **ends, **colours)
+    for drawn in (rims, lines):
+        axes.add_collection(drawn, autolim=False)
+    return lines
+
+
+_DASHES = {"solid": "-", "dash": "--", "dot": ":"}
+_MARKERS = {"circle": "o", "cross": "P", "square": "s", "x-thin-open": "x", "x": "x"}
+_POINTS_A_PIXEL = 0.75
+_STEEP = 45.0
+_BAND = {"color": "#c9d3dc", "linewidth": 0.0}
+_FEW_ENTRIES = 3
+_FINE = 3.0e4
+# From where the three views of a map look: name, elevation and azimuth in degrees.
+_VIEWS = (
+    ("From above", 65.0, -90.0),
+    ("From the left", 22.0, -160.0),
+    ("From the right", 22.0, -20.0),
+)
+
+
+def draw_figure(path: Path, figure: Figure, title: str, shown: Collection[str] = ()) -> None:
+    """A figure of a plane, or panels over each other, with a legend.
+
+    Args:
+        path: the PNG to write.
+        figure: of the plane.
+        title: heading.
+        shown: names of traces that are drawn although the page hides them at first.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    layout = figure.drawing.layout
+    traces = _seen(figure, shown)
+    panels = sorted(name.replace("axis", "") for name in layout if name.startswith("yaxis"))
+    with picture(path, *_paper_size(layout, len(panels))) as canvas:
+        found = canvas.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, panel in zip(found, panels, strict=True):
+            own = [trace for trace in traces if (trace.yaxis or "y") == panel]
+            for order, trace in enumerate(own):
+                _draw(axes, trace, order)
+            _dress(axes, layout, panel)
+            if len(panels) > 1 and own:
+                # Above the panel, where no curve is.
+                axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=_FEW_ENTRIES)
+        found[0].set_title(title, pad=22.0)
+        found[0].annotate(
+            figure.note, (0.0, 1.0), (0.0, 8.0), "axes fraction", textcoords="offset points"
+        )
+        found[-1].set_xlabel(layout.xaxis.title.text)
+        canvas.align_ylabels()
+        if len(panels) == 1:
+            _legend(canvas, found[0])
+
+
+def draw_views(path: Path, figure: Figure, title: str) -> None:
+    """A figure in space, in perspective from above, from the left and from the right.
+
+    Args:
+        path: the PNG to write.
+        figure: in space.
+        title: heading.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    traces, scene = _seen(figure, ()), figure.drawing.layout.scene
+    with picture(path, 17.0, 6.4) as canvas:
+        for k, (name, elevation, azimuth) in enumerate(_VIEWS):
+            place = (1, len(_VIEWS), k + 1)
+            axes: Any = canvas.add_subplot(*place, projection="3d", proj_type="persp")
+            for order, trace in enumerate(traces):
+                _draw(axes, trace, order, "xyz")
+            axes.set(**{f"{a}lim": scene[f"{a}axis"].range for a in "xyz"})
+            axes.set_box_aspect([scene.aspectratio[a] for a in "xyz"], zoom=1.1)
+            axes.view_init(elevation, azimuth)
+            axes.set_title(name, y=0.98)
+            for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+                axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
+                axis.set_tick_params(labelsize=8.0)
+            axes.set_xlabel("right (m)")
+            if elevation > _STEEP:
+                axes.set_zticks([])
+                continue
+            # Beside the first view its neighbour leaves no room for these.
+            axes.set_ylabel("ahead (m)")
+            axes.set_zlabel("up (m)", labelpad=-2.0)
+        canvas.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
+        canvas.supxlabel(figure.note, fontsize=12.0)
+        _legend(canvas, canvas.axes[0], "outside upper right")
+
+
+def _seen(figure: Figure, shown: Collection[str]) -> list[Any]:
+    return [one for one in figure.drawing.data if one.visible is True or one.name in shown]
+
+
+def _draw(axes: Any, trace: Any, order: int, names: str = "xy") -> None:
+    points = [trace[name] for name in names]
+    if trace.type == "scatter" and trace.fill == "toself":
+        axes.fill(*points, label=_label(trace), zorder=2.0 + 0.01 * order, **_BAND)
+        return
+    if "lines" in trace.mode:
+        style = {"color": trace.line.color, "linestyle": _DASHES[trace.line.dash]}
+        width = trace.line.width * (0.5 if len(names) == 3 else _POINTS_A_PIXEL)
+        axes.plot(*points, linewidth=width, label=_label(trace), zorder=2.0 + 0.01 * order, **style)
+    elif len(points[0]):
+        _draw_markers(axes, trace, order, points)
+
+
+def _draw_markers(axes: Any, trace: Any, order: int, points: Sequence[FloatArray]) -> None:
+    marker = trace.marker
+    style: dict[str, Any] = {
+        "label": _label(trace),
+        "marker": _MARKERS[marker.symbol],
+        "zorder": 2.0 + 0.01 * order,
+    }
+    # Dense maps get finer dots.
+    size = (_POINTS_A_PIXEL * marker.size) ** 2
+    style["s"] = min(size, max(_FINE / len(points[0]), 1.0))
+    if len(points) == 3:
+        style["depthshade"] = False
+    if isinstance(marker.color, str):
+        axes.scatter(*points, color=marker.color, linewidths=1.4, **style)
+        return
+    norm = Normalize(marker.cmin, marker.cmax)
+    axes.scatter(*points, c=marker.color, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
+    if len(points) == 2:
+        bar = marker.colorbar.title.text
+        colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
+
+
+def _label(trace: Any) -> str:
+    """Words of the legend."""
+    return html.unescape(trace.name)
+
+
+def _dress(axes: Axes, layout: Any, panel: str) -> None:
+    vertical = layout[f"yaxis{panel[1:]}"]
+    axes.set_ylabel(vertical.title.text)
+    axes.grid(visible=True)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10]))
+    if vertical.rangemode == "tozero":
+        axes.set_ylim(0.0, None)
+    if vertical.scaleanchor:
+        axes.set(xlim=layout.xaxis.range, ylim=vertical.range, aspect="equal")
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=9, steps=[1, 2, 5, 10]))
+
+
+def _legend(canvas: Canvas, axes: Axes, where: Any = "outside lower center") -> None:
+    """One entry a name, in the order of drawing."""
+    handles, labels = axes.get_legend_handles_labels()
+    unique: dict[str, Any] = {}
+    for label, handle in zip(labels, handles, strict=True):
+        unique.setdefault(label, handle)
+    if unique:
+        canvas.legend(list(unique.values()), list(unique), loc=where, ncols=_FEW_ENTRIES)
+
+
+def _paper_size(layout: Any, panels: int) -> tuple[float, float]:
+    """Inches: panels are wide; a plane keeps its shape, with room for a bar and a legend."""
+    if not layout.yaxis.scaleanchor:
+        return 11.0, 1.6 + 2.0 * panels
+    (left, right), (low, high) = layout.xaxis.range, layout.yaxis.range
+    # A straight road is long and thin; half its length keeps the picture readable.
+    aspect = float(np.clip((high - low) / (right - left), 0.2, 5.0))
+    height = float(np.clip(8.2 * aspect, 3.6, 9.0))
+    return min(height / aspect, 16.0) + 2.4, height + 1.8
+
+
+_CAMERAS = ("Right", "Left", "Top")
+# The descriptor looks at a window of about twelve scales; a square of four stays readable.
+_SQUARE_SIDE_IN_SCALES = 4.0
+# Wider images than this are stacked rather than set side by side.
+_PANORAMIC_ASPECT = 2.2
+_IMAGE_INCHES = 5.6
+# Without the dark end, which would be lost in the shadows of the image.
+_DISPARITY_COLOURS = ListedColormap(matplotlib.colormaps["plasma"](np.linspace(0.3, 1.0, 256)))
+
+
+def draw_features(
+    path: Path, images: tuple[Image, ...], features: tuple[Features, ...], title: str = ""
+) -> None:
+    """SIFT features as squares: side proportional to scale, turned by orientation (Fig. 1).
+
+    Args:
+        path: the PNG to write.
+        images: (height, width) uint8, in the order right, left[, top]; drawn as top, left, right.
+        features: of each image, or of the first ones alone: only these are drawn.
+        title: heading of the whole picture, e.g. the frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    order = tuple(reversed(range(len(features))))
+    stacked = images[0].shape[1] > _PANORAMIC_ASPECT * images[0].shape[0]
+    rows, columns = (len(order), 1) if stacked else (1, len(order))
+    width, height = _size(images[0], rows, columns, bool(title))
+    with picture(path, width, height) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
+        for axes, camera in zip(panels, order, strict=True):
+            show_image(axes, images[camera], _CAMERAS[camera], f"{len(features[camera])} features")
+            add_segments(axes, oriented_squares(features[camera]), 1.1, color=YELLOW)
+        _heading(figure, title)
+
+
+def oriented_squares(features: Features) -> FloatArray:
+    """Outlines (n, 7, 2): once around the square, then a stroke from its centre ahead."""
+    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [0, 0]], dtype=float)
+    half = 0.5 * _SQUARE_SIDE_IN_SCALES * features.scale[:, None]
+    ahead = half * np.column_stack([np.cos(features.orientation), np.sin(features.orientation)])
+    # A quarter turn clockwise on the screen, where rows grow downwards.
+    aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    offsets = corners[None, :, :1] * ahead[:, None] + corners[None, :, 1:] * aside[:, None]
+    return np.asarray(features.xy[:, None] + offsets)
+
+
+def draw_disparities(path: Path, image: Image, pixels: FloatArray, title: str = "") -> None:
+    """Matches over the cameras: lines as long as the disparities, coloured by them (Fig. 2).
+
+    Args:
+        path: the PNG to write.
+        image: the reference (right) image, (height, width) uint8.
+        pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top one.
+        title: heading, e.g. the frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    horizontal = pixels[:, 1, 0] - pixels[:, 0, 0]
+    vertical = pixels[:, 2, 1] - pixels[:, 0, 1]
+    trinocular = bool(np.isfinite(vertical).any())
+    colours: dict[str, Any] = {"cmap": _DISPARITY_COLOURS, "norm": _disparity_norm(horizontal)}
+    width, height = _size(image, 1, 1, has_title=True, inches=9.0)
+    with picture(path, width + 1.2, height) as figure:
+        axes = figure.subplots()
+        show_image(axes, image, title or "Stereo matches", f"{len(pixels)} matches")
+        start = pixels[:, 0]
+        lines = add_segments(axes, _rays(start, horizontal, 0), 1.6, array=horizontal, **colours)
+        if trinocular:
+            add_segments(axes, _rays(start, vertical, 1), 1.6, array=horizontal, **colours)
+        axes.scatter(
+            start[:, 0],
+            start[:, 1],
+            s=16,
+            c=horizontal,
+            edgecolors="black",
+            linewidths=0.6,
+            **colours,
+        )
+        colour_bar(axes, lines, "horizontal disparity (px)")
+        if isinstance(colours["norm"], LogNorm):
+            scale = axes.child_axes[0].yaxis
+            scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            scale.set_major_formatter(ScalarFormatter())
+            scale.set_minor_locator(NullLocator())
+
+
+def draw_flow(
+    path: Path, image: Image, before: FloatArray, after: FloatArray, title: str = ""
+) -> None:
+    """How matched features moved between two frames: dot, line, cross (Fig. 3).
+
+    Args:
+        path: the PNG to write.
+        image: the earlier frame's reference image, (height, width) uint8.
+        before: (n, 2) (column, row) in the earlier frame, pixels.
+        after: (n, 2) in the later frame.
+        title: heading, e.g. the frames and the motion between them.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    length = np.linalg.norm(after - before, axis=1)
+    note = f"{len(before)} matches"
+    if len(before):
+        note += f", median flow {np.median(length):.1f} px"
+    width, height = _size(image, 1, 1, has_title=True, inches=9.0)
+    with picture(path, width, height + 0.15) as figure:
+        axes = figure.subplots()
+        show_image(axes, image, title or "Flow between frames", note)
+        add_segments(axes, np.stack([before, after], axis=1), 1.6, color=SKY)
+        cross: dict[str, Any] = {"s": 42, "marker": "x", "zorder": 4}
+        axes.scatter(
+            before[:, 0], before[:, 1], s=26, c=YELLOW, edgecolors="black", linewidths=0.7, zorder=3
+        )
+        axes.scatter(after[:, 0], after[:, 1], c="black", alpha=0.6, linewidths=3.4, **cross)
+        axes.scatter(after[:, 0], after[:, 1], c=ORANGE, linewidths=1.8, **cross)
+        figure.legend(handles=_flow_legend(), loc="outside lower center", ncols=3)
+
+
+def _flow_legend() -> list[Line2D]:
+    dot: dict[str, Any] = {
+        "marker": "o",
+        "markeredgecolor": INK,
+        "color": YELLOW,
+        "linestyle": "none",
+    }
+    cross: dict[str, Any] = {
+        "marker": "x",
+        "color": ORANGE,
+        "linestyle": "none",
+        "markeredgewidth": 2.0,
+    }
+    return [
+        Line2D([], [], label="position in the earlier frame", markersize=7, **dot),
+        Line2D([], [], label="position in the later frame", markersize=8, **cross),
+        Line2D([], [], label="motion", color=SKY, linewidth=2.0),
+    ]
+
+
+def _rays(start: FloatArray, length: FloatArray, axis: int) -> FloatArray:
+    """Segments (n, 2, 2) from ``start`` along +column (0) or +row (1)."""
+    end = start.copy()
+    end[:, axis] += length
+    return np.stack([start, end], axis=1)
+
+
+def _disparity_norm(disparity: FloatArray) -> Normalize:
+    """Logarithmic where disparities span a wide range, so that far features differ too."""
+    if len(disparity) == 0:
+        return Normalize(0.0, 1.0)
+    low, high = float(disparity.min()), float(disparity.max())
+    if low > 0.0 and high > 8.0 * low:
+        return LogNorm(low, high)
+    return Normalize(low, max(high, low + 1.0))
+
+
+def _size(
+    image: Image, rows: int, columns: int, has_title: bool, inches: float = _IMAGE_INCHES
+) -> tuple[float, float]:
+    """Width and height of the figure in inches: panels of ``inches`` width, headings above."""
+    height, width = image.shape
+    if columns == 1:
+        inches = max(inches, 9.0)
+    panel = inches * height / width
+    return columns * inches + 0.2, rows * (panel + 0.42) + (0.45 if has_title and rows else 0.0)
+
+
+def _heading(figure: Canvas, title: str) -> None:
+    if title:
+        figure.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
+
+
+_PAIR_WIDTH_IN = 9.0
+_SHOWN_PX = 1100  # columns of a picture; more would not show
+_PAIR_DIMMED = 0.6
+_EDGE_PART = 0.04  # of a picture: a mark with its number is no wider, nor as high
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MatchedPixels:
+    """Matches of two pictures.
+
+    Attributes:
+        a, b: (n, 2) column and row in either picture, from centre to centre.
+        columns: (n,) which are column segments: drawn as bars, the others as rings.
+    """
+
+    a: FloatArray
+    b: FloatArray
+    columns: BoolArray
+
+
+def draw_view_matches(
+    path: Path, images: tuple[Image, Image], matches: MatchedPixels, titles: tuple[str, str]
+) -> None:
+    """One picture above the other, each match with a number of its own colour in both.
+
+    Args:
+        path: of the PNG.
+        images: (h, w, 3) red, green, blue.
+        matches: accepted ones.
+        titles: above each picture.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    aspect = images[0].shape[0] / images[0].shape[1]
+    with picture(path, _PAIR_WIDTH_IN, 2.0 * (_PAIR_WIDTH_IN * aspect + 0.4)) as figure:
+        upper, lower = figure.subplots(2, 1)
+        # Neighbours in bearing get neighbouring hues, so that a wrong match stands out.
+        order = np.argsort(np.argsort(matches.a[:, 0]))
+        hue = order / max(len(order), 1)
+        colours = hsv_to_rgb(np.column_stack([hue, np.ones(len(hue)), np.ones(len(hue))]))
+        for axes, image, points, title in (
+            (upper, images[0], matches.a, titles[0]),
+            (lower, images[1], matches.b, titles[1]),
+        ):
+            _show(axes, image, title)
+            _mark(axes, points, matches.columns, colours)
+
+
+def _show(axes: Axes, image: Image, title: str) -> None:
+    step = max(1, image.shape[1] // _SHOWN_PX)
+    height, width = image.shape[:2]
+    dimmed = (_PAIR_DIMMED * image[::step, ::step]).astype(np.uint8)
+    axes.imshow(dimmed, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set_visible(False)
+    axes.set_title(title)
+
+
+def _mark(axes: Axes, points: FloatArray, columns: BoolArray, colours: FloatArray) -> None:
+    # Lists of tuples: the drawing library takes arrays, its types do not.
+    tints = [tuple(colour) for colour in colours.tolist()]
+    outer = _near_edge(axes, points).tolist()
+    for number, (point, tint) in enumerate(zip(points.tolist(), tints, strict=True)):
+        common: dict[str, Any] = {"color": tint, "in_layout": outer[number]}
+        if columns[number]:
+            axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, **common)
+        else:
+            axes.plot(*point, marker="o", markersize=5, fillstyle="none", **common)
+        axes.annotate(
+            str(number), point, (3.0, 3.0), textcoords="offset points", fontsize=5.5, **common
+        )
+
+
+def _near_edge(axes: Axes, points: FloatArray) -> BoolArray:
+    """(n,) which marks may reach beyond the picture (n, 2); the layout need not measure others."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    part = np.abs((points - [left, bottom]) / [right - left, top - bottom] - 0.5)
+    return np.asarray((part > 0.5 - _EDGE_PART).any(axis=1))
+
+
+_VIEW_WIDTH_IN = 11.0
+_VIEW_DIMMED = 0.7
+
+
+def draw_view_tracks(path: Path, view: Image, trails: Sequence[FloatArray], title: str) -> None:
+    """Each point with its trail; those that are new are red.
+
+    Args:
+        path: of the PNG.
+        view: (h, w) grey panorama; its last column is followed by its first.
+        trails: (k, 2) column and row of one point in the last k images, the present one last.
+        title: above it.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    height, width = view.shape
+    with picture(path, _VIEW_WIDTH_IN, _VIEW_WIDTH_IN * height / width + 0.4) as figure:
+        axes = figure.subplots()
+        axes.imshow((_VIEW_DIMMED * view).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
+        for trail in trails:
+            for part in _unbroken(trail, width / 2.0):
+                axes.plot(part[:, 0], part[:, 1], color=YELLOW, linewidth=0.7)
+            tint = SKY if len(trail) > 1 else VERMILLION
+            axes.plot(*trail[-1].tolist(), "o", markersize=3.5, fillstyle="none", color=tint)
+        axes.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        axes.set_title(title)
+
+
+def _unbroken(trail: FloatArray, most: float) -> list[FloatArray]:
+    """Parts of a trail between crossings of the seam."""
+    return np.split(trail, np.flatnonzero(np.abs(np.diff(trail[:, 0])) > most) + 1)
+
+
+_SHEET_COLUMNS = 4
+_SHEET_WIDTH_IN = 11.0
+
+
+def draw_sheet(path: Path, images: Sequence[Image], titles: Sequence[str]) -> None:
+    """Pictures side by side, row after row.
+
+    Args:
+        path: of the PNG.
+        images: (h, w, 3) red, green, blue; at least one.
+        titles: above each.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    across = min(_SHEET_COLUMNS, len(images))
+    down = -(-len(images) // across)
+    aspect = images[0].shape[0] / images[0].shape[1]
+    height = down * (_SHEET_WIDTH_IN / across * aspect + 0.35)
+    with picture(path, _SHEET_WIDTH_IN, height) as figure:
+        every = figure.subplots(down, across, squeeze=False).ravel()
+        for axes, image, title in zip(every, images, titles, strict=False):
+            step = max(1, image.shape[1] // _SHOWN_PX)
+            show_image(axes, image[::step, ::step], title)
+        for axes in every[len(images) :]:
+            axes.set_visible(False)
+
+
+_CORNERS_INCHES = 4.5
+
+
+def draw_corners(
+    path: Path, size: tuple[int, int], corners: Sequence[FloatArray], names: Sequence[str]
+) -> None:
+    """All corners of all images, side by side for each camera: empty parts are not calibrated.
+
+    Args:
+        path: the PNG to write.
+        size: width and height of the images.
+        corners: (n, 2) pixels, of each camera.
+        names: of the cameras.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    width, height = size
+    tall = _CORNERS_INCHES * height / width + 0.6
+    with picture(path, _CORNERS_INCHES * len(corners), tall) as figure:
+        panels = figure.subplots(1, len(corners), squeeze=False)[0]
+        for axes, pixels, name in zip(panels, corners, names, strict=False):
+            axes.plot(*pixels.T, ".", color=SKY, markersize=2.5)
+            axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+            axes.set(title=f"{name}: {len(pixels)} corners", xticks=[], yticks=[])
+            for side in ("top", "right"):
+                axes.spines[side].set_visible(True)
+
+
+_COLOURS = (SKY, ORANGE, VERMILLION, INK)
+_PANEL_IN = 4.2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraDrawing:
+    """What is drawn of a camera.
+
+    Attributes:
+        name: its title.
+        size: width and height of its image, pixels.
+        centre: (2,) principal point, pixels.
+        outline: (k, 2) border of the rectified view in its image, pixels; empty without one.
+        place: (4, 4) pose in the first camera.
+        half_angle: half of its horizontal angle of view, radians.
+    """
+
+    name: str
+    size: tuple[int, int]
+    centre: FloatArray
+    outline: FloatArray
+    place: FloatArray
+    half_angle: float
+
+
+def draw_cameras(path: Path, title: str, cameras: Sequence[CameraDrawing]) -> None:
+    """Writes the picture. Raises OutputError where it cannot be written."""
+    count = len(cameras) + 1
+    with picture(path, _PANEL_IN * count, _PANEL_IN) as canvas:
+        canvas.suptitle(title)
+        panels = canvas.subplots(1, count, squeeze=False)[0]
+        for k, (axes, camera) in enumerate(zip(panels, cameras, strict=False)):
+            _image(axes, camera, _COLOURS[k % len(_COLOURS)])
+        _from_above(panels[-1], cameras)
+
+
+def _image(axes: Axes, camera: CameraDrawing, colour: str) -> None:
+    width, height = camera.size
+    axes.add_patch(Rectangle((-0.5, -0.5), width, height, facecolor=FAINT, edgecolor=INK))
+    if len(camera.outline):
+        closed = np.concatenate([camera.outline, camera.outline[:1]])
+        axes.plot(*closed.T, color=colour, linewidth=2.0)
+    axes.plot(*camera.centre, marker="+", color=INK, markersize=12)
+    margin = 0.06 * max(width, height)
+    axes.set(xlim=(-margin, width + margin), ylim=(height + margin, -margin), aspect="equal")
+    axes.set_title(camera.name[-28:], fontsize=11.0)
+    axes.set_xlabel("raw image, px; outline: the rectified view" if len(camera.outline) else "px")
+
+
+def _from_above(axes: Axes, cameras: Sequence[CameraDrawing]) -> None:
+    """Positions, axes and fields of view, x to the right and z ahead, in millimetres."""
+    places = np.array([1e3 * camera.place[:3, 3] for camera in cameras])
+    reach = 0.6 * max(float(np.ptp(places[:, [0, 2]], axis=0).max()), 20.0)
+    for k, camera in enumerate(cameras):
+        x, _, z = places[k]
+        colour = _COLOURS[k % len(_COLOURS)]
+        half = min(camera.half_angle, np.radians(100.0))
+        turns = np.linspace(-half, half, 31)
+        rays = np.column_stack([np.sin(turns), np.zeros(31), np.cos(turns)])
+        rim = reach * (rays @ camera.place[:3, :3].T)[:, [0, 2]] + [x, z]
+        wedge = np.concatenate([[[x, z]], rim, [[x, z]]])
+        axes.fill(*wedge.T, color=colour, alpha=0.15)
+        axes.plot(*wedge.T, color=colour, linewidth=1.0)
+        axes.plot([x], [z], marker="o", color=colour)
+        axes.annotate(str(k), (x, z), textcoords="offset points", xytext=(0, -16), ha="center")
+    axes.set(aspect="equal", xlabel="right, mm", ylabel="ahead, mm")
+    axes.set_title("from above", fontsize=11.0)
+    axes.grid(visible=True)
+
+
+_FILM_INCHES = (12.8, 5.4)
+_FILM_DPI = 100  # 1280 x 540
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """One frame.
+
+    Attributes:
+        image: what the reference camera saw; None where it cannot be read.
+        before, after: (k, 2) pixels of the matched landmarks in the last frame and in this one.
+        new: (l, 2) pixels of landmarks seen for the first time.
+        title: above the image.
+    """
+
+    image: Image | None
+    before: FloatArray
+    after: FloatArray
+    new: FloatArray
+    title: str
+
+
+class FilmCanvas:
+    """Draws moments one after the other onto one canvas.
+
+    Args:
+        path: (n, 2) metres to the right and ahead, of all poses.
+        landmarks: (m, 2) all that will be drawn, for the limits.
+        truth: (k, 2) true path, or None.
+        title: above the map.
+    """
+
+    def __init__(
+        self, path: FloatArray, landmarks: FloatArray, truth: FloatArray | None, title: str
+    ) -> None:
+        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
+            self._figure = Canvas(figsize=_FILM_INCHES, dpi=_FILM_DPI)
+            self._canvas = FigureCanvasAgg(self._figure)
+            self._image, plan = self._figure.subplots(1, 2, width_ratios=(1.15, 1.0))
+            self._figure.subplots_adjust(0.02, 0.12, 0.98, 0.92, 0.13)
+            x, y = _filling(bulk_limits(path, landmarks), plan.get_window_extent())
+            plan.set(xlim=x, ylim=y, aspect="equal", title=title)
+            plan.set(xlabel="right (m)", ylabel="ahead (m)")
+            if truth is not None:
+                plan.plot(*truth.T, "--", color=INK, linewidth=1.0, label="truth")
+            (self._dots,) = plan.plot([], [], ".", color="#8a939c", markersize=2.0)
+            (self._path,) = plan.plot([], [], color=SKY, linewidth=2.2, label="estimate")
+            (self._here,) = plan.plot([], [], "o", color=ORANGE, markersize=7.0)
+            plan.legend(loc="upper right")
+        self._poses = path
+
+    def draw(self, moment: Moment, known: FloatArray, row: int) -> Image:
+        """The frame (540, 1280, 3) in red, green, blue, at pose ``row`` with landmarks (l, 2)."""
+        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
+            self._image.clear()
+            if moment.image is None:
+                self._image.set_axis_off()
+                self._image.set_title(moment.title)
+            else:
+                show_image(self._image, moment.image, moment.title)
+                self._mark(moment)
+            self._dots.set_data(*known.T)
+            self._path.set_data(*self._poses[: row + 1].T)
+            self._here.set_data(*self._poses[row : row + 1].T)
+            return drawn(self._canvas)
+
+    def _mark(self, moment: Moment) -> None:
+        axes = self._image
+        flow = np.stack([moment.before, moment.after], axis=1)
+        axes.add_collection(LineCollection(list(flow), linewidths=1.4, colors=SKY), autolim=False)
+        axes.plot(
+            *moment.after.T, "o", color=ORANGE, markersize=3.5, label="matched, with its motion"
+        )
+        axes.plot(*moment.new.T, "+", color=YELLOW, markersize=5.0, label="new landmark")
+        legend = axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=2)
+        legend.legend_handles[1].set_color(INK)  # yellow on white is hard to see
+
+
+def drawn(canvas: FigureCanvasAgg) -> Image:
+    """What a canvas shows, (height, width, 3) in red, green, blue."""
+    agg: Any = canvas
+    agg.draw()
+    return np.asarray(agg.buffer_rgba())[..., :3].copy()
+
+
+def _filling(limits: list[list[float]], panel: Bbox) -> FloatArray:
+    """Limits (2, 2) with the shorter side widened to the panel's shape."""
+    span = np.array(limits)
+    size, room = np.diff(span)[:, 0], np.array([panel.width, panel.height])
+    more = room * np.max(size / room) - size
+    return np.column_stack([span[:, 0] - more / 2.0, span[:, 1] + more / 2.0])
+
+
+_ROUTE_INCHES = (12.8, 7.2)
+_MOST_NAMED = 25  # path images whose numbers stand below the route
+_LINE = 26  # letters of a reason in a line
+_LINES = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathPicture:
+    """What is shown of a path image.
+
+    Attributes:
+        name: for people.
+        size: columns and rows of its picture.
+        features: (k, 2) pixels of the features that are remembered; NaN where not in view.
+        image: the picture itself; None where only the features are at hand.
+    """
+
+    name: str
+    size: tuple[int, int]
+    features: FloatArray
+    image: Image | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RouteMoment:
+    """One image, and what the robot is told at it.
+
+    Attributes:
+        image: as recorded; None where it cannot be read.
+        title: above the image.
+        nearest, probability: path image, and that it or a neighbour is the nearest; None where
+            nothing is known of the place.
+        target: path image to go to; None likewise.
+        direction, sigma: of the homing vector from the heading, to the left positive, and its
+            deviation, radians; NaN where it is refused.
+        beam, ahead: (m, 2) pixels along that direction, and along the heading, in the image; NaN
+            where not in view.
+        command: speed and turning rate, or why there is no homing vector.
+        refused: whether it is the latter.
+    """
+
+    image: Image | None
+    title: str
+    nearest: int | None
+    probability: float
+    target: int | None
+    direction: float
+    sigma: float
+    beam: FloatArray
+    ahead: FloatArray
+    command: str
+    refused: bool
+
+
+class RouteCanvas:
+    """Draws moments one after the other onto one canvas.
+
+    Args:
+        path: what is shown of each path image, in order.
+    """
+
+    def __init__(self, path: Sequence[PathPicture]) -> None:
+        self._path = path
+        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
+            self._figure = Canvas(figsize=_ROUTE_INCHES, dpi=_FILM_DPI)
+            self._canvas = FigureCanvasAgg(self._figure)
+            grid = self._figure.add_gridspec(
+                3, 2, width_ratios=(1.75, 1.0), height_ratios=(1.0, 1.0, 0.16),
+                left=0.02, right=0.98, top=0.94, bottom=0.06, wspace=0.06, hspace=0.22,
+            )  # fmt: skip
+            self._image = self._figure.add_subplot(grid[:2, 0])
+            self._remembered = self._figure.add_subplot(grid[0, 1])
+            self._compass = self._figure.add_subplot(grid[1, 1])
+            self._route = self._figure.add_subplot(grid[2, :])
+
+    def draw(self, moment: RouteMoment) -> Image:
+        """The frame (720, 1280, 3) in red, green, blue."""
+        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
+            for axes in (self._image, self._remembered, self._compass, self._route):
+                axes.clear()
+            _draw_image(self._image, moment)
+            self._draw_remembered(moment)
+            _draw_compass(self._compass, moment)
+            self._draw_route(moment)
+            return drawn(self._canvas)
+
+    def _draw_remembered(self, moment: RouteMoment) -> None:
+        axes = self._remembered
+        if moment.nearest is None:
+            axes.set_axis_off()
+            axes.set_title("Path image: not known")
+            return
+        shown = self._path[moment.nearest]
+        title = f"Path image {moment.nearest}: {shorten(shown.name, 24, placeholder='...')}"
+        if shown.image is not None:
+            show_image(axes, shown.image, title)
+            return
+        columns, rows = shown.size
+        axes.plot(*shown.features.T, ".", color=SKY, markersize=3.0)
+        axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[])
+        axes.set(aspect="equal", facecolor="#f4f4f4", xlabel="its features: no picture is kept")
+        axes.set_title(title)
+
+    def _draw_route(self, moment: RouteMoment) -> None:
+        axes, last = self._route, len(self._path) - 1
+        axes.plot([0, last], [0, 0], color=FAINT, linewidth=3.0, zorder=1)
+        axes.plot(np.arange(last + 1), np.zeros(last + 1), "o", color="#8a939c", markersize=7.0)
+        said = "Place: not known"
+        if moment.nearest is not None:
+            axes.plot(moment.nearest, 0.0, "o", color=SKY, markersize=15.0)
+            said = (
+                f"Place: path image {moment.nearest}, probability {100 * moment.probability:.0f} %"
+            )
+        if moment.target not in (None, moment.nearest):
+            axes.plot(
+                moment.target, 0.0, "o", markersize=20.0, fillstyle="none", color=ORANGE,
+                markeredgewidth=2.5,
+            )  # fmt: skip
+            said += f"; next {moment.target}"
+        step = -(-(last + 1) // _MOST_NAMED)
+        axes.set(xlim=(-0.5, last + 0.5), ylim=(-1.0, 1.0), yticks=[])
+        axes.set_xticks(np.arange(0, last + 1, step))
+        axes.tick_params(length=0.0)
+        axes.spines[:].set_visible(False)
+        axes.set_title(said)
+
+
+def _draw_image(axes: Axes, moment: RouteMoment) -> None:
+    if moment.image is None:
+        axes.set_axis_off()
+        axes.set_title(moment.title)
+        return
+    show_image(axes, moment.image, moment.title, "white: ahead, orange: home")
+    add_segments(axes, moment.ahead[None], 1.2, color="white")
+    if np.isfinite(moment.beam).any():
+        add_segments(axes, moment.beam[None], 2.5, color=ORANGE)
+
+
+def _draw_compass(axes: Axes, moment: RouteMoment) -> None:
+    """The robot from above, ahead is up: an arrow home with its deviation, and the command."""
+    axes.add_patch(Circle((0.0, 0.0), 1.0, fill=False, color=FAINT, linewidth=1.5))
+    axes.add_patch(Polygon([[-0.1, -0.1], [0.1, -0.1], [0.0, 0.16]], color=INK))
+    axes.text(0.0, 1.06, "ahead", ha="center", va="bottom", fontsize=10.0)
+    if np.isfinite(moment.direction):
+        around = moment.direction + moment.sigma * np.linspace(-1.0, 1.0, 21)
+        rim = np.column_stack([-np.sin(around), np.cos(around)])
+        axes.add_patch(Polygon([[0.0, 0.0], *rim.tolist()], color=ORANGE, alpha=0.3))
+        tip = (-np.sin(moment.direction), np.cos(moment.direction))
+        arrow = {"arrowstyle": "-|>", "color": ORANGE, "linewidth": 3.0, "mutation_scale": 22.0}
+        axes.annotate("", xy=tip, xytext=(0.0, 0.0), arrowprops=arrow)
+    lines = [part for line in moment.command.splitlines() for part in wrap(line, _LINE)]
+    if len(lines) > _LINES:
+        lines = [*lines[: _LINES - 1], lines[_LINES - 1] + " ..."]
+    colour = VERMILLION if moment.refused else INK
+    axes.text(1.3, 0.0, "\n".join(lines), va="center", color=colour, linespacing=1.5)
+    axes.set(xlim=(-1.2, 4.3), ylim=(-1.15, 1.3), aspect="equal", anchor="W")
+    axes.set_axis_off()
+    axes.set_title("Homing vector")
