@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.runs import EXPERIMENTS, say
 from benchmarks.tables import Cell, Table
-from fgslam.backend.filters.online_doubt import fused, pixels_of, shared_covariance
+from fgslam.backend.considered import fused, pixels_of, shared_covariance
 from fgslam.backend.settings import (
     BatchSettings,
     EkfSettings,

@@ -21,8 +21,8 @@ from benchmarks.speed.drives import (
     open_drive,
     play,
 )
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.filters.kalman import LandmarkKalman
+from fgslam.backend.filters.kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.settings import (
     BatchSettings,
     Isam2Settings,

@@ -66,7 +66,7 @@ from fgslam.slam.motion import (
 from fgslam.slam.pipeline import SlamPipeline
 
 if TYPE_CHECKING:
-    from fgslam.backend.filters.self_calibration import SelfCalibration
+    from fgslam.backend.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
@@ -164,11 +164,11 @@ def make_estimator(
 
             estimator = DeadReckoning(rig, prior)
         case LandmarkKalmanSettings():
-            from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+            from fgslam.backend.filters.kalman import LandmarkKalman
 
             estimator = LandmarkKalman(rig, settings, prior, ego_motion)
         case LandmarkKalmanGraphSettings():
-            from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+            from fgslam.backend.filters.kalman_graph import LandmarkKalmanGraph
 
             estimator = LandmarkKalmanGraph(rig, settings, prior, ego_motion)
         case EkfSettings():
@@ -281,7 +281,7 @@ def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibrat
     """Calibration of the rig from the drive; None where the calibration is to be taken as it is."""
     if not calibrates_itself(settings):
         return None
-    from fgslam.backend.filters.self_calibration import SelfCalibration
+    from fgslam.backend.self_calibration import SelfCalibration
 
     return SelfCalibration(rig, settings.stereo.pixel_sigma)
 

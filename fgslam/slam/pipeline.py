@@ -37,7 +37,7 @@ from fgslam.slam.motion import MotionModel
 from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
 
 if TYPE_CHECKING:
-    from fgslam.backend.filters.self_calibration import SelfCalibration
+    from fgslam.backend.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
 
 

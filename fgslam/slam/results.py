@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.backend.filters.rig_models import WeighedCorrection
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.self_calibration import WeighedCorrection
 from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory

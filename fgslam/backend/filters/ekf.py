@@ -21,9 +21,9 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
+from fgslam.backend.considered import OnlineDoubt
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
-from fgslam.backend.filters.loop_correction import within_gate
-from fgslam.backend.filters.online_doubt import OnlineDoubt
+from fgslam.backend.loops import within_gate
 from fgslam.backend.settings import EkfSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.backend.filters.filtered import placed
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import GraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.estimates import EgoMotion, LandmarkMap

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from fgslam.backend.filters.loop_correction import Constraint
+from fgslam.backend.loops import Constraint
 from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.loop_closing import solved

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import Constraint, nearest_positive, refusal
+from fgslam.backend.loops import Constraint, nearest_positive, refusal
 from fgslam.core.estimates import Prediction
 from fgslam.core.floor import Floor
 from fgslam.core.geometry import adjoint, congruence, inverse, se3_exp, se3_log

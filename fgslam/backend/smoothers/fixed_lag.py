@@ -12,11 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import (
+from fgslam.backend.loops import (
     Constraint,
     constraint_factor,
 )
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings
 from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError

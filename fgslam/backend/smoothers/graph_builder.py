@@ -10,8 +10,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
 from fgslam.backend.persistence import MeasurementNoise, Persistence, StatedNoise
+from fgslam.backend.self_calibration import KnownCorrections, RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.turns import Turn, TurnedStep

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import home_changes, rotated, transported
+from fgslam.backend.loops import home_changes, rotated, transported
 from fgslam.backend.smoothers.window_parts import Landmarks
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import Constraint
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.loops import Constraint
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.backend.smoothers.keyframes import Segments

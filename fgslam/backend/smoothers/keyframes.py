@@ -21,7 +21,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.rig_change import KnownCorrections, RigChange
+from fgslam.backend.self_calibration import KnownCorrections, RigChange
 from fgslam.backend.smoothers.graph_builder import TrackedFrame
 from fgslam.backend.smoothers.solver import Solution, allowed_parts
 from fgslam.backend.smoothers.turns import Turn

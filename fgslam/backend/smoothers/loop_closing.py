@@ -2,7 +2,7 @@
 
 The graph as solved before the loop and as it must be with it lie far apart. Linearised in between,
 landmarks would fly and kernels drop what is right: so poses and landmarks are first brought to
-where backward correction (:mod:`fgslam.backend.filters.loop_correction`) has them, each landmark
+where backward correction (:mod:`fgslam.backend.loops`) has them, each landmark
 along with the frame that saw it first. There every observation fits as before, and what is left is
 small.
 """
@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import (
+from fgslam.backend.loops import (
     Chain,
     Constraint,
     changes,

@@ -17,8 +17,8 @@ from typing import Any, ClassVar, TypeAlias
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import Constraint
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.loops import Constraint
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.border import Bordered, Eliminated
 from fgslam.backend.smoothers.graph_builder import GraphBuilder

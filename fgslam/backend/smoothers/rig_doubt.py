@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
-from fgslam.backend.filters.online_doubt import fused, pixels_of, shared_covariance
+from fgslam.backend.considered import fused, pixels_of, shared_covariance
 from fgslam.backend.smoothers.border import Bordered
 from fgslam.backend.smoothers.marginals import reduced
 from fgslam.backend.smoothers.whole_graph import State, WholeGraph

@@ -15,13 +15,13 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import (
+from fgslam.backend.loops import (
     Constraint,
     changes,
     constraint_factor,
     nearest_positive,
 )
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import SlidingWindowSettings
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.drift_undone import drift_undone

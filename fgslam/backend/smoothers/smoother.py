@@ -5,7 +5,7 @@ the landmarks to match against, and the initial values of what is new. After eac
 takes over the smoothed pose and positions. So the graph may be solved every frame, every tenth,
 or once, and the front-end never waits for it.
 
-The parts: a tracker (:class:`~fgslam.backend.filters.landmark_kalman.LandmarkKalman`), a
+The parts: a tracker (:class:`~fgslam.backend.filters.kalman.LandmarkKalman`), a
 :class:`~fgslam.backend.smoothers.graph_builder.GraphBuilder`, a
 :class:`~fgslam.backend.smoothers.solver.GraphSolver`, and, if not every frame is a variable,
 :class:`~fgslam.backend.smoothers.keyframes.Segments`.
@@ -18,15 +18,15 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from fgslam.backend.considered import OnlineDoubt
 from fgslam.backend.filters.filtered import require_finite
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.loop_correction import (
+from fgslam.backend.filters.kalman import LandmarkKalman
+from fgslam.backend.loops import (
     CLOSURE_FACTOR,
     FREE,
     Constraint,
     starts_new_part,
 )
-from fgslam.backend.filters.online_doubt import OnlineDoubt
 from fgslam.backend.persistence import learn_from
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings

@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from fgslam.backend.filters.loop_correction import Chain, Constraint
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.loops import Chain, Constraint
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.smoothers.graph_builder import NewFactors
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fgslam.backend.filters.filtered import placed
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
 from fgslam.backend.smoothers.solver import (
     Smoothed,

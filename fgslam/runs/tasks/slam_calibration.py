@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.backend.filters.self_calibration import SelfCalibration
+from fgslam.backend.self_calibration import SelfCalibration
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import write_corrected
 from fgslam.core.errors import ConfigError, OutputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.backend.filters.error_columns import ErrorColumns
+from fgslam.backend.considered import ErrorColumns
 from fgslam.core.store import restore, state_of
 
 _COUNT = 4

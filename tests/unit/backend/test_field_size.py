@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.backend.filters.field_size import FieldSize
+from fgslam.backend.self_calibration import FieldSize
 from fgslam.core.measurements import Observations
 from fgslam.core.rig_correction import displacements, prior_information
 from fgslam.core.rig_field import field_displacements, field_modes

@@ -22,7 +22,7 @@ from simulated import (
     tracked_at,
 )
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_update import MISS_GROWTH_M
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g

@@ -21,8 +21,8 @@ from simulated import (
     tracked_at,
 )
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.landmark_kalman_graph import LandmarkKalmanGraph
+from fgslam.backend.filters.kalman import LandmarkKalman
+from fgslam.backend.filters.kalman_graph import LandmarkKalmanGraph
 from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.backend.filters.landmark_rows import LandmarkRows
+from fgslam.backend.filters.kalman import LandmarkRows
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import LandmarkMap
 

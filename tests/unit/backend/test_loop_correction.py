@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.backend.filters.loop_correction import DriveRecord
+from fgslam.backend.loops import DriveRecord
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.geometry import pose

@@ -20,7 +20,7 @@ from simulated import (
 )
 from smoothing import FREE, PIXELS, build
 
-from fgslam.backend.filters import loop_correction
+from fgslam.backend import loops
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
     BatchSettings,
@@ -173,7 +173,7 @@ def test_without_the_gate_the_wrong_loop_is_taken(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So it is the gate that refuses it."""
-    monkeypatch.setattr(loop_correction, "GATE_SIGMAS", np.inf)
+    monkeypatch.setattr(loops, "GATE_SIGMAS", np.inf)
     drive = returned(lies=True)
     increments = drive.increments[: CLOSED + 1]
     estimator = build(CLOSING[name])
@@ -250,9 +250,11 @@ def test_batch_solved_in_the_frame_of_a_loop_has_the_loop_in_its_answer() -> Non
 def test_refused_loop_leaves_the_answer_of_its_frame_alone() -> None:
     increments = list(returned(lies=True).increments[: CLOSED + 1])
     answers = []
-    for loops in (increments[-1].loops, ()):
+    for closures in (increments[-1].loops, ()):
         estimator = build(BatchSettings(solve_every=CLOSED + 1))
-        play(estimator, [*increments[:-1], dataclasses.replace(increments[-1], loops=loops)], FREE)
+        play(
+            estimator, [*increments[:-1], dataclasses.replace(increments[-1], loops=closures)], FREE
+        )
         answers.append(estimator.estimate())
     assert "refused" in answers[0].remarks[0]
     assert_same_bits(answers[0].trajectory, answers[1].trajectory)

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from simulated import RIG, Drive, Simulation, assert_same_bits, play, simulate
 
-from fgslam.backend.filters.rig_change import RigChange
-from fgslam.backend.filters.self_calibration import SETTLING, WINDOW
 from fgslam.backend.protocol import Recalibrated
+from fgslam.backend.self_calibration import SETTLING, WINDOW, RigChange
 from fgslam.backend.settings import (
     BatchSettings,
     EstimatorSettings,

@@ -11,8 +11,8 @@ import pytest
 from simulated import RIG, assert_same_bits, play
 from smoothing import FREE, drawn, run
 
-from fgslam.backend.filters import online_doubt
-from fgslam.backend.filters.online_doubt import OnlineDoubt, shared_covariance
+from fgslam.backend import considered
+from fgslam.backend.considered import OnlineDoubt, shared_covariance
 from fgslam.backend.protocol import FullEstimator
 from fgslam.backend.settings import (
     BatchSettings,
@@ -300,7 +300,7 @@ def test_a_correction_is_weighed_once_for_as_long_as_it_stays(
         weighed.append(correction.values)
         return shared_covariance(correction)
 
-    monkeypatch.setattr(online_doubt, "shared_covariance", counted)
+    monkeypatch.setattr(considered, "shared_covariance", counted)
     online = OnlineDoubt(CALIBRATED.rig, NO_FLOOR)
     for frame, increment in enumerate(increments_of(12)):
         applied = UNCORRECTED if frame < 8 else UNCORRECTED + 1e-3

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import block_diag
 
-from fgslam.backend.filters.rig_alignment import RigEvidence
-from fgslam.backend.filters.rig_filter import RigFilter
+from fgslam.backend.self_calibration import RigEvidence, RigFilter
 from fgslam.core.arrays import FloatArray
 from fgslam.core.rig_correction import prior_information
 from fgslam.core.rig_field import field_modes

@@ -11,9 +11,9 @@ from scipy import stats
 from simulated import RIG, Simulation, play
 from smoothing import FREE, drawn
 
-from fgslam.backend.filters import sampled_errors
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
-from fgslam.backend.filters.sampled_errors import SAMPLES, SampledErrors
+from fgslam.backend import considered
+from fgslam.backend.considered import SAMPLES, SampledErrors
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.persistence import StatedNoise
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
@@ -104,7 +104,7 @@ def test_errors_that_persist_are_drawn_as_large_as_the_residuals_so_far_say(
         for seed in range(2)
     ]
     learned = per_dof(drives, FREE)
-    monkeypatch.setattr(sampled_errors, "Persistence", lambda sensor: StatedNoise(1.0))
+    monkeypatch.setattr(considered, "Persistence", lambda sensor: StatedNoise(1.0))
     stated = per_dof(drives, FREE)
     assert (learned[:2] < 0.75 * stated[:2]).all()
     assert learned[2] > stated[2]
@@ -137,13 +137,13 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
 
     def known(
         self: SampledErrors, wTc: FloatArray, seen: PoseProblem
-    ) -> sampled_errors.ObservedColumns:
+    ) -> considered.ObservedColumns:
         sights = original(self, wTc, seen)
         sights.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
         return sights
 
     monkeypatch.setattr(SampledErrors, "_columns", known)
-    monkeypatch.setattr(sampled_errors, "_root", lambda covariance: np.zeros((6, 6)))
+    monkeypatch.setattr(considered, "_root", lambda covariance: np.zeros((6, 6)))
     increments = drawn(2, noise=0.0).increments
     size = 1e-4
     plain = played(increments, update=update)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from fgslam.backend.filters.rig_models import weighed
-from fgslam.backend.filters.self_calibration import WINDOW, SelfCalibration
+from fgslam.backend.self_calibration import WINDOW, SelfCalibration, weighed
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.features import Features

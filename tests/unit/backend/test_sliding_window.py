@@ -9,9 +9,9 @@ import pytest
 from simulated import RIG, Simulation, play
 from smoothing import FREE, answer, assert_consistent, build, drawn
 
-from fgslam.backend.filters.loop_correction import Constraint
-from fgslam.backend.filters.rig_change import RigChange
+from fgslam.backend.loops import Constraint
 from fgslam.backend.protocol import Estimator
+from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import BatchSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
 from fgslam.backend.smoothers.held_landmarks import HeldLandmarks

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits, observations
 
-from fgslam.backend.filters.loop_correction import (
+from fgslam.backend.considered import shares
+from fgslam.backend.loops import (
     CLOSURE_FACTOR,
     FREE,
     Chain,
@@ -21,7 +22,6 @@ from fgslam.backend.filters.loop_correction import (
     rotated,
     transported,
 )
-from fgslam.backend.filters.sampled_errors import shares
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.measurements import LoopClosure

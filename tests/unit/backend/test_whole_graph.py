@@ -11,7 +11,7 @@ import pytest
 from factor_checks import random_covariance
 from smoothing import drawn, run, wrong_matches
 
-from fgslam.backend.filters.loop_correction import Constraint, constraint_factor
+from fgslam.backend.loops import Constraint, constraint_factor
 from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.graph_builder import GraphBuilder
 from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced

@@ -12,7 +12,7 @@ import pytest
 from recordings import write_recording
 
 import fgslam as fg
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.estimates import Prediction
 from fgslam.errors import (

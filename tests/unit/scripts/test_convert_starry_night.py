@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import DatasetError

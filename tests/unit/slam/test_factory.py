@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA

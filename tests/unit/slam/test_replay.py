@@ -11,7 +11,7 @@ import pytest
 from loops import CLOSED, Rounds, drive_rounds
 from simulated import RIG, Drive, assert_same_bits, play, simulate
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.core.errors import EstimatorError, MeasurementLogError
 from fgslam.core.estimates import Estimate, Trajectory, UpdateStats

@@ -13,7 +13,7 @@ import pytest
 from rings import on_ring, walls
 from simulated import RIG, FeatureWorld, assert_same_bits
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import EstimatorSettings, Isam2Settings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, Image

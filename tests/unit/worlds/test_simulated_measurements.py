@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray

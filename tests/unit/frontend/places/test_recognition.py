@@ -22,7 +22,7 @@ from rings import (
 )
 from simulated import RIG, assert_same_bits
 
-from fgslam.backend.filters import loop_correction
+from fgslam.backend import loops
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, StateArrays
@@ -52,7 +52,7 @@ def round_the_ring(path: list[FloatArray] = RING) -> SlamPipeline:
 
 
 def refuse_closures(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(loop_correction, "GATE_SIGMAS", 1e-6)
+    patch.setattr(loops, "GATE_SIGMAS", 1e-6)
 
 
 @dataclasses.dataclass(frozen=True)

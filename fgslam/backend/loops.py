@@ -3,7 +3,7 @@
 A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop asks for the least
 weighted changes to the chain under which it meets itself: the minimum of a pose graph of the poses
 at which submaps begin; within a submap the change is spread over the frames as their steps'
-uncertainty has it. Derivation: docs/derivations/submaps.md.
+uncertainty has it. Filters and smoothers share it. Derivation: docs/derivations/submaps.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The paper's estimator expressed as factor graphs, GTSAM doing the algebra.
 
-Equal to :class:`~fgslam.backend.filters.landmark_kalman.LandmarkKalman` up to rounding: the pose
+Equal to :class:`~fgslam.backend.filters.kalman.LandmarkKalman` up to rounding: the pose
 is that of a graph on fixed landmarks (Se et al. 3.3), each landmark that of its own graph (6.4).
 Which edges of the full graph are missing, and what that costs, is derived in
 docs/derivations/landmark_filter_as_graph.md.
@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.filters.landmark_kalman import LandmarkKalman
+from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_update import FrameUpdate, Landmarks, UpdateKind
 from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core.arrays import BoolArray, FloatArray

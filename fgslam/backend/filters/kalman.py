@@ -3,13 +3,12 @@
 Se, Lowe and Little (2001), Sections 4.1 (averaging) and 6.4 (Kalman filters). The pose is that of
 the least squares against the landmarks (3.3). Correlations between landmarks, and between
 landmarks and pose, are dropped: that is what makes the filter cheap, and its own covariances far
-too small. It goes on with them, and reports those of its errors
-(:mod:`fgslam.backend.filters.sampled_errors`).
+too small. It goes on with them, and reports those of its errors (:mod:`fgslam.backend.considered`).
 
-Past poses are revised by loop closures alone (backward correction by submaps): the
-drive and the landmarks, each with the frame that it was made in, move to where a pose graph has
-them. The filter's own covariances stay: how well a pose is known beside the map around it, and how
-well a landmark beside the poses that saw it.
+Past poses are revised by loop closures alone (backward correction by submaps): the drive and the
+landmarks, each with the frame that it was made in, move to where a pose graph has them. The
+filter's own covariances stay: of a pose relative to the map around it, and of a landmark relative
+to the poses that saw it.
 """
 
 from __future__ import annotations
@@ -18,8 +17,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from fgslam.backend.considered import Moved, SampledErrors, Step, lacking, shares
 from fgslam.backend.filters.filtered import FilteredTrajectory, moved
-from fgslam.backend.filters.landmark_rows import LandmarkRows
 from fgslam.backend.filters.landmark_update import (
     MISS_GROWTH_M,
     FrameUpdate,
@@ -27,7 +26,7 @@ from fgslam.backend.filters.landmark_update import (
     UpdateKind,
     average_weight,
 )
-from fgslam.backend.filters.loop_correction import (
+from fgslam.backend.loops import (
     Chain,
     DriveRecord,
     changes,
@@ -37,12 +36,10 @@ from fgslam.backend.filters.loop_correction import (
     starts_new_part,
     transported,
 )
-from fgslam.backend.filters.rig_change import RigChange
-from fgslam.backend.filters.sampled_errors import Moved, SampledErrors, Step, lacking, shares
-from fgslam.backend.filters.self_calibration import SETTLING
 from fgslam.backend.protocol import recalibrated
+from fgslam.backend.self_calibration import SETTLING, RigChange
 from fgslam.backend.settings import LandmarkKalmanSettings
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import inverse, inverse_spd3
 from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
@@ -300,3 +297,104 @@ def moved_share(
         return average_weight(kind, counts)[:, :, None] * np.eye(3)
     extra = lacking(before)
     return np.asarray(np.eye(3) - (after + extra) @ inverse_spd3(before + extra))
+
+
+class LandmarkRows:
+    """Identities ascending, with position, covariance, sightings, home frame and last frame.
+
+    An update costs what it touches: new landmarks are appended in place, and those that go are
+    mostly young, so that only what lies behind the first of them moves.
+    The arrays are views of the room in use: writing to rows of them changes the landmarks.
+    """
+
+    _columns: Kept[GrowingColumns]
+
+    def __init__(self) -> None:
+        """No landmark."""
+        number = np.empty(0, np.int64)
+        self._columns = GrowingColumns(
+            ids=number,
+            positions=np.empty((0, 3)),
+            covariances=np.empty((0, 3, 3)),
+            counts=number,
+            homes=number,
+            lasts=number,
+        )
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    @property
+    def ids(self) -> IntArray:
+        """(n,) ascending."""
+        return self._columns["ids"]
+
+    @property
+    def positions(self) -> FloatArray:
+        """(n, 3) world, metres."""
+        return self._columns["positions"]
+
+    @property
+    def covariances(self) -> FloatArray:
+        """(n, 3, 3) metres squared."""
+        return self._columns["covariances"]
+
+    @property
+    def counts(self) -> IntArray:
+        """(n,) frames in which each was seen."""
+        return self._columns["counts"]
+
+    @property
+    def homes(self) -> IntArray:
+        """(n,) frame with which each moves when a loop is closed; -1 for one that stays."""
+        return self._columns["homes"]
+
+    @property
+    def lasts(self) -> IntArray:
+        """(n,) frame that saw each last; -1 for one that none saw yet."""
+        return self._columns["lasts"]
+
+    def map(self) -> LandmarkMap:
+        """As a map; only until the next landmark comes or goes."""
+        return LandmarkMap(self.ids, self.positions, self.covariances)
+
+    def rows(self, ids: IntArray) -> IntArray:
+        """Row of each id. Raises KeyError when one is absent."""
+        return self.map().rows(ids)
+
+    def add(self, ids: IntArray, positions: FloatArray, covariances: FloatArray, home: int) -> None:
+        """Adds landmarks (k,), seen once; they must be new."""
+        ones = np.ones(len(ids), np.int64)
+        self.bring(LandmarkMap(ids, positions, covariances), ones, home * ones, home * ones)
+
+    def bring(
+        self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray, lasts: IntArray
+    ) -> None:
+        """Adds landmarks (k,) that are known already; none of them may be there."""
+        before = len(self)
+        self._columns.append(
+            {
+                "ids": landmarks.ids,
+                "positions": landmarks.positions,
+                "covariances": landmarks.covariances,
+                "counts": counts,
+                "homes": homes,
+                "lasts": lasts,
+            }
+        )
+        self._columns.keep_ascending("ids", before)
+
+    def remove(self, ids: IntArray) -> None:
+        """Drops landmarks. Raises KeyError when one is absent."""
+        if not len(ids):
+            return
+        gone = np.zeros(len(self), np.bool_)
+        gone[self.rows(ids)] = True
+        self._columns.drop(gone)
+
+    def load(
+        self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray, lasts: IntArray
+    ) -> None:
+        """Replaces everything; the arrays are copied."""
+        self._columns.take(0, np.empty(0, np.int64))
+        self.bring(landmarks, counts, homes, lasts)
