@@ -23,7 +23,7 @@ from fgslam.core.homing import (
 from fgslam.core.planar import circular_median, wrap
 from fgslam.homing.settings import HomingControlSettings
 
-_MAX_ACROSS = 0.1
+MAX_ACROSS = 0.1
 """Deviation of the target's place across the way, in parts of the leg, beyond which the target is
 matched anew."""
 
@@ -35,7 +35,7 @@ _MAX_RESIDUAL_DEG = 5.0
 """Median difference of the bearings from the estimate's prediction beyond which the estimate counts
 as diverged."""
 
-_MIN_TRACKS = 10  # with fewer the target is matched anew, while the estimate is still used
+MIN_TRACKS = 10  # with fewer the target is matched anew, while the estimate is still used
 _FEWEST_TRACKS = 4
 """With fewer than this the estimate is not used any more (a third view needs three
 bearings)."""
@@ -168,14 +168,14 @@ class ActiveHoming:
 
     def _weakness(self) -> Fault | None:
         count = len(self.tracked)
-        if count < min(_MIN_TRACKS, _KEPT_SHARE * len(self.start.matches)):
+        if count < min(MIN_TRACKS, _KEPT_SHARE * len(self.start.matches)):
             return Fault(f"{count} tracks left", True)
         if self._maps and not self._determined:
             return Fault("target uncertain: the estimator has no covariance", True)
         home = self.home
         with np.errstate(invalid="ignore"):
             across = float(home.distance * np.sqrt(home.covariance[1, 1]))
-        if np.isfinite(across) and across > _MAX_ACROSS:
+        if np.isfinite(across) and across > MAX_ACROSS:
             return Fault(f"target uncertain by {across:.2f} legs across", True)
         return None
 

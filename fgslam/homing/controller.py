@@ -31,20 +31,20 @@ from fgslam.homing.front_end import HomingFrontEnd
 from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.steering import Command, HomingState
 
-_BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
-_GIVE_UP_S = 3.0  # of refusals, standing: the robot looks from farther on, or ends the homing
-_WAIT_S = 60.0  # on one leg, on top of the time without progress, for a blocked way to clear
-_FARTHER_TRIES = 3  # drives farther on for one target
-_STALL_S = 15.0  # without progress for so long, the target is matched anew
-_FARTHER_S = 2.5
+BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
+GIVE_UP_S = 3.0  # of refusals, standing: the robot looks from farther on, or ends the homing
+WAIT_S = 60.0  # on one leg, on top of the time without progress, for a blocked way to clear
+FARTHER_TRIES = 3  # drives farther on for one target
+STALL_S = 15.0  # without progress for so long, the target is matched anew
+FARTHER_S = 2.5
 """Drive straight on, at reduced speed, to look for a refused target from elsewhere; 0.4 m with the
 default steering."""
 
-_NEAR_FRACTION = 0.3
+NEAR_FRACTION = 0.3
 """From this part of the leg on, another look must show the target where the estimate has it before
 it counts as reached."""
 
-_MAX_STALLS = 3  # so often without progress, or with an estimate given up, ends the homing
+MAX_STALLS = 3  # so often without progress, or with an estimate given up, ends the homing
 _BLIND_HEADING_DEG = 20.0  # without tracks the robot drives on only if home was so nearly ahead
 _PASS_FRACTION = 0.25
 """A target nearer than this part of the leg that has fallen behind the robot counts as reached:
@@ -82,7 +82,7 @@ class HomingController:
         self._was_ahead = False
         # Where the leg begins, and where it went on by a vector that two images agree on.
         self._begun: list[HomingStart] = []
-        self._progress, self._patience = _Progress(_STALL_S), _WAIT_S
+        self._progress, self._patience = _Progress(STALL_S), WAIT_S
         self._next_try = -np.inf
         self._blind_until = -np.inf
         self._search_until, self._searches = -np.inf, 0
@@ -133,8 +133,8 @@ class HomingController:
         if arrival and fault is None:
             fault = Fault(f"no track confirms it: {arrival}", True)
         if self._progress.stalled(self.remaining, time):
-            fault = Fault(f"no progress for {_STALL_S:g} s", True)
-            if self._progress.stalls >= _MAX_STALLS:
+            fault = Fault(f"no progress for {STALL_S:g} s", True)
+            if self._progress.stalls >= MAX_STALLS:
                 return self._refuse(time, Refusal(RefusalReason.NO_PROGRESS, fault.reason))
         if fault is None:
             return self._drive(homing, time, f"{len(homing.tracked)} tracks")
@@ -160,7 +160,7 @@ class HomingController:
         A homing vector may be wrong and sure of itself: where things repeat, its tracks fit a
         target that is not there. So near, right matches are many: the look is a test of its own.
         """
-        due = time >= self._next_look and self.remaining <= _NEAR_FRACTION
+        due = time >= self._next_look and self.remaining <= NEAR_FRACTION
         if self._recognised or not (due or arrival):
             return None
         self._next_look = time + self._settings.retry_s
@@ -171,7 +171,7 @@ class HomingController:
             # The first estimate is near when it says so. Later ones took the place of one that
             # failed, with its distance or where its tracks ended.
             first = self.initialisations == 1
-            self._recognised = first or self._surely_left(answer) <= _NEAR_FRACTION
+            self._recognised = first or self._surely_left(answer) <= NEAR_FRACTION
             if arrival and not self._recognised:
                 return self._doubt(time, "target may not be so near", answer.vector)
         elif answer.reason is RefusalReason.AT_TARGET:
@@ -217,7 +217,7 @@ class HomingController:
         self.remaining, self._was_ahead, self._obstacle = left, False, why
         self._recognised = False
         self._progress.begin_anew(time)
-        if self._progress.stalls >= _MAX_STALLS:
+        if self._progress.stalls >= MAX_STALLS:
             return self._refuse(time, Refusal(RefusalReason.LOST, why))
         return self._hold(time, why)
 
@@ -239,7 +239,7 @@ class HomingController:
     def _lose(self, image: ByteArray, time: float, why: str) -> Command:
         """Matches the target anew at once; where that fails, drives blind for a while."""
         ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
-        self._blind_until = time + _BLIND_S if ahead else -np.inf
+        self._blind_until = time + BLIND_S if ahead else -np.inf
         self.active, self._next_try = None, time
         return self._seek(image, time, why)
 
@@ -311,9 +311,9 @@ class HomingController:
         self._obstacle = refusal.details
         command = self._hold(time, refusal.details)
         since = self._standing_since
-        if since is None or time - since < _GIVE_UP_S:
+        if since is None or time - since < GIVE_UP_S:
             return command
-        if self._searches < _FARTHER_TRIES:
+        if self._searches < FARTHER_TRIES:
             return self._search(time, refusal.details)
         if self.initialisations:
             refusal = Refusal(RefusalReason.LOST, f"lost, then: {refusal.details}")
@@ -321,7 +321,7 @@ class HomingController:
 
     def _search(self, time: float, why: str) -> Command:
         self._searches += 1
-        self._search_until = time + _FARTHER_S
+        self._search_until = time + FARTHER_S
         self._standing_since = self._pending = None
         self._progress.pause(time)
         return self._hold(time, why)

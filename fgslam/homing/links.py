@@ -22,9 +22,9 @@ from fgslam.core.homing import (
 )
 from fgslam.core.planar import wrap
 
-_MUTUAL_DEG = 5.0  # largest difference between the answers there and back, beyond three deviations
-_MIN_SUPPORT = 12  # inliers of an edge, in either answer
-_ONE_WAY_SUPPORT = 25
+MUTUAL_DEG = 5.0  # largest difference between the answers there and back, beyond three deviations
+MIN_SUPPORT = 12  # inliers of an edge, in either answer
+ONE_WAY_SUPPORT = 25
 """Inliers of an edge that is answered in one direction and ambiguous in the other."""
 
 Answer: TypeAlias = TwoViewVector | Refusal
@@ -78,8 +78,8 @@ def link_pair(pair: Pair, there: Answer, back: Answer) -> Link | str:
     if isinstance(there, Refusal) or isinstance(back, Refusal):
         return _one_way(pair, there, back)
     support = min(there.support, back.support)
-    if support < _MIN_SUPPORT:
-        return f"{support} inliers, of {_MIN_SUPPORT} needed"
+    if support < MIN_SUPPORT:
+        return f"{support} inliers, of {MIN_SUPPORT} needed"
     gap = np.array(
         [
             there.rotation + back.rotation,
@@ -88,7 +88,7 @@ def link_pair(pair: Pair, there: Answer, back: Answer) -> Link | str:
     )
     apart = float(np.max(np.abs(wrap(gap))))
     variance = float(np.max(np.diag(there.covariance) + np.diag(back.covariance)))
-    if apart > max(np.deg2rad(_MUTUAL_DEG), _SIGMAS * np.sqrt(variance)):
+    if apart > max(np.deg2rad(MUTUAL_DEG), _SIGMAS * np.sqrt(variance)):
         return f"there and back disagree by {np.rad2deg(apart):.1f} deg"
     return Link(
         *pair, there.direction, there.rotation, back.direction, there.covariance,
@@ -108,9 +108,9 @@ def _one_way(pair: Pair, there: Answer, back: Answer) -> Link | str:
         raise TypeError("one direction must be answered, the other refused")
     if other.reason not in _UNDECIDED:
         return f"refused in one direction: {other.details}"
-    if answer.support < _ONE_WAY_SUPPORT:
+    if answer.support < ONE_WAY_SUPPORT:
         return (
-            f"{answer.support} inliers one way, of {_ONE_WAY_SUPPORT} needed; back: {other.details}"
+            f"{answer.support} inliers one way, of {ONE_WAY_SUPPORT} needed; back: {other.details}"
         )
     opposite = _opposite(answer)
     ahead, behind = (opposite, answer) if answer is back else (answer, opposite)
@@ -138,12 +138,12 @@ def _same_place(pair: Pair, there: Refusal, back: Refusal) -> Link | str:
     if there.rotation is None or back.rotation is None:
         return "taken at one place as seen from one of them only"
     apart = abs(float(wrap(np.array(there.rotation + back.rotation))))
-    if apart > np.deg2rad(_MUTUAL_DEG):
+    if apart > np.deg2rad(MUTUAL_DEG):
         return f"there and back disagree by {np.rad2deg(apart):.1f} deg"
     nowhere = np.full((2, 2), np.nan)
-    nowhere[1, 1] = np.deg2rad(_MUTUAL_DEG / _SIGMAS) ** 2
+    nowhere[1, 1] = np.deg2rad(MUTUAL_DEG / _SIGMAS) ** 2
     return Link(
-        *pair, float("nan"), there.rotation, float("nan"), nowhere, nowhere, _MIN_SUPPORT,
+        *pair, float("nan"), there.rotation, float("nan"), nowhere, nowhere, MIN_SUPPORT,
     )  # fmt: skip
 
 
@@ -176,7 +176,7 @@ _LOOP_DEG = 6.0
 """Largest sum of the rotations around a triangle, and largest misfit of its directions, beyond
 three deviations."""
 
-_LONE_SUPPORT = 50
+LONE_SUPPORT = 50
 """Inliers of an edge that no third image confirms, unless its images follow each other on a walk
 (false ones had up to 39 on `omni_home`)."""
 
@@ -291,7 +291,7 @@ class LinkConsistency:
         for pair, (good, _) in self.votes().items():
             support = self._links[pair].support
             follows = pair in self._steps or pair in confirmed
-            if good == 0 and not follows and support < _LONE_SUPPORT:
+            if good == 0 and not follows and support < LONE_SUPPORT:
                 text = f"no third image confirms it, and {support} inliers are too few alone"
                 self._drop(pair, text, rejected)
 

@@ -16,17 +16,17 @@ from fgslam.homing.settings import AvoidanceSettings, SteeringSettings
 ACCELERATION_MPS2, TURN_ACCELERATION_DEG_S2 = 0.5, 120.0
 """Largest changes of speed and of the turning rate: what a passenger takes without holding on."""
 
-_TURN_IN_PLACE_DEG = 60.0
+TURN_IN_PLACE_DEG = 60.0
 """Home farther off than this: turn without driving, until it is within half of it."""
 
 _STEERING_GAIN_PER_S = 1.2
 """Turning rate over the direction of home; slow against the delay of 0.1 s between image and
 wheels."""
 
-_BLIND_SHARE = 0.4  # of the speed, without tracks
-_PASSING_SHARE = 0.6  # of the speed, at targets on the way
+BLIND_SHARE = 0.4  # of the speed, without tracks
+PASSING_SHARE = 0.6  # of the speed, at targets on the way
 _LEAST_SHARE = 0.25  # of the speed, at the last target
-_SLOW_FRACTION = 0.3  # part of the leg that is left from which on the robot slows down
+SLOW_FRACTION = 0.3  # part of the leg that is left from which on the robot slows down
 
 _BEHIND = np.deg2rad(150.0)  # from here on both ways round are as long; noise must not choose
 
@@ -70,7 +70,7 @@ class Steering:
 
     def _forward(self, command: Command) -> float:
         s = self._settings
-        limit = np.deg2rad(_TURN_IN_PLACE_DEG)
+        limit = np.deg2rad(TURN_IN_PLACE_DEG)
         # Two thresholds: with one, noise would switch between turning and driving.
         self._turning = abs(command.heading) > (0.5 * limit if self._turning else limit)
         if self._turning:
@@ -80,9 +80,9 @@ class Steering:
 
     def _share(self, command: Command) -> float:
         if command.state in (HomingState.BLIND, HomingState.SEARCH):
-            return _BLIND_SHARE
-        least = _LEAST_SHARE if command.final else _PASSING_SHARE
-        return float(np.clip(command.remaining / _SLOW_FRACTION, least, 1.0))
+            return BLIND_SHARE
+        least = _LEAST_SHARE if command.final else PASSING_SHARE
+        return float(np.clip(command.remaining / SLOW_FRACTION, least, 1.0))
 
 
 def _towards(now: float, wanted: float, most: float) -> float:
@@ -98,7 +98,7 @@ def _towards(now: float, wanted: float, most: float) -> float:
 _ESCAPE_MPS = 0.25  # speed on the way out
 _ESCAPE_M = 1.2  # ways longer than this are equally good ways out
 _ESCAPE_STEPS = 20  # steps of driving along it; 2 s at 10 a second
-_ESCAPE_AFTER = 20  # steps held up until a way out is taken; 2 s at 10 a second
+ESCAPE_AFTER = 20  # steps held up until a way out is taken; 2 s at 10 a second
 _LOOK_AHEAD_M = 0.6  # length of the corridor that must be free, from standing
 _LOOK_AHEAD_S = 1.5  # what comes on top at speed, in seconds of driving
 _AVOIDING_GAIN_PER_S = 2.0  # turning rate over the chosen direction
@@ -177,7 +177,7 @@ class CorridorAvoidance:
         driven = self._in_corridor(wanted, heading, scan)
         stands = driven.overridden and driven.speed < _STANDING
         self._held_up = self._held_up + self._impatience() if stands else 0.0
-        if self._held_up >= _ESCAPE_AFTER:
+        if self._held_up >= ESCAPE_AFTER:
             self._held_up, self._chosen = 0.0, None
             self._escaping = _ESCAPE_STEPS
         return driven

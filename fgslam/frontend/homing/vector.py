@@ -95,7 +95,7 @@ class HomingSearch:
         self._refinement = HomingRefinement(
             matches, (tilt, settings.height_sigma), INLIER_SIGMAS, LEAST_PARALLAX
         )
-        self._cells = _cells(matches)
+        self.match_cells = match_cells(matches)
         self._tilt = tilt
         self._right = right_probability(matches)
         self._found = np.empty((4, 0))
@@ -252,7 +252,7 @@ class HomingSearch:
 
     def independent_inliers(self, which: BoolArray) -> int:
         """Number of inliers that are independent of each other."""
-        return len(np.unique(self._cells[which]))
+        return len(np.unique(self.match_cells[which]))
 
     def turn_at_target(self, best: Refined) -> Refusal | None:
         """Both views from one place: there is a turn, but no direction.
@@ -358,7 +358,7 @@ class HomingSearch:
         good, _ = wrong.inliers(best.parameters[:1], best.parameters[1:2], sigmas, LEAST_PARALLAX)
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
         gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
-        kept = _one_a_cell(gains, self._cells)
+        kept = _one_a_cell(gains, self.match_cells)
         tests = float(np.log(n * (n - 1.0)))  # two solutions for each pair
         return tests - log_likelihood_ratio(gains[kept], self._right[kept])
 
@@ -424,7 +424,7 @@ def _log_ratios(
     return log_ratio, sigma, eligible
 
 
-def _cells(matches: BearingMatches) -> IntArray:
+def match_cells(matches: BearingMatches) -> IntArray:
     """(n,) number of the cell of both views that a match lies in: one cell counts once."""
     angles = [matches.bearing_a, matches.bearing_b, matches.elevation_a, matches.elevation_b]
     grid = np.round(np.column_stack(angles) * (_CELLS_AROUND / (2.0 * np.pi)))
@@ -598,8 +598,8 @@ class GuidedScore:
             _blocks(m.bearing_a, m.elevation_a, _CELL_DEG),
             _blocks(m.bearing_b, m.elevation_b, _CELL_DEG),
         ]
-        _, self._cells = np.unique(np.column_stack(cells), axis=0, return_inverse=True)
-        self._cells = self._cells.ravel()
+        _, self.match_cells = np.unique(np.column_stack(cells), axis=0, return_inverse=True)
+        self.match_cells = self.match_cells.ravel()
         self._block_a = _blocks(m.bearing_a, m.elevation_a, _BLOCK_DEG)
         self._block_b = _blocks(m.bearing_b, m.elevation_b, _BLOCK_DEG)
 
@@ -641,7 +641,7 @@ class GuidedScore:
     def _each_once(self, rows: IntArray, evidence: FloatArray) -> IntArray:
         """Places among ``rows`` of the best of each cell, then of each feature of either view."""
         order = np.argsort(-evidence, kind="stable")
-        for key in (self._cells, self._matches.index_a, self._matches.index_b):
+        for key in (self.match_cells, self._matches.index_a, self._matches.index_b):
             _, first = np.unique(key[rows[order]], return_index=True)
             order = order[np.sort(first)]
         return order

@@ -30,19 +30,19 @@ from fgslam.core.homing import (
 )
 from fgslam.core.planar import bearings, between, unit, wrap
 from fgslam.homing.active import (
-    _MAX_ACROSS,
-    _MIN_TRACKS,
+    MAX_ACROSS,
+    MIN_TRACKS,
     ActiveHoming,
     Sighting,
     surely_left,
 )
 from fgslam.homing.controller import (
-    _BLIND_S,
-    _FARTHER_S,
-    _FARTHER_TRIES,
-    _GIVE_UP_S,
-    _MAX_STALLS,
-    _NEAR_FRACTION,
+    BLIND_S,
+    FARTHER_S,
+    FARTHER_TRIES,
+    GIVE_UP_S,
+    MAX_STALLS,
+    NEAR_FRACTION,
     HomingController,
 )
 from fgslam.homing.settings import HomingControlSettings
@@ -193,7 +193,7 @@ def bench(*answers: TwoViewVector | Refusal) -> Bench:
 @pytest.fixture
 def _never_farther(monkeypatch: pytest.MonkeyPatch) -> None:
     """A refused target is not looked for from farther on."""
-    monkeypatch.setattr("fgslam.homing.controller._FARTHER_TRIES", 0)
+    monkeypatch.setattr("fgslam.homing.controller.FARTHER_TRIES", 0)
 
 
 FEW = Refusal(RefusalReason.TOO_FEW_MATCHES, "2 matches, of 8 needed")
@@ -279,7 +279,7 @@ def test_few_tracks_match_anew_while_driving_on() -> None:
     b.step()
     b.at(0.4)
     b.step()
-    b.front_end.tracks = _MIN_TRACKS - 1
+    b.front_end.tracks = MIN_TRACKS - 1
     refused = b.step(SETTINGS.retry_s)
     assert refused.state is HomingState.DRIVE
     assert FEW.details in refused.reason
@@ -313,7 +313,7 @@ def test_uncertain_estimate_is_matched_anew() -> None:
     b = bench(vector_to(0.0))
     b.step()
     b.step()
-    b.estimators[-1].sigma = _MAX_ACROSS
+    b.estimators[-1].sigma = MAX_ACROSS
     command = b.step(SETTINGS.retry_s)
     assert "uncertain" in command.reason
     assert b.controller.initialisations == 2
@@ -397,7 +397,7 @@ def test_blind_is_short_then_stands_then_refuses() -> None:
     commands = [b.step() for _ in range(60)]
     states = [c.state for c in commands]
     blind = states.count(HomingState.BLIND)
-    assert 0 < blind <= round(_BLIND_S / 0.1) + 1
+    assert 0 < blind <= round(BLIND_S / 0.1) + 1
     assert states[:blind] == [HomingState.BLIND] * blind
     assert all(not c.stop and c.heading == 0.0 for c in commands[:blind])
     assert states[blind] is HomingState.WAIT
@@ -486,18 +486,18 @@ def test_vectors_that_keep_contradicting_end_the_homing() -> None:
 
 def test_no_progress_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held up for good: matched anew a few times, then given up with the reason."""
-    monkeypatch.setattr("fgslam.homing.controller._STALL_S", 1.0)
+    monkeypatch.setattr("fgslam.homing.controller.STALL_S", 1.0)
     b = bench(vector_to(0.0))
     commands = [b.step() for _ in range(60)]
     assert commands[-1].state is HomingState.REFUSED
     assert commands[-1].refusal is not None
     assert commands[-1].refusal.reason is RefusalReason.NO_PROGRESS
-    assert b.controller.initialisations == _MAX_STALLS
+    assert b.controller.initialisations == MAX_STALLS
 
 
 def test_refused_target_is_looked_for_from_farther_on() -> None:
     """Standing did not help: slowly straight on, and the first answer is driven by."""
-    standing = int(_GIVE_UP_S / SETTINGS.retry_s) + 1
+    standing = int(GIVE_UP_S / SETTINGS.retry_s) + 1
     b = bench(*[FEW] * (standing + 2), vector_to(0.1))
     commands = [b.step() for _ in range(60)]
     states = [c.state for c in commands]
@@ -515,9 +515,9 @@ def test_search_for_a_refused_target_ends_after_the_stated_tries() -> None:
     states = [b.step().state for _ in range(400)]
     assert states[-1] is HomingState.REFUSED
     driven = 0.1 * states.count(HomingState.SEARCH)
-    assert driven == pytest.approx(_FARTHER_TRIES * _FARTHER_S, abs=0.5)
+    assert driven == pytest.approx(FARTHER_TRIES * FARTHER_S, abs=0.5)
     begun = [now for was, now in itertools.pairwise(states) if now is not was]
-    assert begun.count(HomingState.SEARCH) == _FARTHER_TRIES
+    assert begun.count(HomingState.SEARCH) == FARTHER_TRIES
 
 
 def test_answer_after_an_ambiguous_one_needs_another_image() -> None:
@@ -537,10 +537,10 @@ def test_near_the_target_one_look_confirms_it() -> None:
     """Not before, and not again once it agreed; the tracks go on."""
     b = bench(vector_to(0.0))
     b.step()
-    b.at(1.0 - 1.1 * _NEAR_FRACTION)
+    b.at(1.0 - 1.1 * NEAR_FRACTION)
     b.step()
     assert b.front_end.looked == 0
-    b.at(1.0 - 0.9 * _NEAR_FRACTION)
+    b.at(1.0 - 0.9 * NEAR_FRACTION)
     assert b.step().state is HomingState.DRIVE
     b.at(0.95)
     assert b.step().state is HomingState.ARRIVED
@@ -656,7 +656,7 @@ def test_estimate_in_doubt_is_driven_by_no_more_not_even_blind(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Matched anew within the time that may be driven blind; then no look shows the target."""
-    monkeypatch.setattr("fgslam.homing.controller._BLIND_S", 5.0)
+    monkeypatch.setattr("fgslam.homing.controller.BLIND_S", 5.0)
     b = bench(vector_to(0.0), FEW, vector_to(0.0), FEW)
     b.step()
     b.front_end.tracks = 0
@@ -711,9 +711,9 @@ def test_look_from_the_target_itself_is_arrival() -> None:
 
 def test_blocked_way_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held up by obstacles is no lack of progress, for so long; then it is."""
-    monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
-    monkeypatch.setattr("fgslam.homing.controller._STALL_S", 1.0)
-    monkeypatch.setattr("fgslam.homing.controller._WAIT_S", 2.0)
+    monkeypatch.setattr("fgslam.homing.controller.MAX_STALLS", 1)
+    monkeypatch.setattr("fgslam.homing.controller.STALL_S", 1.0)
+    monkeypatch.setattr("fgslam.homing.controller.WAIT_S", 2.0)
     b = bench(vector_to(0.0))
     ended = []
     for _ in range(60):

@@ -109,8 +109,8 @@ def test_graph_drives_as_well() -> None:
 
 @pytest.fixture
 def _refuses_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.homing.controller._GIVE_UP_S", 0.5)
-    monkeypatch.setattr("fgslam.homing.controller._FARTHER_TRIES", 0)
+    monkeypatch.setattr("fgslam.homing.controller.GIVE_UP_S", 0.5)
+    monkeypatch.setattr("fgslam.homing.controller.FARTHER_TRIES", 0)
 
 
 def follower_with_unknown(count: int) -> HomingChain:
@@ -166,9 +166,9 @@ def test_way_that_is_blocked_for_a_while_is_driven_on(
     wait_s: float, result: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What avoidance takes does not count as lack of progress, as long as one may wait."""
-    monkeypatch.setattr("fgslam.homing.controller._MAX_STALLS", 1)
-    monkeypatch.setattr("fgslam.homing.controller._STALL_S", 2.0)
-    monkeypatch.setattr("fgslam.homing.controller._WAIT_S", wait_s)
+    monkeypatch.setattr("fgslam.homing.controller.MAX_STALLS", 1)
+    monkeypatch.setattr("fgslam.homing.controller.STALL_S", 2.0)
+    monkeypatch.setattr("fgslam.homing.controller.WAIT_S", wait_s)
     record = drive_path(winding_path(7, 1, 2.0), avoider=Doorkeeper(20, 70))
     assert [leg.result for leg in record.legs] == [result]
 

@@ -11,12 +11,12 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.planar import to_robot, wrap
 from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings, SteeringSettings
 from fgslam.homing.steering import (
-    _BLIND_SHARE,
-    _PASSING_SHARE,
-    _SLOW_FRACTION,
-    _TURN_IN_PLACE_DEG,
     ACCELERATION_MPS2,
+    BLIND_SHARE,
+    PASSING_SHARE,
+    SLOW_FRACTION,
     TURN_ACCELERATION_DEG_S2,
+    TURN_IN_PLACE_DEG,
     Command,
     CorridorAvoidance,
     Drive,
@@ -63,7 +63,7 @@ def test_limits_hold_whatever_is_asked() -> None:
 def test_turns_on_the_spot_until_half_way_round() -> None:
     """Two thresholds, so that noise around one does not switch."""
     steering = Steering(SETTINGS)
-    limit = np.deg2rad(_TURN_IN_PLACE_DEG)
+    limit = np.deg2rad(TURN_IN_PLACE_DEG)
     assert settled(steering, command(1.01 * limit)).speed == 0.0
     assert settled(steering, command(0.9 * limit)).speed == 0.0
     assert settled(steering, command(0.49 * limit)).speed > 0.0
@@ -72,11 +72,11 @@ def test_turns_on_the_spot_until_half_way_round() -> None:
 
 def test_slows_down_at_the_last_target_most() -> None:
     """Half the slow part left: half the speed at the last target, more at one on the way."""
-    near = 0.5 * _SLOW_FRACTION
+    near = 0.5 * SLOW_FRACTION
     last = settled(Steering(SETTINGS), command(0.0, near)).speed
     between = settled(Steering(SETTINGS), command(0.0, near, final=False)).speed
     assert last == pytest.approx(0.5 * SETTINGS.max_speed_mps)
-    assert between == pytest.approx(_PASSING_SHARE * SETTINGS.max_speed_mps)
+    assert between == pytest.approx(PASSING_SHARE * SETTINGS.max_speed_mps)
     assert settled(Steering(SETTINGS), command(0.0, 0.0)).speed > 0.0
 
 
@@ -88,7 +88,7 @@ def test_robot_stops_at_a_stop_command() -> None:
     assert settled(steering, stop) == Drive(0.0, 0.0)
     for state in (HomingState.BLIND, HomingState.SEARCH):
         slow = settled(steering, command(state=state))
-        assert slow.speed == pytest.approx(_BLIND_SHARE * SETTINGS.max_speed_mps)
+        assert slow.speed == pytest.approx(BLIND_SHARE * SETTINGS.max_speed_mps)
 
 
 def test_home_behind_is_turned_to_one_way_round() -> None:
@@ -227,6 +227,6 @@ def test_held_up_robot_leaves_the_pocket_and_touches_nothing() -> None:
 
 
 def test_robot_that_does_not_escape_stays_in_the_pocket(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.homing.steering._ESCAPE_AFTER", 10_000)
+    monkeypatch.setattr("fgslam.homing.steering.ESCAPE_AFTER", 10_000)
     places = drive()
     assert np.min(places[:, 0]) > 0.0

@@ -97,7 +97,7 @@ def test_consecutive_images_confirm_links_of_a_few_steps_but_not_across_a_gap() 
 
 def test_map_of_a_walk_has_confirmed_far_links_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few inliers are enough where third views confirm them; many do not help where they do not."""
-    monkeypatch.setattr("fgslam.homing.links._LONE_SUPPORT", THINGS + 1)
+    monkeypatch.setattr("fgslam.homing.links.LONE_SUPPORT", THINGS + 1)
 
     def built(seed: int | None) -> TopologicalMap:
         walk = [(k, k + 1) for k in range(COUNT - 1)]

@@ -16,10 +16,10 @@ from fgslam.core.planar import between, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.homing.links import (
-    _LONE_SUPPORT,
-    _MIN_SUPPORT,
-    _MUTUAL_DEG,
-    _ONE_WAY_SUPPORT,
+    LONE_SUPPORT,
+    MIN_SUPPORT,
+    MUTUAL_DEG,
+    ONE_WAY_SUPPORT,
     Answer,
     Link,
     LinkConsistency,
@@ -94,7 +94,7 @@ def test_answers_that_disagree_are_no_link() -> None:
     a, b = random_poses(1, 2)
     there, back = true_vector(a, b), true_vector(b, a)
     assert isinstance(link_pair((0, 1), there, back), Link)
-    off = np.deg2rad(_MUTUAL_DEG + 1.0)
+    off = np.deg2rad(MUTUAL_DEG + 1.0)
     for wrong in (
         vector(back.direction, back.rotation + off),
         vector(back.direction + off, back.rotation),
@@ -102,7 +102,7 @@ def test_answers_that_disagree_are_no_link() -> None:
         assert "disagree" in str(link_pair((0, 1), there, wrong))
     assert "3 matches" in str(link_pair((0, 1), there, NONE))
     assert "3 matches" in str(link_pair((0, 1), NONE, NONE))
-    few = true_vector(b, a, _MIN_SUPPORT - 1)
+    few = true_vector(b, a, MIN_SUPPORT - 1)
     assert "inliers" in str(link_pair((0, 1), there, few))
 
 
@@ -116,7 +116,7 @@ def test_ambiguous_in_one_direction_is_decided_by_the_other() -> None:
     assert isinstance(other, Link)
     gap = [one.direction - other.direction, one.rotation - other.rotation, one.back - other.back]
     assert np.abs(wrap(np.array(gap))).max() < 1e-12
-    few = true_vector(a, b, _ONE_WAY_SUPPORT - 1)
+    few = true_vector(a, b, ONE_WAY_SUPPORT - 1)
     assert "one way" in str(link_pair((0, 1), few, unsure))
 
 
@@ -176,7 +176,7 @@ def test_long_link_between_similar_places_needs_a_third_view() -> None:
     """A chain of places in order, and a link from one end to the other that nothing confirms."""
     poses = np.column_stack([np.arange(8.0), np.zeros(8), np.zeros(8)])
     chain = [true_link(poses, k, k + 1, 20) for k in range(7)]
-    long = turned(true_link(poses, 1, 6, _LONE_SUPPORT - 1), 0.0, 1.0)
+    long = turned(true_link(poses, 1, 6, LONE_SUPPORT - 1), 0.0, 1.0)
     believed, rejected = LinkConsistency(8, [*chain, long], Walks((8,))).accepted()
     assert [(k.a, k.b) for k in believed] == [(k, k + 1) for k in range(7)]
     assert "no third image" in rejected[1, 6]
@@ -295,7 +295,7 @@ def test_impossible_routes_are_refused() -> None:
     _, images = hall()
     poses = hall()[0]
     answers: dict[tuple[int, int], Answer] = {
-        pair: true_vector(poses[pair[0]], poses[pair[1]], _LONE_SUPPORT)
+        pair: true_vector(poses[pair[0]], poses[pair[1]], LONE_SUPPORT)
         for pair in ((0, 1), (1, 0), (2, 3), (3, 2), (4, 5))
     }
     topology = map_of_answers(images[:6], answers)

@@ -8,14 +8,13 @@ import pytest
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.planar import wrap
-from fgslam.datasets import rendered_lab
 from fgslam.datasets.rendered_lab import RenderedLabSequence
 from fgslam.worlds.buildings.house import DEPTH, PLAN, WIDTH, build_house
 from fgslam.worlds.driving import RangeSensor
 from fgslam.worlds.floor import FloorSpace, PathPlanner
 from fgslam.worlds.lab import PlaceChoice, build_place, make_rig, plan_in_place
 from fgslam.worlds.patches import PatchArrays, RayCaster, Surface, Thing, box, stack
-from fgslam.worlds.renderer import content_hash
+from fgslam.worlds.renderer import RenderCache
 from fgslam.worlds.settings import (
     LabDriveSettings,
     LabRigSettings,
@@ -98,7 +97,7 @@ def test_poses_that_do_not_exist_are_refused(bad: LabDriveSettings, why: str) ->
 def _unrendered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The geometry of a recording without its images."""
     monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path))
-    monkeypatch.setattr(RenderedLabSequence, "_render_missing", lambda *_: None)
+    monkeypatch.setattr(RenderCache, "present", lambda *_: True)
 
 
 @pytest.mark.usefixtures("_unrendered")
@@ -145,25 +144,35 @@ def test_no_odometry_is_given_where_the_robot_was_carried() -> None:
     ],
     ids=["paper", "selection", "visit"],
 )
+@pytest.mark.usefixtures("_unrendered")
 def test_cache_keys_of_the_lab_do_not_change_with_later_settings(
-    settings: LabSettings, key: str
+    settings: LabSettings, key: str, tmp_path: Path
 ) -> None:
-    assert content_hash(rendered_lab._render_description(settings))[:20] == key
+    assert cache_key(settings, tmp_path) == key
 
 
-def test_other_places_and_posters_have_other_cache_keys() -> None:
-    drives = {"rooms": LabDriveSettings(path="tour"), "corridors": LabDriveSettings(path="tour")}
-    keys = [
-        content_hash(rendered_lab._render_description(settings))
-        for settings in (
-            LabSettings(),
-            LabSettings(posters="identical"),
-            *(LabSettings(place=name, drive=d) for name, d in drives.items()),  # type: ignore[arg-type]
-            LabSettings(drive=drive(9)),
-            LabSettings(drive=drive(9, seed=1)),
-        )
-    ]
-    assert len(set(keys)) == len(keys)
+def cache_key(settings: LabSettings, cache: Path) -> str:
+    """The name of the folder that a recording's frames are kept in."""
+    before = set(cache.iterdir())
+    RenderedLabSequence(settings, 0)
+    (made,) = set(cache.iterdir()) - before
+    return made.name.removeprefix("lab-")
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_other_places_and_posters_have_other_cache_keys(tmp_path: Path) -> None:
+    drives = {
+        "rooms": LabDriveSettings(path="tour", frames=None),
+        "corridors": LabDriveSettings(path="tour", frames=None),
+    }
+    for settings in (
+        LabSettings(),
+        LabSettings(posters="identical"),
+        *(LabSettings(place=name, drive=d) for name, d in drives.items()),  # type: ignore[arg-type]
+        LabSettings(drive=drive(9)),
+        LabSettings(drive=drive(9, seed=1)),
+    ):
+        assert len(cache_key(settings, tmp_path)) == 20  # a folder that no other settings made
 
 
 # --------------------------------------------------------------------------------------------

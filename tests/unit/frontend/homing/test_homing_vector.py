@@ -20,7 +20,7 @@ from fgslam.frontend.homing.two_view import (
     triangulable,
     triangulate,
 )
-from fgslam.frontend.homing.vector import HomingSearch, _cells, estimate_homing_vector
+from fgslam.frontend.homing.vector import HomingSearch, estimate_homing_vector, match_cells
 from tests.homing import TwoViews, make_matches, two_views
 
 HALF_DEGREE = np.deg2rad(0.5)
@@ -180,9 +180,9 @@ def test_independent_inliers_are_counted_across_the_seam() -> None:
     angles = np.column_stack([wrap(behind), np.full(4, 0.2), np.full(4, 1.0), np.full(4, 0.2)])
     for turn in (0.0, 1.0):
         turned = angles + np.array([0.0, 0.0, turn, 0.0])
-        assert len(np.unique(_cells(make_matches(turned, HALF_DEGREE)))) == 1
+        assert len(np.unique(match_cells(make_matches(turned, HALF_DEGREE)))) == 1
     apart = angles + np.deg2rad(3.0) * np.arange(4)[:, None] * np.array([0.0, 1.0, 0.0, 0.0])
-    assert len(np.unique(_cells(make_matches(apart, HALF_DEGREE)))) == 4
+    assert len(np.unique(match_cells(make_matches(apart, HALF_DEGREE)))) == 4
 
 
 def test_epipolar_residual_of_truth_is_zero_and_of_unit_variance_under_noise() -> None:
