@@ -13,17 +13,19 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.checks import require_flag
 from fgslam.core.errors import ConfigError
 from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
-from fgslam.core.geometry import transform_to_world
+from fgslam.core.geometry import inverse, transform_to_world
 from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.measurements import LoopClosure
 from fgslam.core.quantiles import student_quantile
 from fgslam.core.recordings import LandmarkTruth
 from fgslam.evaluation.statistics import (
     Alignment,
     Consistency,
+    EndPose,
     EstimatorMetrics,
     JsonValue,
     Nees,
-    TrajectoryError,
+    TimeGrowth,
     UpdateTime,
     end_pose,
     estimate_from_truth,
@@ -31,6 +33,8 @@ from fgslam.evaluation.statistics import (
     judge,
     landmark_nees,
     pose_errors,
+    position_errors,
+    rotation_angles,
     time_growth,
     to_estimate_world,
     value_at,
@@ -40,9 +44,6 @@ from fgslam.evaluation.statistics import nees as normalised
 
 if TYPE_CHECKING:
     import pandas
-from fgslam.core.geometry import inverse
-from fgslam.core.measurements import LoopClosure
-from fgslam.evaluation.statistics import position_errors, rotation_angles
 
 LEAST_SIGHTINGS = 3
 """Landmarks are compared with the truth that were seen so often: `valid` of Se et al. (6.1)."""
@@ -181,7 +182,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     nees = {
         "pose": normalised(*final_errors),
         "online_pose": normalised(*online_errors),
-        "landmark": _no_nees() if errors is None else errors.nees,
+        "landmark": Nees(np.empty(0), np.empty(0, np.int64)) if errors is None else errors.nees,
     }
     judged = {name: judge([values]) for name, values in nees.items()}
     metrics = EstimatorMetrics(
@@ -200,17 +201,25 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "frames": max(len(answer.online), len(final)),
             "predicted_frames": int(answer.predicted.sum()),
             "predicted_rows": np.flatnonzero(answer.predicted).tolist(),
-            **_alignment_notes(aligned, first),
+            "alignment": aligned.alignment.value,
+            "matched_poses": aligned.matched_poses,
+            "ate_max_m": aligned.ate_max_m,
+            "ate_first_pose_m": first.ate_rmse_m,
+            "path_length_m": aligned.path_length_m,
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
             "coverage": _coverage(*final_errors),
             "online": _online(answer.online, truth, judged["online_pose"])
             | {"coverage": _coverage(*online_errors)},
-            **_landmark_numbers(errors, truth),
+            "landmark_rmse_m": None if errors is None else errors.rmse_m,
+            "landmark_median_m": None if errors is None else errors.median_m,
+            "landmarks_with_truth": None if errors is None else len(errors),
+            "landmark_truth_sigma_m": truth.landmark_sigma_m,
             **_innovations(answer),
-            "update_growth": _growth(answer.update_ms),
+            "update_growth": _as_json(time_growth(answer.update_ms)),
             "last_pose_sigma": _last_pose_sigma(answer.estimate),
-            "end_against_start": _end_against_start(final),
+            # Se et al. (5) measure by it how well a loop closes.
+            "end_against_start": _as_json(end_pose(final)),
             "noise_factor": answer.estimate.noise_factor,
             **_gyroscope(answer.estimate),
             "remarks": list(answer.estimate.remarks),
@@ -270,15 +279,11 @@ def seen_often(log: MeasurementLog, truth: LandmarkTruth) -> LandmarkTruth:
 # --------------------------------------------------------------------------------------------
 
 
-def _no_nees() -> Nees:
-    return Nees(np.empty(0), np.empty(0, np.int64))
-
-
 def _per_dof(found: Consistency | None) -> float | None:
     return None if found is None else found.per_dof
 
 
-def _as_json(found: Consistency | None) -> JsonValue:
+def _as_json(found: Consistency | TimeGrowth | EndPose | None) -> JsonValue:
     return None if found is None else asdict(found)
 
 
@@ -313,16 +318,6 @@ def _landmark_errors(estimate: Estimate, truth: Truth) -> LandmarkErrors | None:
     return None if eTt is None else landmark_errors(estimate.landmarks, truth.landmarks, eTt)
 
 
-def _alignment_notes(aligned: TrajectoryError, first: TrajectoryError) -> dict[str, JsonValue]:
-    return {
-        "alignment": aligned.alignment.value,
-        "matched_poses": aligned.matched_poses,
-        "ate_max_m": aligned.ate_max_m,
-        "ate_first_pose_m": first.ate_rmse_m,
-        "path_length_m": aligned.path_length_m,
-    }
-
-
 def _online(online: Trajectory, truth: Truth, nees: Consistency | None) -> dict[str, JsonValue]:
     """The same errors of the poses as they were first estimated."""
     aligned = evaluate_trajectory(online, truth.trajectory, Alignment.SE3)
@@ -339,25 +334,11 @@ def _online(online: Trajectory, truth: Truth, nees: Consistency | None) -> dict[
     }
 
 
-def _landmark_numbers(errors: LandmarkErrors | None, truth: Truth) -> dict[str, JsonValue]:
-    return {
-        "landmark_rmse_m": None if errors is None else errors.rmse_m,
-        "landmark_median_m": None if errors is None else errors.median_m,
-        "landmarks_with_truth": None if errors is None else len(errors),
-        "landmark_truth_sigma_m": truth.landmark_sigma_m,
-    }
-
-
 def _innovations(answer: Answer) -> dict[str, JsonValue]:
     """NIS of the matched observations, each frame an independent item."""
     known = np.isfinite(answer.nis) & (answer.nis_dof > 0)
     found = judge([Nees(answer.nis[known], answer.nis_dof[known])], items_independent=True)
     return {"nis_per_dof": _per_dof(found), "nis": _as_json(found)}
-
-
-def _growth(update_ms: FloatArray) -> JsonValue:
-    found = time_growth(update_ms)
-    return None if found is None else asdict(found)
 
 
 def _last_pose_sigma(estimate: Estimate) -> JsonValue:
@@ -383,12 +364,6 @@ def _gyroscope(estimate: Estimate) -> dict[str, JsonValue]:
             "sigmas": np.degrees(sigmas).tolist(),
         }
     }
-
-
-def _end_against_start(trajectory: Trajectory) -> JsonValue:
-    """Last pose in the frame of the first: Se et al. (5) measure by it how well a loop closes."""
-    found = end_pose(trajectory)
-    return None if found is None else asdict(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

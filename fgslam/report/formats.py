@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import struct
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -443,7 +442,6 @@ def _require_finite(path: Path, graph: PoseLandmarkGraph) -> None:
             )
 
 
-_PINHOLE = 1  # COLMAP's number of that camera model
 _CAMERA = 1  # all images are of one camera: rectified rigs have equal intrinsics
 _PIXEL_CENTRE = 0.5
 
@@ -490,7 +488,7 @@ class ImageModel:
 
 
 def write_colmap(folder: Path, model: ImageModel) -> None:
-    """Writes cameras, images and points3D into a folder, as .bin and as .txt.
+    """Writes cameras.txt, images.txt and points3D.txt into a folder.
 
     Image and point numbers are rows plus one; the same model gives the same bytes.
 
@@ -499,12 +497,6 @@ def write_colmap(folder: Path, model: ImageModel) -> None:
     """
     _require_finite_model(folder, model)
     table = _Table.of(model)
-    for name, content in (
-        ("cameras.bin", _camera_bytes(model.rig)),
-        ("images.bin", _image_bytes(model, table)),
-        ("points3D.bin", _point_bytes(model, table)),
-    ):
-        write_bytes(folder / name, content)
     for name, text in (
         ("cameras.txt", _camera_text(model.rig)),
         ("images.txt", _image_text(model, table)),
@@ -519,7 +511,7 @@ def write_colmap(folder: Path, model: ImageModel) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Table:
-    """What both notations need.
+    """The model by image and by point.
 
     ``seven``: (n, 7) world-to-camera, w x y z and translation. ``first``: (n + 1,) first
     observation of each image. ``by_point``: (k,) observations ordered by point, and ``tracks``:
@@ -552,34 +544,11 @@ def _world_to_camera(poses: FloatArray) -> FloatArray:
     return rows[:, [6, 3, 4, 5, 0, 1, 2]] + 0.0
 
 
-def _camera_numbers(rig: CameraRig) -> tuple[float, ...]:
-    return rig.fx, rig.fy, rig.cx + _PIXEL_CENTRE, rig.cy + _PIXEL_CENTRE
-
-
-def _camera_bytes(rig: CameraRig) -> bytes:
-    head = struct.pack("<QiiQQ", 1, _CAMERA, _PINHOLE, rig.width, rig.height)
-    return head + struct.pack("<4d", *_camera_numbers(rig))
-
-
 def _camera_text(rig: CameraRig) -> str:
-    numbers = " ".join(f"{number:.17g}" for number in _camera_numbers(rig))
+    numbers = rig.fx, rig.fy, rig.cx + _PIXEL_CENTRE, rig.cy + _PIXEL_CENTRE
+    text = " ".join(f"{number:.17g}" for number in numbers)
     head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy\n"
-    return head + f"{_CAMERA} PINHOLE {rig.width} {rig.height} {numbers}\n"
-
-
-_SEEN = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<i8")])
-
-
-def _image_bytes(model: ImageModel, table: _Table) -> bytes:
-    seen = np.empty(len(model.image), _SEEN)
-    seen["x"], seen["y"] = (model.pixels + _PIXEL_CENTRE).T
-    seen["point"] = model.point + 1
-    parts = [struct.pack("<Q", len(model.names))]
-    for row, name in enumerate(model.names):
-        own = seen[table.first[row] : table.first[row + 1]]
-        parts.append(struct.pack("<i7di", row + 1, *table.seven[row], _CAMERA))
-        parts.append(name.encode() + b"\0" + struct.pack("<Q", len(own)) + own.tobytes())
-    return b"".join(parts)
+    return head + f"{_CAMERA} PINHOLE {rig.width} {rig.height} {text}\n"
 
 
 def _image_text(model: ImageModel, table: _Table) -> str:
@@ -595,15 +564,6 @@ def _image_text(model: ImageModel, table: _Table) -> str:
         lines.append(f"{row + 1} {numbers} {_CAMERA} {name}")
         lines.append(" ".join(seen[table.first[row] : table.first[row + 1]]))
     return "\n".join(lines) + "\n"
-
-
-def _point_bytes(model: ImageModel, table: _Table) -> bytes:
-    parts = [struct.pack("<Q", len(model.ids))]
-    for row, (place, colour) in enumerate(zip(model.positions, model.colours, strict=True)):
-        track = table.track(model, row).astype("<i4")
-        head = (row + 1, *place, *colour.tolist(), table.error[row], len(track))
-        parts.append(struct.pack("<Q3d3BdQ", *head) + track.tobytes())
-    return b"".join(parts)
 
 
 def _point_text(model: ImageModel, table: _Table) -> str:

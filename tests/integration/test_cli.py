@@ -302,7 +302,7 @@ def test_export_of_images_for_photogrammetry_and_of_a_coloured_map(
     assert "36 images" in capfd.readouterr().out
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.*"))
     assert "images/left/000011.png" in names
-    assert "sparse/0/images.bin" in names
+    assert "sparse/0/images.txt" in names
     points = read_ply(file)
     assert points.normals is not None
     np.testing.assert_allclose(np.linalg.norm(points.normals, axis=1), 1.0, rtol=0, atol=1e-6)
