@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import fgslam as fg
-from fgslam.datasets.simulated_homing import open_house
+from fgslam.datasets.opening import open_house
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 house = open_house(OmniHouseSettings(path=HousePathSettings(legs=1, spacing_m=2.0)), seed=0)

@@ -13,7 +13,7 @@
 import numpy as np
 
 import fgslam as fg
-from fgslam.datasets.simulated_homing import open_house
+from fgslam.datasets.opening import open_house
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
 house = open_house(OmniHouseSettings(path=HousePathSettings(legs=6, spacing_m=2.0)), seed=0)

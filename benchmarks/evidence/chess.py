@@ -12,7 +12,7 @@ from benchmarks.runs import CHESS, DATA, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig

@@ -22,7 +22,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import inverse, project, transform_to_camera
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.evaluation.statistics import align
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatcher, MapMatches

@@ -26,7 +26,7 @@ from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.rendered_lab import RENDER_VERSION, RenderedLabSequence
+from fgslam.datasets.rendered import RENDER_VERSION, RenderedLabSequence
 from fgslam.worlds.lab import PlaceChoice, Room, World, camera_offsets, open_room
 from fgslam.worlds.renderer import RenderCache, Renderer, apply_effects, content_hash, omni_view
 from fgslam.worlds.settings import RenderedLabSettings

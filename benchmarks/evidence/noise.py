@@ -21,7 +21,7 @@ from fgslam.core.geometry import inverse, transform_to_camera
 from fgslam.core.measurements import Observations
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.stereo import StereoMatcher
 
 APART = (1, 2, 5, 10, 20, 40)

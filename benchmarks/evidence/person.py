@@ -18,7 +18,7 @@ from benchmarks.runs import (
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.worlds.people import WALK_FRAMES

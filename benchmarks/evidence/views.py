@@ -13,7 +13,7 @@ from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds.driving import simulate_wheels

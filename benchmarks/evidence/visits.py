@@ -13,7 +13,7 @@ from benchmarks.runs import experiment, say
 from benchmarks.tables import Table
 from fgslam.core.arrays import BoolArray
 from fgslam.core.saved_map import SavedMap, load_map
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.runs.engine import run_task
 from fgslam.runs.tasks.slam import SlamResult, open_slam
 from fgslam.runs.tasks.slam_map_entry import MAP_FILE

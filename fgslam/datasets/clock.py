@@ -165,9 +165,9 @@ class SeenTurns:
         bRc = recording.rig.bTc[:3, :3]
         rig = recording.rig
         camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
-        found, turns, looks = [], [], _Looks(recording)
+        found, turns, features = [], [], SampledFeatures(recording)
         for i in rows.tolist():
-            turn = _turn_between(looks.at(i - 1), looks.at(i), camera)
+            turn = turn_between(features.at(i - 1), features.at(i), camera)
             if turn is not None:
                 found.append(i)
                 turns.append(bRc @ turn)
@@ -224,26 +224,26 @@ def _vector(step: Odometry | None) -> FloatArray:
     return np.full(3, np.nan) if step is None else so3_log(step.motion[:3, :3])
 
 
-class _Looks:
+class SampledFeatures:
     """Features of frames, the last two kept."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._detector = cv2.ORB.create(_FEATURES)
-        self._kept: dict[int, _Look] = {}
+        self._kept: dict[int, FrameFeatures] = {}
 
-    def at(self, i: int) -> _Look:
+    def at(self, i: int) -> FrameFeatures:
         """Of frame ``i``; empty where it cannot be read."""
         if i not in self._kept:
             self._kept = {k: v for k, v in self._kept.items() if k >= i - 1}
             self._kept[i] = self._look(i)
         return self._kept[i]
 
-    def _look(self, i: int) -> _Look:
+    def _look(self, i: int) -> FrameFeatures:
         try:
             right, left = (self._found(x) for x in self._recording.frame(i).images[:2])
         except FrameError:
-            return _Look(np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3)))
+            return FrameFeatures(np.empty((0, 2)), np.empty((0, 32), np.uint8), np.empty((0, 3)))
         points = np.full((len(right[0]), 3), np.nan)
         rows, partners = _matches(right[1], left[1])
         disparity = left[0][partners, 0] - right[0][rows, 0]
@@ -251,7 +251,7 @@ class _Looks:
         good = level & (disparity > 1.0)
         measured = np.column_stack([right[0][rows], disparity])[good]
         points[rows[good]] = triangulate(self._recording.rig, measured)
-        return _Look(right[0], right[1], points)
+        return FrameFeatures(right[0], right[1], points)
 
     def _found(self, image: Image) -> tuple[FloatArray, Image]:
         points, descriptors = self._detector.detectAndCompute(image, None)
@@ -260,7 +260,7 @@ class _Looks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Look:
+class FrameFeatures:
     """Pixels (n, 2), descriptors (n, 32), and points (n, 3) by stereo, NaN where there is none."""
 
     pixels: FloatArray
@@ -279,7 +279,9 @@ def _matches(first: Image, second: Image) -> tuple[IntArray, IntArray]:
     return rows, partners
 
 
-def _turn_between(before: _Look, after: _Look, camera: FloatArray) -> FloatArray | None:
+def turn_between(
+    before: FrameFeatures, after: FrameFeatures, camera: FloatArray
+) -> FloatArray | None:
     """Rotation vector (3,) of the camera, in its own axes, between two images; None if unclear."""
     rows, partners = _matches(before.descriptors, after.descriptors)
     known = np.isfinite(before.points[rows, 0])

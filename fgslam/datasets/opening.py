@@ -22,12 +22,16 @@ from fgslam.datasets.settings import (
     FileRecordingSettings,
     MeasurementDatasetSettings,
     OdometrySettings,
+    OmniDatasetSettings,
+    OmniHouseSettings,
     RecordedOdometrySettings,
+    SimulatedBearingsSettings,
 )
 
 if TYPE_CHECKING:
     from fgslam.datasets.omni import OmniRecording
-    from fgslam.datasets.settings import OmniDatasetSettings
+    from fgslam.worlds.house import OmniWorld as OmniWorld
+    from fgslam.worlds.simulated_bearings import SimulatedHoming
 
 READERS: Mapping[str, Callable[[], Any]] = {
     "image_folder": lambda: import_module("fgslam.datasets.folders").open_image_folder,
@@ -129,17 +133,13 @@ def open_measurements(
         ConfigError: a simulated drive cannot be driven, or synthetic odometry is asked for.
     """
     odometry = odometry or RecordedOdometrySettings()
+    from fgslam.datasets import measured
+
     if settings.kind == "stereo_tracks":
-        from fgslam.datasets.stereo_tracks import open_stereo_tracks
-
-        return open_stereo_tracks(settings, odometry)
+        return measured.open_stereo_tracks(settings, odometry)
     if settings.kind == "measurements":
-        from fgslam.datasets.measurement_files import open_measurement_files
-
-        return open_measurement_files(settings, odometry)
-    from fgslam.datasets.simulated_measurements import open_simulated_measurements
-
-    return open_simulated_measurements(settings, seed, odometry)
+        return measured.open_measurement_files(settings, odometry)
+    return measured.open_simulated_measurements(settings, seed, odometry)
 
 
 def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
@@ -156,3 +156,31 @@ def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
     if settings.kind == "omni_path":
         return omni.open_omni_path(settings)
     return omni.open_omni_video(settings)
+
+
+def open_simulated_homing(
+    settings: SimulatedBearingsSettings, outliers: float, rng: np.random.Generator
+) -> SimulatedHoming:
+    """Matches, tracks and truth of one homing.
+
+    Args:
+        settings: the room, the drive and the noise.
+        outliers: part of the matches, and of the bearings tracked at the drive's end, that is
+            wrong.
+        rng: source of everything random.
+    """
+    from fgslam.worlds.simulated_bearings import HomingOutliers, simulate_homing
+
+    return simulate_homing(settings, rng, HomingOutliers.of_all(outliers))
+
+
+def open_house(settings: OmniHouseSettings, seed: int) -> OmniWorld:
+    """The house as a world to act in, with the wheelchair at the start of its reference path.
+
+    Raises:
+        DatasetError: no reference path of that kind is found.
+        MissingDependencyError: Open3D cannot be loaded.
+    """
+    from fgslam.worlds.house import OmniWorld
+
+    return OmniWorld(settings, seed)

@@ -27,7 +27,7 @@ def open_sequence(
     """
     dataset = config.dataset
     if isinstance(dataset, RenderedLabSettings):
-        from fgslam.datasets.rendered_lab import RenderedLabSequence  # the world and its textures
+        from fgslam.datasets.rendered import RenderedLabSequence  # the world and its textures
 
         _require_own_noise(config.odometry)
         sequence: Sequence = RenderedLabSequence(

@@ -26,7 +26,7 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import LANDMARK_TRUTH_FILE, LandmarkTruth, write_landmark_truth
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.measurement_files import (
+from fgslam.datasets.measured import (
     GROUND_TRUTH_FILE,
     LOG_FILE,
     MeasuredFrame,

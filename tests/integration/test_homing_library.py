@@ -13,7 +13,7 @@ import yaml
 
 import fgslam as fg
 from fgslam.cli.main import app
-from fgslam.datasets.simulated_homing import open_house
+from fgslam.datasets.opening import open_house
 from fgslam.homing.settings import (
     DRIVING,
     AvoidanceSettings,

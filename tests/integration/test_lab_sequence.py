@@ -12,8 +12,8 @@ from scipy import ndimage
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError, FrameError, MissingDependencyError
 from fgslam.core.recordings import Sequence
-from fgslam.datasets import rendered_lab
-from fgslam.datasets.rendered_lab import RenderedLabSequence
+from fgslam.datasets import rendered
+from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.worlds.settings import (
     LabDriveSettings,
     LabEffectsSettings,
@@ -204,7 +204,7 @@ def test_cached_frames_are_the_same_bytes_and_need_no_open3d(
     def absent(*_: object) -> None:
         raise MissingDependencyError("Open3D was asked for")
 
-    monkeypatch.setattr(rendered_lab, "open_room", absent)
+    monkeypatch.setattr(rendered, "open_room", absent)
     again = opened(settings, (10, 12), seed=4)
     for i in range(2):
         for a, b in zip(first[i], again.frame(i).images, strict=True):
@@ -215,7 +215,7 @@ def test_cached_frames_are_the_same_bytes_and_need_no_open3d(
 def test_rendering_is_deterministic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     once = opened(QUICK, (30, 33))
     monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path))
-    rendered_lab.open_room.cache_clear()
+    rendered.open_room.cache_clear()
     again = opened(QUICK, (30, 33))
     for i in range(3):
         for a, b in zip(once.frame(i).images, again.frame(i).images, strict=True):

@@ -9,18 +9,21 @@ Units, files and numbers: those of `path_following`.
 from __future__ import annotations
 
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import StoredMapError
-from fgslam.datasets.simulated_homing import OmniWorld
 from fgslam.homing.api import teach
 from fgslam.homing.route import PathMemory
 from fgslam.homing.topological_map import RouteMap
 from fgslam.runs.config_models import CrossroadsConfig
 from fgslam.runs.engine import Opening, RunResult, Task
 from fgslam.runs.tasks.homing_drives import Opened, drives_task, open_house_front_end
+
+if TYPE_CHECKING:
+    from fgslam.datasets.opening import OmniWorld
 
 _ROUTES = ("first", "second")
 _PICTURES = 1000  # of a route; their noise differs

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from fgslam.core.errors import OutputError
 from fgslam.core.files import make_subfolder
 from fgslam.core.homing import TrackedBearings
 from fgslam.core.planar import between
-from fgslam.datasets.simulated_homing import OmniWorld, open_house
+from fgslam.datasets.opening import open_house
 from fgslam.homing.active import ActiveHoming
 from fgslam.homing.api import teach
 from fgslam.homing.closed_loop import (
@@ -58,6 +58,9 @@ from fgslam.runs.tasks.homing_drive_results import (
     write_logs,
 )
 from fgslam.runs.units import each_apart
+
+if TYPE_CHECKING:
+    from fgslam.datasets.opening import OmniWorld
 
 _TRIES = 50  # places drawn for a start that is free
 

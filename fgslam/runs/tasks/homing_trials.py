@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.arrays import IntArray
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import BearingMatches, HomingStart, Refusal
-from fgslam.datasets.simulated_homing import open_simulated_homing
+from fgslam.datasets.opening import open_simulated_homing
 from fgslam.evaluation.homing import HomingErrors
 from fgslam.evaluation.statistics import JsonValue, Nees, UpdateTime
 from fgslam.frontend.homing.settings import HomingVectorSettings

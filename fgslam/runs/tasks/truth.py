@@ -302,7 +302,7 @@ def _of_rendered(
     mapped: ExperimentConfig | None, sequence: Sequence, config: ExperimentConfig
 ) -> TruthInMap | None:
     """Both worlds are camera poses in one room."""
-    from fgslam.datasets.rendered_lab import RenderedLabSequence, first_camera_pose  # scipy's, slow
+    from fgslam.datasets.rendered import RenderedLabSequence, first_camera_pose  # scipy's, slow
 
     now, then = config.dataset, None if mapped is None else mapped.dataset
     if not isinstance(now, RenderedLabSettings) or not isinstance(then, RenderedLabSettings):

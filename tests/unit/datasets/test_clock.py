@@ -14,13 +14,13 @@ from fgslam.core.errors import OdometryError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, project, so3_exp, so3_log
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.clock import (
+    FrameFeatures,
     Judged,
+    SampledFeatures,
     SeenTurns,
-    _Look,
-    _Looks,
-    _turn_between,
     judged,
     judged_turns,
+    turn_between,
 )
 from fgslam.datasets.odometry import GyroscopeLog, integrated, recorded_motions
 from fgslam.datasets.opening import open_recording
@@ -93,11 +93,11 @@ def test_images_whose_matches_lie_in_one_place_say_no_turn() -> None:
     camera = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])
     points = np.array([0.0, 0.0, 2.0]) + rng.normal(0.0, 1e-3, (40, 3))
     pixels = points @ camera.T
-    look = _Look(pixels[:, :2] / pixels[:, 2:], codes, points)
-    assert _turn_between(look, look, camera) is None
+    look = FrameFeatures(pixels[:, :2] / pixels[:, 2:], codes, points)
+    assert turn_between(look, look, camera) is None
 
 
-class Found(_Looks):
+class Found(SampledFeatures):
     """Features instead of images."""
 
     def _found(self, image: Any) -> Any:
@@ -119,7 +119,7 @@ def test_turns_are_seen() -> None:
         frames.append(SimpleNamespace(images=((measured[:, :2], looks), (left, looks))))
     found = Found(cast(Any, SimpleNamespace(rig=rig, frame=frames.__getitem__)))
     camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
-    assert _turn_between(found.at(0), found.at(1), camera) == pytest.approx(turn, abs=1e-6)
+    assert turn_between(found.at(0), found.at(1), camera) == pytest.approx(turn, abs=1e-6)
 
 
 @pytest.mark.data

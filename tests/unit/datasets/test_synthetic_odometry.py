@@ -12,7 +12,6 @@ from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
 from fgslam.core.measurements import Odometry
 from fgslam.core.recordings import Sequence
-from fgslam.datasets import odometry as odometry_module
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -89,18 +88,18 @@ def test_standard_deviations_follow_the_settings(folder: Path) -> None:
     np.testing.assert_allclose(sigmas[3:], 0.02 * np.linalg.norm(body[:3, 3]))
 
 
-def test_without_noise_but_the_floor_it_is_the_truth(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(odometry_module, "_SYNTHETIC_FLOOR_M", 1e-9)
-    monkeypatch.setattr(odometry_module, "_SYNTHETIC_FLOOR_DEG", 1e-9)
+def test_without_noise_but_the_floor_it_is_the_truth(folder: Path) -> None:
     still = SyntheticOdometrySettings(translation_sigma_fraction=0.0, rotation_sigma_deg=0.0)
     sequence = SyntheticOdometry(opened(folder), still, 1)
     truth = sequence.ground_truth
     assert truth is not None
-    camera = body_to_camera_motion(step(sequence, 7).motion, sequence.rig.bTc)
-    np.testing.assert_allclose(camera, inverse(truth.poses[6]) @ truth.poses[7], atol=1e-7)
-    np.testing.assert_allclose(np.sqrt(np.diag(step(sequence, 7).covariance))[3:], 1e-9)
+    for i in range(1, 8):
+        found = step(sequence, i)
+        sigmas = np.sqrt(np.diag(found.covariance))
+        np.testing.assert_allclose(sigmas, np.repeat([np.radians(0.01), 0.001], 3))
+        camera = body_to_camera_motion(found.motion, sequence.rig.bTc)
+        expected = inverse(truth.poses[i - 1]) @ truth.poses[i]
+        np.testing.assert_allclose(camera, expected, atol=5.0 * 0.001)
 
 
 def test_seeds_repeat_and_differ(folder: Path) -> None:
