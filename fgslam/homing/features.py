@@ -280,14 +280,11 @@ def compacted(features: OmniFeatures, votes: Votes | None = None) -> OmniFeature
     sift = features.sift
     sift = sift.select(_best(sift.bearing, votes.sift, np.arange(len(sift)), MOST_SIFT))
     columns = features.columns
-    shortest_last = np.argsort(np.argsort(-_lengths(columns), kind="stable"), kind="stable")
+    lengths = np.abs(columns.tangents[:, 1] - columns.tangents[:, 0])
+    shortest_last = np.argsort(np.argsort(-lengths, kind="stable"), kind="stable")
     chosen = _best(columns.bearing, votes.columns, shortest_last, MOST_COLUMNS)
     rounded = replace(sift, descriptors=_rounded(sift.descriptors))
     return OmniFeatures(rounded, columns.select(chosen))
-
-
-def _lengths(columns: ColumnSegments) -> FloatArray:
-    return np.asarray(np.abs(columns.tangents[:, 1] - columns.tangents[:, 0]))
 
 
 def _best(bearing: FloatArray, votes: FloatArray, weaker: IntArray, most: int) -> IntArray:

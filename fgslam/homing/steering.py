@@ -176,16 +176,14 @@ class CorridorAvoidance:
             return self._escape(wanted, _points(scan))
         driven = self._in_corridor(wanted, heading, scan)
         stands = driven.overridden and driven.speed < _STANDING
-        self._held_up = self._held_up + self._impatience() if stands else 0.0
+        # Turning towards a way takes its time.
+        faces = self._chosen is None or abs(self._chosen) <= _AHEAD
+        step = 1.0 if faces else _TURNING
+        self._held_up = self._held_up + step if stands else 0.0
         if self._held_up >= ESCAPE_AFTER:
             self._held_up, self._chosen = 0.0, None
             self._escaping = _ESCAPE_STEPS
         return driven
-
-    def _impatience(self) -> float:
-        """What a step at a stand counts: turning towards a way takes its time."""
-        faces = self._chosen is None or abs(self._chosen) <= _AHEAD
-        return 1.0 if faces else _TURNING
 
     def _escape(self, wanted: Drive, points: FloatArray) -> Drive:
         s = self._settings

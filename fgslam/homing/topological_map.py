@@ -516,14 +516,14 @@ def _both_ways(
 ) -> tuple[dict[Pair, Answer], dict[Pair, IntArray]]:
     """Answers there and, where they leave a chance of a link, back; and their inliers."""
     found = dict(ask(images, there))
-    hopeful = [(b, a) for (a, b), (answer, _) in found.items() if _may_link(answer)]
+    hopeful = [
+        (b, a)
+        for (a, b), (answer, _) in found.items()
+        if not isinstance(answer, Refusal) or answer.reason in _UNDECIDED
+    ]
     found |= ask(images, hopeful)
     rows = {pair: inliers for pair, (_, inliers) in found.items() if inliers is not None}
     return {pair: answer for pair, (answer, _) in found.items()}, rows
-
-
-def _may_link(answer: Answer) -> bool:
-    return not isinstance(answer, Refusal) or answer.reason in _UNDECIDED
 
 
 def _memory_of(routes: Mapping[str, PathMemory]) -> tuple[PathMemory, Walks]:

@@ -369,13 +369,18 @@ class StabilisedView:
     def __init__(self, camera: OmniCamera, max_width: int, window: int, levels: int) -> None:
         self._camera = camera
         resolution = pixels_a_radian(camera)
-        width = _fast_period(min(max_width, round(2.0 * np.pi * resolution)) - 1) + 1
+        longest = min(max_width, round(2.0 * np.pi * resolution)) - 1
+        # Fourier transforms are fast for it; at most a few columns shorter.
+        width = next(n for n in range(longest, 0, -1) if next_fast_len(n) == n) + 1
         bottom, top = _seen_elevations(camera)
         height = max(round((top - bottom) * (width - 1) / (2.0 * np.pi)) + 1, 2)
         self.view = Equirectangular(width, height, top, bottom)
         self.margin = window * 2**levels
         self.period = width - 1
-        self._maps = cv2.convertMaps(*_period_maps(camera, self.view), cv2.CV_16SC2)
+        columns, rows = unwrap_maps(camera, self.view)
+        # Without the view's last column, which shows what the first does.
+        period = (columns[:, :-1].copy(), rows[:, :-1].copy())
+        self._maps = cv2.convertMaps(*period, cv2.CV_16SC2)
         wraps = wrapping_period(camera) is not None
         self._border = cv2.BORDER_WRAP if wraps else cv2.BORDER_CONSTANT
 
@@ -448,17 +453,6 @@ def _seen_elevations(camera: OmniCamera) -> tuple[float, float]:
     if len(whole) < 2:
         raise FrameError("the camera sees no elevation all around; check its model and centre")
     return float(whole[0]), float(whole[-1])
-
-
-def _fast_period(longest: int) -> int:
-    """A period that Fourier transforms are fast for, at most a few columns shorter."""
-    return next(n for n in range(longest, 0, -1) if next_fast_len(n) == n)
-
-
-def _period_maps(camera: OmniCamera, view: Equirectangular) -> tuple[Float32, Float32]:
-    """Maps of the view without its last column, which shows what the first does."""
-    columns, rows = unwrap_maps(camera, view)
-    return columns[:, :-1].copy(), rows[:, :-1].copy()
 
 
 def _spectra(grey: Image) -> npt.NDArray[np.complex128]:

@@ -109,7 +109,8 @@ def solve_two_point(
     """
     rho = np.exp(samples.log_ratio)
     ratios = _distance_ratios(samples, rho)
-    ratios[_separation(samples) < least_separation] = np.nan
+    apart = [np.abs(wrap(b[:, 1] - b[:, 0])) for b in (samples.bearing_a, samples.bearing_b)]
+    ratios[np.maximum(*apart) < least_separation] = np.nan
     z_a, z_b = np.exp(1j * samples.bearing_a), np.exp(1j * samples.bearing_b)
     with np.errstate(divide="ignore", invalid="ignore"):
         seen_a = ratios * z_a[:, 1:] - z_a[:, :1]
@@ -151,12 +152,6 @@ def _distance_ratios(samples: TwoPointSamples, rho: FloatArray) -> FloatArray:
     ratios[double, 1] = np.nan
     ratios[refused] = np.nan
     return ratios
-
-
-def _separation(samples: TwoPointSamples) -> FloatArray:
-    """(s,) bearing difference of the two features in the view where it is larger, at most pi."""
-    apart = [np.abs(wrap(b[:, 1] - b[:, 0])) for b in (samples.bearing_a, samples.bearing_b)]
-    return np.maximum(*apart)
 
 
 def _discriminant_sigma(
@@ -560,17 +555,13 @@ def consistent_tangents(a: FloatArray, b: FloatArray) -> tuple[FloatArray, Float
     common = a / along_a[:, None] + b / along_b[:, None]
     norm = np.hypot(common[:, 0], common[:, 1])
     common = common / np.maximum(norm, 1e-12)[:, None]
-    end = _far_end(common)
+    end = np.argmax(np.abs(common), axis=1)
     share = common[np.arange(len(a)), end]
     return (
         np.einsum("ij,ij->i", a, common) * share,
         np.einsum("ij,ij->i", b, common) * share,
         np.abs(share),
     )
-
-
-def _far_end(tangents: FloatArray) -> IntArray:
-    return np.asarray(np.argmax(np.abs(tangents), axis=1), np.int64)
 
 
 # --------------------------------------------------------------------------------------------
