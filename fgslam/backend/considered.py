@@ -204,7 +204,7 @@ class RigTerms:
         self.deviations[: len(SHARED), : len(SHARED)] = np.linalg.cholesky(shared)
 
 
-class OnlineDoubt(ErrorColumns):
+class ConsiderCovariance(ErrorColumns):
     """Derivatives of the newest pose and of the landmarks by what is unknown of the rig.
 
     Of a rig that is exact, or that is taken as stated, nothing is added.

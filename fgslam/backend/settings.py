@@ -9,6 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, Count, Index, NonNegative, Positive
 
+FloorMode: TypeAlias = Literal["auto", "none", "soft", "hard"]
 Family: TypeAlias = Literal["filter", "smoother", "other"]
 """Whether past poses are revised; paired tests compare smoothers with filters, and no others.
 
@@ -23,23 +24,6 @@ _FAMILIES: dict[str, Family] = {
     "isam2": "smoother",
     "batch": "smoother",
 }
-
-
-@dataclass(frozen=True, config=STRICT)
-class FloorSettings:
-    """How an estimator uses the floor under the robot."""
-
-    mode: Literal["auto", "none", "soft", "hard"] = Field(
-        default="auto",
-        description="`auto` as frontend.ego_motion.dof; `none`; `hard` exact; `soft` with the "
-        "deviations below",
-    )
-    height_sigma_m: Positive = Field(
-        default=0.005, description="soft: deviation of the camera's height a frame, metres"
-    )
-    tilt_sigma_deg: Positive = Field(
-        default=0.2, description="soft: deviation of pitch and of roll a frame, degrees"
-    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -113,7 +97,11 @@ class EkfSettings(NamedSettings):
     """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
 
     kind: Literal["ekf"] = "ekf"
-    floor: FloorSettings = FloorSettings()
+    floor: FloorMode = Field(
+        default="auto",
+        description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
+        "exact; `soft` up to 5 mm and 0.2 degrees a frame",
+    )
     gate_sigmas: NonNegative = Field(
         default=5.0, description="gate on a match's innovation, standard deviations; 0: none"
     )
@@ -127,7 +115,11 @@ class EkfSettings(NamedSettings):
 class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
-    floor: FloorSettings = FloorSettings()
+    floor: FloorMode = Field(
+        default="auto",
+        description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
+        "exact; `soft` up to 5 mm and 0.2 degrees a frame",
+    )
     kernel: KernelSettings = KernelSettings()
     noise_factor: Positive | None = Field(
         default=None,

@@ -18,7 +18,7 @@ from fgslam.backend.settings import (
     EkfSettings,
     EstimatorSettings,
     FixedLagSettings,
-    FloorSettings,
+    FloorMode,
     Isam2Settings,
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from fgslam.frontend.places.recognition import PlaceRecognition
     from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
 
+_SOFT_HEIGHT_M, _SOFT_TILT_DEG = 0.005, 0.2  # deviations a frame of a soft floor
 _LOCATING_STREAM = 12  # of random numbers, next to those of the recording
 
 
@@ -152,7 +153,7 @@ def make_estimator(
 ) -> FullEstimator:
     """The estimator, at the prior pose; without one the world is the first camera frame, exactly.
 
-    ``ego_motion`` are the front-end's settings: ``floor.mode: auto`` takes their degrees of freedom
+    ``ego_motion`` are the front-end's settings: ``floor: auto`` takes their degrees of freedom
     over, ``landmark_kalman_graph`` their whole cost.
     """
     prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
@@ -212,17 +213,17 @@ def made_or_given(
     return cast("Estimator", estimator)
 
 
-def make_floor(rig: CameraRig, settings: FloorSettings, dof: DegreesOfFreedom) -> Floor:
+def make_floor(rig: CameraRig, mode: FloorMode, dof: DegreesOfFreedom) -> Floor:
     """The floor as an estimator is to use it."""
-    if settings.mode == "auto":
+    if mode == "auto":
         return Floor.under(rig, dof)
-    if settings.mode == "none":
+    if mode == "none":
         return Floor.under(rig, 6)
     return dataclasses.replace(
         Floor.under(rig, 3 if dof == 6 else dof),
-        hard=settings.mode == "hard",
-        height_sigma_m=settings.height_sigma_m,
-        tilt_sigma_rad=float(np.deg2rad(settings.tilt_sigma_deg)),
+        hard=mode == "hard",
+        height_sigma_m=_SOFT_HEIGHT_M,
+        tilt_sigma_rad=float(np.deg2rad(_SOFT_TILT_DEG)),
     )
 
 

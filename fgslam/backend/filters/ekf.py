@@ -21,7 +21,7 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 
-from fgslam.backend.considered import OnlineDoubt
+from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.loops import within_gate
 from fgslam.backend.settings import EkfSettings
@@ -171,7 +171,7 @@ class FullEkf:
     _gated: Kept[int]
     _skipped: Kept[int]
     _remarks: Kept[list[str]]
-    _doubt: Kept[OnlineDoubt]
+    _considered: Kept[ConsiderCovariance]
 
     def __init__(
         self, sensor: CameraRig, settings: EkfSettings, floor: Floor, prior: Prediction
@@ -185,7 +185,7 @@ class FullEkf:
         self._ids = np.empty(0, np.int64)
         self._positions = np.empty((0, 3))
         self._past = FilteredTrajectory()
-        self._doubt = OnlineDoubt(sensor, floor)
+        self._considered = ConsiderCovariance(sensor, floor)
         self._matched = self._gated = self._skipped = 0
         self._remarks = []
         self._map: LandmarkMap | None = None
@@ -203,7 +203,7 @@ class FullEkf:
         self._ids, self._positions = landmarks.ids, landmarks.positions
         self._fixed = fixed
         if fixed:
-            self._doubt.hold_map()
+            self._considered.hold_map()
         self._map = None
 
     def predict(self, odometry: Odometry | None) -> Prediction:
@@ -257,8 +257,8 @@ class FullEkf:
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         self._drop(increment)
         self._add(*first)
-        self._doubt.observe(increment, self._wTc)
-        current = self._doubt.pose(Prediction(self._wTc, self._covariance.front()[:FRONT]))
+        self._considered.observe(increment, self._wTc)
+        current = self._considered.pose(Prediction(self._wTc, self._covariance.front()[:FRONT]))
         self._past.append(increment.timestamp, current)
         return UpdateStats(
             current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof, closed
@@ -279,7 +279,7 @@ class FullEkf:
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
-            self._doubt.landmarks(self.landmarks()),
+            self._considered.landmarks(self.landmarks()),
             (*remarks, *self._remarks),
             noise_factor=1.0,
         )
@@ -287,12 +287,12 @@ class FullEkf:
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Marginal covariances (k, 3, 3) of the named landmarks."""
         held = self.landmarks()
-        return self._doubt.landmarks(held.select(held.rows(ids))).covariances
+        return self._considered.landmarks(held.select(held.rows(ids))).covariances
 
     def joint_covariance(self, ids: IntArray) -> FloatArray:
         """Joint covariance of the last pose and the named landmarks, the rig's terms included."""
         rows = rows_of(self._blocks(ids)).ravel()
-        return self._doubt.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
+        return self._considered.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
 
     def remake(self) -> None:
         """The map is made anew of what was put back."""

@@ -18,7 +18,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from fgslam.backend.considered import OnlineDoubt
+from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import require_finite
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.loops import (
@@ -133,7 +133,7 @@ class Smoother:
         self._answer: Solution | None = None
         self._takeovers = 0
         self._eras: list[int] = []
-        self._doubt = OnlineDoubt(problem.sensor, problem.floor)
+        self._doubt = ConsiderCovariance(problem.sensor, problem.floor)
         self._doubts: list[FloatArray] = []  # (6, 6) a frame: added to its pose when it came
 
     # -- the method ----------------------------------------------------------------------------

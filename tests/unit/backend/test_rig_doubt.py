@@ -12,7 +12,7 @@ from simulated import RIG, assert_same_bits, play
 from smoothing import FREE, drawn, run
 
 from fgslam.backend import considered
-from fgslam.backend.considered import OnlineDoubt, shared_covariance
+from fgslam.backend.considered import ConsiderCovariance, shared_covariance
 from fgslam.backend.protocol import FullEstimator
 from fgslam.backend.settings import (
     BatchSettings,
@@ -203,9 +203,9 @@ def increments_of(
     ]
 
 
-def driven(frames: int, floor: Floor = NO_FLOOR, field_px: float = 0.0) -> OnlineDoubt:
+def driven(frames: int, floor: Floor = NO_FLOOR, field_px: float = 0.0) -> ConsiderCovariance:
     """After the first frames of a drive, at its true poses."""
-    online = OnlineDoubt(CALIBRATED.rig, floor)
+    online = ConsiderCovariance(CALIBRATED.rig, floor)
     seen = increments_of(frames, field_px=field_px)
     for increment, wTc in zip(seen, drawn(3, frames=12).poses, strict=False):
         online.observe(increment, wTc)
@@ -301,7 +301,7 @@ def test_a_correction_is_weighed_once_for_as_long_as_it_stays(
         return shared_covariance(correction)
 
     monkeypatch.setattr(considered, "shared_covariance", counted)
-    online = OnlineDoubt(CALIBRATED.rig, NO_FLOOR)
+    online = ConsiderCovariance(CALIBRATED.rig, NO_FLOOR)
     for frame, increment in enumerate(increments_of(12)):
         applied = UNCORRECTED if frame < 8 else UNCORRECTED + 1e-3
         online.observe(dataclasses.replace(increment, rig_correction=applied), np.eye(4))
