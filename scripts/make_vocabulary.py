@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.frontend.features.descriptor_index import VOCABULARY_FILE
+from fgslam.frontend.features.matching import VOCABULARY_FILE
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import load_config
 from fgslam.runs.opening import open_sequence

@@ -15,8 +15,13 @@ from fgslam.core.estimates import Prediction
 from fgslam.core.features import Features
 from fgslam.core.measurements import Increment, Odometry
 from fgslam.core.recordings import Frame
-from fgslam.frontend.places.closures import LoopGates, difference
-from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
+from fgslam.frontend.places.recognition import (
+    LoopGates,
+    LostRules,
+    PlaceRecognition,
+    RecognitionParts,
+    difference,
+)
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over

@@ -19,7 +19,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import OmniFeatures, TwoViewVector
 from fgslam.core.planar import between, wrap
 from fgslam.datasets.opening import open_house
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator
 from fgslam.homing.front_end import compare_views
 from fgslam.homing.route import PathMemory, with_neighbours_votes

@@ -22,7 +22,7 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.settings import PermanenceSettings
-from fgslam.frontend.tracking.database import reliable, seen_past
+from fgslam.frontend.tracking.landmarks import reliable, seen_past
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 COVER = (110, 140)

@@ -18,7 +18,7 @@ from fgslam.core.geometry import inverse, project, transform_to_camera
 from fgslam.core.recordings import Sequence
 from fgslam.core.sensors import CameraRig
 from fgslam.evaluation.statistics import rotation_angles
-from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import LocalisationConfig

@@ -27,7 +27,7 @@ from fgslam.backend.homing.settings import (
 from fgslam.core.arrays import Image
 from fgslam.core.homing import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd

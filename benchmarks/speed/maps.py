@@ -26,7 +26,7 @@ from fgslam.frontend.settings import (
     FrontendSettings,
     PermanenceSettings,
 )
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.factory import make_tracker
 

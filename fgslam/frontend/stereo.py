@@ -9,11 +9,13 @@ from __future__ import annotations
 import dataclasses
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.features import Features, StereoFeatures
+from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.features import PATCH_PX, Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
+from fgslam.core.recordings import Frame, clearance
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.sensors import (
     CameraRig,
@@ -24,7 +26,9 @@ from fgslam.core.sensors import (
     vertical_to_horizontal,
 )
 from fgslam.frontend.features.matching import alike, choose, pairs_within
+from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.features.sift import FineImage
 from fgslam.frontend.settings import StereoSettings
 
 Linear: TypeAlias = tuple[FloatArray, FloatArray]
@@ -231,3 +235,169 @@ def _average(pairs: list[tuple[Features, IntArray]]) -> tuple[FloatArray, FloatA
     orientation = np.arctan2(np.sin(angles).sum(axis=0), np.cos(angles).sum(axis=0))
     # The remainder of a tiny negative angle rounds up to the full turn itself.
     return scale, orientation % (2.0 * np.pi) % (2.0 * np.pi)
+
+
+# ------------------------------------------------------------------------------------------
+# Features of the reference image alone, measured in the other images by their patches
+
+GREY_NOISE = 4.0  # sigma of a grey value: noise, and what no affine map does
+DEFORMATION = 0.05  # sigma of a patch's stretching between two images
+ALIGNMENTS_ACROSS = 3  # in another camera's image, from a disparity known to a pixel or two
+_MIN_CORRELATION = 0.8
+"""Of a patch with what it is in another image, gain and offset taken out. Of patches whose partner
+is elsewhere, or is none, two or three in a hundred reach it by chance."""
+
+_BLOCK_PX = 9  # of the images of half the size: about a patch
+_LARGEST_SHARE = 0.5  # of the image's width: the largest disparity looked for, where none is set
+_UNIQUE_PERCENT = 10  # by which the best block must beat any other
+_BELOW_ZERO = 2  # pixels of half the size that disparities may be too small, by the calibration
+_FRACTIONS = 16.0  # of a pixel, in which OpenCV states disparities
+_AT_ONCE = 8192  # patches, some ten kilobytes each; OpenCV samples less than 32767 rows at once
+
+
+class PatchStereo:
+    """Turns features of the reference image into stereo features."""
+
+    def __init__(self, rig: CameraRig, stereo: StereoMatcher, largest_px: float) -> None:
+        """``stereo`` measures, by its gates; disparities up to ``largest_px`` are looked for."""
+        self._rig = rig
+        self._stereo = stereo
+        limit = largest_px if np.isfinite(largest_px) else _LARGEST_SHARE * rig.width
+        reach = 0.5 * min(limit, rig.width) + _BELOW_ZERO
+        self._margin = 16 * int(np.ceil(reach / 16.0))
+        self._blocks = cv2.StereoBM.create(self._margin, _BLOCK_PX)
+        self._blocks.setMinDisparity(-_BELOW_ZERO)
+        self._blocks.setTextureThreshold(0)
+        self._blocks.setUniquenessRatio(_UNIQUE_PERCENT)
+        self._blocks.setDisp12MaxDiff(1)  # the same from either image
+
+    def match(
+        self, frame: Frame, found: Features, correction: RigCorrection | None = None
+    ) -> StereoFeatures:
+        """The features that all images show, measured in each.
+
+        Args:
+            frame: the images, right, left[, top], and where they show nothing.
+            found: features of the right one.
+            correction: of the rig; None where its calibration is taken as stated.
+        """
+        found = found.select(np.asarray(np.isfinite(found.xy).all(axis=1)))
+        coarse = self._coarse(frame.images, found.xy)
+        known = np.isfinite(coarse)
+        found, coarse = found.select(known), coarse[known]
+        views = [FineImage(image) for image in frame.images]
+        pixels = np.empty((len(found.xy), len(frame.images), 2))
+        good: BoolArray = np.empty(len(found.xy), np.bool_)
+        for first in range(0, len(found.xy), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            pixels[some], good[some] = self._aligned(frame, views, found.xy[some], coarse[some])
+        rest = (found.scale, found.orientation, found.descriptors)
+        in_each = tuple(
+            Features(pixels[:, camera], *rest).select(good) for camera in range(len(frame.images))
+        )
+        return self._stereo.measured(in_each, self._stereo.by_reference(), correction)[0]
+
+    def _aligned(
+        self, frame: Frame, views: list[FineImage], places: FloatArray, coarse: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Pixels (n, cameras, 2) of places (n, 2) in each image, and which all of them show."""
+        patches = anchor(views[0], places, PATCH_PX, GREY_NOISE, DEFORMATION)
+        good: BoolArray = np.ones(len(places), np.bool_)
+        pixels = [places]
+        for camera, view in enumerate(views[1:], 1):
+            seen, alike = across(self._rig, view, camera, patches, places, coarse)
+            pixels.append(seen)
+            good &= alike >= _MIN_CORRELATION
+        for margin, seen in zip(frame.margins, pixels, strict=False):  # none: all are full
+            good &= clearance(margin, seen) > PATCH_PX // 2
+        return np.stack(pixels, axis=1), good
+
+    def _coarse(self, images: tuple[Image, ...], places: FloatArray) -> FloatArray:
+        """Disparities (n,) at places (n, 2) of the right image, to a pixel or two; NaN unknown."""
+        if min(images[0].shape) < 2 * _BLOCK_PX:
+            return np.full(len(places), np.nan)
+        table = self._blocks.compute(*(self._prepared(image) for image in images[:2]))
+        at = np.rint((places - 0.5) / 2.0).astype(np.int64)
+        width = table.shape[1] - self._margin - _BELOW_ZERO
+        column = self._margin + np.clip(width - 1 - at[:, 0], 0, width - 1)
+        found = table[np.clip(at[:, 1], 0, len(table) - 1), column].astype(np.float64)
+        known = found >= -_FRACTIONS * _BELOW_ZERO
+        return np.where(known, 2.0 * found / _FRACTIONS, np.nan)
+
+    def _prepared(self, image: Image) -> Image:
+        """The image at half its size, mirrored, with margins.
+
+        OpenCV's reference is the left image: seen in a mirror, ours is. It says nothing of what
+        lies nearer to the border than the largest disparity.
+        """
+        half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        mirrored = cv2.flip(half, 1)
+        sides = (0, 0, self._margin, _BELOW_ZERO)
+        return np.asarray(cv2.copyMakeBorder(mirrored, *sides, cv2.BORDER_REPLICATE), np.uint8)
+
+
+def across(
+    rig: CameraRig,
+    view: FineImage,
+    camera: int,
+    patches: ReferencePatches,
+    places: FloatArray,
+    disparity: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) of points in another camera's image, and how well (n,) they correlate there.
+
+    Args:
+        rig: the cameras.
+        view: of the other camera.
+        camera: 1 left, 2 top.
+        patches: of the points, as they look in the reference image.
+        places: (n, 2) there.
+        disparity: (n,) expected, within a few pixels.
+    """
+    seen = places.copy()
+    if camera == 1:
+        seen[:, 0] += disparity
+    else:
+        seen[:, 1] += disparity / vertical_to_horizontal(rig)
+    correlation = np.empty(0)
+    for _ in range(ALIGNMENTS_ACROSS):
+        patches, seen, correlation = align(patches, view, seen)
+    last = np.array([rig.width, rig.height]) - 1.0
+    inside = ((seen >= 0.0) & (seen <= last)).all(axis=1)
+    return seen, np.where(inside, correlation, -1.0)
+
+
+# ------------------------------------------------------------------------------------------
+# Stereo features of a frame, from the features that were found in it
+
+
+class RigStereo:
+    """Measures features in all of a rig's images, whichever they were found in."""
+
+    def __init__(self, matcher: StereoMatcher, patches: PatchStereo, by_patches: bool) -> None:
+        """Takes what matches features of all images, and what measures those of the first.
+
+        ``by_patches``: whether the latter is asked whatever images have features.
+        """
+        self._matcher = matcher
+        self._patches = patches
+        self._by_patches = by_patches
+
+    def match(
+        self,
+        frame: Frame | None,
+        features: tuple[Features, ...],
+        correction: RigCorrection | None = None,
+    ) -> StereoFeatures:
+        """What all images show, then what only two of three do; empty without features.
+
+        Args:
+            frame: the images, right, left[, top]; patches need them.
+            features: of the right image, or of each.
+            correction: of the rig; None where its calibration is taken as stated.
+        """
+        if not features:
+            return StereoFeatures.empty()
+        if frame is not None and (self._by_patches or len(features) == 1):
+            return self._patches.match(frame, features[0], correction)
+        return self._matcher.match_all(features, correction)

@@ -27,9 +27,9 @@ from fgslam.core.errors import (
 )
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.settings import make_settings
-from fgslam.frontend.features.images import colour_image
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings
+from fgslam.frontend.features.sift import colour_image
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import pair_generator, vector_between
 from fgslam.homing.controller import HomingChain, LegOutcome

@@ -18,7 +18,7 @@ from fgslam.core.homing import (
     TrackedBearings,
     TwoViewVector,
 )
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable
 from fgslam.frontend.homing.two_view import make_local_map, match_features, triangulable
 from fgslam.frontend.homing.vector import estimate_homing_vector, paired_anew

@@ -23,7 +23,7 @@ from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialC
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.homing.active import CONTRADICTION_DEG, parallax
 from fgslam.homing.features import compacted
 from fgslam.homing.front_end import compare_views

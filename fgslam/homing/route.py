@@ -29,7 +29,7 @@ from fgslam.core.files import as_path
 from fgslam.core.geometry import is_rigid
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import circular_median, wrap
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator
 from fgslam.homing.active import parallax
 from fgslam.homing.features import VERSIONS, Votes, compacted, pack_features, unpack_features

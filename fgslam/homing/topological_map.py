@@ -18,8 +18,8 @@ from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason
-from fgslam.frontend.features.images import colour_image
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
+from fgslam.frontend.features.sift import colour_image
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import pair_generator, vector_between
 from fgslam.homing.features import VERSIONS

@@ -23,14 +23,14 @@ from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.report.formats import MapPoints, write_map
 from fgslam.slam.choices import chosen_frontend
 from fgslam.slam.factory import make_describer, make_relocaliser, make_stereo
 from fgslam.slam.inputs import checked_images
 
 if TYPE_CHECKING:
-    from fgslam.frontend.places.map_alignment import Alignment
+    from fgslam.frontend.places.merging import Alignment
 
 _VALID_HITS = 3  # where the map does not say how many its run asked for (Se et al. 6.1)
 _SUFFIX = ".fgmap"
@@ -219,8 +219,7 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
         OutputError: ``out`` is there already, is one of the two, or cannot be written.
     """
     # Not before: no run merges maps, and these load much of SciPy.
-    from fgslam.frontend.places.map_alignment import align_maps
-    from fgslam.frontend.places.map_fusion import adds_nothing, merge_maps
+    from fgslam.frontend.places.merging import adds_nothing, align_maps, merge_maps
 
     require_output(out, overwrite, (first, second))
     a, b = load_map(first), load_map(second)
@@ -257,7 +256,7 @@ def _about_alignment(found: Alignment, first: str, second: str) -> list[str]:
 
 def _in_common(a: SavedMap, b: SavedMap, first: str, second: str) -> list[str]:
     """A line about the evidence that both maps hold; none where there is none."""
-    from fgslam.frontend.places.map_fusion import shared_frames, shared_moments
+    from fgslam.frontend.places.merging import shared_frames, shared_moments
 
     once = "they count once (covariance intersection)"
     if common := shared_frames(a, b):

@@ -31,7 +31,7 @@ from fgslam.core.geometry import (
     so3_log,
     transform_to_world,
 )
-from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.landmarks import MapParts
 
 _STRETCHES = 50  # of located frames that are compared, those nearest to the gap
 _STILL = 1e-12  # radians and metres: no way at all

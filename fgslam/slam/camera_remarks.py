@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fgslam.core.estimates import EgoMotionStatus
-from fgslam.frontend.camera_watch import CameraWatch
+from fgslam.frontend.camera_faults import CameraWatch
 from fgslam.slam.results import RunRecorder
 
 

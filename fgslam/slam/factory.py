@@ -38,16 +38,13 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.frontend.camera_watch import CameraWatch
+from fgslam.frontend.camera_faults import CameraWatch
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.patch_stereo import PatchStereo
-from fgslam.frontend.rig_stereo import RigStereo
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
-from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.carrying import LandmarkCarrier
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.stereo import PatchStereo, RigStereo, StereoMatcher
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.key_frames import KeyFrameTracker
+from fgslam.frontend.tracking.key_frames import KeyFrameTracker, LandmarkCarrier
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.map_matching import MapMatcher
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.slam.arrival import Arrival, take_over, trusted
@@ -68,7 +65,7 @@ from fgslam.slam.pipeline import SlamPipeline
 if TYPE_CHECKING:
     from fgslam.backend.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
-    from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+    from fgslam.frontend.places.relocalisation import Relocaliser
 
 _SOFT_HEIGHT_M, _SOFT_TILT_DEG = 0.005, 0.2  # deviations a frame of a soft floor
 _LOCATING_STREAM = 12  # of random numbers, next to those of the recording
@@ -300,8 +297,12 @@ def make_places(
     """
     if not (settings.loops or settings.lost or joins):
         return None
-    from fgslam.frontend.places.closures import LoopGates
-    from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
+    from fgslam.frontend.places.recognition import (
+        LoopGates,
+        LostRules,
+        PlaceRecognition,
+        RecognitionParts,
+    )
 
     parts = RecognitionParts(
         joins=joins,
@@ -316,7 +317,7 @@ def make_places(
 
 def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
     """Relocaliser without a prior, for the poses that the ego-motion allows."""
-    from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+    from fgslam.frontend.places.relocalisation import Relocaliser
 
     floor = Floor.under(rig, settings.ego_motion.dof)
     return Relocaliser(rig, floor, settings.relocalisation)

@@ -19,7 +19,7 @@ from fgslam.core.arrays import BoolArray, Image
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.features import Features
 from fgslam.core.recordings import Frame, Sequence, clearance
-from fgslam.frontend.features.own_descriptors import as_bytes
+from fgslam.frontend.features.sift import as_bytes
 
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
 # the next frame's images fill the gap.

@@ -17,7 +17,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.odometry import pose_noise
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
-from fgslam.frontend.features.images import grey_image
+from fgslam.frontend.features.sift import grey_image
 from fgslam.slam.feature_stream import FeatureExtractor
 from fgslam.slam.motion import MotionModel
 

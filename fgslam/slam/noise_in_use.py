@@ -1,7 +1,7 @@
 """The noise that each frame was estimated with, where the drive itself shows how large it is.
 
 Of the motion model (:mod:`fgslam.slam.motion_noise`), of matches
-(:mod:`fgslam.frontend.tracking.match_noise`) and of a graph's measurements
+(:mod:`fgslam.frontend.tracking.ego_motion`) and of a graph's measurements
 (:mod:`fgslam.backend.persistence`).
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from fgslam.backend.protocol import Estimator, NoiseEstimating
 from fgslam.core.measurements import Odometry
-from fgslam.frontend.tracking.match_noise import MatchNoise
+from fgslam.frontend.tracking.ego_motion import MatchNoise
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 
 

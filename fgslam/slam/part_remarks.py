@@ -6,7 +6,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, IntArray
 from fgslam.core.estimates import EgoMotionStatus
-from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.bridging import bridged_frames
 from fgslam.slam.results import RunRecorder
 

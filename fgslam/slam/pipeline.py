@@ -26,8 +26,8 @@ from fgslam.core.features import StereoFeatures
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.rig_correction import RigCorrection
 from fgslam.core.store import Kept, has_state, put_back, snapshot
-from fgslam.frontend.camera_watch import CameraWatch
-from fgslam.frontend.rig_stereo import RigStereo
+from fgslam.frontend.camera_faults import CameraWatch
+from fgslam.frontend.stereo import RigStereo
 from fgslam.frontend.tracking.ego_motion import unmeasured
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker

@@ -37,9 +37,8 @@ from fgslam.core.measurements import Increment, MeasurementType, Observations
 from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
-from fgslam.frontend.tracking.map_parts import MapParts
-from fgslam.frontend.tracking.resection import Resection
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection, unmeasured
+from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.bridging import bridged
 from fgslam.slam.factory import made_or_given

@@ -13,7 +13,7 @@ from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import between
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.two_view import (
     PLAIN_MATCHING,

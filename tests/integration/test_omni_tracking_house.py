@@ -8,7 +8,7 @@ import pytest
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.homing import BearingMatches
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable
 from fgslam.frontend.homing.two_view import match_features

@@ -14,7 +14,7 @@ from fgslam.core.homing import FeatureKind, TwoViewVector
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniVideoSettings
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking import ReplenishedTracker

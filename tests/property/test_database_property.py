@@ -11,7 +11,7 @@ from simulated import RIG
 
 from fgslam.core.features import StereoFeatures
 from fgslam.frontend.settings import DatabaseSettings, PermanenceSettings
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 
 TYPES = st.sampled_from(["I", "II", "III"])
 FRAMES = st.lists(

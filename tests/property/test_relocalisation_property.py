@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fgslam.frontend.places.relocalisation import relocaliser
-from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
+from fgslam.frontend.places import relocalisation as relocaliser
+from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, error, floor, planar, room, seen
 

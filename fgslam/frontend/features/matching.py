@@ -2,12 +2,232 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
 import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from fgslam.core.features import Words
 from fgslam.core.planar import wrap
 from fgslam.frontend.features.settings import AppearanceSettings
+
+# ------------------------------------------------------------------------------------------
+# Nearest SIFT descriptors among many, by a fixed vocabulary
+
+VOCABULARY_FILE = Path(__file__).with_name("vocabulary.npz")
+
+CHUNK = 4096  # descriptors compared at a time; their distances stay in the cache
+
+
+@lru_cache(maxsize=1)
+def vocabulary() -> ByteArray:
+    """(w, 128) the cells' centres."""
+    with np.load(VOCABULARY_FILE, allow_pickle=False) as stored:
+        return np.asarray(stored["words"], np.uint8)
+
+
+def words_of(descriptors: ByteArray) -> Words:
+    """The word (m,) of each descriptor (m, 128): the cell whose centre is nearest."""
+    out = np.empty(len(descriptors), np.int16)
+    for start in range(0, len(descriptors), CHUNK):
+        part = slice(start, start + CHUNK)
+        out[part] = np.argmin(_to_centres(descriptors[part]), axis=1)
+    return out
+
+
+def nearest_words(descriptors: ByteArray, count: int) -> IntArray:
+    """The ``count`` nearest cells (m, count) of each of a frame's descriptors, nearest first."""
+    order = np.argsort(_to_centres(descriptors), axis=1, kind="stable")
+    return np.asarray(order[:, :count])
+
+
+def _to_centres(descriptors: ByteArray) -> npt.NDArray[np.float32]:
+    """Squared distances (m, w) to the centres, each row less the descriptor's own square.
+
+    Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
+    """
+    centres, squares = _centres()
+    products = np.asarray(descriptors.astype(np.float32) @ centres, np.float32)
+    return np.subtract(squares, products, out=products)
+
+
+@lru_cache(maxsize=1)
+def _centres() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Twice the centres (128, w), and their squares (w,)."""
+    values = vocabulary().astype(np.float32)
+    return np.ascontiguousarray(2.0 * values.T), np.einsum("ij,ij->i", values, values)
+
+
+EXACT = 6000  # contents up to here are compared in full, which costs no more
+PROBES = 12  # cells searched for each query, of 256
+AT_ONCE = 1024  # queries; more than a frame has, and their distances are tens of megabytes
+LEADING = 1024  # of a query's distances bound the rest: those of its nearest cells
+
+_Floats = npt.NDArray[np.float32]
+Cell = tuple[ByteArray, _Floats]
+"""Descriptors (m, 128) of one cell, and their squares (m,)."""
+Candidates = tuple[IntArray, IntArray, _Floats]
+"""Queries (c,), rows (c,) that may be among their nearest, squared distances less the query's own
+square (c,)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Neighbours:
+    """What the index knows of each asked descriptor, nearest first, then by row.
+
+    Attributes:
+        rows: (q, k) rows of held descriptors; -1 where the index holds fewer.
+        distances: (q, k) Euclidean, a descriptor's norm being 512; infinite where the row is -1.
+    """
+
+    rows: IntArray
+    distances: FloatArray
+
+
+class AppearanceIndex:
+    """SIFT descriptors, found by what is near; the answer depends on nothing else."""
+
+    def __init__(self, descriptors: ByteArray, words: Words | None = None) -> None:
+        """Holds ``descriptors`` (m, 128), which are not copied and must not change.
+
+        ``words`` (m,) are those of ``vocabulary.words_of``, where known.
+        """
+        self._descriptors = descriptors
+        self._small = len(descriptors) <= EXACT
+        if not self._small:
+            words = words_of(descriptors) if words is None else words
+            self._order = np.argsort(words, kind="stable")
+            counts = np.bincount(words, minlength=len(vocabulary()))
+            self._starts = np.concatenate([[0], np.cumsum(counts)])
+            self._held: dict[int, Cell] = {}
+
+    def __len__(self) -> int:
+        """Number of descriptors held."""
+        return len(self._descriptors)
+
+    def query(self, descriptors: ByteArray, neighbours: int) -> Neighbours:
+        """The nearest stored descriptors of each of (q, 128), at most ``neighbours``.
+
+        Approximate in contents of more than a few thousand: a neighbour in a cell that the query
+        does not search is not found. Distances are exact.
+        """
+        found = [
+            self._some(descriptors[start : start + AT_ONCE], neighbours)
+            for start in range(0, max(len(descriptors), 1), AT_ONCE)
+        ]
+        return Neighbours(
+            np.concatenate([one.rows for one in found]),
+            np.concatenate([one.distances for one in found]),
+        )
+
+    def _some(self, descriptors: ByteArray, neighbours: int) -> Neighbours:
+        """The neighbours of so many descriptors that their distances fit into memory."""
+        asked = descriptors.astype(np.float32)
+        if self._small or not len(asked):
+            query, row, squared = self._in_full(asked, neighbours)
+        else:
+            query, row, squared = self._probed(
+                asked, nearest_words(descriptors, PROBES), neighbours
+            )
+        order = np.lexsort((row, squared, query))
+        query, row, squared = query[order], row[order], squared[order]
+        rank = np.arange(len(query)) - np.searchsorted(query, query)
+        first = rank < neighbours
+        query, rank = query[first], rank[first]
+        rows = np.full((len(asked), neighbours), -1, np.int64)
+        distances = np.full((len(asked), neighbours), np.inf)
+        rows[query, rank] = row[first]
+        own = np.einsum("ij,ij->i", asked, asked)
+        distances[query, rank] = np.sqrt((squared[first] + own[query]).astype(np.float64))
+        return Neighbours(rows, distances)
+
+    def _in_full(self, asked: _Floats, neighbours: int) -> Candidates:
+        found = [(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32))]
+        for start in range(0, len(self), CHUNK):
+            squared = _squared(asked, self._descriptors[start : start + CHUNK])
+            bound = _bound(squared, neighbours)
+            query, column = np.nonzero(squared <= bound[:, None])
+            found.append((query, start + column, squared[query, column]))
+        query, row, near = (np.concatenate(part) for part in zip(*found, strict=True))
+        return query, row, near
+
+    def _probed(self, asked: _Floats, cells: IntArray, neighbours: int) -> Candidates:
+        """Searches ``cells`` (q, p): cell by cell, for all queries that want it.
+
+        The distances lie behind each other as they are found: of each cell, of each query that
+        wants it, to all that the cell holds. Those of a query's nearest cells bound the others.
+        """
+        wanted = np.argsort(cells, axis=None, kind="stable")
+        query, cell = wanted // cells.shape[1], cells.ravel()[wanted]
+        sizes = self._starts[cell + 1] - self._starts[cell]
+        ends = np.cumsum(sizes)
+        squared = np.empty(ends[-1], np.float32)
+        first = np.searchsorted(cell, np.arange(len(self._starts))).tolist()
+        for k in np.unique(cell).tolist():
+            values, squares = self._cell(k)
+            stop = ends[first[k + 1] - 1]
+            part = squared[stop - len(values) * (first[k + 1] - first[k]) : stop]
+            of = asked[query[first[k] : first[k + 1]]]
+            _less_own(of, values.astype(np.float32), squares, part.reshape(len(of), len(values)))
+        place = np.empty(cells.shape, np.int64)
+        place.flat[wanted] = ends - sizes
+        bound = _bound(self._leading(squared, place, cells), neighbours)
+        near = np.flatnonzero(squared <= np.repeat(bound[query], sizes))
+        at = np.searchsorted(ends, near, side="right")
+        row = self._order[self._starts[cell[at]] + near - (ends - sizes)[at]]
+        return query[at], row, squared[near]
+
+    def _cell(self, k: int) -> Cell:
+        """What a cell holds, found when it is first searched."""
+        if k not in self._held:
+            values = self._descriptors.take(
+                self._order[self._starts[k] : self._starts[k + 1]], axis=0
+            )
+            wide = values.astype(np.float32)
+            self._held[k] = values, np.vecdot(wide, wide)
+        return self._held[k]
+
+    def _leading(self, squared: _Floats, place: IntArray, cells: IntArray) -> _Floats:
+        """Distances (q, m) of each query to what its nearest cells hold, padded with infinity."""
+        sizes = self._starts[cells + 1] - self._starts[cells]
+        ends = np.minimum(np.cumsum(sizes, axis=1), LEADING)
+        out = np.full((len(cells), LEADING), np.inf, np.float32)
+        starts = ends - np.diff(ends, axis=1, prepend=0)
+        for i, probe in zip(*np.nonzero(ends > starts), strict=True):
+            start, end, here = starts[i, probe], ends[i, probe], place[i, probe]
+            out[i, start:end] = squared[here : here + end - start]
+        return out
+
+
+def _squared(asked: _Floats, held: ByteArray, out: _Floats | None = None) -> _Floats:
+    """Squared distances (q, m) less the queries' own squares.
+
+    Exact in float32: all sums of 128 products of bytes, and their doubles, are below 2^24.
+    """
+    values = held.astype(np.float32)
+    return _less_own(asked, values, np.vecdot(values, values), out)
+
+
+def _less_own(asked: _Floats, values: _Floats, squares: _Floats, out: _Floats | None) -> _Floats:
+    """The same of values (m, 128) whose squares (m,) are known."""
+    products = (values @ (-2.0 * asked).T).T  # this way round in half the time
+    return np.add(products, squares, out=out)
+
+
+def _bound(values: _Floats, count: int) -> _Floats:
+    """A finite bound (q,) of each row's smallest ``count`` of (q, m); ties are never cut.
+
+    No larger than that many of the leading ones, where there are so many.
+    """
+    bound = np.full(len(values), np.finfo(np.float32).max)
+    leading = values[:, :LEADING]
+    if leading.shape[1] > count:
+        bound = np.minimum(bound, np.partition(leading, count - 1, axis=1)[:, count - 1])
+    return bound
+
 
 MAX_DISTANCE = 350.0  # of descriptors of the same point, whose norm is 512
 RATIO = 0.85  # of the best distance to the second best, at most

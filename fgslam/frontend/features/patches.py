@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
-from fgslam.frontend.features.fine_image import PER_PIXEL, FineImage, Float32
 from fgslam.frontend.features.matching import pairs_within
+from fgslam.frontend.features.sift import PER_PIXEL, FineImage, Float32
 
 View: TypeAlias = Image | FineImage
 """What patches are sampled in: grey values (h, w), between them on straight lines; or finely."""

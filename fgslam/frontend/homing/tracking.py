@@ -21,8 +21,7 @@ from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures, TrackedBearings
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.colour_sift import wrapping_period
-from fgslam.frontend.features.omni_features import pixels_a_radian
+from fgslam.frontend.features.omni import pixels_a_radian, wrapping_period
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 
 _MAX_VIEW_WIDTH = 720  # columns: half a degree; coarser cameras get fewer

@@ -43,8 +43,7 @@ from fgslam.core.homing import (
     UprightFeatures,
 )
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.colour_sift import up_in_image
-from fgslam.frontend.features.column_segments import whitened
+from fgslam.frontend.features.omni import up_in_image, whitened
 from fgslam.frontend.features.settings import OmniMatchingSettings
 
 LEAST_SEPARATION = np.deg2rad(5.0)

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray, Rows
 from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
-from fgslam.core.features import StereoFeatures
-from fgslam.core.geometry import in_front, project, transform_to_camera
+from fgslam.core.features import LandmarkAppearances, StereoFeatures
+from fgslam.core.geometry import (
+    in_front,
+    project,
+    rotate_covariances,
+    transform_to_camera,
+    transform_to_world,
+)
 from fgslam.core.measurements import Observations
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import Kept
-from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
+from fgslam.frontend.features.matching import mutual_nearest
+from fgslam.frontend.tracking.ego_motion import (
+    EgoMotionSolver,
+    MatchNoise,
+    PoseProblem,
+    Resection,
+    sample_size,
+)
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase, MapParts
 from fgslam.frontend.tracking.map_matching import (
     REFINE_SHIFT_PX,
     ExpectedLandmarks,
@@ -24,11 +39,244 @@ from fgslam.frontend.tracking.map_matching import (
     lean,
     predicted_covariance,
 )
-from fgslam.frontend.tracking.map_parts import MapParts
-from fgslam.frontend.tracking.match_noise import MatchNoise
-from fgslam.frontend.tracking.other_motion import OtherMotion
-from fgslam.frontend.tracking.regaining import Regainer
-from fgslam.frontend.tracking.resection import Resection
+
+# ------------------------------------------------------------------------------------------
+# The pose of a frame whose prediction failed: a sudden turn, a gap, a blurred or dark image
+
+LATELY = 10  # frames before the last sighting whose landmarks are looked for
+_AT_LAST = 0  # likewise where that fails: among few landmarks few others look like the right one
+FALSE_POSES = 1e-6  # poses by chance that are allowed in a frame
+
+
+class Regainer:
+    """Finds a frame by landmarks seen lately, without a prediction."""
+
+    def __init__(
+        self, rig: CameraRig, database: LandmarkDatabase, solver: EgoMotionSolver, parts: MapParts
+    ) -> None:
+        """Takes the tracker's own parts."""
+        self._database = database
+        self._solver = solver
+        self._parts = parts
+        self._resection = Resection(solver)
+        self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
+
+    def find(self, landmarks: LandmarkMap, features: StereoFeatures) -> Prediction | None:
+        """Pose and covariance; None where none is to be believed. The same input, the same bits."""
+        for frames in (LATELY, _AT_LAST):
+            found = self._found_by(frames, landmarks, features)
+            if found is not None:
+                return Prediction(found.wTc, found.covariance)
+        return None
+
+    def _found_by(
+        self, frames: int, landmarks: LandmarkMap, features: StereoFeatures
+    ) -> EgoMotion | None:
+        """The frame by what the last frames described; None if it is not to be believed."""
+        recent = np.intersect1d(self._database.described_lately(frames), landmarks.ids)
+        looks = self._database.appearances(recent)
+        latest = np.flatnonzero(np.diff(looks.ids, append=-1))
+        part = self._parts.of(looks.ids[latest])
+        within = [
+            self._among(latest[part == one], looks, landmarks, features)
+            for one in np.unique(part).tolist()
+        ]
+        found = [one for one in within if one is not None]
+        return max(found, key=lambda one: int(one.inliers.sum()), default=None)
+
+    def _among(
+        self,
+        rows: IntArray,
+        looks: LandmarkAppearances,
+        landmarks: LandmarkMap,
+        features: StereoFeatures,
+    ) -> EgoMotion | None:
+        """The frame by some landmarks, given by rows of their looks; None if not to be believed."""
+        seen = features.whole
+        i, j = mutual_nearest(seen.descriptors, looks.descriptors[rows])
+        observed = seen.observations(i, looks.ids[rows[j]], is_new=False)
+        problem = PoseProblem.of(landmarks, observed)
+        found = self._resection.solve(problem)
+        if not found.status.measured or not self._certain(found, problem):
+            return None
+        return found
+
+    def _certain(self, found: EgoMotion, problem: PoseProblem) -> bool:
+        agreeing = places(problem.measurement[found.inliers, :2], self._solver.farthest)
+        size = sample_size(self._solver.floor)
+        if log_false_poses(len(problem), agreeing, size, self._by_chance) > math.log(FALSE_POSES):
+            return False
+        return 2 * self._resection.rival(problem, found) <= int(found.inliers.sum())
+
+
+def places(pixels: FloatArray, side: float) -> int:
+    """How many places of the image, squares of this side, the pixels (n, 2) lie in."""
+    return len(np.unique(np.floor(pixels / side), axis=0))
+
+
+def log_false_poses(matches: int, agreeing: int, sample: int, by_chance: float) -> float:
+    """Logarithm of the number of poses that as many matches would agree with by chance.
+
+    Args:
+        matches: m of the frame.
+        agreeing: k of them with a pose.
+        sample: s that fix a pose, and agree for nothing.
+        by_chance: p, probability that a wrong match agrees.
+
+    ``(m - s) C(m, k) C(k, s) p^(k - s)``, equation 11 of Moisan and Stival.
+    """
+    if agreeing <= sample:
+        return math.inf
+    return (
+        math.log(matches - sample)
+        + _log_choose(matches, agreeing)
+        + _log_choose(agreeing, sample)
+        + (agreeing - sample) * math.log(by_chance)
+    )
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)
+
+
+# ------------------------------------------------------------------------------------------
+# Whether much of what a frame shows moves rigidly, but otherwise than its pose says
+
+_FEWEST = 15  # matches that move otherwise; chance is judged besides
+_SHARE = 0.1  # of those that the pose follows
+_FRAMES, _WINDOW = 3, 10  # so many of so many described frames: no wrong match, no blurred frame
+_LARGEST = 300  # features of each frame that are matched: the time is that of their square
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Unexplained(Rows):
+    """Features (n,) of a frame that no landmark known before it explains.
+
+    ``ids`` are the landmarks that they began, -1 for none; ``positions`` (n, 3) and
+    ``covariances`` (n, 3, 3) in the world, by that frame's pose, metres.
+    """
+
+    ids: IntArray
+    descriptors: ByteArray
+    positions: FloatArray
+    covariances: FloatArray
+
+    @staticmethod
+    def none() -> _Unexplained:
+        return _Unexplained(
+            np.empty(0, np.int64),
+            np.empty((0, 128), np.uint8),
+            np.empty((0, 3)),
+            np.empty((0, 3, 3)),
+        )
+
+    @staticmethod
+    def of(features: StereoFeatures, ids: IntArray, wTc: FloatArray) -> _Unexplained:
+        return _Unexplained(
+            ids,
+            features.descriptors,
+            transform_to_world(wTc, features.position),
+            rotate_covariances(wTc[:3, :3], features.position_covariance),
+        )
+
+
+class OtherMotion:
+    """Remembers the frames of a drive that show a second rigid motion."""
+
+    _before: Kept[_Unexplained]
+    _latest: Kept[deque[tuple[int, float]]]
+    _doubted: Kept[dict[int, float]]
+
+    def __init__(self, rig: CameraRig, solver: EgoMotionSolver) -> None:
+        """Nothing seen yet."""
+        self._solver = solver
+        self._resection = Resection(solver)
+        self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
+        self._before = _Unexplained.none()
+        self._latest = deque(maxlen=_WINDOW)
+        self._doubted = {}
+
+    def look(
+        self,
+        index: int,
+        features: StereoFeatures,
+        known: tuple[IntArray, IntArray],
+        tracking: EgoMotion,
+        wTc: FloatArray,
+    ) -> None:
+        """Takes in a frame whose features were found.
+
+        Args:
+            index: its number.
+            features: (n,) those found in every image.
+            known: (n,) the landmark that each is taken for, -1 for none, and the identities of
+                those among them that were known before.
+            tracking: its pose, as it was tracked.
+            wTc: (4, 4) the same after the update, from which the next frame is told.
+        """
+        partners, old = known
+        left = np.flatnonzero(~np.isin(partners, old))
+        left = left[np.argsort(-features.scale[left], kind="stable")[:_LARGEST]]
+        share = self._share(features, left, old, tracking) if tracking.status.measured else 0.0
+        self._latest.append((index, share))
+        seen = [one for one in self._latest if one[1] > _SHARE]
+        if len(seen) >= _FRAMES:
+            self._doubted.update(seen)
+        followed = tracking.status.measured or tracking.status is EgoMotionStatus.FIRST
+        self._before = _Unexplained.none()
+        if followed:
+            self._before = _Unexplained.of(features.select(left), partners[left], wTc)
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be said of the frames with two motions."""
+        if not self._doubted:
+            return ()
+        frames, most = sorted(self._doubted), max(self._doubted.values())
+        # The pose follows the fewer matches only where odometry, or the map, says so.
+        or_odometry = (
+            ", or the odometry is wrong (its unit or clock, the camera's place on the robot)"
+            if most > 1.0
+            else ""
+        )
+        return (
+            f"in {len(frames)} frames, from {frames[0]} to {frames[-1]}, something else moves "
+            f"rigidly, with up to {100.0 * most:.0f} % as many matches as the pose follows: "
+            f"something large passes{or_odometry}. Without odometry that tells which is which the "
+            "pose is in doubt where that fills more of the view than the scene, for it may follow "
+            "what passes (leave these frames out: --start, --stop)",
+        )
+
+    def _share(
+        self, features: StereoFeatures, left: IntArray, old: IntArray, tracking: EgoMotion
+    ) -> float:
+        """Matches that agree with another motion over those of the pose; zero where none is."""
+        before = self._before.select(~np.isin(self._before.ids, old))
+        if min(len(left), len(before)) < _FEWEST:
+            return 0.0
+        i, j = mutual_nearest(features.descriptors[left], before.descriptors)
+        problem = PoseProblem(
+            before.positions[j],
+            before.covariances[j],
+            features.measurement[left[i]],
+            features.measurement_covariance[left[i]],
+        )
+        against = self._solver.image_residuals(tracking.wTc, problem) > self._solver.farthest
+        if against.sum() < _FEWEST:
+            return 0.0
+        rest = problem.select(against)
+        found = self._resection.solve(rest)
+        agreeing = int(found.inliers.sum()) if found.status.measured else 0
+        if agreeing < _FEWEST or not self._certain(found, rest, len(problem)):
+            return 0.0
+        return agreeing / max(int(tracking.inliers.sum()), 1)
+
+    def _certain(self, found: EgoMotion, problem: PoseProblem, matches: int) -> bool:
+        agreeing = places(problem.measurement[found.inliers, :2], self._solver.farthest)
+        size = sample_size(self._solver.floor)
+        return log_false_poses(matches, agreeing, size, self._by_chance) <= math.log(FALSE_POSES)
+
+    # ----------------------------------------------------------------------------------------
+
 
 _FEW_MATCHED = 0.2
 """Of a frame's features: landmarks in the pose's favour, below which it is looked for anew too."""

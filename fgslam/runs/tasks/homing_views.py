@@ -36,8 +36,7 @@ from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniDatasetSettings
 from fgslam.evaluation.statistics import JsonValue
-from fgslam.frontend.features.column_segments import empty_segments
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor, empty_segments
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import PLAIN_MATCHING, plain_sift

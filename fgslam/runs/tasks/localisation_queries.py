@@ -28,9 +28,9 @@ from fgslam.core.recordings import Sequence
 from fgslam.core.saved_map import require_rig
 from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import OdometrySettings
-from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.rig_stereo import RigStereo
+from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import FrontendSettings
+from fgslam.frontend.stereo import RigStereo
 from fgslam.runs.config_models import LocalisationConfig
 from fgslam.runs.engine import Context
 from fgslam.runs.tasks.slam_map_entry import GivenMap

@@ -20,7 +20,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.settings import RenderedLabSettings
 from fgslam.evaluation.statistics import align, associate
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.config_reading import parse
 from fgslam.runs.opening import open_sequence

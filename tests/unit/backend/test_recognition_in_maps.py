@@ -36,7 +36,7 @@ from fgslam.core.estimates import EgoMotionStatus, Prediction
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.store import restore, state_of
-from fgslam.frontend.places.closures import difference
+from fgslam.frontend.places.recognition import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.factory import make_estimator

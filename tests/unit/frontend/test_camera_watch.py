@@ -15,8 +15,7 @@ import fgslam as fg
 from fgslam.core.arrays import Image
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import restore, state_of
-from fgslam.frontend.camera_watch import CameraWatch
-from fgslam.frontend.image_lag import Lag, LagModel, LineRows
+from fgslam.frontend.camera_faults import CameraWatch, Lag, LagModel, LineRows
 
 BEGINS = 12  # the fault
 SOON = 10  # frames until it is found

@@ -9,18 +9,12 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.features import PATCH_PX, LandmarkPatches
 from fgslam.core.geometry import project
 from fgslam.core.store import restore, state_of
-from fgslam.frontend.features.fine_image import FineImage
 from fgslam.frontend.features.patches import ReferencePatches, crowding
 from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.features.sift import FineImage
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.carrying import (
-    NOISE_SHARE,
-    Begun,
-    Carried,
-    LandmarkCarrier,
-    Points,
-)
+from fgslam.frontend.tracking.key_frames import NOISE_SHARE, Begun, Carried, LandmarkCarrier, Points
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
 

@@ -16,7 +16,7 @@ from fgslam.core.features import LandmarkPatches, StereoFeatures
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import restore, state_of
 from fgslam.frontend.settings import DatabaseSettings
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.map_matching import predicted_covariance
 
 SETTINGS = DatabaseSettings()

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.frontend.features.exposure import contrast_share, noise_sigma
+from fgslam.frontend.features.sift import contrast_share, noise_sigma
 
 
 def as_image(grey: FloatArray) -> Image:

@@ -16,9 +16,15 @@ from fgslam.core.store import state_of
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import DatabaseSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.carrying import Begun, Carried, LandmarkCarrier
-from fgslam.frontend.tracking.database import LandmarkDatabase
-from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
+from fgslam.frontend.tracking.key_frames import (
+    Begun,
+    Carried,
+    CarriedFrame,
+    KeyFrameTracker,
+    LandmarkCarrier,
+    spread,
+)
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.map_matching import MapMatches
 from fgslam.frontend.tracking.tracker import Association, Tracked
 from tests.textured_wall import HERE, RIG, pictures

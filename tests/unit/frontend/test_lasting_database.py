@@ -20,8 +20,8 @@ from fgslam.frontend.settings import (
     DatabaseSettings,
     PermanenceSettings,
 )
-from fgslam.frontend.tracking import database as database_module
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking import landmarks as database_module
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 
 PLACES = at_pixels([(80, 60, 8), (100, 110, 12), (120, 90, 10), (150, 100, 9)])
 LASTING = DatabaseSettings(

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
 from fgslam.core.store import restore, state_of
-from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.landmarks import MapParts
 
 GUESS = Odometry(np.eye(4), np.eye(6), measured=False)
 WHEELS = Odometry(np.eye(4), np.eye(6))

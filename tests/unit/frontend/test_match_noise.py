@@ -14,8 +14,7 @@ from fgslam.core.store import restore, state_of
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, unmeasured
-from fgslam.frontend.tracking.match_noise import MatchNoise
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, MatchNoise, unmeasured
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.replay import replay, replay_frame, replay_motion
 from fgslam.worlds.settings import (

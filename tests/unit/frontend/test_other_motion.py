@@ -15,7 +15,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.core.store import restore, state_of
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.other_motion import OtherMotion
+from fgslam.frontend.tracking.tracker import OtherMotion
 from fgslam.slam.results import STAGES
 from fgslam.slam.session import Session
 

@@ -13,9 +13,8 @@ from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.recordings import Frame
 from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.patch_stereo import PatchStereo
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
-from fgslam.frontend.stereo import StereoMatcher
+from fgslam.frontend.stereo import PatchStereo, StereoMatcher
 from fgslam.slam.factory import as_measured, make_describer, make_stereo
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
 

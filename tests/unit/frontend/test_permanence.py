@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.frontend.settings import PermanenceSettings
-from fgslam.frontend.tracking.database import is_blind, reliable, seen_past
+from fgslam.frontend.tracking.landmarks import is_blind, reliable, seen_past
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks
 
 
@@ -71,7 +71,7 @@ SEEN = {
 def test_a_feature_seen_behind_contradicts_a_missed_landmark(
     what: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fgslam.frontend.tracking.database.NEAR_PX", 20.0)
+    monkeypatch.setattr("fgslam.frontend.tracking.landmarks.NEAR_PX", 20.0)
     shown, past = SEEN[what]
     found = seen_past(np.array([PLACE]), np.array(shown, np.float64).reshape(-1, 3))
     assert found.tolist() == [past]

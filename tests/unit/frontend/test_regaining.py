@@ -13,9 +13,8 @@ from test_tracker import CERTAIN, SETTINGS, Scene
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import EgoMotionStatus, Prediction
-from fgslam.frontend.tracking import regaining
-from fgslam.frontend.tracking.regaining import log_false_poses, places
-from fgslam.frontend.tracking.tracker import Tracked
+from fgslam.frontend.tracking import tracker as regaining
+from fgslam.frontend.tracking.tracker import Tracked, log_false_poses, places
 
 RESCUING = dataclasses.replace(
     SETTINGS, matching=dataclasses.replace(SETTINGS.matching, rescue=True)

@@ -19,7 +19,7 @@ from fgslam.frontend.settings import (
     PermanenceSettings,
 )
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.frontend.tracking.database import LandmarkDatabase
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import Association
 from fgslam.slam.factory import make_tracker
 

@@ -17,9 +17,15 @@ from fgslam.core.geometry import so3_exp
 from fgslam.core.rig_correction import TERMS, camera_displacements
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import restore, state_of
-from fgslam.frontend.camera_watch import CameraWatch
-from fgslam.frontend.image_lag import LineRows
-from fgslam.frontend.turned_cameras import WINDOW, Knock, Turns, TurnWatch, turns_of
+from fgslam.frontend.camera_faults import (
+    WINDOW,
+    CameraWatch,
+    Knock,
+    LineRows,
+    Turns,
+    TurnWatch,
+    turns_of,
+)
 
 KNOCKED_AT = 5 * WINDOW
 FRAMES = 10 * WINDOW

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import IntArray
-from fgslam.frontend.tracking.views import Places, ViewPool, Views
+from fgslam.frontend.tracking.landmarks import Places, ViewPool, Views
 
 ANGLE = np.deg2rad(20.0)
 

@@ -15,7 +15,7 @@ from fgslam.core.homing import (
     RefusalReason,
     TwoViewVector,
 )
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.homing import places as path_places
 from fgslam.homing.places import PathPlaces
 from fgslam.homing.route import PathMemory

@@ -15,7 +15,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, StoredMapError
 from fgslam.core.homing import BearingMatches, OmniFeatures
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor
+from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.homing.features import (
     MOST_COLUMNS,
     MOST_SIFT,

@@ -7,7 +7,7 @@ import numpy as np
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
-from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.bridging import bridged, bridged_frames
 
 SIGMA = np.repeat([0.05, 0.1], 3)  # of each step: radians, metres

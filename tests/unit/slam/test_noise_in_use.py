@@ -15,7 +15,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Odometry
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.match_noise import MatchNoise
+from fgslam.frontend.tracking.ego_motion import MatchNoise
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.noise_in_use import FrameNoise, noise_in_use

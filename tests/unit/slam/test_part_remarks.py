@@ -8,7 +8,7 @@ from simulated import RIG
 from fgslam.core.features import StereoFeatures
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Odometry
-from fgslam.frontend.tracking.map_parts import MapParts
+from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.part_remarks import in_first_map, part_remarks
 from fgslam.slam.results import FrameRow, RunRecorder
 

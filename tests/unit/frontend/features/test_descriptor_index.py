@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import ByteArray
-from fgslam.frontend.features import descriptor_index
-from fgslam.frontend.features.descriptor_index import AppearanceIndex, Neighbours
-from fgslam.frontend.tracking import views as views_module
-from fgslam.frontend.tracking.views import ViewPool, Views
+from fgslam.frontend.features import matching as descriptor_index
+from fgslam.frontend.features.matching import AppearanceIndex, Neighbours
+from fgslam.frontend.tracking import landmarks as views_module
+from fgslam.frontend.tracking.landmarks import ViewPool, Views
 from tests.known_places import blurred, looks
 
 

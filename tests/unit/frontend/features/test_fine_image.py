@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.frontend.features.fine_image import FineImage
 from fgslam.frontend.features.patches import View, align, anchor
+from fgslam.frontend.features.sift import FineImage
 
 ROWS, COLUMNS = np.mgrid[0:60, 0:80]
 INSIDE = slice(10, -10)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import FrameError
-from fgslam.frontend.features.images import grey_image
+from fgslam.frontend.features.sift import grey_image
 
 GREY = np.random.default_rng(1).integers(0, 256, (12, 17), np.uint8)
 

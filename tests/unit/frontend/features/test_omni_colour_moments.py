@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.frontend.features.colour_moments import PAIRS, PatchColours, colour_from_means
+from fgslam.frontend.features.omni import PAIRS, PatchColours, colour_from_means
 
 
 def patch(seed: int = 1) -> Image:
@@ -53,7 +53,7 @@ def test_dark_patches_are_grey() -> None:
 
 
 def test_patches_are_clipped_at_the_border(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.frontend.features.colour_moments.PATCH_SIGMAS", 2.0)
+    monkeypatch.setattr("fgslam.frontend.features.omni.PATCH_SIGMAS", 2.0)
     image = patch()
     colours = PatchColours(image)
     found = colours.around(np.array([[0.0, 0.0], [15.0, 10.0]]), np.array([2.0, 2.0]))

@@ -13,14 +13,15 @@ from fgslam.core.arrays import Image
 from fgslam.core.errors import FrameError
 from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.planar import wrap
-from fgslam.frontend.features import colour_sift
-from fgslam.frontend.features.colour_sift import (
+from fgslam.frontend.features import omni as colour_sift
+from fgslam.frontend.features.omni import (
     SIGMA_PX,
     SIGMA_SCALES,
+    OmniFeatureExtractor,
+    View,
     up_in_image,
     wrapping_period,
 )
-from fgslam.frontend.features.omni_features import OmniFeatureExtractor, View
 from fgslam.frontend.features.settings import (
     OmniFeatureSettings,
     OmniMatchingSettings,

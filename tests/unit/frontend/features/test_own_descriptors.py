@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from fgslam.core.errors import ConfigError
 from fgslam.frontend.features.matching import descriptor_distance
-from fgslam.frontend.features.own_descriptors import as_bytes
+from fgslam.frontend.features.sift import as_bytes
 
 FAR = 512.0
 """How far apart two unrelated SIFT descriptors are, about."""

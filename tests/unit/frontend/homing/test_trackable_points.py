@@ -14,8 +14,7 @@ from fgslam.core.homing import (
     UprightFeatures,
 )
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.colour_sift import empty_features
-from fgslam.frontend.features.column_segments import empty_segments
+from fgslam.frontend.features.omni import empty_features, empty_segments
 from fgslam.frontend.homing.tracking import DISTINCT_PX, move_to_trackable
 from tests.homing import make_matches
 from tests.textured_room import CAMERA, angles, hits, picture

@@ -10,7 +10,7 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.homing import OmniFeatures, Refusal, TwoViewVector, UprightFeatures
 from fgslam.core.planar import wrap
-from fgslam.frontend.features.column_segments import empty_segments
+from fgslam.frontend.features.omni import empty_segments
 from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import (

@@ -9,11 +9,11 @@ import pytest
 
 from fgslam.core.arrays import IntArray
 from fgslam.core.estimates import LandmarkMap, RelocalisationStatus
-from fgslam.frontend.places.relocalisation.known_map import Tentative
-from fgslam.frontend.places.relocalisation.refinement import Refined
-from fgslam.frontend.places.relocalisation.relocaliser import (
+from fgslam.frontend.places.known_map import Tentative
+from fgslam.frontend.places.relocalisation import (
     ENOUGH_INLIERS,
     MAX_MISFIT,
+    Refined,
     accept,
 )
 from fgslam.frontend.settings import RelocalisationSettings

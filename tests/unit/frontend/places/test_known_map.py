@@ -9,7 +9,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances
 from fgslam.core.geometry import project, transform_to_camera
-from fgslam.frontend.places.relocalisation.known_map import KnownMap
+from fgslam.frontend.places.known_map import KnownMap
 from tests.known_places import RIG, looks, planar
 
 SIGMA_M = 0.02

@@ -15,9 +15,8 @@ from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.places import map_alignment
-from fgslam.frontend.places.map_alignment import Alignment, align_maps, tentative_pairs
-from fgslam.frontend.places.map_fusion import merge_maps
+from fgslam.frontend.places import merging as map_alignment
+from fgslam.frontend.places.merging import Alignment, align_maps, merge_maps, tentative_pairs
 from fgslam.runs.maps import merge_files
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))

@@ -23,8 +23,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap, load_map, save_map
-from fgslam.frontend.places.map_alignment import align_maps
-from fgslam.frontend.places.map_fusion import merge_maps
+from fgslam.frontend.places.merging import align_maps, merge_maps
 from fgslam.runs.maps import merge_files
 
 POINTS = 250

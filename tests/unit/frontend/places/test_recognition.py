@@ -30,12 +30,11 @@ from fgslam.core.estimates import EgoMotionStatus
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.store import restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.frontend.features.descriptor_index import AppearanceIndex
-from fgslam.frontend.places.closures import difference
-from fgslam.frontend.places.recognition import LostRules, PlaceRecognition
-from fgslam.frontend.places.relocalisation import known_map
+from fgslam.frontend.features.matching import AppearanceIndex
+from fgslam.frontend.places import known_map
+from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.landmark_table import LandmarkTable
+from fgslam.frontend.tracking.landmarks import LandmarkTable
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe

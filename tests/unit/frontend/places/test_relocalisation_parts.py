@@ -8,25 +8,26 @@ import pytest
 from fgslam.core import geometry
 from fgslam.core.estimates import LandmarkMap
 from fgslam.core.features import StereoFeatures
-from fgslam.frontend.features.descriptor_index import Neighbours
-from fgslam.frontend.places.relocalisation.known_map import KnownMap, specific
-from fgslam.frontend.places.relocalisation.proposals import Evidence, Proposals, distinct
-from fgslam.frontend.places.relocalisation.refinement import (
+from fgslam.frontend.features.matching import Neighbours
+from fgslam.frontend.places.known_map import KnownMap
+from fgslam.frontend.places.relocalisation import (
+    Evidence,
+    Pairs,
+    Proposals,
     Refiner,
+    Relocaliser,
+    SeenPoints,
     covered,
     crowd,
+    distinct,
     independent_inliers,
-)
-from fgslam.frontend.places.relocalisation.relocaliser import Relocaliser
-from fgslam.frontend.places.relocalisation.residuals import (
-    Pairs,
-    SeenPoints,
     log_uniform,
     refine,
     residuals,
+    specific,
 )
 from fgslam.frontend.settings import RelocalisationSettings
-from fgslam.frontend.tracking.resection import align, align_in_space, rigid
+from fgslam.frontend.tracking.ego_motion import align, align_in_space, rigid
 from tests.known_places import RIG, Place, error, floor, planar, room, seen
 
 

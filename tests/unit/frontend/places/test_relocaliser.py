@@ -12,8 +12,8 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import Relocalisation, RelocalisationStatus
 from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.frontend.places.relocalisation import relocaliser
-from fgslam.frontend.places.relocalisation.relocaliser import LEAST_INLIERS, Relocaliser
+from fgslam.frontend.places import relocalisation as relocaliser
+from fgslam.frontend.places.relocalisation import LEAST_INLIERS, Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
 from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
 

@@ -16,18 +16,17 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, LoopClosure, Observations
 from fgslam.core.store import restore, state_of
 from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.places.closures import (
+from fgslam.frontend.places.recognition import (
     Confirmation,
     LoopGates,
+    SightingMemory,
     close_loop,
     difference,
     drift_allows,
     duplicates,
 )
-from fgslam.frontend.places.sightings import SightingMemory
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
-from fgslam.frontend.tracking.resection import Resection
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection
 
 LOOPS = LoopGates()
 DOWN = np.array([0.0, 1.0, 0.0])

@@ -13,7 +13,7 @@ from fgslam.core.floor import Floor
 from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.planar import wrap
 from fgslam.core.sensors import CameraRig
-from fgslam.frontend.features.descriptor_index import AppearanceIndex, Neighbours
+from fgslam.frontend.features.matching import AppearanceIndex, Neighbours
 
 _NEAREST_M = 0.3
 _ROUNDING_M = 1e-6  # of depths computed in two ways, with thousands of kilometres to spare

@@ -1,1 +1,0 @@
-"""Relocalisation: the pose of a frame in a map, without a prior (the kidnapped robot)."""
