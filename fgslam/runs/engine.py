@@ -19,7 +19,6 @@ from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import Page, TextTable, read_metrics, write_json
-from fgslam.report.page import write_html
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
 from fgslam.runs.crews import Crew
@@ -351,6 +350,8 @@ def write_page(result: RunResult, subtitle: str, **parts: Any) -> None:
     """report.html, unless the configuration does without; ``parts`` as of Page."""
     if not result.config.wants_report:
         return
+    from fgslam.report.page import write_html  # loads Plotly
+
     page = Page(
         title=result.config.name,
         subtitle=subtitle,

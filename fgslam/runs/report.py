@@ -22,7 +22,6 @@ from fgslam.core.trajectories import read_covariances
 from fgslam.core.yaml_text import plain_values
 from fgslam.report.content import Picture, read_metrics
 from fgslam.report.formats import MapPoints, read_ply
-from fgslam.report.page import write_report
 from fgslam.report.results import (
     EstimatorReport,
     ReportData,
@@ -53,6 +52,8 @@ def report_from_folder(folder: Path, run: Path | None = None) -> Path:
     Raises:
         FgslamError: there are no results, one of the files is damaged, or writing failed.
     """
+    from fgslam.report.page import write_report  # loads Plotly
+
     page = folder / REPORT_FILE
     write_report(page, load_report(folder, run))
     return page

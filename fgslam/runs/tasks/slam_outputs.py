@@ -19,14 +19,6 @@ from fgslam.core.sensors import vertical_of
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 from fgslam.report.content import Column, StageTime, TextTable, write_metrics, write_timing
-from fgslam.report.figures import (
-    LANDMARK_ELLIPSES,
-    ON_PAPER,
-    drive_from_above,
-    error_by_axis,
-    map_to_turn,
-    matches_over_time,
-)
 from fgslam.report.results import ReportData, judged_report, truth_in_their_world
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.estimator_files import NOISE_TABLE, write_estimate, write_noise
@@ -406,22 +398,24 @@ def figures_of(outputs: RunOutputs) -> RunFigures:
 
 def draw_run(run: Path, figures: RunFigures) -> list[Path]:
     """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
+    from fgslam.report import figures as drawn  # Plotly and Matplotlib take a second
     from fgslam.report.pictures import draw_figure, draw_views
 
     folder = make_subfolder(run, FOLDER)
     results = _results(figures)
     kind = "valid landmarks" if figures.valid.any() else "landmarks"
     what = figures.title(f"{len(results.estimators[0].landmarks):,} {kind}")
-    above = drive_from_above(results, ON_PAPER)
-    draw_figure(folder / "map_from_above.png", above, what, {LANDMARK_ELLIPSES})
-    draw_views(folder / "map_views.png", map_to_turn(results, ON_PAPER), what)
+    above = drawn.drive_from_above(results, drawn.ON_PAPER)
+    draw_figure(folder / "map_from_above.png", above, what, {drawn.LANDMARK_ELLIPSES})
+    views = drawn.map_to_turn(results, drawn.ON_PAPER)
+    draw_views(folder / "map_views.png", views, what)
     # The first frame has no landmarks to match.
     counts = (figures.frames, figures.matched, figures.inliers, figures.landmarks)
-    matches = matches_over_time(*(values[1:] for values in counts))
+    matches = drawn.matches_over_time(*(values[1:] for values in counts))
     draw_figure(folder / "matches.png", matches, figures.title("landmark matches"))
     if results.truth is not None:
         title = figures.title("position error, first pose aligned")
-        draw_figure(folder / "position_error.png", error_by_axis(results), title)
+        draw_figure(folder / "position_error.png", drawn.error_by_axis(results), title)
     return sorted(folder.glob("*.png"))
 
 

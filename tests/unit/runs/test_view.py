@@ -1,4 +1,4 @@
-"""What is sent to the viewer, as plain arrays: changed blocks of the map, colours of matches."""
+"""What is sent to the viewer."""
 
 from __future__ import annotations
 
