@@ -18,12 +18,12 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.lenses import RawCamera, checked_camera
-from fgslam.core.array_files import UNREADABLE, require_plain
 from fgslam.core.arrays import FloatArray
 from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import read_text, require_file
 from fgslam.core.geometry import is_rigid
+from fgslam.core.store import UNREADABLE, require_plain
 from fgslam.core.yaml_text import PlainLoader
 
 Size: TypeAlias = tuple[int, int]

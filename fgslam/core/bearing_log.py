@@ -1,6 +1,6 @@
 """The bearing log: all that a homing estimator consumes, replayable without images.
 
-One uncompressed ``.npz`` (:mod:`fgslam.core.array_files`), like the measurement log. Rows of image
+One uncompressed ``.npz`` (:mod:`fgslam.core.store`), like the measurement log. Rows of image
 ``k`` are ``image_start[k]:image_start[k + 1]``.
 """
 
@@ -14,18 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.array_files import (
-    ArrayFile,
-    Items,
-    by_field,
-    fields_from,
-    joined,
-    of_rows,
-    offsets,
-    rows_of,
-    write_arrays,
-)
-from fgslam.core.array_values import require_covariances, require_finite, require_single
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.homing import (
@@ -35,6 +23,20 @@ from fgslam.core.homing import (
     LocalMap,
     TrackedBearings,
     TwoViewVector,
+)
+from fgslam.core.store import (
+    ArrayFile,
+    Items,
+    by_field,
+    fields_from,
+    joined,
+    of_rows,
+    offsets,
+    require_covariances,
+    require_finite,
+    require_single,
+    rows_of,
+    write_arrays,
 )
 
 LOG = ArrayFile(

@@ -11,37 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.array_files import (
-    Items,
-    from_upper,
-    joined,
-    of_rows,
-    offsets,
-    rows_of,
-    split,
-)
-from fgslam.core.array_values import (
-    require_covariances,
-    require_finite,
-    require_motions,
-    require_single,
-)
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
-from fgslam.core.log_layout import (
-    BEFORE_LOOPS,
-    CORRECTIONS,
-    LOG,
-    LOOPS,
-    PER_FRAME,
-    PER_LOOP,
-    PER_OBSERVATION,
-    PER_TURN,
-    SENSOR_POSE,
-    WITH_CORRECTIONS,
-    WITH_EVERYTHING,
-    WITH_LOOPS,
-)
 from fgslam.core.measurements import (
     BiasEffect,
     Increment,
@@ -53,6 +24,59 @@ from fgslam.core.measurements import (
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import (
+    ArrayFile,
+    Items,
+    from_upper,
+    joined,
+    of_rows,
+    offsets,
+    require_covariances,
+    require_finite,
+    require_motions,
+    require_single,
+    rows_of,
+    split,
+)
+
+LOG = ArrayFile(
+    name="fgslam measurement log",
+    # 2: without loops, 3: without corrections of the rig, 6: without the bias of a gyroscope.
+    versions=(2, 3, 6, 7),
+    error=MeasurementLogError,
+    give="give a run folder's measurements.npz",
+    again="run again",
+)
+BEFORE_LOOPS, WITH_LOOPS, WITH_CORRECTIONS, WITH_EVERYTHING = LOG.versions
+CORRECTIONS, SENSOR_POSE = "rig_correction", "rig_bTc"
+
+# Arrays by the count that their first axis has, with type and the shape of an item.
+PER_FRAME: Items = {
+    "frame_index": ("i", ()),
+    "timestamp": ("f", ()),
+    "odometry_motion": ("f", (4, 4)),
+    "odometry_covariance": ("f", (6, 6)),
+}
+PER_OBSERVATION: Items = {
+    "observation_id": ("i", ()),
+    "measurement": ("f", (3,)),
+    "measurement_covariance": ("f", (6,)),
+    "pixels": ("f", (3, 2)),
+    "is_new": ("b", ()),
+    "rejected": ("b", ()),
+}
+LOOPS = "loop_"  # before the names of the arrays of the loops' own observations
+PER_LOOP: Items = {
+    "loop_frame": ("i", ()),
+    "loop_oTc": ("f", (4, 4)),
+    "loop_covariance": ("f", (6, 6)),
+}
+PER_TURN: Items = {
+    "gyroscope_jacobian": ("f", (3, 3)),
+    "gyroscope_bias": ("f", (3,)),
+    "gyroscope_bias_covariance": ("f", (3, 3)),
+    "gyroscope_stability": ("f", (2,)),
+}
 
 _UPPER = np.triu_indices(3)
 _UNSETTLED = -1  # number of knocks of a frame that knows nothing of its rig

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.array_files import write_arrays
 from fgslam.core.arrays import Brief, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.files import as_path
-from fgslam.core.log_arrays import SENSOR_ARRAYS, arrays_of, frames_of, sensor_of
-from fgslam.core.log_layout import LOG
+from fgslam.core.log_arrays import LOG, SENSOR_ARRAYS, arrays_of, frames_of, sensor_of
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import write_arrays
 
 
 @dataclass(slots=True, eq=False, repr=False)

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.array_files import ArrayFile, Items, from_upper, of_rows
-from fgslam.core.array_values import require_covariances, require_finite
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MapError
 from fgslam.core.estimates import LandmarkMap, Trajectory
@@ -25,6 +23,14 @@ from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatche
 from fgslam.core.files import replacing
 from fgslam.core.rig_checks import rig_fault
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import (
+    ArrayFile,
+    Items,
+    from_upper,
+    of_rows,
+    require_covariances,
+    require_finite,
+)
 
 FILE = ArrayFile(
     name="fgslam map",

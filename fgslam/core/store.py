@@ -5,6 +5,9 @@ pickle. The same value gives the same bytes. What is read back is what the reade
 and of a union only its own members. Lists are stacked by column: 10,000 poses are one array, a list
 of dataclasses one column a field.
 
+Logs, maps and features name their arrays themselves, as tables in the documents have them: they
+share reading, writing and the checks of what is read (:class:`ArrayFile`).
+
 A class that changes during a run marks what it keeps: ``_pose: Kept[FloatArray]``. That is its
 state; what is made of it (caches) or given to it (settings, cameras) is not. :func:`state_of` takes
 a snapshot, :func:`restore` puts it back into a part made with the same settings.
@@ -15,18 +18,25 @@ from __future__ import annotations
 import dataclasses
 import json
 import sys
+import tokenize
 import types
 import typing
+import zipfile
+import zlib
 from collections import abc, deque
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, Any, Protocol, Self, TypeAlias, TypeVar, get_args, get_origin
 
 import numpy as np
 
-from fgslam.core.arrays import StateArrays
+from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.errors import FgslamError, MeasurementLogError
+from fgslam.core.files import replacing, require_file
+from fgslam.core.geometry import is_rigid
 
 T = TypeVar("T")
 _KEPT = "kept"
@@ -457,3 +467,283 @@ def put_back(part: Any, kept: Any) -> None:
             put_back(now, value)
         else:
             setattr(part, name, value)
+
+
+# --------------------------------------------------------------------------------------------
+# Files of arrays
+
+Items: TypeAlias = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Arrays by name: their kind (of ``numpy.dtype.kind``) and the shape of one row."""
+
+UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    KeyError,
+    TypeError,
+    RuntimeError,  # encrypted; NotImplementedError is one, too
+    MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+"""What NumPy and zipfile raise on truncated, damaged and foreign files."""
+_UNPACKED_FREELY = 100_000_000
+_MOST_PACKED = 50
+"""Bytes out of one: maps are packed by two, their emptiest arrays by thirty."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ArrayFile:
+    """A kind of file, and how a file that is not one is refused.
+
+    Attributes:
+        name: what it holds, as in "fgslam measurement log".
+        versions: that are read, the newest last.
+        error: what is raised.
+        give: what to do where it is another file, or none: "give measurements.npz".
+        again: what to do where it is damaged: "run again".
+    """
+
+    name: str
+    versions: tuple[int, ...]
+    error: type[FgslamError]
+    give: str
+    again: str
+
+    @property
+    def short(self) -> str:
+        """The name without the leading `fgslam`."""
+        return self.name.removeprefix("fgslam ")
+
+    def header(self, version: int | None = None, **values: Any) -> StateArrays:
+        """The array ``header`` with plain JSON values; by default of the newest version."""
+        chosen = self.versions[-1] if version is None else version
+        text = json.dumps({"format": self.name, "version": chosen, **values}, sort_keys=True)
+        return {"header": np.array(text)}
+
+    def load(self, path: Path, names: Sequence[str] | None = None) -> StateArrays:
+        """The arrays of a file of these names, or all; never unpickled.
+
+        Raises:
+            FgslamError: :attr:`error`, for what cannot be read.
+        """
+        if path.exists() and not path.is_file() and not path.is_dir():
+            require_file(path, self.error, self.give)  # who opens a pipe waits for its other end
+        try:
+            path.open("rb").close()
+        except FileNotFoundError:
+            raise self.error(f"{path}: no such file; {self.give}") from None
+        except IsADirectoryError:
+            raise self.error(f"{path}: is a folder; give the file itself") from None
+        except OSError as error:
+            raise self.error(f"{path}: cannot be read ({error.strerror}); {self.give}") from None
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                require_plain(file)
+                return {name: file[name] for name in (file.files if names is None else names)}
+        except UNREADABLE as error:
+            cause = " ".join(str(error).split()) or type(error).__name__
+            if "pickle" in cause:  # NumPy advises to unpickle, which would run what the file says
+                cause = "neither arrays nor an archive of them"
+            raise self.error(
+                f"{path}: not a readable {self.short} ({cause}); it may be truncated, {self.again}"
+            ) from None
+
+    def read_header(self, arrays: StateArrays, where: str) -> dict[str, Any]:
+        """The header's values. Raises :attr:`error` for a foreign file and another version."""
+        try:
+            header = json.loads(str(arrays["header"]))
+        except (KeyError, json.JSONDecodeError):
+            header = None
+        if not isinstance(header, dict) or header.get("format") != self.name:
+            raise self.error(f"{where}: not an {self.name}; {self.give}")
+        if header.get("version") not in self.versions:
+            raise self.error(f"{where}: {self.short} made by another version; {self.again}")
+        return header
+
+    def damaged(self, name: str, where: str) -> FgslamError:
+        """The error for an array that is absent, of a wrong type or size, or out of order."""
+        return self.error(f"{where}: array {name} is absent or damaged; {self.again}")
+
+    def require(self, arrays: Mapping[str, Any], items: Items, where: str) -> None:
+        """Raises :attr:`error` unless arrays of these kinds and whole shapes are there."""
+        for name, (kind, shape) in items.items():
+            array = arrays.get(name)
+            if not isinstance(array, np.ndarray) or (array.dtype.kind, array.shape) != (
+                kind,
+                shape,
+            ):
+                raise self.damaged(name, where)
+
+    def require_offsets(
+        self, arrays: Mapping[str, Any], name: str, parts: int | None, where: str
+    ) -> int:
+        """Rows that offsets run to, from 0 and without a step back.
+
+        Raises:
+            FgslamError: they do not, or are not those of so many ``parts`` (None: of any).
+        """
+        start = arrays.get(name)
+        if not isinstance(start, np.ndarray) or start.dtype.kind != "i" or start.ndim != 1:
+            raise self.damaged(name, where)
+        if len(start) != (max(len(start), 1) if parts is None else parts + 1):
+            raise self.damaged(name, where)
+        if start[0] != 0 or (np.diff(start) < 0).any():
+            raise self.damaged(name, where)
+        return int(start[-1])
+
+
+def require_plain(file: Any) -> None:
+    """Raises ValueError for what no open archive of arrays holds: other files, far more than it is.
+
+    ValueError is one of :data:`UNREADABLE`, as is what reading the arrays may raise.
+    """
+    members = file.zip.infolist()
+    foreign = [one.filename for one in members if not one.filename.endswith(".npy")]
+    if foreign:
+        raise ValueError(f"holds {foreign[0]}, which is no array")
+    names = [one.filename for one in members]
+    if len(set(names)) < len(names):
+        raise ValueError("holds an array twice")
+    size, packed = (sum(getattr(m, k) for m in members) for k in ("file_size", "compress_size"))
+    if size > _UNPACKED_FREELY + _MOST_PACKED * packed:
+        raise ValueError(f"would unpack to {size / 1e6:.0f} MB from {packed / 1e6:.0f}")
+
+
+def write_arrays(path: Path, arrays: StateArrays, compressed: bool = False) -> int:
+    """Writes an ``.npz`` whole or not at all; the same arrays give the same bytes.
+
+    Returns:
+        Size of the file in bytes.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    save = np.savez_compressed if compressed else np.savez
+    with replacing(path) as partial, partial.open("wb") as file:
+        save(file, allow_pickle=False, **arrays)
+        return file.tell()
+
+
+def load_arrays(path: Path) -> StateArrays:
+    """All arrays of a file of a run folder. Raises MeasurementLogError where it cannot be read."""
+    return _OF_RUNS.load(path)
+
+
+_OF_RUNS = ArrayFile(
+    "file of arrays", (1,), MeasurementLogError, "give the run folder's own", "run again"
+)
+
+
+# --------------------------------------------------------------------------------------------
+# Rows
+
+
+def of_rows(count: int, items: Items) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """Kinds and whole shapes of arrays of ``count`` rows."""
+    return {name: (kind, (count, *item)) for name, (kind, item) in items.items()}
+
+
+def rows_of(arrays: Mapping[str, Any], name: str) -> int:
+    """Rows of an array; 0 where it is absent or a scalar."""
+    array = arrays.get(name)
+    return len(array) if isinstance(array, np.ndarray) and array.ndim else 0
+
+
+def offsets(sizes: Sequence[int]) -> IntArray:
+    """Offsets (n + 1,) of parts of these sizes."""
+    return np.cumsum(np.array([0, *sizes], np.int64))
+
+
+def joined(
+    parts: Sequence[Any], item: tuple[int, ...] = (), dtype: Any = np.float64
+) -> np.ndarray[Any, Any]:
+    """Parts with rows of shape ``item`` one after the other; of ``dtype`` where there are none."""
+    return np.concatenate([np.empty((0, *item), dtype), *parts])
+
+
+def split(array: np.ndarray[Any, Any], start: IntArray) -> list[np.ndarray[Any, Any]]:
+    """The parts between offsets."""
+    return np.split(array, start[1:-1]) if len(start) > 1 else []
+
+
+def by_field(value: Any, prefix: str) -> StateArrays:
+    """The arrays of a dataclass by prefix and field name."""
+    return {
+        f"{prefix}{field.name}": getattr(value, field.name) for field in dataclasses.fields(value)
+    }
+
+
+def fields_from(kind: type, arrays: StateArrays, prefix: str) -> dict[str, Any]:
+    """The arrays of :func:`by_field` by field name, to make the dataclass ``kind`` of."""
+    return {field.name: arrays[f"{prefix}{field.name}"] for field in dataclasses.fields(kind)}
+
+
+def from_upper(upper: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
+    """Symmetric matrices (n, size, size) of their upper triangles (n, m), row by row."""
+    rows, columns = np.triu_indices(size)
+    out = np.empty((len(upper), size, size), upper.dtype)
+    out[:, rows, columns] = out[:, columns, rows] = upper
+    return out
+
+
+# --------------------------------------------------------------------------------------------
+# Values from a file: a file whose shapes fit may still hold what no run wrote
+
+_ROUNDED = 1e-9
+"""Of a covariance's trace: what rounding may take from its smallest eigenvalue."""
+
+
+def require_finite(
+    file: ArrayFile, arrays: Mapping[str, Any], names: Sequence[str], where: str
+) -> None:
+    """Raises the file's error for the first array that holds NaN or infinity."""
+    for name in names:
+        if not np.isfinite(arrays[name]).all():
+            raise _refusal(file, where, f"array {name} is not finite")
+
+
+def require_covariances(
+    file: ArrayFile, name: str, covariances: FloatArray, where: str, *, definite: bool = True
+) -> None:
+    """Raises the file's error unless matrices (n, k, k) are finite, symmetric and positive.
+
+    ``definite`` False: some direction may be without noise, as of a motion in the plane.
+    """
+    if not np.isfinite(covariances).all():
+        raise _refusal(file, where, f"array {name} is not finite")
+    if not len(covariances):
+        return
+    size = np.abs(covariances).max(axis=(1, 2))
+    skew = np.abs(covariances - np.swapaxes(covariances, 1, 2)).max(axis=(1, 2))
+    least = np.linalg.eigvalsh(covariances)[:, 0]
+    wrong = (skew > _ROUNDED * size) | (least < -_ROUNDED * size)
+    if definite:
+        wrong |= least <= 0.0
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise _refusal(file, where, f"array {name}, row {row}, is no covariance")
+
+
+def require_motions(file: ArrayFile, name: str, motions: FloatArray, where: str) -> None:
+    """Raises the file's error unless all of (n, 4, 4) are rigid motions."""
+    wrong = [not is_rigid(motion) for motion in motions]
+    if any(wrong):
+        raise _refusal(file, where, f"array {name}, row {wrong.index(True)}, is no rigid motion")
+
+
+def require_single(file: ArrayFile, name: str, ids: IntArray, start: IntArray, where: str) -> None:
+    """Raises the file's error where one part between offsets holds an identity twice."""
+    part = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    order = np.lexsort((ids, part))
+    twice = (np.diff(ids[order]) == 0) & (np.diff(part[order]) == 0)
+    if twice.any():
+        at = order[int(np.argmax(twice))]
+        found = f"array {name} holds {ids[at]} twice in part {part[at]}"
+        raise _refusal(file, where, found)
+
+
+def _refusal(file: ArrayFile, where: str, what: str) -> Exception:
+    return file.error(f"{where}: {what}, so it is damaged or no run wrote it; {file.again}")

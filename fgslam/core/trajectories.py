@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.array_files import from_upper
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import as_path, read_text, write_text
 from fgslam.core.geometry import pose, quaternion_from_rotation, rotation_from_quaternion
+from fgslam.core.store import from_upper
 
 _TUM_FORMAT = "%.9f" + 7 * " %.12f"
 _EUROC_FORMAT = ",".join(7 * ["%.12f"])

@@ -15,8 +15,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from fgslam.core.array_files import ArrayFile, joined, of_rows, offsets, split
-from fgslam.core.array_values import require_finite
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import StoredMapError
 from fgslam.core.homing import (
@@ -26,6 +24,7 @@ from fgslam.core.homing import (
     OmniFeatures,
     UprightFeatures,
 )
+from fgslam.core.store import ArrayFile, joined, of_rows, offsets, require_finite, split
 
 VERSIONS = (2,)
 """Of files that hold features."""

@@ -21,14 +21,21 @@ from scipy.sparse import csr_matrix, diags
 
 from fgslam.cameras.omni import OmniCamera
 from fgslam.cameras.omni_files import camera_of, camera_values
-from fgslam.core.array_files import ArrayFile, Items, by_field, fields_from, of_rows, write_arrays
-from fgslam.core.array_values import require_covariances
 from fgslam.core.arrays import FloatArray, Image, StateArrays
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.files import as_path
 from fgslam.core.geometry import is_rigid
 from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import circular_median, wrap
+from fgslam.core.store import (
+    ArrayFile,
+    Items,
+    by_field,
+    fields_from,
+    of_rows,
+    require_covariances,
+    write_arrays,
+)
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator
 from fgslam.homing.active import parallax

@@ -14,10 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
-from fgslam.core.store import UNFIT, pack, unpack
+from fgslam.core.store import UNFIT, load_arrays, pack, unpack, write_arrays
 from fgslam.runs.crews import Crew
 from fgslam.runs.processes import WorkerEnded, Workers, run_apart
 

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 
 import fgslam as fg
-from fgslam.core.array_files import write_arrays
 from fgslam.core.bearing_log import BearingLog
 from fgslam.core.homing import HomingStart, TwoViewVector
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations, Odometry
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import write_arrays
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector

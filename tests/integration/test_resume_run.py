@@ -27,7 +27,6 @@ from running import (
     write_config,
 )
 
-from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import (
     ConfigError,
     DatasetError,
@@ -36,6 +35,7 @@ from fgslam.core.errors import (
     OutputError,
 )
 from fgslam.core.measurements import Odometry
+from fgslam.core.store import load_arrays, write_arrays
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings

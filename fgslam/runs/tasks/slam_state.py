@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from fgslam.core import __version__, store
-from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import OutputError
 from fgslam.core.estimates import Estimate
 from fgslam.core.files import remove_file
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, save_map
+from fgslam.core.store import load_arrays, write_arrays
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.folder import LOG_FILE, STATE_FILE
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray, Rows
 from fgslam.core.estimates import LandmarkMap
-from fgslam.core.store import restore, state_of
+from fgslam.core.store import pack, unpack
 from fgslam.core.trajectories import Trajectory
 
 
@@ -117,11 +117,11 @@ def test_growing_columns_equal_plain_arrays(steps) -> None:
 def test_a_snapshot_is_not_touched_by_what_follows() -> None:
     columns = GrowingColumns(name=np.empty(0, np.int64))
     columns.append({"name": np.arange(5)})
-    state = state_of(columns)
+    state = pack(columns)
     columns["name"][:] = 7
     columns.drop(np.array([True, False, False, False, False]))
     assert state["name"].tolist() == [0, 1, 2, 3, 4]
-    restore(columns, state)
-    assert columns["name"].tolist() == [0, 1, 2, 3, 4]
-    columns["name"][0] = 9
+    back = unpack(state, GrowingColumns)
+    assert back["name"].tolist() == [0, 1, 2, 3, 4]
+    back["name"][0] = 9
     assert state["name"][0] == 0

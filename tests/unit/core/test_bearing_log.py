@@ -66,7 +66,7 @@ def test_foreign_and_truncated_files_are_refused(log: BearingLog, tmp_path: Path
     with pytest.raises(MeasurementLogError, match="not an fgslam bearing log"):
         BearingLog.from_arrays(other, "a.npz")
     new = arrays | {"header": np.array('{"format": "fgslam bearing log", "version": 9}')}
-    with pytest.raises(MeasurementLogError, match="version 9"):
+    with pytest.raises(MeasurementLogError, match="made by another version"):
         BearingLog.from_arrays(new, "a.npz")
     path = tmp_path / "bearings.npz"
     np.savez(path, **arrays)

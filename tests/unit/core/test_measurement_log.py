@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
-from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.geometry import se3_exp
 from fgslam.core.measurement_log import MeasurementLog
@@ -28,6 +27,7 @@ from fgslam.core.measurements import (
 from fgslam.core.rig_correction import term_names
 from fgslam.core.sensors import CameraRig
 from fgslam.core.settings import RigPlaces
+from fgslam.core.store import load_arrays, write_arrays
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 

@@ -15,7 +15,6 @@ import fgslam
 from fgslam.core import files as whole_files
 from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
-from fgslam.core.array_files import load_arrays
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MapError, OutputError
 from fgslam.core.estimates import LandmarkMap, Trajectory
@@ -23,6 +22,7 @@ from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatche
 from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
 from fgslam.core.sensors import CameraRig
+from fgslam.core.store import load_arrays
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.estimates import (
     EgoMotion,
     EgoMotionStatus,
@@ -23,7 +22,7 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.measurements import Increment, Observations
 from fgslam.core.recordings import Frame
 from fgslam.core.sensors import CameraRig
-from fgslam.core.store import restore, state_of
+from fgslam.core.store import load_arrays, restore, state_of, write_arrays
 from fgslam.evaluation.judging import Truth
 from fgslam.evaluation.statistics import value_at
 from fgslam.runs.tasks.slam_metrics import estimator_metrics, frame_problems, run_numbers

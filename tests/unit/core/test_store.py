@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.core.array_files import load_arrays, write_arrays
 from fgslam.core.errors import DatasetError, MeasurementLogError
 from fgslam.core.files import read_text
+from fgslam.core.store import load_arrays, write_arrays
 
 
 def archive(tmp_path: Path) -> Path:
