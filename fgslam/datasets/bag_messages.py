@@ -367,9 +367,9 @@ def _rigid_pose(child: str, numbers: FloatArray) -> FloatArray:
 def view_axes(tree: FrameTree, left: str, right: str, body: str) -> tuple[FloatArray, str]:
     """Pose (4, 4) of a camera in its frame, and what was assumed.
 
-    Images are given in axes x right, y down, z ahead, and their frame's name says "optical"
+    Images are given in axes x right, y down, z ahead, and their frame's name states "optical"
     (REP 103). Some give a frame with the axes of a robot, x ahead and z up: there the cameras sit
-    beside each other along y, or would look upwards.
+    next to each other along y, or would point upwards.
     """
     robot = False
     if "optical" not in left + right:

@@ -51,10 +51,10 @@ class Chosen:
         views: of left and right images, perhaps of top ones.
         left_info, right_info: of their camera_info; None where there is none.
         motion: of odometry, or None.
-        transforms: of tf_static; where the bag has none, of tf, which says again what stays.
+        transforms: of tf_static; where the bag has none, of tf, which states again what stays.
         notes: what else could have been taken.
-        numbers: which cameras of the calibration file the views are, so that it tells the sides;
-            empty: the topics do.
+        numbers: which cameras of the calibration file the views are, so that it determines the
+            sides; empty: the topics do.
         depth: whether left is the depth of right, in place of a second camera.
     """
 
@@ -96,7 +96,7 @@ class FileCameras:
 
 
 def file_cameras(settings: BagSettings) -> FileCameras:
-    """What the calibration file says of topics; a file at fault is refused with the rig."""
+    """What the calibration file states of topics; a file at fault is refused with the rig."""
     if settings.camera_file is None:
         return FileCameras()
     file = Path(settings.camera_file)
@@ -163,7 +163,7 @@ def choose_topics(
 def _views_as_named(
     names: Sequence[str], topics: Sequence[Topic], cameras: FileCameras, where: str
 ) -> _Views:
-    """The user's topics and, where the file tells them or must, their cameras in it."""
+    """The user's topics and, where the file names them or must, their cameras in it."""
     images = [topic.name for topic in topics if topic.kind in IMAGES]
     depths = [name for name in names if _is_depth(name, images)]
     if len(names) == 2 and len(depths) == 1:
@@ -237,7 +237,7 @@ def _views_by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -
     absent = [topic for topic in cameras.topics if topic and _absolute(topic) not in shown]
     if absent:
         text = f"no images here of {', '.join(absent)}, the rostopic in {cameras.file}"
-        notes.insert(0, f"{text}: topics are told by their names")
+        notes.insert(0, f"{text}: topics are recognised by their names")
     numbers = (0, 1, 2) if third else _numbered_of_many(used, cameras)
     return _Views(tuple(by_view[name] for name in names), numbers, tuple(notes))
 
@@ -254,7 +254,7 @@ def _no_pair(topics: Sequence[Topic], views: Sequence[str], where: str) -> str:
             "record both cameras"
         )
     return (
-        f"{where}: which of {', '.join(views)} are left and right cannot be told by their names; "
+        f"{where}: which of {', '.join(views)} are left and right is unknown by their names; "
         "say it: --topics LEFT,RIGHT"
     )
 
@@ -264,7 +264,7 @@ def _list(topics: Sequence[Topic]) -> str:
 
 
 def _numbered_of_many(names: Sequence[str], cameras: FileCameras) -> tuple[int, ...]:
-    """Of a file of more than three cameras those that numbers in names tell; () where none do."""
+    """Of a file of more than three cameras those that numbers in names state; () where none do."""
     numbers = _differing_numbers(names)
     count = len(cameras.topics)
     return numbers if count > 3 and numbers and max(numbers) < count else ()
@@ -296,12 +296,12 @@ def _rank(view: str) -> int:
 
 
 def _infos(topics: Sequence[Topic], left: str, right: str) -> tuple[str | None, str | None]:
-    """camera_info beside each image topic; else the only pair of camera_info that there is."""
+    """camera_info next to each image topic; else the only pair of camera_info that there is."""
     names = {topic.name for topic in topics if topic.kind == messages.CAMERA_INFO}
     found = []
     for topic in (left, right):
         plain = topic.removesuffix(_DEPTHS[1]).removesuffix(TRANSPORT)
-        # RealSense's viewer records .../image/data beside .../info/camera_info.
+        # RealSense's viewer records .../image/data next to .../info/camera_info.
         viewer = plain.removesuffix("/image/data") + "/info/camera_info"
         near = (plain.rpartition("/")[0] + "/camera_info", viewer)
         found.append(next((name for name in near if name in names), None))
@@ -316,7 +316,7 @@ def _infos(topics: Sequence[Topic], left: str, right: str) -> tuple[str | None, 
 
 _REGISTERED = re.compile(r"aligned|regist|to_(rgb|colou?r)", re.IGNORECASE)
 _COLOUR = re.compile(r"rgb|colou?r", re.IGNORECASE)
-_OF_DEPTHAI = re.compile(r"/stereo/image_raw(/|$)")  # beside its colour camera's images
+_OF_DEPTHAI = re.compile(r"/stereo/image_raw(/|$)")  # next to its colour camera's images
 SENSOR = re.compile(r"/device_\d+/(sensor_\d+)/")  # of a file of RealSense's viewer
 _DEPTHS = ("", "/compressedDepth", TRANSPORT)
 """Endings of topics of depth, plain before compressed."""
@@ -336,7 +336,7 @@ def _colour_and_depth(topics: Sequence[Topic]) -> _Views | None:
 
 
 def is_registered(topic: str) -> bool:
-    """Whether the name of a topic of depth says that it is registered to colour."""
+    """Whether the name of a topic of depth states that it is registered to colour."""
     return _REGISTERED.search(topic) is not None
 
 
@@ -376,7 +376,7 @@ _SIMULATED = re.compile(r"^/(airsim|carla|tesse)|/segmentation(/|$)|/seg_cam/", 
 def motion_of_bag(
     topics: Sequence[Topic], frame_of: Callable[[Topic], str]
 ) -> tuple[Topic | None, tuple[str, ...]]:
-    """Odometry, of the preferred type the topic whose name says so; and what is none, in a note.
+    """Odometry, of the preferred type the topic whose name states so; and what is none, in a note.
 
     Truth, and others' answers in a global frame, would make the drive look better than it is.
     """
@@ -388,7 +388,7 @@ def motion_of_bag(
         if topic.kind != messages.ODOMETRY or _OF_WHEELS.search(topic.name):
             return ""
         if simulated:
-            return f"truth of a simulator, which {simulated} tells"
+            return f"truth of a simulator, by {simulated}"
         frame = frame_of(topic)
         return f"in the global frame {frame}" if _GLOBAL.fullmatch(frame.strip("/")) else ""
 

@@ -87,7 +87,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
 
     Raises:
         DatasetError: it is no bag, has no pair of cameras, or their images do not pair.
-        CalibrationError: neither its camera_info nor a file says where the cameras are.
+        CalibrationError: neither its camera_info nor a file states where the cameras are.
     """
     where = Path(settings.path)
     paths = paths_of(where)
@@ -234,7 +234,7 @@ def paths_of(given: Path) -> list[Path]:
     found = _bag_files(given) if given.is_dir() else files_of(given)
     if packed := next(filter(is_packed_bag, found), None):
         raise DatasetError(
-            f"{packed} is compressed as a whole, and no metadata.yaml is beside it; unpack it: "
+            f"{packed} is compressed as a whole, and no metadata.yaml is next to it; unpack it: "
             f"zstd -d {packed.name}"
         )
     return found
@@ -513,7 +513,7 @@ def _odometry_source(
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """What a bag says of its cameras.
+    """What a bag states of its cameras.
 
     Attributes:
         infos: by topic of camera_info its first message, as in a file.
@@ -546,7 +546,7 @@ def rig_of_bag(settings: BagSettings, stated: Stated, chosen: Chosen) -> Placed:
     """The rig of the topics that are chosen, or of one of them and its depth, on the robot.
 
     Raises:
-        CalibrationError: nothing says where the cameras are, or what does is malformed.
+        CalibrationError: nothing states where the cameras are, or what does is malformed.
     """
     if chosen.depth:
         found = _rig_of_depth(settings, stated, chosen)
@@ -558,8 +558,8 @@ def rig_of_bag(settings: BagSettings, stated: Stated, chosen: Chosen) -> Placed:
     if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
         rig = mounted(rig, settings)
     else:
-        rig, said = _on_robot(found, stated)
-        notes = (*notes, *said)
+        rig, reported = _on_robot(found, stated)
+        notes = (*notes, *reported)
     return replace(found, rig=rig, notes=notes)
 
 
@@ -569,7 +569,7 @@ def _rig_of_file(settings: BagSettings, file: Path, stated: Stated, chosen: Chos
     on_body = not any(np.array_equal(camera.bTc, np.eye(4)) for camera in cameras)
     if not numbers and len(cameras) > 3:
         raise CalibrationError(
-            f"{file} holds {len(cameras)} cameras, and nothing says which of them {chosen.left} "
+            f"{file} holds {len(cameras)} cameras, and nothing states which of them {chosen.left} "
             f"and {chosen.right} are; write those two: fgslam camera convert {file.name} "
             "two.yaml --cameras 0,1"
         )
@@ -642,7 +642,7 @@ def _rig_of_topics(settings: BagSettings, stated: Stated, chosen: Chosen) -> Pla
     if lacking:
         raise CalibrationError(
             f"{settings.path}: no camera_info belongs to {' and '.join(lacking)}, and one camera's "
-            "says nothing of the other; give the calibration of both by --camera FILE"
+            "states nothing of the other; give the calibration of both by --camera FILE"
         )
     left, right = (_info_of(settings, stated, str(topic)) for topic in topics)
     if all(_is_rectified(topic) for topic in (chosen.left, chosen.right)):
@@ -679,7 +679,7 @@ def _rig_by_tree(
     try:
         if left == right:
             raise CalibrationError(f"both cameras have the frame {left or 'without a name'}")
-        fTc, said = view_axes(stated.tree, left, right, "")
+        fTc, reported = view_axes(stated.tree, left, right, "")
         apart = inverse(fTc) @ stated.tree.pose(left, right) @ fTc
     except CalibrationError as fault:
         raise CalibrationError(
@@ -697,14 +697,14 @@ def _rig_by_tree(
     # A unit is that of camera_info; transforms are in metres (REP 103).
     rig = read_rig(replace(settings, unit_m=1.0), pair, stated.size)
     note = f"camera_info has no baseline: by tf_static {right} is {rig.baseline:.4g} m from {left}"
-    if doubted := implausible(source, rig.plain()):  # --unit, which that names, is another's
+    if unlikely := implausible(source, rig.plain()):  # --unit, which that names, is another's
         note += ", which no rig has: tf_static is in metres; give the calibration by --camera FILE"
-        rig = replace(rig, remarks=tuple(text for text in rig.remarks if text not in doubted))
-    return Placed(rig, pair.cameras, chosen, (note, *filter(None, [said])))
+        rig = replace(rig, remarks=tuple(text for text in rig.remarks if text not in unlikely))
+    return Placed(rig, pair.cameras, chosen, (note, *filter(None, [reported])))
 
 
 def _info_of(settings: BagSettings, stated: Stated, topic: str) -> Info:
-    """The camera_info of images as they were sent: cropped and binned as it says.
+    """The camera_info of images as they were sent: cropped and binned as it states.
 
     Raises:
         CalibrationError: its numbers are 0.
@@ -773,14 +773,14 @@ def _on_robot(found: Placed, stated: Stated) -> tuple[StereoRig, tuple[str, ...]
         bTf = tree.pose(frame, body)
     except CalibrationError as fault:
         return _unconnected(found, tree, body, f" ({fault})" if tree else "")
-    fTc, said = view_axes(tree, left, right, body)
+    fTc, reported = view_axes(tree, left, right, body)
     bTc = bTf @ fTc @ inverse(found.cameras[camera].bTc) @ found.rig.bTc
     x, y, z = (round(float(v), 3) + 0.0 for v in bTc[:3, 3])
     note = (
         f"by tf_static the right camera is {x:g}, {y:g}, {z:g} m (x, y, z) from {body}, whose "
         f"motion {motion.name} is"
     )
-    return replace(found.rig, bTc=bTc), (*tree.notes, note, *filter(None, [said]))
+    return replace(found.rig, bTc=bTc), (*tree.notes, note, *filter(None, [reported]))
 
 
 def _unconnected(
@@ -790,8 +790,8 @@ def _unconnected(
     if found.on_body or not body_is_camera(found.rig.bTc):
         return found.rig, ()
     if "optical" in body:  # axes of a camera (REP 103), as RealSense's gyroscope has
-        said = f"{body} has a camera's axes, and is taken as turned like the camera{reason}"
-        return found.rig, (*tree.notes, said)
-    unknown = "nothing says where the camera sits on the robot whose odometry is used"
+        reported = f"{body} has a camera's axes, and is taken as turned like the camera{reason}"
+        return found.rig, (*tree.notes, reported)
+    unknown = "nothing states where the camera sits on the robot whose odometry is used"
     ahead = replace(found.rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA)
     return ahead, (*tree.notes, f"{unknown}{reason}: {LOOKS_AHEAD}")

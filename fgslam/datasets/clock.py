@@ -17,7 +17,7 @@ from fgslam.core.measurements import Odometry
 from fgslam.datasets.odometry import OdometrySource
 from fgslam.datasets.recording import Recording
 
-_STEPS = 60  # those in which the turn changes most: a steady one says nothing of the clock
+_STEPS = 60  # those in which the turn changes most: a steady one states nothing of the clock
 _FEWEST_STEPS = 15
 _FEATURES, _RATIO, _FEWEST_MATCHES = 1000, 0.8, 20
 _INLIER_PX = 2.0
@@ -53,7 +53,7 @@ class Judged:
 def judged_turns(recording: Recording) -> Judged:
     """Clock, unit and axes of a recording's odometry by the turns that its images show.
 
-    Nothing is said of recordings that hardly turn, or whose images do not match.
+    Nothing is reported of recordings that hardly turn, or whose images do not match.
 
     Raises:
         OdometryError: the odometry is malformed, or its turns are in degrees.
@@ -110,7 +110,7 @@ def _disagreement(left: float, size: float) -> str:
     return (
         "the gyroscope does not turn as the images do (off by "
         f"{np.degrees(left):.2g} of {np.degrees(size):.2g} degrees a step) and is not used; give a "
-        "calibration that says where it sits (T_BS, T_cam_imu), or correct its axes or its unit, "
+        "calibration that states where it sits (T_BS, T_cam_imu), or correct its axes or its unit, "
         "radians/s (where something large moves through most of these images, they are wrong)"
     )
 
@@ -150,7 +150,7 @@ def _telling(recording: Recording) -> IntArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenTurns:
-    """Turns of the body (k, 3) by the images, in the steps ``rows``; and the odometry beside."""
+    """Turns of the body (k, 3) by the images, in the steps ``rows``; and the odometry."""
 
     name: str
     rows: IntArray

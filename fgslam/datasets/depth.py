@@ -1,7 +1,7 @@
 """Colour and depth as a stereo pair, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md).
 
-Depth is measured as disparity: what a second camera beside the colour camera would see is made from
-the depth image, and found again by the front-end as in any stereo pair.
+Depth is measured as disparity: what a second camera next to the colour camera would see is made
+from the depth image, and found again by the front-end as in any stereo pair.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def seen_from_the_left(image: Image, shift: npt.NDArray[np.float32], known: Bool
     Nearer surfaces hide farther ones. What is seen by neither is filled without texture.
     """
     height, width = shift.shape
-    # The column of the original at which each pixel of the view looks.
+    # The column of the original that each pixel of the view shows.
     rows, columns = np.nonzero(known)
     order = np.argsort(shift[rows, columns], kind="stable")  # the nearest last, which stays
     rows, columns = rows[order], columns[order]
@@ -160,11 +160,11 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
 
     Args:
         settings: where they are, and of which camera.
-        odometry: noise and limits of a file of odometry beside them.
+        odometry: noise and limits of a file of odometry in the folder.
 
     Raises:
         DatasetError: images are missing or do not pair, or depths are in another unit.
-        CalibrationError: nothing says the colour camera's focal length.
+        CalibrationError: nothing states the colour camera's focal length.
     """
     root = Path(settings.path)
     pairs, stamps, notes, lists = _pairs(root, settings)
@@ -175,7 +175,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
     camera, known = _camera(root, settings, size)
     odometry_file = find_odometry(root, settings.odometry_file)
     rig, mounting = on_wheels(mounted(depth_rig(camera), settings), settings, odometry_file)
-    scale, said = _scale(root, pairs, settings, size)
+    scale, reported = _scale(root, pairs, settings, size)
 
     def read(index: int) -> tuple[Image, Depth, str]:
         colour_file, depth_file = pairs[index]
@@ -187,7 +187,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         [*lists, *filter(None, [odometry_file])], (path for pair in pairs for path in pair)
     )
     images = depth_images(read, rig, camera)
-    notes = (*notes, *known, *said, *mounting)
+    notes = (*notes, *known, *reported, *mounting)
     name, truth = root.resolve().name, root / "groundtruth.txt"
     recording = image_recording(settings, name, rig, stamps, images, identity, notes)
     return replace(
@@ -290,7 +290,7 @@ def _scale(
     seen, of_integers = _some_depths(root, pairs, size)
     stated = settings.depth_scale or _stated_scale(root, settings)
     guessed = stated is None and of_integers
-    scale, doubt = _assumed_scale(root, seen) if guessed else (stated or 1.0, ())
+    scale, caveat = _assumed_scale(root, seen) if guessed else (stated or 1.0, ())
     median = float(np.median(seen)) / scale
     if not _NEAREST_M < median < (_FARTHEST_GUESSED_M if guessed else _FARTHEST_M):
         raise DatasetError(
@@ -299,15 +299,15 @@ def _scale(
             "10000 for tenths of them, 5000 as in TUM's, 1 for metres"
         )
     assumed = ", which nothing states" if guessed else ""
-    said = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
-    return scale, (*doubt, said)
+    reported = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
+    return scale, (*caveat, reported)
 
 
 def _assumed_scale(root: Path, seen: FloatArray) -> tuple[float, tuple[str, ...]]:
-    """TUM's units a metre or millimetres, whichever a depth camera can have seen; doubt in words.
+    """TUM's units a metre or millimetres, whichever a depth camera can have seen; caveat in words.
 
-    No motion tells: all that is seen is the same in a world of another size. Where both or neither
-    can be, it is the layout's own.
+    Motion does not decide it: all that is seen is the same in a world of another size. Where both
+    or neither can be, it is the layout's own.
 
     Args:
         root: the recording, in TUM's layout or another.
@@ -406,7 +406,7 @@ def _camera(
     known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
     if known is None or size != (640, 480):
         raise CalibrationError(
-            f"{root}: nothing says the colour camera's focal length; give its calibration by "
+            f"{root}: nothing states the colour camera's focal length; give its calibration by "
             "--camera FILE"
         )
     fx, fy, cx, cy = _TUM_CAMERAS[known[1]]

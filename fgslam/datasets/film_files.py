@@ -51,7 +51,7 @@ def write_film(path: Path, frames: Iterable[Image], fps: float) -> int:
 
 
 def _write_mp4(path: Path, frames: Iterable[Image], fps: float) -> int:
-    """Raises OSError or OutputError; OpenCV itself tells of no file that it cannot write."""
+    """Raises OSError or OutputError; OpenCV itself reports no file that it cannot write."""
     count, writer = 0, None
     path.write_bytes(b"\0")
     try:

@@ -17,7 +17,7 @@ _FEATURES = 800
 _WIDE_PX = 400  # wider images are made smaller: a misfit is large
 _RATIO = 0.8
 _FEWEST_MATCHES = 60
-"""In all pairs; below, nothing is said."""
+"""In all pairs; below, nothing is reported."""
 _ROW_PX = 2.0  # at 640 columns: rows of a sound pair agree within half a pixel
 _LEAST_SHARE = 1.0 / 3.0
 """Of matches whose rows agree, wrong matches included. Real pairs by their own calibration: 0.74 to

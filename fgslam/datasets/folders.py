@@ -182,7 +182,7 @@ def _folder_rig(
     chosen = ((0, 1, 2) if three else (0, 1)) if settings.camera_file is None else None
     size = first_size(cameras[root / "right"].values())
     rig = loaded_rig(settings, calibration, size=size, cameras=chosen, pair=not three)
-    # Two of three cameras in a line may be the outer ones, where the file tells the images' sides.
+    # Two of three cameras in a line may be the outer ones, where the file states the images' sides.
     known = None if rig.rectifier is None else rig.rectifier.calibration
     outer_two = known is not None and known.sided and len(known.cameras) == 3
     if three and rig.vertical_baseline is None and not outer_two:

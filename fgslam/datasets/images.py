@@ -98,7 +98,7 @@ def require_size(image: Image, name: str, width: int, height: int) -> Image:
     """The image itself. Raises FrameError where it has another size than calibrated."""
     if image.shape[:2] != (height, width):
         raise FrameError(
-            f"{name} is {image.shape[1]}x{image.shape[0]} but the calibration says "
+            f"{name} is {image.shape[1]}x{image.shape[0]} but the calibration states "
             f"{width}x{height}; restore the right file"
         )
     return image
@@ -107,7 +107,7 @@ def require_size(image: Image, name: str, width: int, height: int) -> Image:
 def _bytes_of(path: Path) -> bytes:
     remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
     if path.exists() and not path.is_file():
-        require_file(path, FrameError, remedy)  # who reads a pipe waits, a device may have no end
+        require_file(path, FrameError, remedy)  # reading a pipe waits, a device may have no end
     try:
         return path.read_bytes()
     except OSError as cause:
@@ -393,7 +393,7 @@ def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where
         )
     if sizes[0] != f"{size[0]}x{size[1]}":
         raise CalibrationError(
-            f"{where}: images are {sizes[0]} but the calibration says {size[0]}x{size[1]}"
+            f"{where}: images are {sizes[0]} but the calibration states {size[0]}x{size[1]}"
             "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
         )
 

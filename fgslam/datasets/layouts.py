@@ -47,7 +47,7 @@ def recognise_layout(folder: Path, kind: str | None = None) -> dict[str, str]:
     """The keys of ``dataset`` in a configuration that open this folder: kind, path and so on.
 
     A folder that has all parts of one layout has that layout. One that has some parts of one
-    alone counts as that, so that its reader says what is missing. Of several KITTI drives the
+    alone counts as that, so that its reader states what is missing. Of several KITTI drives the
     first is taken.
 
     Args:
@@ -177,7 +177,7 @@ def _unknown(folder: Path) -> str:
     with_images = [path for path in places if path.is_dir() and images_in(path)]
     if len(with_images) == 1:
         return (
-            f"{with_images[0]} holds images of one camera only; a stereo pair is the least, beside "
+            f"{with_images[0]} holds images of one camera only; a stereo pair is the least, with "
             "a gyroscope, too: images of a left and a right camera by the names of folders or "
             "files (of a mirror or panoramas: fgslam teach; where each shows both views side by "
             "side, cut them into left/ and right/, or make a film of them, which is read as it is)"
@@ -236,7 +236,7 @@ def _kitti_keys(folder: Path) -> dict[str, str]:
         here = folder.resolve()
         return {"kind": "kitti", "path": str(here.parent.parent), "sequence": here.name}
     raise DatasetError(
-        f"{folder} looks like one KITTI drive, but it is not in a folder sequences/ under two "
+        f"{folder} seems to be one KITTI drive, but it is not in a folder sequences/ under two "
         "digits; move it to ROOT/sequences/00 (its poses to ROOT/poses/00.txt) and give ROOT"
     )
 
@@ -316,11 +316,11 @@ _DEPTH_FOLDERS = (
     *("aligned_depth", "aligned_depth_to_color", "depth_aligned", "depth"),
     *("depths", "depth_images", "depth_image"),
 )
-"""Of several the first: beside one that is registered to colour, depth is as it was measured."""
+"""Of several the first: next to one that is registered to colour, depth is as it was measured."""
 
 
 def colour_and_depth(folder: Path) -> tuple[Path, Path] | None:
-    """Folders of colour and of depth images beside each other, or None."""
+    """Folders of colour and of depth images in one folder, or None."""
     colour, depth = (
         next((folder / name for name in names if (folder / name).is_dir()), None)
         for names in (_COLOUR_FOLDERS, _DEPTH_FOLDERS)
@@ -379,7 +379,7 @@ class CameraFiles:
 
     @property
     def numbered(self) -> bool:
-        """Whether numbers tell the cameras, as in a calibration's file, and not sides."""
+        """Whether numbers identify the cameras, as in a calibration's file, and not sides."""
         left, right = (str(files[0].relative_to(self.folder)) for files in (self.left, self.right))
         if not self.interleaved:
             left, right = (name.partition("/")[0] for name in (left, right))

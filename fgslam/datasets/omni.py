@@ -197,7 +197,7 @@ def ids_of(names: Sequence[str]) -> IntArray:
 
 
 def times_of(images: Sequence[Path], folder: Path) -> FloatArray:
-    """Time stamps (n,) of a folder's images, by a list beside them or their names; NaN without.
+    """Time stamps (n,) of a folder's images, by a list in the folder or their names; NaN without.
 
     Raises:
         DatasetError: the list is malformed, or lacks an image.
@@ -274,7 +274,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
         load_image=load,
     )
     if places:
-        # Beside poses.csv lie plans, too; pictures that no row names are looked for in panos/.
+        # Plans lie next to poses.csv, too; pictures that no row names are looked for in panos/.
         inside = pictures.iterdir() if pictures.is_dir() else ()
         extra = [p for p in inside if p.suffix.lower() in IMAGE_SUFFIXES and p not in paths]
         note = f"{len(extra)} pictures of {_PICTURES}/ are not in {POSES_FILE}"

@@ -60,7 +60,7 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
     if isinstance(camera, RadialCamera):
         assumed = (
             "the picture's middle is taken to look down, as of a mirror above the camera; of a "
-            "fisheye that looks up dataset.camera.kind=lens and dataset.camera.middle=up say so",
+            "fisheye that points up dataset.camera.kind=lens and dataset.camera.middle=up say so",
         )
         mirror = _mirror_notes(recording, camera.frame.centre, camera.outer_radius, stated)
         return (*(assumed if stated and isinstance(camera, OCamCamera) else ()), *mirror)
@@ -98,7 +98,7 @@ def _side_notes(recording: OmniRecording) -> tuple[str, ...]:
         return ()
     return (
         f"{recording.name}: {what}: they are no panoramas of all 360 degrees from end to end, so "
-        "directions are wrong; cut off what is beside them, or give the camera that took them",
+        "directions are wrong; cut off what is next to them, or give the camera that took them",
     )
 
 

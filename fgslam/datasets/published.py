@@ -114,7 +114,7 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
 
 
 def _euroc_rig(settings: EurocSettings, root: Path, size: tuple[int, int] | None) -> StereoRig:
-    """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain beside mav0."""
+    """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain next to mav0."""
     given: tuple[Path, ...] = tuple(root / name / "sensor.yaml" for name in _CAMERAS)
     chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
     if settings.camera_file is not None:
@@ -328,7 +328,7 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     rig, iTc = _raw_rig(settings, drive, names, first_size(right))
     oxts = read_oxts(drive)
     untrue = (
-        "oxts is used as odometry of a camera that looks ahead, and not as truth: beside "
+        "oxts is used as odometry of a camera that points ahead, and not as truth: next to "
         f"{CALIBRATION} there are no calib_imu_to_velo.txt and calib_velo_to_cam.txt"
     )
     images, noticed = open_frames(pairs, rig, drive)
@@ -362,7 +362,7 @@ def _raw_rig(
         rig = loaded_rig(settings, Path(settings.camera_file), size=size)
     elif path is None:
         raise CalibrationError(
-            f"{drive}: no {CALIBRATION} in it or beside it; unpack the calibration of that date, "
+            f"{drive}: no {CALIBRATION} in it or next to it; unpack the calibration of that date, "
             "or give one by --camera FILE"
         )
     else:

@@ -47,7 +47,7 @@ class Recording(Brief):
         load_images: reads the images of one of the recording's own frames.
         ground_truth: true poses of the reference camera at the selected frames, or None.
         odometry_source: where the body's motions come from, or None. Asked once, when first
-            needed, so that a bad odometry file hurts only who uses it.
+            needed, so that a bad odometry file hurts only its user.
         rectifier: what makes the images its own that the cameras gave; None where they are stored
             rectified.
         margins: of frames, in place of the rectifier's.
@@ -286,7 +286,7 @@ def on_wheels(
         return rig, ()
     if not body_is_camera(rig.bTc):
         return rig, ()
-    text = f"nothing says where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
+    text = f"nothing states where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
     return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (text,)
 
 
@@ -294,4 +294,4 @@ LOOKS_AHEAD = (
     "it is taken to look straight ahead from there (dataset.camera_yaw_deg and lever_arm_m say "
     "otherwise)"
 )
-"""What is assumed of a camera where nothing says how it sits on the body that odometry moves."""
+"""What is assumed of a camera where nothing states how it sits on the body that odometry moves."""

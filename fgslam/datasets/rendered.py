@@ -151,7 +151,7 @@ class RenderedLabSequence:
         return len(self._indices)
 
     def frame(self, i: int) -> Frame:
-        """Images of selected frame ``i``, with their noise; a damaged cached file is rendered anew.
+        """Images of frame ``i`` with their noise; a damaged cached file is rendered again.
 
         Raises:
             FrameError: there is no frame ``i``.

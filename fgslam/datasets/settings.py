@@ -272,7 +272,7 @@ class OmniVideoSettings(RecordingSettings):
     kind: Literal["omni_video"] = "omni_video"
     camera: OmniCameraSettings = BloggieSettings()
     frame_rate_hz: float | None = Field(
-        default=None, gt=0.0, le=1000.0, description="frames a second; null: as the file says"
+        default=None, gt=0.0, le=1000.0, description="frames a second; null: as the file states"
     )
 
 
@@ -353,7 +353,7 @@ class RecordedOdometrySettings:
 
 @dataclass(frozen=True, config=STRICT)
 class SyntheticOdometrySettings:
-    """Ground truth plus stated noise stands in for odometry; every output says so.
+    """Ground truth plus stated noise stands in for odometry; every output states so.
 
     Independent normal noise per body axis on each step, drawn from the experiment's seed.
     """

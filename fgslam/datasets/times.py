@@ -290,15 +290,15 @@ def pair_all(
     rows = np.arange(len(reference))[:, None]
     notes: tuple[str, ...] = ()
     for side, other, stamps in others:
-        (kept, partners), said = pair_stamps(
+        (kept, partners), reported = pair_stamps(
             reference[rows[:, 0]], stamps, tolerance, (name, other), side
         )
-        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *said)
+        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *reported)
     return rows, notes
 
 
 # --------------------------------------------------------------------------------------------
-# Time stamps of images: a list beside them, or their own names, in whatever unit of time
+# Time stamps of images: a list next to them, or their own names, in whatever unit of time
 
 
 LISTS = (
@@ -337,14 +337,14 @@ def stamps_of(
     if written is not None:
         return written
     rate = fps or _ASSUMED_FPS
-    note = f"no list of times: taken as {rate:g} frames a second (--fps says otherwise)"
+    note = f"no list of times: taken as {rate:g} frames a second (--fps states otherwise)"
     return np.array(_places(images, every)) / rate, () if fps else (note,), ()
 
 
 def written_stamps(
     images: Sequence[Path], folders: Sequence[Path], every: Sequence[Path] | None = None
 ) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]] | None:
-    """As :func:`stamps_of`, from a list or from names; None where neither says anything."""
+    """As :func:`stamps_of`, from a list or from names; None where neither states anything."""
     for folder in folders:
         for path in (folder / name for name in LISTS):
             if path.is_file():
@@ -609,7 +609,7 @@ def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pair
         raise DatasetError(
             f"{found.folder}: {len(found.left)} images of the left camera and {len(found.right)} "
             f"of the right one, and their names ({found.left[0].name}, {found.right[0].name}) do "
-            "not match: which belong together cannot be told; name both of a pair alike"
+            "not match: which belong together is unknown; name both of a pair alike"
         )
     pairs = tuple(zip(found.right, found.left, strict=True))
     if all(numbers_in(right.stem) == numbers_in(left.stem) != [] for right, left in pairs):

@@ -37,7 +37,7 @@ from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
 from fgslam.datasets.times import NANOSECONDS, pair_all
 
 _VIEWS = {"side_by_side": (2, 1), "over_under": (1, 2)}
-"""Views beside each other and above each other."""
+"""Views next to each other and above each other."""
 
 _USUAL_SHAPE = 1.5  # width over height of a camera's image
 
@@ -119,8 +119,8 @@ def _views(
         except CalibrationError as error:
             fault = fault or error
             continue
-        said = () if settings.views else (f"the film is taken as {name.replace('_', ' ')}",)
-        return partial(_halves, film, size), rig, (*assumed, *said)
+        reported = () if settings.views else (f"the film is taken as {name.replace('_', ' ')}",)
+        return partial(_halves, film, size), rig, (*assumed, *reported)
     with suppress(CalibrationError):
         calibrated_rig(settings, folder, (width, height))
         raise DatasetError(
@@ -175,7 +175,7 @@ def _rig(
     """The rig of views of a size, or of a column or row more, and what was assumed then.
 
     Most encoders take even sizes only, and leave out the last of an odd number; ``views`` are those
-    beside and above each other: of two the film's size is even.
+    next to and above each other: of two the film's size is even.
     """
     try:
         return calibrated_rig(settings, folder, size, pair), ()

@@ -292,8 +292,8 @@ def check_truth(sequence: Sequence) -> tuple[Finding, ...]:
 def _jumps(truth: Trajectory) -> list[int]:
     """Rows that are reached many times faster than the rows around them, and than most others.
 
-    Who stands for long and then drives is fast against the median, yet not against the steps that
-    follow. A jump is one step, of one bad pose two.
+    A robot that stands for long and then drives is fast against the median, yet not against the
+    steps that follow. A jump is one step, of one bad pose two.
     """
     if len(truth) < _STEPS_AROUND + 2:
         return []

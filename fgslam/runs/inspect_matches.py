@@ -62,7 +62,7 @@ LEFT_RIGHT = Pair(
     "rows",
     "cameras look swapped",
     "swap left and right",
-    "the left camera seems to lie above or below the right one, not beside it; give as left a "
+    "the left camera seems to lie above or below the right one, not next to it; give as left a "
     "camera at the right one's left",
 )
 TOP_RIGHT = Pair(
@@ -70,9 +70,9 @@ TOP_RIGHT = Pair(
     "epipolar, top",
     "top and right",
     "columns",
-    "the top camera looks swapped with the right one, or lies below it",
+    "the top camera seems swapped with the right one, or lies below it",
     "swap their images; a camera below cannot be used, so leave it out with dataset.use_top",
-    "the top camera seems to lie beside the right one, not above it; give as top a camera above "
+    "the top camera seems to lie next to the right one, not above it; give as top a camera above "
     "the right one, or leave it out with dataset.use_top",
 )
 
@@ -130,7 +130,7 @@ def match_frames(
 ) -> tuple[FrameMatches, ...]:
     """Features and matches of up to ``frames`` frames spread over the recording.
 
-    Frames that cannot be read are left out; the checks of the images tell about them.
+    Frames that cannot be read are left out; the checks of the images report them.
     """
     # Descriptors are needed whatever the run makes of them.
     extractor = SiftExtractor(settings.sift, "descriptor")

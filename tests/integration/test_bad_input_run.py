@@ -117,7 +117,7 @@ def empty_image(path: Path) -> str:
 
 def resize_image(path: Path) -> str:
     assert cv2.imwrite(str(path), np.full((HEIGHT // 2, WIDTH // 2), 90, np.uint8))
-    return f"is {WIDTH // 2}x{HEIGHT // 2} but the calibration says {WIDTH}x{HEIGHT}"
+    return f"is {WIDTH // 2}x{HEIGHT // 2} but the calibration states {WIDTH}x{HEIGHT}"
 
 
 SPOILING = (remove_image, truncate_image, damage_image, empty_image, resize_image)

@@ -222,13 +222,13 @@ def test_left_camera_above_is_reported(tmp_path: Path) -> None:
 
 def test_top_camera_below_is_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, {**PAIR, "top": (0.0, -1.0)}))
-    assert "PROBLEM epipolar, top: the top camera looks swapped with the right one, or" in report
+    assert "PROBLEM epipolar, top: the top camera seems swapped with the right one, or" in report
     assert "dataset.use_top" in report
 
 
 def test_top_camera_beside_is_reported(tmp_path: Path) -> None:
     report = inspected(write(tmp_path, {**PAIR, "top": (-1.0, 0.0)}))
-    assert "PROBLEM epipolar, top: the top camera seems to lie beside the right one" in report
+    assert "PROBLEM epipolar, top: the top camera seems to lie next to the right one" in report
 
 
 def test_wrong_vertical_baseline_is_reported(tmp_path: Path) -> None:

@@ -367,7 +367,7 @@ def test_an_image_of_another_size_is_one_lost_frame(tmp_path: Path) -> None:
     k = next(i for i, m in enumerate(messages) if m[0] == "/cam/left/image_raw" and i > 3)
     messages[k] = (*messages[k][:3], raw_image(picture(1, 16, 12)))
     recording = opened(write_bag(tmp_path / "a.bag", messages))
-    with pytest.raises(FrameError, match="is 16x12 but the calibration says 32x24"):
+    with pytest.raises(FrameError, match="is 16x12 but the calibration states 32x24"):
         recording.frame(1)
     assert codes(recording, 2) == (12, 62)
 
@@ -437,7 +437,7 @@ def test_truth_is_no_odometry_and_another_clock_is_said(tmp_path: Path) -> None:
         ("/odometry", "world", "in the global frame world"),
         ("/mavros/local_position/odom", "map", "in the global frame map"),
         ("/leica/pose", "odom", "truth by its name"),
-        ("/carla/car/odometry", "odom", "truth of a simulator, which /carla/car/odometry tells"),
+        ("/carla/car/odometry", "odom", "truth of a simulator, by /carla/car/odometry"),
         ("/odometry", "odom", ""),
         ("/wheel/odometry", "world", ""),
     ],
@@ -466,7 +466,7 @@ def test_beside_pictures_of_objects_odometry_is_a_simulators_truth(tmp_path: Pat
     poses = odometry(stamps, np.zeros((4, 4)), "/odometry")
     turns = gyroscope(stamps, np.array([0.0, 0.0, 0.5]))
     recording = opened(write_bag(tmp_path / "a.mcap", stereo(4) + objects + poses + turns))
-    reason = "/odometry (truth of a simulator, which /cam/left/segmentation tells)"
+    reason = "/odometry (truth of a simulator, by /cam/left/segmentation)"
     assert any(reason in note for note in recording.notes)
     assert recording.odometry_source is not None  # the gyroscope's
 
@@ -539,7 +539,7 @@ def test_bags_without_a_pair(tmp_path: Path) -> None:
     for messages, line in (
         ([m for m in stereo(2) if "left" in m[0]], "has images of one camera only, /cam/left/ima"),
         ([m for m in stereo(2) if "info" in m[0]], "has no topic of camera images .*; it has /cam"),
-        (stereo(2, names=("/front", "/back")), "cannot be told by their names; say it: --topics"),
+        (stereo(2, names=("/front", "/back")), "is unknown by their names; say it: --topics"),
     ):
         path = write_bag(tmp_path / f"{len(line)}.bag", messages)
         with pytest.raises(DatasetError, match=line):

@@ -240,7 +240,7 @@ def test_scatter_without_a_pattern_is_not_called_a_turn(rng: np.random.Generator
 def test_crossed_disparity_is_not_called_unrectified(rng: np.random.Generator) -> None:
     found = check_epipolar(rng.uniform(3.0, 30.0, 200), rng.normal(0.0, 0.2, 200), TOP_RIGHT)
     problems = reported(found, Level.PROBLEM)
-    assert "the top camera seems to lie beside the right one" in problems
+    assert "the top camera seems to lie next to the right one" in problems
     assert "rectified" not in problems
 
 

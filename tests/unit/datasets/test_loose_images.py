@@ -424,7 +424,7 @@ def test_kitti_raw_that_lacks_a_left_image(tmp_path: Path) -> None:
 def test_kitti_raw_that_lacks_a_part(tmp_path: Path) -> None:
     drive = kitti_raw(tmp_path)
     (drive.parent / "calib_cam_to_cam.txt").rename(drive.parent / "elsewhere.txt")
-    with pytest.raises(CalibrationError, match=r"no calib_cam_to_cam\.txt in it or beside it"):
+    with pytest.raises(CalibrationError, match=r"no calib_cam_to_cam\.txt in it or next to it"):
         open_recording(KittiRawSettings(path=str(drive)))
     (drive / "image_01").rename(drive / "image_07")
     with pytest.raises(DatasetError, match="has no two cameras' images"):

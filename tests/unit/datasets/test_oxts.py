@@ -121,7 +121,7 @@ def test_without_its_place_on_the_car_it_is_odometry_alone(tmp_path: Path) -> No
     recording = opened(path)
     assert recording.ground_truth is None
     assert recording.odometry(1) is not None
-    assert "and not as truth: beside calib_cam_to_cam.txt there are no" in recording.notes[-1]
+    assert "and not as truth: next to calib_cam_to_cam.txt there are no" in recording.notes[-1]
 
 
 def cut(path: Path) -> None:

@@ -260,7 +260,7 @@ def test_a_colour_image_without_depth_takes_its_time_along(tmp_path: Path) -> No
 def test_the_colour_camera(tmp_path: Path) -> None:
     root = tum(tmp_path / "walk")
     (root / "calib.json").rename(tmp_path / "mine.json")
-    with pytest.raises(CalibrationError, match="nothing says the colour camera's focal length"):
+    with pytest.raises(CalibrationError, match="nothing states the colour camera's focal length"):
         opened(root)
     assert opened(root, camera_file=str(tmp_path / "mine.json")).rig.fx == FOCAL
     camera(root, width=640, height=480)

@@ -146,7 +146,7 @@ def test_a_missing_or_wrong_view_is_refused(grid: Path) -> None:
         convert(grid, grid / "converted")
     save(grid / "r08_c06.png", np.zeros((9, 12), np.uint8))
     with pytest.raises(
-        FrameError, match=r"r08_c06\.png is 12x9 but the calibration says 120x90; restore"
+        FrameError, match=r"r08_c06\.png is 12x9 but the calibration states 120x90; restore"
     ):
         convert(grid, grid / "converted")
 
