@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -124,44 +124,23 @@ def sources_of(run: Path) -> tuple[Path, ...]:
     return (run, *load_experiment(run / RUN_MARKER).inputs)
 
 
-class _Results:
-    """What an estimator left in a run; each file is read when it is first asked for, once."""
-
-    def __init__(self, run: Path, folder: Path) -> None:
-        self._run, self._folder = run, folder
-
-    @cached_property
-    def trajectory(self) -> Trajectory:
-        return Trajectory.load(self._folder / "final.tum")
-
-    @cached_property
-    def points(self) -> MapPoints:
-        return read_ply(self._folder / "map.ply")
-
-    @cached_property
-    def log(self) -> MeasurementLog:
-        return MeasurementLog.load(log_of(self._run))
-
-    def save_trajectory(self, path: Path, remark: str) -> None:
+def _export(run: Path, folder: Path, wanted: Wanted, remark: str) -> Iterator[str]:
+    trajectory = Trajectory.load(folder / "final.tum")
+    if (path := wanted.trajectory) is not None:
         covariances = None
         if path.suffix.lower() == MCAP_SUFFIX:
-            covariances = read_covariances(self._folder / "covariance.csv")[1]
-        _save(path, self.trajectory, covariances, remark)
-
-
-def _export(run: Path, folder: Path, wanted: Wanted, remark: str) -> Iterator[str]:
-    found = _Results(run, folder)
-    if wanted.trajectory is not None:
-        found.save_trajectory(wanted.trajectory, remark)
-        yield f"{wanted.trajectory}: {len(found.trajectory)} poses"
-    if wanted.graph is not None:
-        yield export_graph(wanted.graph, found.log, found.trajectory, found.points, remark)
-    if not (wanted.colour or wanted.images or wanted.map):
+            covariances = read_covariances(folder / "covariance.csv")[1]
+        _save(path, trajectory, covariances, remark)
+        yield f"{path}: {len(trajectory)} poses"
+    if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return
-    points = found.points.select(found.points.valid) if wanted.valid_only else found.points
+    points, log = read_ply(folder / "map.ply"), cache(lambda: MeasurementLog.load(log_of(run)))
+    if wanted.graph is not None:
+        yield export_graph(wanted.graph, log(), trajectory, points, remark)
+    points = points.select(points.valid) if wanted.valid_only else points
     if wanted.colour or wanted.images:
         config = load_config(run / RUN_MARKER)
-        points, line = export_images(wanted.images, config, found.log, found.trajectory, points)
+        points, line = export_images(wanted.images, config, log(), trajectory, points)
         yield from filter(None, [line])
     if wanted.map is not None:
         write_map(wanted.map, points, remark)
@@ -220,13 +199,9 @@ def export_map(
 
     Raises:
         MapError: it is not one.
-        ConfigError: a target is the map's own file.
         OutputError: a file cannot be written, or its ending is not known.
     """
     saved = load_map(path)
-    for target in (map_file, trajectory_file):
-        if target is not None and target.resolve() == path.resolve():
-            raise ConfigError(f"{target}: is the map itself; export to another name")
     if map_file is None and trajectory_file is None:
         return describe_map(saved, path)
     remark = remark_of_map(saved)

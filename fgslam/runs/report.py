@@ -210,10 +210,7 @@ def _estimator(
 
 
 def _predicted(rows: object, count: int) -> BoolArray | None:
-    """(n,) which poses no landmark measured, of the rows that metrics.json lists.
-
-    None where it lists none: a run of an earlier version does not tell.
-    """
+    """(n,) which poses no landmark measured, of the rows that metrics.json lists; None: unknown."""
     if not isinstance(rows, list):
         return None
     out = np.zeros(count, np.bool_)
