@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import StoredMapError
+import fgslam as fg
+from fgslam.cameras.omni import Equirectangular
+from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.planar import between, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
@@ -24,6 +28,7 @@ from fgslam.homing.links import (
     Link,
     LinkConsistency,
     Pair,
+    ThirdViewConsistency,
     VisualWords,
     Walks,
     between_misfit,
@@ -33,7 +38,14 @@ from fgslam.homing.links import (
 )
 from fgslam.homing.places import Localiser
 from fgslam.homing.settings import LocalisationSettings, TopologicalMapSettings
-from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
+from fgslam.homing.topological_map import (
+    RouteMap,
+    TopologicalMap,
+    map_candidates,
+    map_of_answers,
+    route_of,
+)
+from tests import textured_room
 from tests.landmark_world import landmark_features, match_landmarks, numbers
 
 SETTINGS = TopologicalMapSettings()
@@ -421,3 +433,288 @@ def test_image_that_matches_nothing_leaves_belief_near_where_it_was(
     assert after.max() < before.max()
     assert hops(here.best()[0], 5) <= 1
     assert numbers(dark).size == 0
+
+
+# --------------------------------------------------------------------------------------------
+# Third views tell a place seen again from one that looks the same
+
+
+THIRD_SETTINGS = TopologicalMapSettings()
+THIRD_COUNT, THINGS = 12, 60
+WALK = Walks((THIRD_COUNT,))
+FAR = (1, 9)
+
+
+def view() -> OmniFeatures:
+    """All things of the world in their order; the same view at each place is enough here."""
+    rng = np.random.default_rng(0)
+    ring = np.linspace(-3.1, 3.1, THINGS)
+    points = np.column_stack([2.0 * np.cos(ring), 2.0 * np.sin(ring), np.full(THINGS, 0.5)])
+    features = landmark_features(points, np.zeros(3), 5.0, 0.0, rng)
+    assert len(features.sift) == THINGS
+    return features
+
+
+def link(pair: Pair, support: int = THINGS) -> Link:
+    """Straight ahead."""
+    covariance = np.eye(2) * 1e-4
+    return Link(*pair, 0.0, 0.0, np.pi, covariance, covariance, support)
+
+
+def rows_of(pairs: list[Pair], seed: int | None = None) -> dict[Pair, IntArray]:
+    """Each thing with itself; with a seed, with another one of its kind, by lot."""
+    out = {}
+    for pair in pairs:
+        other = np.arange(THINGS)
+        if seed is not None:
+            other = np.random.default_rng((seed, *pair)).permutation(THINGS)
+        out[pair] = np.column_stack([np.arange(THINGS), other])
+    return out
+
+
+def checked(far: list[Pair], seed: int | None) -> ThirdViewConsistency:
+    """A walk, and links from one end of it to the other whose matches are true or by lot."""
+    walk = [(k, k + 1) for k in range(THIRD_COUNT - 1)]
+    rows = rows_of(walk) | rows_of(far, seed)
+    return ThirdViewConsistency(
+        [view()] * THIRD_COUNT, [link(p) for p in (*walk, *far)], rows, WALK
+    )
+
+
+NEIGHBOURS = [FAR, (1, 8), (1, 10), (2, 9), (0, 9)]
+
+
+def test_features_of_a_place_come_back_in_its_neighbours() -> None:
+    """Every inlier in each of the four neighbours that are linked with the other end, exactly."""
+    views = checked(NEIGHBOURS, None)
+    assert views.share(link(FAR)) == 4.0
+    kept, seen, rejected = views.confirmed()
+    assert FAR in seen
+    assert FAR in {(k.a, k.b) for k in kept}
+    assert rejected == {}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_similar_place_matches_things_of_a_kind_at_random(seed: int) -> None:
+    """As many inliers and links as before, but not the same things."""
+    views = checked(NEIGHBOURS, seed)
+    assert views.share(link(FAR)) < 0.5
+    kept, seen, rejected = views.confirmed()
+    assert set(NEIGHBOURS) == set(rejected)
+    assert seen.isdisjoint(NEIGHBOURS)
+    assert len(kept) == THIRD_COUNT - 1
+    assert "third views" in rejected[FAR]
+
+
+def test_far_link_that_no_neighbour_shares_is_dropped() -> None:
+    """True or not: nothing says so."""
+    views = checked([FAR], None)
+    assert views.share(link(FAR)) == 0.0
+    assert set(views.confirmed()[2]) == {FAR}
+
+
+def test_consecutive_images_confirm_links_of_a_few_steps_but_not_across_a_gap() -> None:
+    """Two steps on, confirmed by nothing: believed, unless one of the steps is missing."""
+    walk = [(k, k + 1) for k in range(THIRD_COUNT - 1)]
+    short = (4, 6)
+    by_lot = rows_of([short], 1)
+    for steps, believed in ((walk, True), ([p for p in walk if p != (4, 5)], False)):
+        links = [link(p) for p in (*steps, short)]
+        views = ThirdViewConsistency([view()] * THIRD_COUNT, links, rows_of(steps) | by_lot, WALK)
+        assert (short not in views.confirmed()[2]) is believed
+
+
+def test_map_of_a_walk_has_confirmed_far_links_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few inliers are enough where third views confirm them; many do not help where they do not."""
+    monkeypatch.setattr("fgslam.homing.links.LONE_SUPPORT", THINGS + 1)
+
+    def built(seed: int | None) -> TopologicalMap:
+        walk = [(k, k + 1) for k in range(THIRD_COUNT - 1)]
+        there = [*walk, *NEIGHBOURS]
+        pairs = [q for a, b in there for q in ((a, b), (b, a))]
+        answers: dict[Pair, Answer] = {
+            (a, b): TwoViewVector(
+                0.0 if a < b else np.pi, 0.0, np.eye(2) * 1e-4, np.ones(THINGS, np.bool_), 0
+            )
+            for a, b in pairs
+        }
+        rows = rows_of(walk) | rows_of(NEIGHBOURS, seed)
+        images = [view()] * THIRD_COUNT
+        return map_of_answers(images, answers, walks=WALK, rows=rows)
+
+    true, false = built(None), built(0)
+    assert FAR in {(k.a, k.b) for k in true.links}
+    assert {(k.a, k.b) for k in false.links} == {(k, k + 1) for k in range(THIRD_COUNT - 1)}
+    assert FAR in false.rejected
+
+
+# --------------------------------------------------------------------------------------------
+# Routes taught on their own: where they are joined, where not, the way, the place of an image
+
+
+FINE = textured_room.CAMERA
+CAMERA = Equirectangular(301, 91, FINE.top_elevation, FINE.bottom_elevation)
+"""Every other pixel of the room's."""
+POSTER = slice(150, 250), slice(60, 130)  # of the texture: 1.75 m wide, on one wall
+
+
+def picture(x: float, y: float, heading: float = 0.0) -> Image:
+    pose = np.array([x, y, heading + 1e-3])  # no ray along a wall
+    return np.ascontiguousarray(textured_room.picture(pose)[::2, ::2])
+
+
+def taught(places: Sequence[tuple[float, float]], heading: float) -> fg.PathMemory:
+    return fg.teach([picture(x, y, heading) for x, y in places], CAMERA)
+
+
+def other_texture() -> FloatArray:
+    """Another room's walls, but for one poster that hangs in both."""
+    shifted = np.roll(textured_room.TEXTURE[::-1, ::-1], 333, axis=1)
+    shifted[POSTER] = textured_room.TEXTURE[POSTER]
+    return shifted
+
+
+ROUTE_COUNT = 5
+EAST = [(x, 0.1) for x in np.linspace(-2.0, 2.0, ROUTE_COUNT)]
+NORTH = [(0.2, y) for y in np.linspace(-2.0, 2.0, ROUTE_COUNT)]
+
+
+@pytest.fixture(scope="module")
+def routes() -> dict[str, fg.PathMemory]:
+    """Two that cross in the middle of one room, and a third in another room."""
+    there = {"east": taught(EAST, 0.0), "north": taught(NORTH, np.pi / 2)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(textured_room, "TEXTURE", other_texture())
+        return {**there, "elsewhere": taught(EAST[1:], 0.0)}
+
+
+@pytest.fixture(scope="module")
+def joined(routes: dict[str, fg.PathMemory]) -> RouteMap:
+    return RouteMap.join(routes)
+
+
+def test_routes_that_cross_are_joined_by_true_links(joined: RouteMap) -> None:
+    poses = np.array([(x, y, 0.0) for x, y in EAST] + [(x, y, np.pi / 2) for x, y in NORTH])
+    between = [
+        link for link in joined.topology.links if link.a < ROUTE_COUNT <= link.b < 2 * ROUTE_COUNT
+    ]
+    assert len(between) >= 3
+    for link in between:
+        way = poses[link.b, :2] - poses[link.a, :2]
+        off = np.exp(1j * (link.direction - np.arctan2(way[1], way[0])))
+        assert np.hypot(*way) < 0.3 or abs(np.angle(off)) < np.deg2rad(6.0)
+        assert link.rotation == pytest.approx(np.pi / 2, abs=np.deg2rad(3.0))
+    assert {"east/2", "north/2"} <= set(joined.crossroads)
+
+
+def test_rooms_that_share_a_poster_are_not_joined(joined: RouteMap) -> None:
+    assert [len(part) for part in joined.topology.components()] == [
+        2 * ROUTE_COUNT,
+        ROUTE_COUNT - 1,
+    ]
+    with pytest.raises(StoredMapError, match="no way from east/0 to elsewhere/3"):
+        joined.way("east/0", "elsewhere")
+
+
+def test_the_way_turns_off_at_the_crossroads_and_leads_back(joined: RouteMap) -> None:
+    way = joined.way("east/0", "north")
+    assert (way.names[0], way.names[-1]) == ("east/0", "north/4")
+    kinds = [route_of(name) for name in way.names]
+    assert kinds == sorted(kinds)  # once from one to the other
+    assert len(way) <= 8
+    assert joined.way("north", "east/0").names == way.names[::-1]
+    assert way.camera == CAMERA
+    follower = fg.PathFollower(CAMERA, way, by="looks")
+    command = follower.step(picture(-2.0, 0.1), 0.0)
+    assert command.place is not None
+    assert command.place.nearest == 0
+
+
+def test_an_image_finds_its_place_and_its_way(joined: RouteMap) -> None:
+    place = joined.locate(picture(-1.5, 0.0, 0.7))
+    assert place
+    assert place.name in ("east/0", "east/1")
+    assert place.inliers >= 50
+    assert all(link.back_covariance[0, 0] < np.deg2rad(5.0) ** 2 for link in place.links)
+    assert joined.way(place, "east/2").names[-1] == "east/2"
+    assert joined.way(place, "north").names[-1] == "north/4"
+
+
+def test_an_image_from_nowhere_is_refused(joined: RouteMap) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (91, 301, 3), np.uint8)
+    assert not joined.locate(noise)
+    black = joined.locate(np.zeros((91, 301, 3), np.uint8))
+    assert not black
+    assert "grey" in black.details
+
+
+def test_a_gap_in_a_route_is_a_way_of_last_resort(routes: dict[str, fg.PathMemory]) -> None:
+    """Two rooms on one route: nothing in common there, but somebody drove it."""
+    one, other = routes["east"], routes["elsewhere"]
+    through = fg.PathMemory(one.images[:3] + other.images[:3], tuple("abcdef"), CAMERA)
+    joined = RouteMap.join({"through": through})
+    link = joined.link("through/c", "through/d")
+    assert link.support == 0
+    assert np.isnan(link.direction)
+    assert joined.way("through/a", "through").names[-1] == "through/f"
+    assert joined.topology.costs.max() > 20.0
+
+
+def test_a_map_survives_its_file(joined: RouteMap, tmp_path: Path) -> None:
+    joined.save(tmp_path / "house.fgmap")
+    again = RouteMap.load(tmp_path / "house.fgmap")
+    assert again.names == joined.names
+    assert again.crossroads == joined.crossroads
+    assert again.way("east/0", "north").names == joined.way("east/0", "north").names
+    assert again.topology.camera == CAMERA
+
+
+def test_wrong_routes_and_places_are_refused(
+    joined: RouteMap, routes: dict[str, fg.PathMemory]
+) -> None:
+    with pytest.raises(StoredMapError, match="no route"):
+        RouteMap.join({})
+    with pytest.raises(StoredMapError, match="no place cellar; its routes are east, north"):
+        joined.way("east/0", "cellar")
+    with pytest.raises(StoredMapError, match="slash"):
+        RouteMap.join({"a/b": routes["east"]})
+    alike = fg.PathMemory(routes["east"].images, ("0",) * ROUTE_COUNT, CAMERA)
+    with pytest.raises(StoredMapError, match="two path images are called a/0"):
+        RouteMap.join({"a": alike})
+    few = fg.PathMemory(routes["east"].images[:2], ("0", "1"), None)
+    mixed = RouteMap.join({"a": few, "b": fg.PathMemory(few.images, few.names, CAMERA)})
+    with pytest.raises(CalibrationError, match="give the image's"):
+        mixed.locate(picture(0.0, 0.0))
+
+
+SPOILED = [
+    ("link_cost", lambda a: a * np.nan, "array link_cost"),
+    ("link_cost", lambda a: -a, "array link_cost"),
+    ("link_support", lambda a: a - 10_000, "array link_support"),
+    ("link_ends", lambda a: a[:, ::-1].copy(), "array link_ends"),
+    ("link_ends", lambda a: np.repeat(a[:1], len(a), axis=0), "array link_ends"),
+    ("link_angles", lambda a: a * [1.0, np.nan, 1.0], "array link_angles"),
+    ("link_covariances", lambda a: -a, "array link_covariances, row 0, is no covariance"),
+    ("column_tangents", lambda a: a * np.float32(np.inf), "array column_tangents is not finite"),
+    ("sift_elevation", lambda a: np.full_like(a, 32767), "array sift_elevation"),
+]
+
+
+@pytest.mark.parametrize(("name", "spoil", "said"), SPOILED)
+def test_values_that_no_map_has_are_refused(
+    joined: RouteMap, tmp_path: Path, name: str, spoil: Callable[[Any], Any], said: str
+) -> None:
+    joined.save(tmp_path / "house.fgmap")
+    with np.load(tmp_path / "house.fgmap") as file:
+        arrays = dict(file)
+    with np.errstate(invalid="ignore"):
+        arrays[name] = spoil(arrays[name]).astype(arrays[name].dtype)
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(StoredMapError, match=said):
+        RouteMap.load(tmp_path / "bad.npz")
+
+
+def test_places_of_one_name_are_refused(joined: RouteMap, tmp_path: Path) -> None:
+    replace(joined.topology, names=("a/0",) * len(joined)).save(tmp_path / "bad.fgmap")
+    with pytest.raises(StoredMapError, match="two places have one name"):
+        RouteMap.load(tmp_path / "bad.fgmap")

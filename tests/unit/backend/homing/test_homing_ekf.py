@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 import pytest
-from homings import trial
+from homings import Trial, trial
 
 from fgslam.backend.homing import ekf
-from fgslam.backend.homing.ekf import FilterState, HomingEkf, motion
+from fgslam.backend.homing.ekf import (
+    INITIAL_SPEED,
+    FilterState,
+    HomingEkf,
+    initial_state,
+    motion,
+    predicted,
+    seen_from_robot,
+    updated,
+)
 from fgslam.backend.homing.estimators import AverageDisplacement, AverageLandmarkVector
-from fgslam.backend.homing.paper_ekf import PaperEkf
+from fgslam.backend.homing.paper_ekf import PaperEkf, seen_from_target, separate_initial_state
 from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.homing import HomingStart, LocalMap, TrackedBearings, TwoViewVector
 from fgslam.core.planar import bearings, wrap
+from fgslam.factors.bearing_residuals import (
+    bearing_jacobians,
+    polar_jacobians,
+    polar_points,
+    target_jacobian,
+    target_pose,
+)
 from fgslam.worlds.settings import SimulatedBearingsSettings
 
 
@@ -166,3 +184,202 @@ def test_a_filter_that_breaks_down_says_so_and_stays(
     with pytest.raises(EstimatorError, match=r"filter.* at \d"):
         estimator.update(case.tracks[1])
     assert estimator.state is before
+
+
+# --------------------------------------------------------------------------------------------
+# The homing filters are the graph, linearised once, with past poses eliminated
+
+
+TOLERANCE = 1e-11
+JOINT, SEPARATE = HomingEkfSettings(gate_sigmas=0.0), PaperEkfSettings()
+
+
+def robot(k: int) -> int:
+    return int(gtsam.symbol("r", k))
+
+
+TARGET = int(gtsam.symbol("t", 0))
+
+
+def feature(identity: int) -> int:
+    return int(gtsam.symbol("l", int(identity)))
+
+
+@dataclass
+class Linear:
+    """A graph of whitened linear factors on absolute values."""
+
+    graph: gtsam.GaussianFactorGraph
+
+    def add(self, blocks: dict[int, FloatArray], value: FloatArray, sigma: float) -> None:
+        """Sum of blocks times variables equals ``value`` up to ``sigma``."""
+        unit = gtsam.noiseModel.Unit.Create(len(value))
+        terms = [part for key, block in blocks.items() for part in (key, block / sigma)]
+        self.graph.add(gtsam.JacobianFactor(*terms, value / sigma, unit))
+
+    def marginalised(self, keys: list[int]) -> None:
+        """Eliminates variables; what they leave behind replaces their factors."""
+        ordering = gtsam.Ordering()
+        for key in keys:
+            ordering.push_back(key)
+        if keys:
+            _, self.graph = self.graph.eliminatePartialSequential(ordering, gtsam.EliminateQR)
+
+    def solved(self, keys: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance of variables in the order given, which must be all."""
+        ordering = gtsam.Ordering()
+        for key in keys:
+            ordering.push_back(key)
+        root, right = self.graph.eliminateSequential(ordering, gtsam.EliminateQR).matrix()
+        inverse = np.linalg.inv(root)
+        return inverse @ right, inverse @ inverse.T
+
+
+def joint_start(case: Trial, state: FilterState) -> Linear:
+    """Vector, start bearings and target bearings, each once, linearised at the triangulation."""
+    linear = Linear(gtsam.GaussianFactorGraph())
+    vector = case.start.vector
+    half = np.linalg.inv(np.linalg.cholesky(0.5 * (vector.covariance + vector.covariance.T)))
+    mean = np.array([vector.direction, vector.rotation])
+    linear.add({TARGET: half}, half @ mean, 1.0)
+    target = state.mean[4:7]
+    points = polar_points(state.polar)
+    by_pose, by_point = bearing_jacobians(target_pose(target), points)
+    by_target = (by_pose @ target_jacobian(target))[:, 1:]
+    by_polar = np.einsum("ij,ijk->ik", by_point, polar_jacobians(state.polar))
+    rows = np.searchsorted(case.start.local_map.ids, state.ids)
+    for k, row in enumerate(rows.tolist()):
+        polar, sigma = state.polar[k], case.start.matches.sigma[row]
+        linear.add({feature(row): np.array([[0.0, 1.0]])}, polar[1:], float(sigma[0]))
+        value = by_target[k] @ mean + by_polar[k] @ polar
+        blocks = {TARGET: by_target[k][None], feature(row): by_polar[k][None]}
+        linear.add(blocks, np.array([value]), float(sigma[2]))
+    return linear
+
+
+def map_start(state: FilterState) -> Linear:
+    """Each feature's own prior; nothing without variance."""
+    linear = Linear(gtsam.GaussianFactorGraph())
+    for k, identity in enumerate(state.ids.tolist()):
+        rows = free_rows(state, k)
+        at = 7 + 2 * k + rows
+        if len(rows):
+            half = np.linalg.inv(np.linalg.cholesky(state.covariance[np.ix_(at, at)]))
+            linear.add({feature(identity): half}, half @ state.mean[at], 1.0)
+    return linear
+
+
+def free_rows(state: FilterState, k: int) -> np.ndarray:
+    """Which of a feature's (distance, bearing) have a variance at the start."""
+    return np.flatnonzero(np.diagonal(state.covariance)[7 + 2 * k : 9 + 2 * k] > 0.0)
+
+
+def run_both(case: Trial, joint: bool) -> tuple[FilterState, FloatArray, FloatArray]:
+    """The filter's last state, and mean and covariance of the graph, of all that is not fixed."""
+    state = initial_state(case.start) if joint else separate_initial_state(case.start)
+    linear = joint_start(case, state) if joint else map_start(state)
+    rows_of = {
+        identity: np.arange(2) if joint else free_rows(state, k)
+        for k, identity in enumerate(state.ids.tolist())
+    }
+    speed = INITIAL_SPEED
+    linear.add({robot(0): np.eye(1)}, np.zeros(1), speed)
+    time = case.start.time
+    for k, image in enumerate(case.tracks):
+        lost = np.setdiff1d(state.ids, image.ids)
+        linear.marginalised([feature(i) for i in lost if len(rows_of[i])])
+        state = state.keeping(~np.isin(state.ids, lost))
+        step = image.time - time
+        time = image.time
+        moved, by, spread = motion(state.mean[:4], step)
+        whiten = np.diag(np.diagonal(spread) ** -0.5)
+        if k == 0:  # the start's pose is no variable
+            by = by[:, 3:]
+            value = moved - by @ state.mean[3:4]
+        else:
+            value = moved - by @ state.mean[:4]
+        linear.add({robot(k): -whiten @ by, robot(k + 1): whiten}, whiten @ value, 1.0)
+        state = predicted(state, step)
+        rows = np.isin(image.ids, state.ids)
+        seen = seen_from_robot(state, image.bearing[rows], image.sigma_bearing[rows])
+        for m, identity in enumerate(state.ids.tolist()):
+            at = 7 + 2 * m + rows_of[identity]
+            by_robot, by_feature = seen.jacobian[m, :4], seen.jacobian[m, at]
+            value = seen.innovation[m] + by_robot @ state.mean[:4] + by_feature @ state.mean[at]
+            blocks = {robot(k + 1): by_robot[None]}
+            if len(at):
+                blocks[feature(identity)] = by_feature[None]
+            linear.add(blocks, np.array([value]), float(np.sqrt(seen.variance[m])))
+        state = updated(state, seen, 0.0)
+        linear.marginalised([robot(k)])
+    keys = [robot(len(case.tracks))] + ([TARGET] if joint else [])
+    keys += [feature(i) for i in state.ids.tolist() if len(rows_of[i])]
+    return state, *linear.solved(keys)
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings"), [(HomingEkf, JOINT), (PaperEkf, SEPARATE)], ids=["corrected", "paper"]
+)
+def test_filter_is_the_graph_with_past_poses_eliminated(
+    kind: type[HomingEkf], settings: HomingEkfSettings
+) -> None:
+    case = trial(5)
+    joint = kind is HomingEkf
+    state, mean, covariance = run_both(case, joint)
+    estimator = kind(case.start, settings)
+    for image in case.tracks:
+        estimator.update(image)
+    np.testing.assert_array_equal(estimator.state.mean[:4], state.mean[:4])
+    free = np.diagonal(state.covariance) > 0.0
+    if not joint:
+        free[4:7] = False
+    assert np.count_nonzero(free) == len(mean) > 20
+    np.testing.assert_allclose(state.mean[free], mean, rtol=0.0, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        state.covariance[np.ix_(free, free)], covariance, rtol=0.0, atol=TOLERANCE
+    )
+
+
+def test_joint_start_is_the_graph_of_the_two_views() -> None:
+    case = trial(6)
+    state = initial_state(case.start)
+    linear = joint_start(case, state)
+    keys = [TARGET, *(feature(i) for i in state.ids.tolist())]
+    mean, covariance = linear.solved(keys)
+    np.testing.assert_allclose(state.mean[5:], mean, rtol=0.0, atol=TOLERANCE)
+    np.testing.assert_allclose(state.covariance[5:, 5:], covariance, rtol=0.0, atol=TOLERANCE)
+
+
+def test_printed_target_filter_counts_each_bearing_once_an_image() -> None:
+    """It is the graph that has every target bearing as often as there were images."""
+    case = trial(7)
+    estimator = PaperEkf(case.start, SEPARATE)
+    linear = Linear(gtsam.GaussianFactorGraph())
+    first = estimator.state
+    half = np.linalg.inv(np.linalg.cholesky(first.covariance[4:7, 4:7]))
+    linear.add({TARGET: half}, half @ first.mean[4:7], 1.0)
+    counted = 0
+    for image in case.tracks:
+        before = estimator.state.mean[4:7]
+        estimator.update(image)
+        now = estimator.state
+        held = FilterState(
+            now.ids, np.concatenate([now.mean[:4], before, now.mean[7:]]), now.covariance
+        )
+        rows = np.searchsorted(case.start.local_map.ids, now.ids)
+        matches = case.start.matches
+        seen = seen_from_target(held, matches.bearing_b[rows], matches.sigma[rows, 2])
+        for m in range(len(rows)):
+            by = seen.jacobian[m, 4:7]
+            linear.add(
+                {TARGET: by[None]},
+                np.array([seen.innovation[m] + by @ before]),
+                float(seen.variance[m]) ** 0.5,
+            )
+        counted += len(rows)
+    mean, covariance = linear.solved([TARGET])
+    np.testing.assert_allclose(estimator.state.mean[4:7], mean, rtol=0.0, atol=TOLERANCE)
+    np.testing.assert_allclose(
+        estimator.state.covariance[4:7, 4:7], covariance, rtol=0.0, atol=TOLERANCE
+    )
+    assert counted > 40 * len(case.start.matches)
