@@ -21,6 +21,7 @@ from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError, FrameError
 from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures, TrackedBearings
 from fgslam.core.planar import wrap
+from fgslam.core.store import Kept
 from fgslam.frontend.features.omni import pixels_a_radian, wrapping_period
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 
@@ -82,9 +83,11 @@ class BearingTracker:
             another one's state goes on from there, to the same bits.
     """
 
+    state: Kept[TrackerState | None]
+
     def __init__(self, camera: OmniCamera) -> None:
         self.stabilised = StabilisedView(camera, _MAX_VIEW_WIDTH, WINDOW_PX, _PYRAMID_LEVELS)
-        self.state: TrackerState | None = None
+        self.state = None
 
     @property
     def view(self) -> OmniCamera:
@@ -248,21 +251,11 @@ class TrackedImage:
     added: IntArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class VideoState:
-    """All that goes over from one image to the next.
-
-    Attributes:
-        tracker: of the points; None before the first image.
-        next: identity of the next new point.
-    """
-
-    tracker: TrackerState | None
-    next: int
-
-
 class ReplenishedTracker:
     """A tracker that always follows enough points."""
+
+    _tracker: Kept[BearingTracker]
+    _next: Kept[int]
 
     def __init__(self, camera: OmniCamera, least: int, most: int) -> None:
         """Fills up to ``most`` points whenever fewer than ``least`` are left."""
@@ -289,14 +282,6 @@ class ReplenishedTracker:
         if tracked is None or len(added):
             tracked = self._tracker.bearings()
         return TrackedImage(tracked, survivors, added)
-
-    def state(self) -> VideoState:
-        """What it takes to go on later."""
-        return VideoState(self._tracker.state, self._next)
-
-    def restore(self, state: VideoState) -> None:
-        """Goes on from :meth:`state`, to the same bits."""
-        self._tracker.state, self._next = state.tracker, state.next
 
     def pixels(self) -> FloatArray:
         """(n, 2) where the points are in the view (:meth:`view`) of the last image."""

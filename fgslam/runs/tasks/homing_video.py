@@ -9,12 +9,13 @@ from time import perf_counter
 
 import numpy as np
 
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.files import make_subfolder
+from fgslam.core.store import restore, state_of
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.evaluation.statistics import JsonValue, UpdateTime
-from fgslam.frontend.homing.tracking import ReplenishedTracker, TrackedImage, VideoState
+from fgslam.frontend.homing.tracking import ReplenishedTracker, TrackedImage
 from fgslam.report.content import Column, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure
 from fgslam.runs.config_models import OmniVideoConfig
@@ -76,7 +77,7 @@ class _Progress:
     """What the run goes on from: the tracks so far, and the tracker after the last frame."""
 
     tracks: _Tracks
-    tracker: VideoState
+    tracker: StateArrays
 
 
 def open_video(config: OmniVideoConfig, opening: Opening) -> Task[RunResult]:
@@ -116,13 +117,13 @@ def _track(config: OmniVideoConfig, recording: OmniRecording, context: Context) 
     tracks = _Tracks()
     if saved := context.store.load(_STATE, _Progress).get(0):
         tracks = saved.tracks
-        tracker.restore(saved.tracker)
+        restore(tracker, saved.tracker)
     shown = np.linspace(0, len(recording), config.output.pictures + 1).astype(int)[1:] - 1
     last_saved = perf_counter()
     for i in range(len(tracks.frames), len(recording)):
         stopped = context.stopped()
         if stopped or perf_counter() - last_saved >= SAVE_EVERY_S:
-            context.store.add(_STATE, {0: _Progress(tracks, tracker.state())}, _Progress)
+            context.store.add(_STATE, {0: _Progress(tracks, state_of(tracker))}, _Progress)
             last_saved = perf_counter()
         if stopped:
             break
