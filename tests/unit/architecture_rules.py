@@ -445,13 +445,9 @@ PRIVATE_IN_TESTS = frozenset(
     {
         "tests/integration/test_lab_sequence.py",
         "tests/unit/backend/test_error_columns.py",
-        "tests/unit/backend/test_recorded_inputs.py",
         "tests/unit/backend/test_rig_doubt.py",
         "tests/unit/backend/test_sampled_errors.py",
         "tests/unit/backend/test_submaps.py",
-        "tests/unit/core/test_log_blocks.py",
-        "tests/unit/core/test_log_file.py",
-        "tests/unit/frontend/test_lasting_database.py",
         "tests/unit/runs/test_comparison_parts.py",
         "tests/unit/runs/test_processes.py",
         "tests/unit/runs/test_sweep_grid.py",

@@ -333,18 +333,6 @@ class ViewPool:
         self._words = np.full(len(self._size), _UNKNOWN, np.int16)
         self.changes += 1
 
-    def bytes_per_view(self) -> int:
-        """Memory of one view, without the room kept for growth."""
-        columns: tuple[npt.NDArray[Any], ...] = (
-            self._size,
-            self._orientation,
-            self._descriptors,
-            self._direction,
-            self._used,
-            self._words,
-        )
-        return sum(c.dtype.itemsize * int(np.prod(c.shape[1:])) for c in columns)
-
     def _find_words(self, places: npt.NDArray[np.integer[Any]]) -> None:
         self._words[places] = words_of(self._descriptors[places])
 
@@ -409,10 +397,20 @@ def _no_columns(max_views: int, patch_pixels: int) -> GrowingColumns:
     )
 
 
-class LandmarkTable:
+MAX_VIEWS = 8  # of a landmark; a further one replaces that matched longest ago
+_VIEW_ANGLE_DEG = 20.0
+"""A direction farther than this from every view becomes a view of its own: SIFT descriptors match
+up to about this angle (docs/concepts/maps.md)."""
+
+_LEAST_LOOKS = 4
+"""Of key frames, until what they miss is gone."""
+
+
+class LandmarkDatabase:
     """One row a landmark, ascending in identity; the views lie in a pool of their own.
 
-    The arrays over landmarks are read only by agreement, and good until the next change.
+    Counted frame by frame: hits n, misses m, consecutive misses l. The arrays over landmarks are
+    read only by agreement, and good until the next change.
     """
 
     _pool: Kept[ViewPool]
@@ -420,15 +418,26 @@ class LandmarkTable:
     _frame: Kept[int]
     _columns: Kept[GrowingColumns]
 
-    def __init__(self, max_views: int, view_angle: float, patch_pixels: int = 0) -> None:
-        """Starts empty; see ``views.ViewPool`` for the views (radians).
+    def __init__(
+        self,
+        rig: CameraRig,
+        settings: DatabaseSettings,
+        max_disparity_px: float,
+        patch_pixels: int = 0,
+    ) -> None:
+        """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected.
 
-        With ``patch_pixels`` there is room for each landmark's own patch of so many grey values.
+        Landmarks that are carried need ``patch_pixels`` for their own patch.
         """
-        self._pool = ViewPool(max_views, view_angle)
+        self._settings = settings
+        self._rig = rig
+        self._field_of_view = FieldOfView(rig, settings, max_disparity_px)
+        views = MAX_VIEWS if settings.viewpoints else 1
+        angle = _VIEW_ANGLE_DEG if settings.viewpoints else 0.0
+        self._pool = ViewPool(views, float(np.deg2rad(angle)))
         self.next_id = 0
         self._frame = 0
-        self._columns = _no_columns(max_views, patch_pixels)
+        self._columns = _no_columns(views, patch_pixels)
 
     def __len__(self) -> int:
         return len(self._columns)
@@ -595,121 +604,6 @@ class LandmarkTable:
         self.next_id = int(ids[-1]) + 1 if len(ids) else 0
         self._frame = 0
 
-    def _append(self, ids: IntArray, views: Views, colour: ByteArray) -> None:
-        """New landmarks (k,), seen once, in this frame."""
-        zeros = np.zeros(len(ids), np.int64)
-        self._columns.append(
-            {
-                "ids": ids,
-                "colour": colour,
-                "permanent": np.zeros(len(ids), np.bool_),
-                _PLACES: self._pool.start(views),
-                "hits": zeros + 1,
-                "misses": zeros,
-                "missed": zeros,
-                "unlooked": zeros,
-                "seen": zeros + self._frame,
-                "contradicted": zeros,
-                **self._as_columns(None, len(ids)),
-            }
-        )
-
-    def _as_columns(self, patches: LandmarkPatches | None, count: int) -> StateArrays:
-        """Own patches as this table keeps them; none where they are not known, or not kept."""
-        pixels = self.patch_pixels
-        if patches is None or not (pixels and patches.kept):
-            patches = LandmarkPatches.none(count, pixels)
-        return {"patch": patches.grey, "patch_distance": patches.distances}
-
-    @property
-    def _places(self) -> Places:
-        return self._columns[_PLACES]
-
-    def _views_from(self, rows: IntArray, directions: FloatArray | None) -> tuple[Views, BoolArray]:
-        """The view of each row (k,) nearest to a direction (k, 3), and whether it is near (6.3).
-
-        Without directions the first view, as near.
-        """
-        places = self._places[rows]
-        if directions is None:
-            return self._pool.at(places[:, 0]), np.ones(len(rows), np.bool_)
-        column, known = self._pool.nearest(places, directions.astype(np.float32))
-        return self._pool.at(places[np.arange(len(rows)), column]), known
-
-    def _largest_sizes(self, rows: IntArray) -> FloatArray:
-        """Largest size (k,) of any view of each row."""
-        return self._pool.largest_sizes(self._places[rows])
-
-    def _refresh(self, rows: IntArray, seen: Views) -> None:
-        """Updates the nearest view of matched rows (k,), or adds a further one."""
-        places = self._places[rows]
-        self._pool.refresh(places, seen)
-        self._places[rows] = places
-
-    def _places_of(
-        self, rows: IntArray, by_age: bool = False
-    ) -> tuple[IntArray, npt.NDArray[np.int32]]:
-        """To which of the rows (k,) each of their views belongs, as kept or by last use; places."""
-        places = self._places[rows]
-        owner, column = np.nonzero(places >= 0)
-        flat = places[owner, column]
-        if by_age and len(owner) > len(rows):
-            flat = flat[np.lexsort((self._pool.last_use(flat), owner))]
-        return owner, flat
-
-    def _require_mergeable(self, ends: IntArray, stays: IntArray) -> None:
-        unknown = np.setdiff1d(np.concatenate([ends, stays]), self.ids)
-        if len(unknown):
-            raise ValueError(f"landmarks {unknown[:5].tolist()} are not in the database")
-        if len(np.unique(ends)) < len(ends) or np.isin(ends, stays).any():
-            raise ValueError("a landmark can end only once, and not stay as well")
-
-    def _remove(self, gone: BoolArray) -> None:
-        if gone.any():
-            self._pool.release(self._places[gone])
-            self._columns.drop(gone)
-
-    def _clear(self, patch_pixels: int) -> None:
-        """No landmark; room for patches of so many pixels, at least, whoever began in them.
-
-        A session that carries none keeps those of its map for the next one.
-        """
-        self._remove(np.ones(len(self), np.bool_))
-        if patch_pixels > self.patch_pixels:
-            self._columns = _no_columns(self._places.shape[1], patch_pixels)
-
-
-MAX_VIEWS = 8  # of a landmark; a further one replaces that matched longest ago
-_VIEW_ANGLE_DEG = 20.0
-"""A direction farther than this from every view becomes a view of its own: SIFT descriptors match
-up to about this angle (docs/concepts/maps.md)."""
-
-_LEAST_LOOKS = 4
-"""Of key frames, until what they miss is gone."""
-
-
-class LandmarkDatabase(LandmarkTable):
-    """Landmark table updated frame by frame: hits n, misses m, consecutive misses l."""
-
-    def __init__(
-        self,
-        rig: CameraRig,
-        settings: DatabaseSettings,
-        max_disparity_px: float,
-        patch_pixels: int = 0,
-    ) -> None:
-        """Starts empty (4.2); landmarks of more than ``max_disparity_px`` are not expected.
-
-        Landmarks that are carried need ``patch_pixels`` for their own patch.
-        """
-        if settings.viewpoints:
-            super().__init__(MAX_VIEWS, float(np.deg2rad(_VIEW_ANGLE_DEG)), patch_pixels)
-        else:
-            super().__init__(1, 0.0, patch_pixels)
-        self._settings = settings
-        self._rig = rig
-        self._field_of_view = FieldOfView(rig, settings, max_disparity_px)
-
     @property
     def valid(self) -> BoolArray:
         """(n,) landmarks seen often enough to be trusted (6.1)."""
@@ -729,7 +623,12 @@ class LandmarkDatabase(LandmarkTable):
         found = self._field_of_view.select(wTc, landmarks.positions, wanted)
         rows = self.rows(landmarks.ids[found.rows])
         directions = directions_to(wTc, found.points) if self._pool.several else None
-        views, known = self._views_from(rows, directions)
+        places = self._places[rows]
+        if directions is None:  # the first view, as near
+            views, known = self._pool.at(places[:, 0]), np.ones(len(rows), np.bool_)
+        else:  # that nearest to the direction (6.3)
+            column, known = self._pool.nearest(places, directions.astype(np.float32))
+            views = self._pool.at(places[np.arange(len(rows)), column])
         return ExpectedLandmarks(
             ids=landmarks.ids[found.rows],
             rows=found.rows,
@@ -763,7 +662,9 @@ class LandmarkDatabase(LandmarkTable):
             directions: (k, 3) from the camera to each, unit, world; None where nobody asks.
         """
         rows = self._hit(ids)
-        self._refresh(rows, Views.of(features, which, directions, self._frame))
+        places = self._places[rows]
+        self._pool.refresh(places, Views.of(features, which, directions, self._frame))
+        self._places[rows] = places
         permanence = self._settings.permanence
         if permanence is not None and permanence.when == "running":
             counts = self.hits[rows], self.misses[rows]
@@ -837,7 +738,22 @@ class LandmarkDatabase(LandmarkTable):
         ids = np.arange(self.next_id, self.next_id + len(which))
         self.next_id += len(which)
         views = Views.of(features, which, directions, self._frame)
-        self._append(ids, views, colour)
+        zeros = np.zeros(len(ids), np.int64)
+        self._columns.append(
+            {
+                "ids": ids,
+                "colour": colour,
+                "permanent": np.zeros(len(ids), np.bool_),
+                _PLACES: self._pool.start(views),
+                "hits": zeros + 1,
+                "misses": zeros,
+                "missed": zeros,
+                "unlooked": zeros,
+                "seen": zeros + self._frame,
+                "contradicted": zeros,
+                **self._as_columns(None, len(ids)),
+            }
+        )
         return ids
 
     def prune(self) -> IntArray:
@@ -882,7 +798,8 @@ class LandmarkDatabase(LandmarkTable):
         """Predicate on landmarks, by rows and distances: expected scale at least that large."""
 
         def wanted(rows: IntArray, distance: FloatArray) -> BoolArray:
-            return np.asarray(self._largest_sizes(self.rows(ids[rows])) >= least * distance)
+            places = self._places[self.rows(ids[rows])]
+            return np.asarray(self._pool.largest_sizes(places) >= least * distance)
 
         return wanted
 
@@ -891,6 +808,49 @@ class LandmarkDatabase(LandmarkTable):
     ) -> BoolArray:
         valid = hits >= self._settings.valid_hits
         return valid & reliable(hits, misses, permanence)
+
+    def _as_columns(self, patches: LandmarkPatches | None, count: int) -> StateArrays:
+        """Own patches as this table keeps them; none where they are not known, or not kept."""
+        pixels = self.patch_pixels
+        if patches is None or not (pixels and patches.kept):
+            patches = LandmarkPatches.none(count, pixels)
+        return {"patch": patches.grey, "patch_distance": patches.distances}
+
+    @property
+    def _places(self) -> Places:
+        return self._columns[_PLACES]
+
+    def _places_of(
+        self, rows: IntArray, by_age: bool = False
+    ) -> tuple[IntArray, npt.NDArray[np.int32]]:
+        """To which of the rows (k,) each of their views belongs, as kept or by last use; places."""
+        places = self._places[rows]
+        owner, column = np.nonzero(places >= 0)
+        flat = places[owner, column]
+        if by_age and len(owner) > len(rows):
+            flat = flat[np.lexsort((self._pool.last_use(flat), owner))]
+        return owner, flat
+
+    def _require_mergeable(self, ends: IntArray, stays: IntArray) -> None:
+        unknown = np.setdiff1d(np.concatenate([ends, stays]), self.ids)
+        if len(unknown):
+            raise ValueError(f"landmarks {unknown[:5].tolist()} are not in the database")
+        if len(np.unique(ends)) < len(ends) or np.isin(ends, stays).any():
+            raise ValueError("a landmark can end only once, and not stay as well")
+
+    def _remove(self, gone: BoolArray) -> None:
+        if gone.any():
+            self._pool.release(self._places[gone])
+            self._columns.drop(gone)
+
+    def _clear(self, patch_pixels: int) -> None:
+        """No landmark; room for patches of so many pixels, at least, whoever began in them.
+
+        A session that carries none keeps those of its map for the next one.
+        """
+        self._remove(np.ones(len(self), np.bool_))
+        if patch_pixels > self.patch_pixels:
+            self._columns = _no_columns(self._places.shape[1], patch_pixels)
 
 
 NEAR_PX = 40.0  # what is seen past a place is this near to it in the image

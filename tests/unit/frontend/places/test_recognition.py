@@ -34,7 +34,7 @@ from fgslam.frontend.features.matching import AppearanceIndex
 from fgslam.frontend.places import known_map
 from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.frontend.tracking.landmarks import LandmarkTable
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.slam.factory import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
@@ -323,7 +323,7 @@ def test_who_is_lost_indexes_the_same_looks_once_with_the_same_answers(
     )
     once = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
     first = len(made)
-    monkeypatch.setattr(LandmarkTable, "changes", property(lambda self: len(made)))
+    monkeypatch.setattr(LandmarkDatabase, "changes", property(lambda self: len(made)))
     every = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
     assert first < len(made) - first == len(poses) - 12 + 1
     for one, other in zip(once, every, strict=True):
