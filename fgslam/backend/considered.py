@@ -73,7 +73,7 @@ class ErrorColumns:
         self._held = False
         self._gain = np.zeros((6, count))
         self._order = GrowingColumns(ids=np.empty(0, np.int64), row=np.empty(0, np.int64))
-        """Identities, ascending, and the rows that are theirs in the map"""
+        """Identities, ascending, and the rows that are theirs in the map; free ones are nobody's"""
         self._map = GrowingColumns(gain=np.empty((0, 3, count), kind), **more)
         self._free = np.empty(0, np.int64)
 
@@ -90,7 +90,9 @@ class ErrorColumns:
             self._free = np.concatenate([self._free, self._order["row"][gone]])
             self._order.drop(gone)
 
-    def append(self, values: StateArrays) -> None:
+    # ----------------------------------------------------------------------------------------
+
+    def _append(self, values: StateArrays) -> None:
         """Landmarks (k,) that are not there yet; their identities ascend."""
         ids = values["ids"]
         if not len(ids):
@@ -115,7 +117,7 @@ class ErrorColumns:
         places = np.minimum(np.searchsorted(have, ids), len(have) - 1)
         return places, np.asarray(have[places] == ids)
 
-    def rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
+    def _rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
         """(k,) rows of landmarks in the map, and which of them are there."""
         places, known = self._places(ids)
         return (self._order["row"][places] if known.any() else places), known
@@ -124,11 +126,11 @@ class ErrorColumns:
         """(k, 3, m) columns of landmarks, as far as they are reported."""
         if self._held:
             return np.zeros((len(ids), *self._map["gain"].shape[1:]))
-        return self.values_of("gain", ids)
+        return self._of("gain", ids)
 
-    def values_of(self, name: str, ids: IntArray) -> FloatArray:
+    def _of(self, name: str, ids: IntArray) -> FloatArray:
         """(k, ...) what is kept of landmarks under a name; zero of unknown ones."""
-        rows, known = self.rows(ids)
+        rows, known = self._rows(ids)
         kept = self._map[name]
         out = np.zeros((len(ids), *kept.shape[1:]))
         out[known] = kept[rows[known]]
@@ -240,7 +242,7 @@ class ConsiderCovariance(ErrorColumns):
         kept = increment.observations.select(~increment.rejected)
         near = kept.measurement[:, 2] > _LEAST_DISPARITY_PX
         seen = _Linearised.of(rig, self._terms, kept.select(near), wTc)
-        rows, known = self.rows(seen.ids)
+        rows, known = self._rows(seen.ids)
         if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
             basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
             self._gain = seen.select(known).pose_gain(*self._at(rows[known]), basis)
@@ -267,7 +269,7 @@ class ConsiderCovariance(ErrorColumns):
         covariance = self._terms.covariance
         if covariance is None or self._held:
             return known
-        gain = self.values_of("gain", known.ids)
+        gain = self._of("gain", known.ids)
         more = gain @ covariance @ np.swapaxes(gain, 1, 2)
         return dataclasses.replace(known, covariances=known.covariances + more)
 
@@ -297,7 +299,7 @@ class ConsiderCovariance(ErrorColumns):
         if len(seen.ids):
             gain = np.linalg.solve(seen.by_point, seen.off(self._gain))
             information = seen.landmark_information()[1]
-            self.append({"ids": seen.ids, "gain": gain, "information": information})
+            self._append({"ids": seen.ids, "gain": gain, "information": information})
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -505,10 +507,10 @@ class SampledErrors(ErrorColumns):
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
         moved = carried @ self._gain
-        moved[:, self._count :] += symmetric_root(noise) @ self._signs(1, 6)[0]
-        columns = self.linearised(wTc, problem)
+        moved[:, self._count :] += _root(noise) @ self._signs(1, 6)[0]
+        columns = self._columns(wTc, problem)
         self._enter(used.ids, columns, problem.point_covariances, moved)
-        rows, _ = self.rows(used.ids)
+        rows, _ = self._rows(used.ids)
         self._seen = rows, columns, self._map["gain"][rows].astype(np.float64)
         self._gain = self._on_floor(wTc, moved)
         if step.measured:
@@ -529,8 +531,8 @@ class SampledErrors(ErrorColumns):
             points = transform_to_camera(wTc, placed.points)
             near = in_front(points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
             gain = np.zeros((len(ids), 3, self._count + SAMPLES))
-            gain[near] = self.linearised(wTc, placed.select(near)).placed(self._gain)
-            self.append({"ids": ids, "gain": gain})
+            gain[near] = self._columns(wTc, placed.select(near)).placed(self._gain)
+            self._append({"ids": ids, "gain": gain})
 
     def close(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, moved: Moved
@@ -545,7 +547,7 @@ class SampledErrors(ErrorColumns):
         """
         if self._off:
             return
-        rows, known = self.rows(landmarks.ids)
+        rows, known = self._rows(landmarks.ids)
         self._map["gain"][rows[known]] = moved.rotations[known] @ self._map["gain"][rows[known]]
         apart = adjoint(wTc) @ (self._gain - self._returned(loop, landmarks, wTc, moved.homes))
         self._gain = self._on_floor(
@@ -565,7 +567,7 @@ class SampledErrors(ErrorColumns):
         """The newest pose with the covariance of its errors."""
         if self._off:
             return newest
-        return Prediction(newest.wTc, self.covariances(self._gain, self._solver.floor.rigid_dof))
+        return Prediction(newest.wTc, self._covariances(self._gain, self._solver.floor.rigid_dof))
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with the covariances of their errors; those without keep what they have."""
@@ -574,7 +576,7 @@ class SampledErrors(ErrorColumns):
         if self._held or not have.any():
             return known
         covariances = known.covariances.copy()
-        covariances[have] = self.covariances(gain[have], 3)
+        covariances[have] = self._covariances(gain[have], 3)
         return dataclasses.replace(known, covariances=covariances)
 
     def joint(self, pose: FloatArray, known: LandmarkMap) -> FloatArray:
@@ -595,8 +597,7 @@ class SampledErrors(ErrorColumns):
 
     # ----------------------------------------------------------------------------------------
 
-    def linearised(self, wTc: FloatArray, seen: PoseProblem) -> ObservedColumns:
-        """Measurements of a frame at ``wTc``, with the columns of their own errors."""
+    def _columns(self, wTc: FloatArray, seen: PoseProblem) -> ObservedColumns:
         points = transform_to_camera(wTc, seen.points)
         projection = projection_jacobian(self._sensor, points)
         shift = np.zeros((len(seen), 3, self._count + SAMPLES))
@@ -625,35 +626,35 @@ class SampledErrors(ErrorColumns):
 
         Their map was made with the same rig: its terms have them where the pose does.
         """
-        new = ~self.rows(ids)[1]
+        new = ~self._rows(ids)[1]
         if new.any():
             gain = columns.select(new).placed(pose)
             gain[:, :, self._count :] = self._drawn(covariances[new])
-            self.append({"ids": ids[new], "gain": gain})
+            self._append({"ids": ids[new], "gain": gain})
 
     def _returned(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, homes: IntArray
     ) -> FloatArray:
         """Errors (6, m) of the newest pose, at ``wTc``, by the landmarks of an old place."""
         seen = loop.observations
-        seen = seen.select(self.rows(seen.ids)[1] & np.isin(seen.ids, landmarks.ids))
+        seen = seen.select(self._rows(seen.ids)[1] & np.isin(seen.ids, landmarks.ids))
         problem = PoseProblem.of(landmarks, seen)
         ahead = in_front(transform_to_camera(wTc, problem.points))
         if ahead.sum() < _LEAST_PLACING:
             gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
-            gain[:, self._count :] += symmetric_root(loop.covariance) @ self._signs(1, 6)[0]
+            gain[:, self._count :] += _root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
         problem = problem.select(ahead)
-        columns = self.linearised(wTc, problem)
+        columns = self._columns(wTc, problem)
         by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
-        return columns.following(by_measurement, self.values_of("gain", seen.ids[ahead]))
+        return columns.following(by_measurement, self._of("gain", seen.ids[ahead]))
 
     def _of_place(self, frame: int, landmarks: LandmarkMap, homes: IntArray) -> FloatArray:
         """Errors (6, m) of a frame's place as a motion of the world, by landmarks first seen there.
 
         Weighted least squares over those whose first frames are nearest; zero where there are none.
         """
-        have = np.flatnonzero(self.rows(landmarks.ids)[1] & (homes >= 0))
+        have = np.flatnonzero(self._rows(landmarks.ids)[1] & (homes >= 0))
         nearest = have[np.argsort(np.abs(homes[have] - frame), kind="stable")][:_PLACE]
         near = landmarks.select(np.sort(nearest))
         by_motion = np.concatenate(
@@ -662,14 +663,14 @@ class SampledErrors(ErrorColumns):
         weights = np.asarray(np.linalg.inv(near.covariances + lacking(near.covariances)))
         turned = np.swapaxes(by_motion, 1, 2) @ weights
         information = (turned @ by_motion).sum(axis=0)
-        pull = (turned @ self.values_of("gain", near.ids)).sum(axis=0)
+        pull = (turned @ self._of("gain", near.ids)).sum(axis=0)
         return np.asarray(np.linalg.pinv(information, hermitian=True) @ pull)
 
     def _on_floor(self, wTc: FloatArray, columns: FloatArray) -> FloatArray:
         basis = self._solver.floor.basis(wTc)
         return np.asarray(basis @ (basis.T @ columns))
 
-    def covariances(self, columns: FloatArray, freedom: int) -> FloatArray:
+    def _covariances(self, columns: FloatArray, freedom: int) -> FloatArray:
         """Covariances (..., d, d) of errors (..., d, m) with so many degrees of freedom."""
         weighed = self._weighed(columns, freedom)
         return np.asarray(weighed @ np.swapaxes(weighed, -1, -2))
@@ -697,7 +698,7 @@ def lacking(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.where(flat, _PADDING * trace, 0.0)[:, None, None] * np.eye(3))
 
 
-def symmetric_root(covariance: FloatArray) -> FloatArray:
+def _root(covariance: FloatArray) -> FloatArray:
     """(6, 6) symmetric root of a covariance of any rank: it follows rounding as little."""
     variances, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray((directions * np.sqrt(np.maximum(variances, 0.0))) @ directions.T)

@@ -24,13 +24,13 @@ def sweep(  # noqa: PLR0913 - each option is a parameter
     it early with the table so far; the same command with --resume does what is missing.
     """
     from fgslam.cli.console import progress_with_table
-    from fgslam.runs.sweeps.sweep import crew_of, make_plan, run_sweep
+    from fgslam.runs.sweeps.sweep import make_plan, run_sweep, workers_of
 
     existing = existing_folder(overwrite, resume)
     plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
     folder = out or plan.default_folder
     with stop_flag() as stopped, progress_with_table() as (progress, shown):
-        tell, crew = stoppable(progress, stopped), crew_of(jobs, scheduler, len(plan.grid))
-        result = run_sweep(plan, folder, crew, existing, metric, (tell, stopped, shown))
+        tell, pool = stoppable(progress, stopped), workers_of(jobs, scheduler)
+        result = run_sweep(plan, folder, pool, existing, metric, (tell, stopped, shown))
     show_all([result], same_with_resume())
     exit_as([result])

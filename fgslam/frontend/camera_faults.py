@@ -521,19 +521,12 @@ class CameraWatch:
             if repeated or swapped:
                 continue
             if self._before:
-                if moved is None:  # points that no other image shows come back nowhere
-                    moved = points.copy(), np.zeros(len(points), np.bool_)
-                    back = followed(now.images[0], self._before[0], points[shown])
-                    moved[0][shown], moved[1][shown] = back
+                moved = moved or _followed_of(now.images[0], self._before[0], points, shown)
                 since = moved[0][kept], moved[1][kept]
                 seen.append(self._judge(camera, now, (here, there), since))
             else:
-                # A first frame's points, as if at rest: how far they moved is not known.
-                at_rest = here, np.ones(len(here), np.bool_)
-                offset = (there - here)[:, pair.model.across]
-                seen.append(self._shifted(at_rest, here, offset, there, pair))
-        late = f"{_named(self._late)} old images" if any(self._late) else ""
-        fault = repeated or swapped or late
+                seen.append(self._still(pair, here, there))
+        fault = repeated or swapped or self._old()
         if not fault:
             self._turns.take(self._frames if number is None else number, seen)
         self._before, self._frames = now.images, self._frames + 1
@@ -610,6 +603,12 @@ class CameraWatch:
             pair.rows[1].clear()
         return rows
 
+    def _still(self, pair: _Pair, here: FloatArray, there: FloatArray) -> LineRows:
+        """Points (n, 2) of a first frame, as if at rest: how far they moved is not known."""
+        every = here, np.ones(len(here), np.bool_)
+        offset = (there - here)[:, pair.model.across]
+        return self._shifted(every, here, offset, there, pair)
+
     def _shifted(
         self,
         moved: Followed,
@@ -648,6 +647,9 @@ class CameraWatch:
             return rows
         return LineRows(-rows.offset, -rows.shift, rows.place)
 
+    def _old(self) -> str:
+        return f"{_named(self._late)} old images" if any(self._late) else ""
+
     # ----------------------------------------------------------------------------------------
 
 
@@ -655,6 +657,13 @@ def _named(which: list[bool]) -> str:
     names = [CAMERA_NAMES[k] for k, one in enumerate(which) if one]
     verb = "camera delivers" if len(names) == 1 else "cameras deliver"
     return f"the {' and '.join(names)} {verb}"
+
+
+def _followed_of(a: Image, b: Image, points: FloatArray, which: BoolArray) -> Followed:
+    """As :func:`followed`, of some points (n,); the others come back nowhere."""
+    found, kept = points.copy(), np.zeros(len(points), np.bool_)
+    found[which], kept[which] = followed(a, b, points[which])
+    return found, kept
 
 
 def _grey(image: Image, points: FloatArray) -> FloatArray:

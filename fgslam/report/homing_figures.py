@@ -333,8 +333,7 @@ def _moment(
     )
     yield dots("lost features", _upwards(_lost(estimates, row)), GREY, 7.0, "star")
     known = np.isfinite(now.landmark_covariances).all(axis=(1, 2))
-    # Half the corners: they are many and small, and a moment's are as large as all the rest.
-    around = outlines(now.landmarks[known], now.landmark_covariances[known])[:, ::2]
+    around = outlines(now.landmarks[known], now.landmark_covariances[known])
     yield line("features, 3 sigma", _upwards(around), GREY, 1.0, shown=False)
     path = np.array([e.robot[:2] for e in estimates[: row + 1]])
     yield line("estimated path", _upwards(path), colour(0), 1.6)

@@ -21,7 +21,6 @@ from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import Page, TextTable, read_metrics, write_json
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment
-from fgslam.runs.crews import Crew
 from fgslam.runs.folder import (
     METRICS_FILE,
     REPORT_FILE,
@@ -36,7 +35,6 @@ from fgslam.runs.folder import (
     write_config,
 )
 from fgslam.runs.owner import OWNER_NAME, Owner
-from fgslam.runs.processes import Workers
 from fgslam.runs.units import (
     Argument,
     Done,
@@ -48,6 +46,7 @@ from fgslam.runs.units import (
     holds_units,
     perform,
 )
+from fgslam.runs.workers import Executor, Pool
 
 _GROUND = ("log", "trials", "first_seed")
 """What a resumed run must find as it was, of its provenance, beside the data set's identity."""
@@ -120,8 +119,7 @@ class Context:
         store: of finished units.
         jobs: processes at a time.
         progress, stopped: as of :func:`run_task`.
-        workers: processes that small units share, whichever their stage; None: there are none.
-        crew: does the units in place of processes of this machine; None: these do.
+        executor: does the units.
     """
 
     folder: Path
@@ -130,13 +128,11 @@ class Context:
     jobs: int
     progress: Progress
     stopped: Stopped
-    workers: Workers | None = None
-    crew: Crew | None = None
+    executor: Executor
 
-    def perform(self, stage: Stage[Argument, Result], single_threaded: bool = True) -> Done[Result]:
+    def perform(self, stage: Stage[Argument, Result]) -> Done[Result]:
         """Does what is missing of a stage; as :func:`fgslam.runs.units.perform`."""
-        loop = (self.jobs, self.progress, self.stopped)
-        return perform(stage, self.store, *loop, single_threaded, self.workers, self.crew)
+        return perform(stage, self.store, self.executor, self.progress, self.stopped)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,7 +197,7 @@ def run_task(
     progress: Progress = lambda what, done, total: None,
     stopped: Stopped = lambda: False,
     jobs: int | None = None,
-    crew: Crew | None = None,
+    executor: Executor | None = None,
 ) -> R_co:
     """Runs a configuration into a run folder by the task that ``opener`` opens.
 
@@ -213,7 +209,7 @@ def run_task(
         progress: called after each step of the work.
         stopped: asked after each step; True ends the run early, resumable, with all files valid.
         jobs: processes at a time; None: as the configuration says, else one.
-        crew: does the units in place of processes of this machine; None: these do.
+        executor: does the units; None: processes of this machine.
 
     Raises:
         FgslamError: of any kind, with a message for the user.
@@ -230,8 +226,8 @@ def run_task(
             write_config(folder, config, dict(task.provenance))
         store = UnitStore(folder)
         jobs = jobs or getattr(config, "jobs", 1) or os.cpu_count() or 1
-        with Workers() as workers:
-            loop = (jobs, progress, stopped, workers, crew)
+        with Pool(jobs) as pool:
+            loop = (jobs, progress, stopped, executor or pool)
             result = task.run(Context(folder, resumed, store, *loop))
         if result.status == "finished":
             store.remove()

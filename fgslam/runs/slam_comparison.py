@@ -102,8 +102,8 @@ def replay_apart(
     """
     ego_motion, remark = config.frontend.ego_motion, config.remark
     tasks = [ReplayTask(run, context.folder, s, ego_motion, remark) for s in estimators]
-    stage = each_apart(("replays", "replaying"), perform, tasks, EstimatorMetrics)
-    found = context.perform(stage, single_threaded=False).all(
+    stage = each_apart(("replays", "replaying"), perform, tasks, EstimatorMetrics, fresh=True)
+    found = context.perform(stage).all(
         lambda k, why: EstimatorMetrics(more={"kind": estimators[k].kind, "failure": why})
     )
     return {settings.title: one for settings, one in zip(estimators, found, strict=True)}

@@ -21,7 +21,6 @@ from fgslam.report.content import write_metrics
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
 from fgslam.runs.config import load_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
-from fgslam.runs.dask_crew import LocalCrew
 from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import (
     METRICS_FILE,
@@ -32,7 +31,6 @@ from fgslam.runs.folder import (
     is_run_folder,
 )
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.processes import worker_count
 from fgslam.runs.slam_comparison import named, with_odometry
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, trials_table, write_comparison_csv
 from fgslam.runs.tasks.homing_trials import open_trials
@@ -106,8 +104,7 @@ def run_trials(
         changes: dict[str, Any] = {"trials": seeds.count, "seed": first}
         changes |= {"estimator": estimators[0], "compare": estimators[1:]}
         chosen = config.model_copy(update=changes)
-    with LocalCrew(worker_count(jobs, seeds.count)) as crew:
-        return run_task(opener, chosen, folder, existing, progress, stopped, jobs, crew)
+    return run_task(opener, chosen, folder, existing, progress, stopped, jobs)
 
 
 def _open(

@@ -1,7 +1,7 @@
 """The units of a run: finished ones are kept in the run folder, so that a resumed run skips them.
 
 A unit is what need not be done twice: a pair of views, a drive, a trial, an estimator's replay.
-Blocks of units are done in processes of their own; each block's results are one file of
+Blocks of units are done by an executor; each block's results are one file of
 ``RUN/units``, written whole or not at all. What a run goes on with is always what was read back
 from there: so a resumed run goes on with the same values to the bit.
 """
@@ -17,8 +17,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
 from fgslam.core.store import UNFIT, load_arrays, pack, unpack, write_arrays
-from fgslam.runs.crews import Crew
-from fgslam.runs.processes import WorkerEnded, Workers, run_apart
+from fgslam.runs.workers import Executor, Failed
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -43,8 +42,7 @@ class Stage(Generic[Argument, Result]):
         argument: what a process is given for a block of units.
         kind: type of one unit's result.
         blocks: divides the units that are missing into blocks.
-        small: a process does several blocks, one after the other: starting one takes as long as
-            some units. Not where a process's own memory is measured.
+        fresh: each block in a process that has done nothing before: its memory is measured.
     """
 
     name: str
@@ -54,7 +52,7 @@ class Stage(Generic[Argument, Result]):
     argument: Callable[[tuple[int, ...]], Argument]
     kind: Any
     blocks: Callable[[Sequence[int]], Sequence[Sequence[int]]]
-    small: bool = False
+    fresh: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +90,7 @@ def each_apart(
     arguments: Sequence[Argument],
     kind: Any,
     block: int = 1,
+    fresh: bool = False,
 ) -> Stage[list[Argument], Result]:
     """A stage with a unit for each argument.
 
@@ -100,14 +99,15 @@ def each_apart(
         function: of a module's top level; makes the result of one unit.
         arguments: one a unit.
         kind: type of one unit's result.
-        block: units that share a process: starting one takes as long as some units.
+        block: units that are handed out, and kept, together.
+        fresh: each block in a process that has done nothing before: its memory is measured.
     """
 
     def those(units: tuple[int, ...]) -> list[Argument]:
         return [arguments[k] for k in units]
 
     name, label = names
-    return Stage(name, label, len(arguments), _Each(function), those, kind, in_blocks(block))
+    return Stage(name, label, len(arguments), _Each(function), those, kind, in_blocks(block), fresh)
 
 
 class UnitStore:
@@ -170,24 +170,18 @@ def _is_own(path: Path) -> bool:
 def perform(
     stage: Stage[Argument, Result],
     store: UnitStore,
-    jobs: int,
+    executor: Executor,
     progress: Progress,
     stopped: Stopped,
-    single_threaded: bool = True,
-    workers: Workers | None = None,
-    crew: Crew | None = None,
 ) -> Done[Result]:
-    """Does what is missing of a stage, in processes.
+    """Does what is missing of a stage.
 
     Args:
         stage: which units.
         store: where finished ones are.
-        jobs: processes at a time.
+        executor: does the blocks.
         progress: called after each block that is done.
         stopped: True ends it; what was done until then is kept.
-        single_threaded: linear algebra on one thread a process.
-        workers: processes for the blocks of small units; None: each block has one of its own.
-        crew: does the blocks in place of processes of this machine; None: these do.
 
     Raises:
         FgslamError: what a unit raised, or a unit's file cannot be written or read.
@@ -198,14 +192,9 @@ def perform(
     ended: list[tuple[tuple[int, ...], str]] = []
     progress(stage.label, len(found), stage.count)
     arguments = [stage.argument(block) for block in blocks]
-    kept = workers if stage.small else None
-    if crew is not None:
-        pieces = crew.do(stage.work, arguments, stopped)
-    else:
-        pieces = run_apart(stage.work, arguments, jobs, stopped, single_threaded, kept)
-    for index, result in pieces:
+    for index, result in executor.run(stage.work, arguments, stopped, stage.fresh):
         block = blocks[index]
-        if isinstance(result, WorkerEnded):
+        if isinstance(result, Failed):
             ended.append((block, result.why))
         else:
             found |= store.add(stage.name, dict(zip(block, result, strict=True)), stage.kind)
@@ -215,7 +204,7 @@ def perform(
 
 
 def in_blocks(size: int) -> Callable[[Sequence[int]], list[Sequence[int]]]:
-    """Neighbours in blocks of at most so many: starting a process takes as long as some units."""
+    """Neighbours in blocks of at most so many."""
 
     def divided(units: Sequence[int]) -> list[Sequence[int]]:
         return [units[k : k + size] for k in range(0, len(units), size)]

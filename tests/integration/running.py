@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +22,10 @@ from fgslam.core.measurement_log import MeasurementLog
 from fgslam.core.trajectories import Trajectory, read_covariances
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import make_config
-from fgslam.runs.crews import Here
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
+from fgslam.runs.workers import InProcess
 from fgslam.slam.results import STAGES
 
 Capture = pytest.CaptureFixture[str]
@@ -92,15 +92,9 @@ def stop_after(frames: int) -> Callable[[], bool]:
 def units_in_this_process() -> Iterator[None]:
     """The units of a run are done in this process, one after the other."""
 
-    def here(
-        function: Callable[[Any], Any], arguments: Sequence[Any], *_: object
-    ) -> Iterator[tuple[int, Any]]:
-        for k, argument in enumerate(arguments):
-            yield k, function(argument)
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fgslam.runs.units.run_apart", here)
-        patch.setattr("fgslam.runs.trials.LocalCrew", lambda jobs: nullcontext(Here()))
+        patch.setattr("fgslam.runs.engine.Pool", lambda jobs: nullcontext(InProcess()))
+        patch.setattr("fgslam.runs.sweeps.sweep.Pool", lambda *_: nullcontext(InProcess()))
         yield
 
 

@@ -466,13 +466,6 @@ def test_interrupted_pairs_say_so_and_count_nothing_that_is_not_done(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def one_by_one(work: Any, arguments: Any, _jobs: int, stopped: Any, *_: object) -> Any:
-        for index, argument in enumerate(arguments):
-            if stopped():
-                return
-            yield index, work(argument)
-
-    monkeypatch.setattr("fgslam.runs.units.run_apart", one_by_one)
     values = values_of("homing_pairs") | {"reference": True}
     reached: list[int] = []
 

@@ -20,8 +20,8 @@ from running import HANGS_AFTER_S, main
 
 import fgslam
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.runs.crews import Here
 from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, make_plan, run_sweep
+from fgslam.runs.workers import InProcess
 
 DRIVE: dict[str, Any] = {
     "name": "short_drive",
@@ -54,7 +54,7 @@ def drive(tmp_path: Path) -> Path:
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cases are done in this process."""
-    monkeypatch.setattr("fgslam.runs.sweeps.sweep.LocalCrew", lambda jobs: nullcontext(Here()))
+    monkeypatch.setattr("fgslam.runs.sweeps.sweep.Pool", lambda *_: nullcontext(InProcess()))
 
 
 def do(
@@ -62,7 +62,7 @@ def do(
 ) -> SweepResult:
     watch = UNWATCHED if stopped is None else (UNWATCHED[0], stopped, UNWATCHED[2])
     plan = make_plan([source], sets)
-    return run_sweep(plan, out, nullcontext(Here()), existing, watch=watch)
+    return run_sweep(plan, out, nullcontext(InProcess()), existing, watch=watch)
 
 
 @pytest.mark.usefixtures("here")
@@ -306,11 +306,12 @@ def test_a_sweep_that_is_ended_leaves_no_worker_and_goes_on(
         assert len(pandas.read_parquet(out / "results.parquet")) == done(out)
     when(lambda: not any(Path("/proc", pid).exists() for pid in workers))
     plan = make_plan([drive], ["seed=0:40"])
-    assert run_sweep(plan, out, nullcontext(Here()), "resume").done == 40
+    assert run_sweep(plan, out, nullcontext(InProcess()), "resume").done == 40
 
 
 def children(parent: int) -> list[str]:
-    """Of a process, those that work for a scheduler."""
-    found = Path(f"/proc/{parent}/task/{parent}/children").read_text(encoding="utf-8").split()
+    """Of a process, those that work for a scheduler; any of its threads may have started them."""
+    lists = Path(f"/proc/{parent}/task").glob("*/children")
+    found = [pid for path in lists for pid in path.read_text(encoding="utf-8").split()]
     lines = {pid: Path("/proc", pid, "cmdline").read_bytes() for pid in found}
-    return [pid for pid, line in lines.items() if b"dask_worker" in line]
+    return [pid for pid, line in lines.items() if b"spawn_main" in line]

@@ -17,13 +17,13 @@ from fgslam.report.content import plain, read_metrics
 from fgslam.runs.compare import Choice, choose
 from fgslam.runs.config import make_experiment
 from fgslam.runs.config_models import Experiment, ExperimentConfig
-from fgslam.runs.crews import Failed, Here
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import METRICS_FILE, versions
 from fgslam.runs.run import opener_of
 from fgslam.runs.slam_comparison import judged_apart
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS
 from fgslam.runs.trial import TrialTask, perform_trial
+from fgslam.runs.workers import Failed, InProcess
 
 _ABOUT = ("name", "task", "status", "remarks", "estimators")
 _TIMED = ("ms", "mb", "seconds", "second", "growth", "memory")
@@ -137,7 +137,7 @@ def perform_case(task: CaseTask) -> CaseResult | Failed:
         rows = tuple(_rows(config, estimators))
     except (FgslamError, *_FAULTS) as error:
         kind = "" if isinstance(error, FgslamError) else f"{type(error).__name__}: "
-        return Failed(f"{kind}{' '.join(str(error).split())[:500]}", _address())
+        return Failed(f"{kind}{' '.join(str(error).split())[:500]}")
     return CaseResult(time.monotonic() - begun, rows)
 
 
@@ -167,7 +167,7 @@ def _document(config: Experiment) -> dict[str, Any]:
     """metrics.json of a run that is gone afterwards, done in this process alone."""
     with tempfile.TemporaryDirectory(prefix="fgslam-case-") as scratch:
         run = Path(scratch) / "run"
-        run_task(opener_of(config), config, run, jobs=1, crew=Here())
+        run_task(opener_of(config), config, run, jobs=1, executor=InProcess())
         return read_metrics(run / METRICS_FILE)
 
 
@@ -188,13 +188,3 @@ def _require_same_versions(made_with: Mapping[str, str | None]) -> None:
             f"this worker has other versions than the sweep was begun with ({', '.join(other)}), "
             "which would not give the same bytes; install these there"
         )
-
-
-def _address() -> str:
-    """Of the Dask worker that this is; empty where it is none."""
-    try:
-        from distributed import get_worker
-
-        return str(get_worker().address)
-    except ValueError:
-        return ""

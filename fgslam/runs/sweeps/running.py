@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fgslam.report.content import Column, TextTable
-from fgslam.runs.crews import Failed
-from fgslam.runs.processes import WorkerEnded
 from fgslam.runs.sweeps.case import CaseResult
 from fgslam.runs.sweeps.findings import METRICS
 from fgslam.runs.sweeps.grid import SEED, Case, Grid
 from fgslam.runs.tables import measured_marks, with_marks
+from fgslam.runs.workers import Failed
 
 _SHOWN = 16
 _EVERY_S = 0.5
@@ -51,7 +50,7 @@ class RunningMeans:
     _means: dict[str, _Mean] = field(default_factory=dict)
     _told: float = -_EVERY_S
 
-    def add(self, case: Case, outcome: CaseResult | Failed | WorkerEnded[Any]) -> bool:
+    def add(self, case: Case, outcome: CaseResult | Failed) -> bool:
         """Takes a case in; whether it is time to show the means again."""
         label = self._label(case)
         if not isinstance(outcome, CaseResult):

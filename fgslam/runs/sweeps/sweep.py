@@ -14,12 +14,9 @@ from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import SimulatedMeasurementsSettings
 from fgslam.report.content import TextTable
 from fgslam.runs.config_models import Experiment
-from fgslam.runs.crews import NOT_BEGUN, Crew
-from fgslam.runs.dask_crew import LocalCrew, crew_at
 from fgslam.runs.engine import Opening, RunResult, Status
 from fgslam.runs.folder import REPORT_FILE, ExistingFolder, digest_of, versions
 from fgslam.runs.owner import Owner
-from fgslam.runs.processes import worker_count
 from fgslam.runs.run import opener_of
 from fgslam.runs.sweeps.case import CaseResult, CaseTask, perform_case
 from fgslam.runs.sweeps.findings import Findings, find
@@ -30,6 +27,7 @@ from fgslam.runs.sweeps.page import comparison_tables, sentences, write_sweep_pa
 from fgslam.runs.sweeps.running import RunningMeans
 from fgslam.runs.sweeps.table import TABLE_FILE, SweepTable, make_table
 from fgslam.runs.units import Progress, Stopped
+from fgslam.runs.workers import NOT_BEGUN, Executor, Pool
 
 if TYPE_CHECKING:
     import pandas
@@ -88,25 +86,23 @@ class SweepResult(RunResult):
         return pandas.read_parquet(self.folder / TABLE_FILE)
 
 
-def crew_of(jobs: int | None, scheduler: str | None, cases: int) -> AbstractContextManager[Crew]:
-    """Workers of a scheduler, or so many of this machine for the cases; None: one a core.
+def workers_of(jobs: int | None, scheduler: str | None) -> Pool:
+    """Workers of a scheduler, or so many of this machine; None: one a core.
 
     Raises:
         ConfigError: both are given, or there would be no worker.
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"jobs is {jobs}; give at least 1, or none for one a core")
-    if scheduler is None:
-        return LocalCrew(worker_count(jobs, cases))
-    if jobs is not None:
+    if jobs is not None and scheduler is not None:
         raise ConfigError("--jobs is for workers of this machine; leave it out with --scheduler")
-    return crew_at(scheduler)
+    return Pool(jobs, scheduler)
 
 
 def run_sweep(
     plan: Plan,
     folder: Path,
-    crew: AbstractContextManager[Crew],
+    pool: AbstractContextManager[Executor],
     existing: ExistingFolder = "refuse",
     metric: str | None = None,
     watch: Watch = UNWATCHED,
@@ -116,7 +112,7 @@ def run_sweep(
     Args:
         plan: what is swept.
         folder: of the results.
-        crew: who does the cases, as :func:`crew_of` makes it.
+        pool: does the cases, as :func:`workers_of` makes it.
         existing: what to do where it holds a sweep: `resume` does what is missing, also of axes
             that have become longer.
         metric: column of the table that curves and tests are of; None: the first that is known.
@@ -127,7 +123,7 @@ def run_sweep(
             written.
     """
     begin_sweep(folder, existing, plan)
-    with crew as workers, Owner(folder) as owner:  # workers get ready while cases are checked
+    with pool as workers, Owner(folder) as owner:
         keys, config = _checked(plan, watch)
         begin_sweep(folder, existing, plan, owner)
         with Journal(folder / JOURNAL_FILE) as journal:
@@ -265,7 +261,7 @@ class _Work:
         """Whether nothing is left to do."""
         return self.done + len(self.failures) == len(self.keys)
 
-    def do(self, workers: Crew, watch: Watch) -> None:
+    def do(self, workers: Executor, watch: Watch) -> None:
         """Does what has no result yet."""
         progress, stopped, shown = watch
         todo = self._missing()
@@ -273,7 +269,7 @@ class _Work:
         count = len(self.keys)
         had = count - len(todo)
         progress("cases", had, count)
-        for index, outcome in workers.do(perform_case, _Tasks(self.plan, todo), stopped):
+        for index, outcome in workers.run(perform_case, _Tasks(self.plan, todo), stopped):
             number = todo[index]
             if isinstance(outcome, CaseResult):
                 self.journal.add(self.keys[number], outcome)

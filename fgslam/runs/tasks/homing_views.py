@@ -389,7 +389,6 @@ def extract_features(
         argument=lambda units: _Block(dataset, settings, units),
         kind=OmniFeatures,
         blocks=in_blocks(VIEWS_A_BLOCK),
-        small=True,
     )
     done = context.perform(stage)
     if done.ended and not context.stopped():
@@ -474,7 +473,6 @@ def answer_pairs(
         argument=lambda units: replace(search, pairs=tuple(search.pairs[k] for k in units)),
         kind=PairAnswer,
         blocks=interleaved(_BLOCKS_A_JOB * context.jobs),
-        small=True,
     )
     done = context.perform(stage)
     failures = [f"{len(units)} pairs: {why}" for units, why in done.ended]

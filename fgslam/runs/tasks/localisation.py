@@ -46,6 +46,7 @@ from fgslam.runs.tasks.localisation_results import (
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.units import Progress, UnitStore
+from fgslam.runs.workers import InProcess
 
 
 def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[LocalisationResult]:
@@ -139,7 +140,8 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
         if out is not None:
             begin_run_folder(out, wanted.existing, stack.enter_context(Owner(out)))
             write_config(out, config, _provenance(given, sequence))
-        context = Context(out or Path(), False, UnitStore(None), 1, progress, stopped)
+        loop = (1, progress, stopped, InProcess())
+        context = Context(out or Path(), False, UnitStore(None), *loop)
         asked = ask_all(config, given, sequence, context)
         result = result_of(config, out, asked, sequence.notes)
         notes = (*_other_frontend(config, given), *result.notes)

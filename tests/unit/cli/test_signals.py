@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import signal
 import subprocess
 import sys
@@ -11,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from fgslam.cli.signals import WITHIN_S
-from fgslam.runs.processes import run_apart
 
 _WHILE_IMPORTING = """
 import os, sys
@@ -125,14 +123,6 @@ def test_a_command_that_does_not_end_by_itself_is_ended(number: signal.Signals) 
     assert status == 128 + number
     assert said == "fgslam: interrupted; what was saved until then is in valid files\n"
     assert WITHIN_S < 2.0
-
-
-def test_a_worker_hears_no_ctrl_c_from_its_first_moment_on() -> None:
-    """Ctrl-C reaches every process of a terminal; a worker still imports then."""
-    blocked = functools.partial(signal.pthread_sigmask, signal.SIG_BLOCK)
-    [(_, inherited)] = run_apart(blocked, [()])
-    assert signal.SIGINT in inherited
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def test_an_output_that_is_full_is_said_in_one_line() -> None:

@@ -1,4 +1,4 @@
-"""Columns of errors: whatever comes and goes, each landmark has its own, and where it was."""
+"""Covariances that the per-landmark filter reports, against its errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from simulated import RIG, Simulation, play
 from smoothing import FREE, drawn
 
 from fgslam.backend import considered
-from fgslam.backend.considered import SAMPLES, ErrorColumns, SampledErrors
+from fgslam.backend.considered import SAMPLES, SampledErrors
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.persistence import StatedNoise
 from fgslam.backend.settings import LandmarkKalmanSettings
@@ -20,54 +20,9 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.measurements import Increment
-from fgslam.core.store import restore, state_of
 from fgslam.evaluation.statistics import landmark_nees, nees, pose_errors, pose_nees, within
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
-
-_COUNT = 4
-
-
-def test_columns_are_their_landmarks_whatever_comes_and_goes() -> None:
-    rng = np.random.default_rng(3)
-    columns, expected = ErrorColumns(_COUNT), dict[int, np.ndarray]()
-    for _ in range(60):
-        gone = rng.permutation(sorted(expected))[: rng.integers(0, 9)]
-        columns.forget(np.sort(gone).astype(np.int64))
-        for identity in gone.tolist():
-            del expected[identity]
-        ids = np.setdiff1d(rng.integers(0, 200, rng.integers(0, 12)), sorted(expected))
-        gain = rng.standard_normal((len(ids), 3, _COUNT))
-        columns.append({"ids": ids, "gain": gain})
-        expected |= dict(zip(ids.tolist(), gain, strict=True))
-        state = state_of(columns)
-        assert state["order/ids"].tolist() == sorted(expected)
-        kept = state["map/gain"][state["order/row"]]
-        assert np.array_equal(kept, [expected[i] for i in sorted(expected)])
-    again = ErrorColumns(_COUNT)
-    again.append({"ids": np.array([7]), "gain": np.ones((1, 3, _COUNT))})
-    restore(again, state)
-    asked = np.array([*sorted(expected), 999])
-    found = [*(expected[i] for i in sorted(expected)), np.zeros((3, _COUNT))]
-    assert np.array_equal(again.values_of("gain", asked), found)
-
-
-def test_what_comes_and_goes_moves_no_other_landmark_and_takes_the_room_that_is_free() -> None:
-    """So a frame costs what it sees, not what the map holds."""
-    columns = ErrorColumns(_COUNT)
-    columns.append({"ids": np.arange(100), "gain": np.zeros((100, 3, _COUNT))})
-    kept = np.arange(50, 100)
-    before = columns.rows(kept)[0]
-    columns.forget(np.arange(0, 50, 2))
-    columns.append({"ids": np.arange(100, 125), "gain": np.ones((25, 3, _COUNT))})
-    columns.append({"ids": np.array([0]), "gain": np.ones((1, 3, _COUNT))})
-    assert np.array_equal(columns.rows(kept)[0], before)
-    assert len(state_of(columns)["map/gain"]) == 101
-
-
-# --------------------------------------------------------------------------------------------
-# Covariances that the per-landmark filter reports, against its errors
-
+from fgslam.frontend.tracking.ego_motion import PoseProblem
 
 FIRST = Prediction(np.eye(4), np.zeros((6, 6)))
 UPDATES = ("pixel", "world", "running_mean", "half")
@@ -178,7 +133,7 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
     update: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All samples are one known error of all measurements, none of the odometry."""
-    original = SampledErrors.linearised
+    original = SampledErrors._columns
 
     def known(
         self: SampledErrors, wTc: FloatArray, seen: PoseProblem
@@ -187,34 +142,33 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
         sights.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
         return sights
 
-    monkeypatch.setattr(SampledErrors, "linearised", known)
-    monkeypatch.setattr(considered, "symmetric_root", lambda covariance: np.zeros((6, 6)))
+    monkeypatch.setattr(SampledErrors, "_columns", known)
+    monkeypatch.setattr(considered, "_root", lambda covariance: np.zeros((6, 6)))
     increments = drawn(2, noise=0.0).increments
     size = 1e-4
     plain = played(increments, update=update)
     moved = played([with_pattern(each, size) for each in increments], update=update)
-    here, there = (each.estimate().trajectory.poses[-1] for each in (plain, moved))
-    step = g.se3_log(g.inverse(here) @ there) / size
-    state = state_of(plain)
-    column = state["errors/gain"][:, -1]
+    step = g.se3_log(g.inverse(plain._current.wTc) @ moved._current.wTc) / size
+    column = plain._errors._gain[:, -1]
     np.testing.assert_allclose(column, step, rtol=0.0, atol=1e-2 * np.abs(step).max())
     before, after = plain.landmarks(), moved.landmarks()
     shift = (after.positions - before.positions) / size
-    np.testing.assert_array_equal(state["errors/order/ids"], before.ids)
-    columns = state["errors/map/gain"][state["errors/order/row"]][:, :, -1]
+    columns = plain._errors._of("gain", before.ids)[:, :, -1]
     np.testing.assert_allclose(columns, shift, rtol=0.0, atol=1e-2 * np.abs(shift).max())
 
 
 def test_covariances_of_few_samples_are_stated_larger_so_that_the_nees_is_right(
     rng: np.random.Generator,
 ) -> None:
-    errors = SampledErrors(EgoMotionSolver(RIG, FREE))
+    errors = SampledErrors(
+        LandmarkKalman(RIG, LandmarkKalmanSettings(), FIRST, FREE)._errors._solver
+    )
     found = []
     for _ in range(400):
-        columns = np.zeros((6, state_of(errors)["gain"].shape[1]))
+        columns = np.zeros((6, errors._gain.shape[1]))
         columns[:, -SAMPLES:] = rng.standard_normal((6, SAMPLES))
         error = rng.standard_normal((1, 6))
-        found.append(nees(error, errors.covariances(columns, 6)[None]).values[0])
+        found.append(nees(error, errors._covariances(columns, 6)[None]).values[0])
     assert np.mean(found) / 6.0 == pytest.approx(1.0, abs=0.1)
 
 
