@@ -326,6 +326,7 @@ def _local_cluster() -> Iterator[LocalCluster]:
     """A scheduler of this machine alone, that starts processes as it is scaled up."""
     import dask
     from distributed import LocalCluster
+    from distributed.security import Security
 
     main = sys.modules["__main__"]
     with ExitStack() as stack:
@@ -362,6 +363,7 @@ def _local_cluster() -> Iterator[LocalCluster]:
                 n_workers=0,
                 threads_per_worker=1,  # more would share memory and the limit of BLAS
                 host=_HOST,
+                security=Security.temporary(),  # other users of this machine reach it, too
                 dashboard_address=f"{_HOST}:0",
                 memory_limit=0,
                 local_directory=folder,
