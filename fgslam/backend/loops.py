@@ -13,7 +13,6 @@ import itertools
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
@@ -22,9 +21,6 @@ from fgslam.core.estimates import EgoMotion, Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
 from fgslam.core.measurements import Increment, LoopClosure, Odometry
 from fgslam.core.store import Kept
-from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
-from fgslam.factors.motion import odometry_factor, pose_prior
-from fgslam.factors.noise import robust
 
 _DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
 SUBMAP_FRAMES = 10
@@ -166,7 +162,11 @@ def corrected(
 
 
 def constraint_factor(known: Constraint) -> Any:
-    """The factor of a constraint between the poses of its frames."""
+    """GTSAM's factor of a constraint between the poses of its frames."""
+    from fgslam.factors.graphs import pose_key  # a filter alone does without GTSAM
+    from fgslam.factors.motion import odometry_factor
+    from fgslam.factors.noise import robust
+
     step = Odometry(known.motion, known.covariance)
     factor = odometry_factor(pose_key(known.before), pose_key(known.after), step)
     if not known.doubted:
@@ -203,6 +203,11 @@ def _minimum(
     poses: FloatArray, errors: FloatArray, constraints: list[Constraint], every: int
 ) -> tuple[dict[int, FloatArray], float]:
     """Poses (4, 4) at which submaps begin, by frame, at the least cost; and that cost."""
+    import gtsam
+
+    from fgslam.factors.graphs import pose_key, poses_of_frame, solver_parameters
+    from fgslam.factors.motion import odometry_factor, pose_prior
+
     ends = {frame for known in constraints for frame in (known.before, known.after)}
     begins = sorted({*range(0, len(poses), every), len(poses) - 1, *ends})
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
