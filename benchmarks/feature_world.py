@@ -6,8 +6,8 @@ import numpy as np
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from fgslam.core.features import Features
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Features
 
 _BORDER_PX = 5.0
 _NEAREST_M = 0.2

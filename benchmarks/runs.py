@@ -13,8 +13,8 @@ from typing import Any
 import cv2
 
 from fgslam.core.arrays import Image
-from fgslam.core.estimates import EgoMotionStatus, Trajectory
-from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.log import Frame, ImageSequence
+from fgslam.core.types import EgoMotionStatus, Trajectory
 from fgslam.evaluation.statistics import Alignment, TrajectoryError, evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import EDGE_THRESHOLD, OCTAVE_LAYERS
@@ -24,7 +24,7 @@ from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE
 from fgslam.runs.tasks.slam import SlamResult, open_slam
-from fgslam.slam.factory import make_pipeline, make_stream
+from fgslam.slam.build import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -99,7 +99,7 @@ def run_whole(config: ExperimentConfig) -> Run:
 class FoundFeatures:
     """A recording with the features of all its frames, to be used by many variants."""
 
-    sequence: Sequence
+    sequence: ImageSequence
     frames: list[FeatureFrame]
 
     def whole(self, frame: FeatureFrame) -> FeatureFrame:
@@ -118,7 +118,7 @@ def find_features(config: ExperimentConfig) -> FoundFeatures:
     return found_features(open_sequence(config), config.frontend)
 
 
-def found_features(sequence: Sequence, settings: FrontendSettings) -> FoundFeatures:
+def found_features(sequence: ImageSequence, settings: FrontendSettings) -> FoundFeatures:
     """Features of all frames of a recording."""
     stream = make_stream(sequence, settings)()
     try:
@@ -141,7 +141,7 @@ def described(config: ExperimentConfig, frame: Frame) -> tuple[Image, ...]:
     return images[:1] if config.frontend.stereo.by_patches(len(images)) else images
 
 
-def make_system(config: ExperimentConfig, sequence: Sequence) -> SlamPipeline:
+def make_system(config: ExperimentConfig, sequence: ImageSequence) -> SlamPipeline:
     """A fresh system for the sequence."""
     return make_pipeline(sequence.rig, config.frontend, config.odometry, config.estimator)
 
@@ -157,7 +157,7 @@ def process(found: FoundFeatures, pipeline: SlamPipeline) -> Iterator[FrameRepor
 
 
 def trajectory_error(
-    pipeline: SlamPipeline, sequence: Sequence, alignment: Alignment = Alignment.SE3
+    pipeline: SlamPipeline, sequence: ImageSequence, alignment: Alignment = Alignment.SE3
 ) -> TrajectoryError:
     """Errors of the system's trajectory so far, as a run of it would state them."""
     truth = sequence.ground_truth

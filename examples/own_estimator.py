@@ -12,10 +12,9 @@ import numpy as np
 import fgslam as fg
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import transform_to_world, triangulate, triangulation_covariance
-from fgslam.core.measurements import Increment, MeasurementType
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, MeasurementType
+from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 
 
 class FirstSight:

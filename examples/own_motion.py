@@ -13,8 +13,8 @@ import numpy as np
 
 import fgslam as fg
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import inverse, se3_exp, se3_log
+from fgslam.core.types import Prediction
 
 # Of the camera, in the order of all tangents: turns about x, y, z, then ways along them. The camera
 # looks along z and y points down: the robot turns about y and drives along z.

@@ -28,11 +28,10 @@ if TYPE_CHECKING:
     from fgslam.backend.protocol import Estimator
     from fgslam.cameras.omni_files import load_camera
     from fgslam.cameras.rig import StereoRig, load_rig
-    from fgslam.core.features import Features
-    from fgslam.core.homing import Refusal, TwoViewVector
-    from fgslam.core.measurement_log import MeasurementLog
-    from fgslam.core.measurements import Odometry
-    from fgslam.core.trajectories import Trajectory
+    from fgslam.core.bearings import Refusal, TwoViewVector
+    from fgslam.core.log import MeasurementLog
+    from fgslam.core.sensors import Odometry
+    from fgslam.core.types import Features, Trajectory
     from fgslam.evaluation.judging import compare
     from fgslam.homing.api import HomingVector, PathFollower, teach
     from fgslam.homing.route import PathMemory
@@ -40,12 +39,11 @@ if TYPE_CHECKING:
     from fgslam.homing.topological_map import RouteMap
     from fgslam.report.figures import plot
     from fgslam.runs.library import open_recording, rendered_recording, replay, run, sweep
-    from fgslam.runs.live import Result, Slam
-    from fgslam.runs.maps import Map
+    from fgslam.runs.session import Map, Result, Slam
     from fgslam.slam.feature_stream import FeatureExtractor
     from fgslam.slam.motion import MotionModel
-    from fgslam.slam.newest_frame import NewestFrame
     from fgslam.slam.results import Step
+    from fgslam.slam.session import NewestFrame
 
 __all__ = [
     "DriveCommand",
@@ -86,23 +84,23 @@ _HOMES = {
     "DriveCommand": "fgslam.homing.steering",
     "Estimator": "fgslam.backend.protocol",
     "FeatureExtractor": "fgslam.slam.feature_stream",
-    "Features": "fgslam.core.features",
+    "Features": "fgslam.core.types",
     "HomingVector": "fgslam.homing.api",
-    "Map": "fgslam.runs.maps",
-    "MeasurementLog": "fgslam.core.measurement_log",
+    "Map": "fgslam.runs.session",
+    "MeasurementLog": "fgslam.core.log",
     "MotionModel": "fgslam.slam.motion",
-    "NewestFrame": "fgslam.slam.newest_frame",
-    "Odometry": "fgslam.core.measurements",
+    "NewestFrame": "fgslam.slam.session",
+    "Odometry": "fgslam.core.sensors",
     "PathFollower": "fgslam.homing.api",
     "PathMemory": "fgslam.homing.route",
-    "Refusal": "fgslam.core.homing",
-    "Result": "fgslam.runs.live",
+    "Refusal": "fgslam.core.bearings",
+    "Result": "fgslam.runs.session",
     "RouteMap": "fgslam.homing.topological_map",
-    "Slam": "fgslam.runs.live",
+    "Slam": "fgslam.runs.session",
     "Step": "fgslam.slam.results",
     "StereoRig": "fgslam.cameras.rig",
-    "Trajectory": "fgslam.core.trajectories",
-    "TwoViewVector": "fgslam.core.homing",
+    "Trajectory": "fgslam.core.types",
+    "TwoViewVector": "fgslam.core.bearings",
     "compare": "fgslam.evaluation.judging",
     "load_camera": "fgslam.cameras.omni_files",
     "load_rig": "fgslam.cameras.rig",

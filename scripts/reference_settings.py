@@ -11,8 +11,7 @@ import textwrap
 from collections.abc import Iterator
 from typing import Any, TypeAlias
 
-from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
+from fgslam.runs.config import HOMING_TASKS, TASKS, ExperimentConfig, LocalisationConfig
 
 WIDTH = 118
 

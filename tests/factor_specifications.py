@@ -17,19 +17,20 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
+    between,
     inverse,
     project,
+    rotation,
     se3_log,
     so3_log,
     transform_to_camera,
 )
-from fgslam.core.planar import between, rotation
 from fgslam.core.sensors import (
     CameraRig,
     vertical_to_horizontal,
 )
+from fgslam.core.types import Floor
 from fgslam.factors.noise import Whitening
 
 _SMALL = 1e-5  # radians: below it the series of the logarithm is exact to rounding

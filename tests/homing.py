@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.homing import BearingMatches, FeatureKind
-from fgslam.core.planar import bearings, unit
+from fgslam.core.bearings import BearingMatches, FeatureKind
+from fgslam.core.geometry import bearings, unit
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fgslam.core.homing import HomingEstimate, HomingTruth
+from fgslam.core.bearings import HomingEstimate, HomingTruth
 from fgslam.report.content import Column, Page, TextTable
 from fgslam.report.homing_figures import (
     Drive,

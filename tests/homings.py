@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray
-from fgslam.core.homing import HomingStart, HomingTruth, TrackedBearings, TwoViewVector
+from fgslam.core.bearings import HomingStart, HomingTruth, TrackedBearings, TwoViewVector
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector

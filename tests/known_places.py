@@ -8,10 +8,14 @@ import numpy as np
 
 from fgslam.core import geometry
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
-from fgslam.core.floor import DegreesOfFreedom, Floor
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import (
+    DegreesOfFreedom,
+    Floor,
+    LandmarkAppearances,
+    LandmarkMap,
+    StereoFeatures,
+)
 
 RIG = CameraRig(
     320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, geometry.BODY_FORWARD_LEFT_UP_FROM_CAMERA

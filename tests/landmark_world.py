@@ -15,7 +15,7 @@ import numpy as np
 from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingEstimatorSettings
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
     HomingStart,
@@ -25,14 +25,14 @@ from fgslam.core.homing import (
     TrackedBearings,
     UprightFeatures,
 )
-from fgslam.core.planar import bearings, compose, wrap
+from fgslam.core.geometry import bearings, compose, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.homing.active import Sighting
 from fgslam.homing.closed_loop import Driver, DriveRecord, follow
 from fgslam.homing.controller import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, ObstacleAvoider, Steering
-from fgslam.runs.tasks.homing_trials import start_from_matches
+from fgslam.runs.tasks.homing_drives import start_from_matches
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

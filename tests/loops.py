@@ -17,7 +17,7 @@ from simulated import Drive, noisy_odometry, observations, points_in_views
 from benchmarks.feature_world import visible
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.measurements import Increment, LoopClosure
+from fgslam.core.sensors import Increment, LoopClosure
 
 CIRCLE = (0.0, 0.1, 0.0, 0.0, 0.0, 0.25)
 """63 frames a round of 5 m across."""

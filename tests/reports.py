@@ -9,8 +9,8 @@ import numpy as np
 from PIL import Image
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Trajectory
 from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.types import LandmarkMap, Trajectory
 from fgslam.report.content import Column, Picture, TextTable
 from fgslam.report.results import EstimatorReport, ReportData
 

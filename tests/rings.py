@@ -11,10 +11,9 @@ from simulated import RIG, FeatureWorld, assert_same_bits
 from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, StateArrays
-from fgslam.core.estimates import Prediction
-from fgslam.core.features import Features
-from fgslam.core.measurements import Increment, Odometry
-from fgslam.core.recordings import Frame
+from fgslam.core.log import Frame
+from fgslam.core.sensors import Increment, Odometry
+from fgslam.core.types import Features, Prediction
 from fgslam.frontend.places.recognition import (
     LoopGates,
     LostRules,
@@ -24,8 +23,14 @@ from fgslam.frontend.places.recognition import (
 )
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.factory import make_estimator, make_relocaliser, make_stereo, make_tracker
+from fgslam.slam.build import (
+    Arrival,
+    make_estimator,
+    make_relocaliser,
+    make_stereo,
+    make_tracker,
+    take_over,
+)
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline

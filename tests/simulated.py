@@ -17,9 +17,8 @@ from benchmarks.feature_world import visible
 from fgslam.backend.protocol import Estimator
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
-from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
+from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem

@@ -19,17 +19,18 @@ from fgslam.backend.settings import (
     Isam2Settings,
     SlidingWindowSettings,
 )
-from fgslam.backend.smoothers import admission, graph_builder
-from fgslam.backend.smoothers.whole_graph import WholeGraph
+from fgslam.backend.smoothers import admission
+from fgslam.backend.smoothers import graph as graph_builder
+from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.estimates import Estimate, Prediction, UpdateStats
-from fgslam.core.measurements import Increment
+from fgslam.core.sensors import Increment
+from fgslam.core.types import Estimate, Prediction, UpdateStats
 from fgslam.evaluation.statistics import Nees, judge, landmark_nees, pose_nees
 from fgslam.factors import graphs
 from fgslam.factors.noise import plain
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 
 FREE = EgoMotionSettings(dof=6)
 """The front-end's least squares without a floor: the simulated drives leave it."""

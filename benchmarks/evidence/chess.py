@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.runs import CHESS, DATA, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.features.settings import Appearance
 from fgslam.frontend.stereo import StereoMatcher
@@ -60,13 +60,13 @@ def tables(data: Path = DATA) -> list[Table]:
     ]
 
 
-def _matcher(sequence: Sequence, config: ExperimentConfig, mode: Appearance) -> StereoMatcher:
+def _matcher(sequence: ImageSequence, config: ExperimentConfig, mode: Appearance) -> StereoMatcher:
     appearance = replace(config.frontend.appearance, mode=mode)
     return StereoMatcher(sequence.rig, config.frontend.stereo, appearance)
 
 
 def landmarks_table(
-    config: ExperimentConfig, sequence: Sequence, frames: list[FeatureFrame]
+    config: ExperimentConfig, sequence: ImageSequence, frames: list[FeatureFrame]
 ) -> Table:
     """How many landmarks agree in three views, over the frames of the walk."""
     columns = (
@@ -85,7 +85,7 @@ def landmarks_table(
 
 def judge_chess(
     config: ExperimentConfig,
-    sequence: Sequence,
+    sequence: ImageSequence,
     frames: list[FeatureFrame],
     row: Row,
     mode: Appearance,

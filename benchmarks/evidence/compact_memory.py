@@ -16,8 +16,8 @@ import numpy as np
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import OmniFeatures, TwoViewVector
-from fgslam.core.planar import between, wrap
+from fgslam.core.bearings import OmniFeatures, TwoViewVector
+from fgslam.core.geometry import between, wrap
 from fgslam.datasets.opening import open_house
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator

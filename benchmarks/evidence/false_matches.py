@@ -19,16 +19,16 @@ from benchmarks.runs import (
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import inverse, project, transform_to_camera
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import StereoFeatures
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.evaluation.statistics import align
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatcher, MapMatches
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.tasks.truth import points_under
+from fgslam.runs.tasks.slam_results import points_under
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 Kind: TypeAlias = Literal["anywhere", "nearest"]

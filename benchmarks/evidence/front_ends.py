@@ -18,9 +18,9 @@ from benchmarks.evidence.street_world import RIG, Street
 from benchmarks.runs import LOCATED, plain_sift, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.estimates import Trajectory
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
 

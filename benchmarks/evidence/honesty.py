@@ -25,11 +25,9 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.core.arrays import FloatArray
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment
-from fgslam.core.recordings import MeasurementRecording
-from fgslam.core.rig_correction import RigCorrection, shared_displacements
-from fgslam.core.sensors import CameraRig
+from fgslam.core.correction import RigCorrection, shared_displacements
+from fgslam.core.log import MeasurementLog, MeasurementRecording
+from fgslam.core.sensors import CameraRig, Increment
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.judging import Truth, judge_replay

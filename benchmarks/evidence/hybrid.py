@@ -13,12 +13,12 @@ import numpy as np
 from benchmarks.runs import LOCATED, described, experiment, make_system, plain_sift, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_extractor
+from fgslam.slam.build import make_extractor
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport
@@ -58,7 +58,7 @@ class Found:
         raw: seconds of CPU a frame that OpenCV's SIFT takes for all its images.
     """
 
-    sequence: Sequence
+    sequence: ImageSequence
     frames: list[FeatureFrame]
     seconds: FloatArray
     raw: float

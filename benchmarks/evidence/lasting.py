@@ -19,7 +19,7 @@ from benchmarks.runs import (
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap
 from fgslam.frontend.settings import PermanenceSettings
 from fgslam.frontend.tracking.landmarks import reliable, seen_past
@@ -207,7 +207,7 @@ def _with_places(
         yield report, np.where(still[:, None], expected.measurement[at], np.nan)
 
 
-def _map_of(pipeline: SlamPipeline, sequence: Sequence) -> SavedMap:
+def _map_of(pipeline: SlamPipeline, sequence: ImageSequence) -> SavedMap:
     database, estimate = pipeline.tracker.database, pipeline.estimator.estimate()
     return SavedMap(
         sequence.rig, estimate.landmarks, database.appearances(), database.hits.copy(),

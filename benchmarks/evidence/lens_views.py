@@ -21,11 +21,10 @@ from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.cameras.write_formats import raw_values, write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FrameError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, pose, so3_exp
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import Frame
+from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.types import Trajectory
 from fgslam.datasets.rendered import RENDER_VERSION, RenderedLabSequence
 from fgslam.worlds.lab import PlaceChoice, Room, World, camera_offsets, open_room
 from fgslam.worlds.renderer import RenderCache, Renderer, apply_effects, content_hash, omni_view

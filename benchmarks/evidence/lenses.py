@@ -24,18 +24,16 @@ from benchmarks.runs import (
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.gauss_newton import GaussNewton, Linearised
 from fgslam.core.geometry import (
     inverse_spd3,
     project,
     projection_jacobian,
     triangulate,
 )
-from fgslam.core.measurements import Increment, Observations
-from fgslam.core.robust import KERNEL
-from fgslam.core.sensors import CameraRig
+from fgslam.core.least_squares import KERNEL, GaussNewton, Linearised
+from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.threads import one_blas_thread
-from fgslam.runs.config_models import ExperimentConfig
+from fgslam.runs.config import ExperimentConfig
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.settings import RenderedLabSettings
 

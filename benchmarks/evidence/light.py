@@ -22,11 +22,11 @@ from benchmarks.runs import (
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.features import Features
-from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.log import Frame, ImageSequence
+from fgslam.core.types import Features
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_extractor
+from fgslam.slam.build import make_extractor
 from fgslam.slam.feature_stream import FeatureExtractor, FrameDescriber
 
 _READING = 0.3
@@ -141,7 +141,9 @@ def _lit(frame: Frame, light: Light, seed: int) -> Frame:
     return replace(frame, images=tuple(images))
 
 
-def _found(sequence: Sequence, frames: list[Frame], extract: FeatureExtractor) -> FoundFeatures:
+def _found(
+    sequence: ImageSequence, frames: list[Frame], extract: FeatureExtractor
+) -> FoundFeatures:
     describer = FrameDescriber(extract)
     try:
         return FoundFeatures(sequence, [describer.describe(i, f) for i, f in enumerate(frames)])

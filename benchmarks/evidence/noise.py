@@ -18,9 +18,8 @@ from benchmarks.runs import (
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.geometry import inverse, transform_to_camera
-from fgslam.core.measurements import Observations
-from fgslam.core.recordings import Sequence
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import ImageSequence
+from fgslam.core.sensors import CameraRig, Observations
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.stereo import StereoMatcher
 
@@ -107,7 +106,10 @@ def _between(
 
 
 def reprojection_errors(
-    sequence: Sequence, observed: list[Observations], frames: tuple[int, int], depth: FloatArray
+    sequence: ImageSequence,
+    observed: list[Observations],
+    frames: tuple[int, int],
+    depth: FloatArray,
 ) -> FloatArray:
     """(n, 2) pixels: where the second frame saw landmarks less where they truly are in it.
 

@@ -10,13 +10,13 @@ from benchmarks.evidence.views import LabViews, View, ViewPair, make_pair
 from benchmarks.runs import EVERY_FRAME, experiment, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import EgoMotion, Trajectory
+from fgslam.core.types import EgoMotion, Trajectory
 from fgslam.evaluation.statistics import end_pose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
-from fgslam.slam.factory import make_pipeline
+from fgslam.slam.build import make_pipeline
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport

@@ -17,7 +17,7 @@ from benchmarks.runs import (
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -123,7 +123,7 @@ def run_person(overrides: Iterable[str] = ()) -> PersonRun:
     )
 
 
-def position_errors(pipeline: SlamPipeline, sequence: Sequence) -> FloatArray:
+def position_errors(pipeline: SlamPipeline, sequence: ImageSequence) -> FloatArray:
     """(n, 3) metres, first pose aligned. Raises ValueError without ground truth."""
     estimate, truth = pipeline.estimator.estimate().trajectory, sequence.ground_truth
     matched = None if truth is None else to_estimate_world(estimate, truth)

@@ -12,24 +12,20 @@ import numpy as np
 from benchmarks.runs import DATA, EXPERIMENTS, experiment, find_features, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import inverse, project, transform_to_camera
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import LandmarkAppearances, LandmarkMap, StereoFeatures
 from fgslam.evaluation.statistics import rotation_angles
 from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
-from fgslam.runs.config import load_experiment
-from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.config import LocalisationConfig, load_experiment
 from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.tasks.localisation import open_localisation
-from fgslam.runs.tasks.localisation_queries import submap_features
+from fgslam.runs.tasks.localisation import open_localisation, submap_features
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
-from fgslam.runs.tasks.truth import truth_in_map
-from fgslam.slam.arrival import trusted
-from fgslam.slam.factory import make_relocaliser, make_stereo, make_stream
+from fgslam.runs.tasks.slam_results import truth_in_map
+from fgslam.slam.build import make_relocaliser, make_stereo, make_stream, trusted
 from fgslam.slam.feature_stream import FeatureFrame
 
 SEEDS = (0, 1, 2, 3)
@@ -148,7 +144,7 @@ def _queries(
 
 
 def _submap(
-    config: LocalisationConfig, sequence: Sequence, held: list[FeatureFrame]
+    config: LocalisationConfig, sequence: ImageSequence, held: list[FeatureFrame]
 ) -> StereoFeatures:
     return submap_features(sequence, held, config.frontend, config.odometry)[0]
 

@@ -18,12 +18,12 @@ from benchmarks.runs import (
     trajectory_error,
 )
 from benchmarks.tables import Cell, Table
-from fgslam.core.features import Features
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Features
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_extractor
+from fgslam.slam.build import make_extractor
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameReport
 
@@ -80,7 +80,7 @@ def _row(width: int, frames: int) -> tuple[Cell, ...]:
     )
 
 
-def _detect(config: ExperimentConfig, sequence: Sequence) -> Detected:
+def _detect(config: ExperimentConfig, sequence: ImageSequence) -> Detected:
     """One image after the other, so that the thread's time is that of detection."""
     extract, frames, seconds = make_extractor(config.frontend), [], 0.0
     for i in range(len(sequence)):

@@ -13,9 +13,9 @@ from benchmarks.evidence.street_world import FRAMES, RIG, Float32, Street
 from benchmarks.runs import say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.estimates import Trajectory
-from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.core.correction import RigCorrection, term_names
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 
 SEEDS = range(6)

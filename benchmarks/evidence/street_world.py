@@ -16,8 +16,8 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.correction import camera_displacements
 from fgslam.core.geometry import pose
-from fgslam.core.rig_correction import camera_displacements
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.patches import Patch, RayCaster, Surface, Thing, rectangle, stack
 from fgslam.worlds.renderer import Layer, LightMaps, PixelRays, Renderer, pinhole_view
@@ -62,7 +62,7 @@ class Street:
 
         Args:
             correction: (p,) by which the rig differs from RIG, terms as in
-                :func:`fgslam.core.rig_correction.term_names`.
+                :func:`fgslam.core.correction.term_names`.
             frames: how many, from the first one.
         """
         cameras = [self._camera(number, correction) for number in range(RIG.cameras)]

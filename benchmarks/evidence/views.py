@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Trajectory
-from fgslam.core.features import Features
 from fgslam.core.geometry import inverse, pose, so3_exp
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import Frame
+from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.types import Features, Trajectory
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.runs.config import ExperimentConfig

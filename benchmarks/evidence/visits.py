@@ -15,9 +15,8 @@ from fgslam.core.arrays import BoolArray
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.runs.engine import run_task
-from fgslam.runs.tasks.slam import SlamResult, open_slam
+from fgslam.runs.tasks.slam import SlamResult, first_config, open_slam
 from fgslam.runs.tasks.slam_map_entry import MAP_FILE
-from fgslam.runs.tasks.slam_state import first_config
 from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.patches import Thing
 

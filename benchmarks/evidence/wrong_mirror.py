@@ -13,10 +13,9 @@ import numpy as np
 from benchmarks.runs import EXPERIMENTS, say
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import between, wrap
+from fgslam.core.geometry import between, wrap
 from fgslam.homing.closed_loop import DriveRecord, HomingLog, pass_distances, truly_arrived
-from fgslam.runs.config import as_task, load_experiment
-from fgslam.runs.config_models import DrivingConfig
+from fgslam.runs.config import DrivingConfig, as_task, load_experiment
 from fgslam.runs.tasks.homing_drives import DriveTask, open_house_drive, perform_drive
 
 ERRORS = (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 
 
 @dataclass

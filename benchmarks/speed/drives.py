@@ -13,15 +13,15 @@ from benchmarks.runs import EXPERIMENTS
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction, Trajectory, UpdateStats
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, Odometry
+from fgslam.core.types import EgoMotion, LandmarkMap, Prediction, Trajectory, UpdateStats
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import load_config
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 from fgslam.slam.replay import replay_frame, replay_motion
 
 

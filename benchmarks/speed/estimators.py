@@ -31,16 +31,16 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers.batch import BatchSolver
-from fgslam.backend.smoothers.marginals import reduced
+from fgslam.backend.smoothers.bundle import WholeGraph
+from fgslam.backend.smoothers.elimination import reduced
 from fgslam.backend.smoothers.smoother import Smoother
-from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import LandmarkMap
 from fgslam.factors.graphs import solver_parameters
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 from fgslam.slam.replay import replay_frame, replay_motion
 
 LIMITS = {

@@ -25,7 +25,7 @@ from fgslam.backend.homing.settings import (
     HomingGraphSettings,
 )
 from fgslam.core.arrays import Image
-from fgslam.core.homing import OmniFeatures, TrackedBearings
+from fgslam.core.bearings import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings

@@ -22,14 +22,12 @@ from benchmarks.speed.blocks import Memory
 from fgslam.cli.console import progress_bar
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Trajectory
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame, Sequence
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import Frame, ImageSequence, MeasurementLog
+from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.types import Trajectory
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_pipeline, make_stream
+from fgslam.slam.build import make_pipeline, make_stream
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion, description_of
 from fgslam.slam.pipeline import SlamPipeline
@@ -51,7 +49,7 @@ LIMITS = {
 class Preloaded:
     """A block of a sequence with its images in memory, so that no reading is timed."""
 
-    whole: Sequence
+    whole: ImageSequence
     frames: dict[int, Frame]
 
     @property
@@ -147,7 +145,7 @@ def best_of(ways: list[Callable[[Iterable[Frame]], None]], frames: list[Frame]) 
 
 
 def run_blocks(
-    config: ExperimentConfig, sequence: Sequence, tell: Callable[[int], None]
+    config: ExperimentConfig, sequence: ImageSequence, tell: Callable[[int], None]
 ) -> tuple[Series, int]:
     """The whole drive, block by block; and how many landmarks the map had at its end."""
     pipeline = make_pipeline(sequence.rig, config.frontend, config.odometry, config.estimator)

@@ -18,8 +18,8 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
-from fgslam.core.estimates import Estimate
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Estimate
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
 
 KEYFRAMES = Isam2Settings(keyframe_every=4, update_every=40, ordering_window=10)

@@ -15,12 +15,16 @@ import numpy as np
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Prediction, Trajectory
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
-from fgslam.core.measurements import Observations
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import (
+    LandmarkAppearances,
+    LandmarkMap,
+    Prediction,
+    StereoFeatures,
+    Trajectory,
+)
 from fgslam.frontend.settings import (
     DatabaseSettings,
     FrontendSettings,
@@ -28,7 +32,7 @@ from fgslam.frontend.settings import (
 )
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import LandmarkTracker
-from fgslam.slam.factory import make_tracker
+from fgslam.slam.build import make_tracker
 
 SIZES = (1_000, 10_000, 100_000)
 FRAMES = 30

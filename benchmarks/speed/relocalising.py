@@ -21,19 +21,24 @@ import numpy as np
 
 from benchmarks.runs import EXPERIMENTS
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Prediction, Trajectory
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import pose
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import (
+    LandmarkAppearances,
+    LandmarkMap,
+    Prediction,
+    StereoFeatures,
+    Trajectory,
+)
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.runs.config import load_config
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_pipeline, make_relocaliser, make_stereo, make_tracker
+from fgslam.slam.build import make_pipeline, make_relocaliser, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
 

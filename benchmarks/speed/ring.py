@@ -22,8 +22,8 @@ from benchmarks.speed.blocks import Memory, of_blocks
 from benchmarks.speed.maps import RIG
 from fgslam.core import geometry as g
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
+from fgslam.core.log import Frame
+from fgslam.core.sensors import Odometry
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.statistics import align, moved, position_errors
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings

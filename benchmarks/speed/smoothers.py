@@ -13,8 +13,8 @@ import numpy as np
 
 from benchmarks.speed.drives import MeasuredDrive, cpu_seconds, interleaved, open_drive, play
 from fgslam.backend.settings import BatchSettings, FixedLagSettings, Isam2Settings, KernelSettings
+from fgslam.backend.smoothers.bundle import WholeGraph
 from fgslam.backend.smoothers.smoother import Smoother
-from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread

@@ -22,8 +22,15 @@ from fgslam.backend.loops import (
 )
 from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, Rows, StateArrays
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
-from fgslam.core.floor import Floor
+from fgslam.core.correction import (
+    EXPECTED_PX,
+    SHARED,
+    RigCorrection,
+    field_displacements,
+    field_modes,
+    shared_displacements,
+    shared_information,
+)
 from fgslam.core.geometry import (
     adjoint,
     block_diagonal,
@@ -36,17 +43,17 @@ from fgslam.core.geometry import (
     transform_to_camera,
     triangulate,
 )
-from fgslam.core.measurements import Increment, LoopClosure, Observations
-from fgslam.core.rig_correction import (
-    EXPECTED_PX,
-    SHARED,
-    RigCorrection,
-    shared_displacements,
-    shared_information,
+from fgslam.core.sensors import (
+    CameraRig,
+    Increment,
+    LoopClosure,
+    Observations,
+    pixel_model,
+    rig_map,
+    vertical_to_horizontal,
 )
-from fgslam.core.rig_field import field_displacements, field_modes
-from fgslam.core.sensors import CameraRig, pixel_model, rig_map, vertical_to_horizontal
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 
@@ -143,7 +150,7 @@ class ErrorColumns:
 # The Schmidt-Kalman filter's cross terms (Schmidt 1966), as derivatives: how the newest pose and
 # each landmark follow the terms that all cameras share, and the field that no term follows,
 # neither of which is estimated. A frame costs what it sees. Final covariances of a whole graph
-# have the same from the graph (:mod:`fgslam.backend.smoothers.rig_doubt`).
+# have the same from the graph (:mod:`fgslam.backend.smoothers.final`).
 # docs/derivations/measurement_noise.md.
 
 

@@ -17,10 +17,10 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, Prediction
 from fgslam.core.geometry import adjoint, congruence, inverse, reorthonormalise, se3_log, skew
-from fgslam.core.measurements import Increment, LoopClosure, Odometry
+from fgslam.core.sensors import Increment, LoopClosure, Odometry
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion, Prediction
 
 _DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
 SUBMAP_FRAMES = 10

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, GrowingColumns, IntArray, StateArrays
-from fgslam.core.measurements import Observations
+from fgslam.core.sensors import Observations
 from fgslam.core.store import Kept
 
 LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two

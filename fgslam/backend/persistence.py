@@ -15,7 +15,6 @@ import numpy as np
 
 from fgslam.backend.open_tracks import LONGEST, OpenTracks, Tracks, tracks_of
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, StateArrays
-from fgslam.core.estimates import EgoMotion
 from fgslam.core.geometry import (
     in_front,
     inverse,
@@ -25,9 +24,9 @@ from fgslam.core.geometry import (
     reorthonormalise,
     triangulate,
 )
-from fgslam.core.measurements import Increment, Observations
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion
 
 _EVERY = 5  # frames between judgements
 _ITERATIONS = 5

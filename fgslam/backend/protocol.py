@@ -7,7 +7,7 @@ can steer the front-end and any log can be given to any estimator.
 To add an estimator:
 
 1. Write a class with the members of :class:`Estimator`. It needs no base class. It is handed plain
-   values (:mod:`fgslam.core.measurements`, :mod:`fgslam.core.estimates`): poses ``wTc`` in metres,
+   values (:mod:`fgslam.core.sensors`, :mod:`fgslam.core.types`): poses ``wTc`` in metres,
    covariances in the pose's tangent space, rotation first. ``examples/`` shows a small one; an
    object of it can be given to ``fgslam.Slam(rig, estimator=...)`` as it is.
 2. Where it can do more, add the members of :class:`~fgslam.core.store.Resumable` (interrupted runs;
@@ -17,12 +17,12 @@ To add an estimator:
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
    derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
    its family; add it to the union there, and one ``case`` to ``make_estimator`` in
-   :mod:`fgslam.slam.factory`.
+   :mod:`fgslam.slam.build`.
 
 ``tests/contract/test_estimators.py`` then holds it to the protocol without further ado: predicting
 changes nothing, time must increase, arguments stay as they were, a restored one continues to the
 same bits. A graph can be had without writing one: hand a
-:class:`~fgslam.backend.smoothers.solver.GraphSolver` to
+:class:`~fgslam.backend.smoothers.graph.GraphSolver` to
 :class:`~fgslam.backend.smoothers.smoother.Smoother`.
 """
 
@@ -34,8 +34,8 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
-from fgslam.core.measurements import Increment, MeasurementType, Odometry
+from fgslam.core.sensors import Increment, MeasurementType, Odometry
+from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 
 
 class Estimator(Protocol):

@@ -16,7 +16,16 @@ import numpy as np
 from scipy.linalg import null_space
 
 from fgslam.backend.considered import pixels_of
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
+from fgslam.core.correction import (
+    RigCorrection,
+    displacements,
+    early_terms,
+    field_displacements,
+    field_modes,
+    prior_information,
+    term_names,
+)
 from fgslam.core.geometry import (
     in_front,
     moved_apart,
@@ -25,18 +34,11 @@ from fgslam.core.geometry import (
     projection_jacobian,
     triangulate,
 )
-from fgslam.core.measurements import Increment, Observations, SettledRig
-from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.rig_correction import (
-    RigCorrection,
-    displacements,
-    early_terms,
-    prior_information,
-    term_names,
-)
-from fgslam.core.rig_field import field_displacements, field_modes
 from fgslam.core.sensors import (
     CameraRig,
+    Increment,
+    Observations,
+    SettledRig,
     pixel_covariance,
     pixel_model,
     rig_map,
@@ -216,7 +218,7 @@ _DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no eviden
 
 
 class _Field(NamedTuple):
-    """Modes of a field (:mod:`fgslam.core.rig_field`) as the same windows show them.
+    """Modes of a field (:mod:`fgslam.core.correction`) as the same windows show them.
 
     Eliminated from what is known, they would need their prior at once; so they are kept beside it,
     and the prior may change with what is found. docs/derivations/self_calibration.md.
@@ -377,7 +379,7 @@ MODELS: dict[str, frozenset[str]] = {
     "turned": frozenset({"yaw", "pitch", "roll", "focal"}),
 }
 """Terms of the other cameras that are free, by name of the model; in `lens` all early ones are
-(:func:`fgslam.core.rig_correction.early_terms`), in `whole` every term is."""
+(:func:`fgslam.core.correction.early_terms`), in `whole` every term is."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -483,7 +485,7 @@ class RigEvidence:
         at: (p,) the correction at which both are taken.
         landmarks: that were seen in two frames or more.
         lean: (p, q) Hessian of the correction against the modes of a field
-            (:mod:`fgslam.core.rig_field`), which are zero at ``at``.
+            (:mod:`fgslam.core.correction`), which are zero at ``at``.
         field: (q, q) Hessian of those.
         pull: (q,) where they would go.
     """
@@ -906,7 +908,7 @@ class RigChange:
     Attributes:
         rig: the cameras.
         values: (p,) the new correction less the old one
-            (:func:`fgslam.core.rig_correction.term_names`).
+            (:func:`fgslam.core.correction.term_names`).
     """
 
     rig: CameraRig

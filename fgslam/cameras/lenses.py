@@ -585,7 +585,7 @@ class Calibration(Brief):
         sided: whether the file calls its first camera the left one and the second the right one.
         view: the rectification that it states; None where there is none.
         corrections: of images rectified like that, what a drive found, by the names of its terms
-            (:func:`fgslam.core.rig_correction.term_names`); None where there are none.
+            (:func:`fgslam.core.correction.term_names`); None where there are none.
         notes: what a user should know, a line each.
     """
 

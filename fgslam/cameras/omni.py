@@ -22,7 +22,7 @@ from fgslam.cameras.lenses import RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.files import read_text
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 
 
 class OmniCamera(Protocol):

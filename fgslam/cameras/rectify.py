@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.core.arrays import Brief, FloatArray, Image
+from fgslam.core.correction import camera_displacements
 from fgslam.core.geometry import pose
-from fgslam.core.rig_correction import camera_displacements
 from fgslam.core.sensors import CameraRig
 
 MapArray: TypeAlias = npt.NDArray[np.float32]
@@ -44,7 +44,7 @@ class Rectifier(Brief):
         shown: per camera, what of its raw image may be used (h, w), nonzero where it may; None:
             all of it. Empty: all of every image.
         correction: (p,) displacements of the rectified images
-            (:mod:`fgslam.core.rig_correction`) that the maps undo; None: none.
+            (:mod:`fgslam.core.correction`) that the maps undo; None: none.
         calibration: of the raw cameras, with this view, without the correction; None where the
             images are rectified as they are stored.
 

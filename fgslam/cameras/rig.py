@@ -39,11 +39,11 @@ from fgslam.cameras.trees import Size, Tree, intrinsic_matrix, is_camera_text, r
 from fgslam.cameras.write_formats import raw_values
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
+from fgslam.core.correction import RigCorrection, term_names
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import as_path, read_text, shown_in, write_text
 from fgslam.core.geometry import inverse, pose
-from fgslam.core.rig_checks import rig_fault
-from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.core.log import rig_fault
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.sides import camera_pairs
 
@@ -880,7 +880,7 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
 
 # --------------------------------------------------------------------------------------------
 # What a drive found wrong in a calibration, written: displacements of each image's pixels
-# (:mod:`fgslam.core.rig_correction`), which are undone where an image is read
+# (:mod:`fgslam.core.correction`), which are undone where an image is read
 
 
 _NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")

@@ -16,7 +16,7 @@ from fgslam.core.files import require_output
 if TYPE_CHECKING:
     from fgslam.cameras.boards import Board as CalibrationBoard
 
-app = typer.Typer(
+calibrate_app = typer.Typer(
     help="Calibrate cameras from images of a board, a mirror from one of rings.",
     no_args_is_help=True,
 )
@@ -49,7 +49,7 @@ Out = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .jso
 MirrorOut = Annotated[Path, typer.Option(metavar="FILE", help="where to write it, .yaml")]
 
 
-@app.command()
+@calibrate_app.command()
 def stereo(  # noqa: PLR0913 - each option is a parameter
     images: Annotated[
         list[Path],
@@ -76,7 +76,7 @@ def stereo(  # noqa: PLR0913 - each option is a parameter
     _calibrate(images, (target, board, square, spacing, dictionary), lens, out, overwrite)
 
 
-@app.command()
+@calibrate_app.command()
 def trinocular(  # noqa: PLR0913 - each option is a parameter
     left: Annotated[Path, typer.Argument(metavar="LEFT", help="folder of the left images")],
     right: Annotated[Path, typer.Argument(metavar="RIGHT", help="folder of the right images")],
@@ -96,7 +96,7 @@ def trinocular(  # noqa: PLR0913 - each option is a parameter
     )
 
 
-@app.command()
+@calibrate_app.command()
 def omni(  # noqa: PLR0913 - each option is a parameter
     images: Annotated[Path, typer.Argument(metavar="IMAGES", help="folder of the board's images")],
     board: Board,
@@ -121,7 +121,7 @@ def omni(  # noqa: PLR0913 - each option is a parameter
     _show(lines)
 
 
-@app.command()
+@calibrate_app.command()
 def rings(
     image: Annotated[
         Path, typer.Argument(metavar="IMAGE", help="rings around the camera in its mirror")

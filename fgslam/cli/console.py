@@ -22,9 +22,9 @@ from rich.table import Table
 from fgslam.runs.folder import METRICS_FILE, REPORT_FILE
 
 if TYPE_CHECKING:
+    from fgslam.cli.signals import Tell
     from fgslam.report.content import TextTable
     from fgslam.runs.engine import RunResult
-    from fgslam.runs.units import Progress as Tell
 
 _NOTES_SHOWN = 8
 _LABEL_WIDTH = 12

@@ -3,31 +3,297 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fgslam.cli import options, routes, signals
-from fgslam.cli.calibrate import app as calibrate_app
+from fgslam.cli import options, signals
+from fgslam.cli.calibrate import calibrate_app
 from fgslam.cli.calibrate import camera as camera_app
-from fgslam.cli.filming import film
-from fgslam.cli.performing import (
-    EXIT_FAULT,
-    existing_folder,
-    exit_as,
-    same_with_resume,
-    show_all,
-    under_way,
-    watched_by,
-)
-from fgslam.cli.signals import stop_flag, stoppable
-from fgslam.cli.sweeping import sweep
+from fgslam.cli.signals import Tell, stop_flag, stoppable
 from fgslam.core.errors import FgslamError, one_line
 from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import experiment_names, find_experiment
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from fgslam.runs.config import Experiment
+    from fgslam.runs.engine import RunResult
+    from fgslam.runs.folder import ExistingFolder
+    from fgslam.runs.tasks.slam import Watch
+
+
+# ------------------------------------------------------------------------------------------
+# The command `fgslam film`
+
+
+def film(
+    run_folder: options.RunToView,
+    out: Annotated[Path, typer.Argument(metavar="FILE", help="the film, .mp4 or .gif")],
+    estimator: Annotated[
+        str | None, typer.Option(help="whose path and map; default the one that steered")
+    ] = None,
+    taught: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="of a route that was followed: the run folder of fgslam teach (its --report), for "
+            "the pictures of path images",
+        ),
+    ] = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Make a film of a run: images with their matches, next to the map as it grows.
+
+    Of what fgslam follow wrote: images with the path image, its probability, the way home as an
+    arrow, and the command or why there is none.
+    """
+    from fgslam.cli.console import progress_bar
+    from fgslam.runs.view import film_of_run
+
+    with progress_bar() as progress:
+        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite)
+    typer.echo(line)
+
+
+# ------------------------------------------------------------------------------------------
+# What the commands that run something share: progress and stop flag, results, exit status
+
+EXIT_FAULT = 1
+EXIT_NOT_LOCATED = 3
+
+
+@contextmanager
+def under_way() -> Iterator[tuple[Tell, Callable[[], bool]]]:
+    """Progress bar and stop flag while something is under way."""
+    from fgslam.cli.console import progress_bar
+
+    with stop_flag() as stopped, progress_bar() as progress:
+        yield stoppable(progress, stopped), stopped
+
+
+@contextmanager
+def watched_by(config: Experiment, live: bool, file: Path | None) -> Iterator[Watch | None]:
+    """What shows a run in the viewer, frame by frame; None without a viewer."""
+    if not live and file is None:
+        yield None
+        return
+    from fgslam.runs.view import watched
+
+    with watched(config, live, file) as watch:
+        yield watch
+
+
+def show_all(results: Sequence[RunResult], resume: str = "") -> None:
+    """Prints what the results say; ``resume`` is the command that goes on with the rest."""
+    from fgslam.cli.console import show
+
+    for result in results:
+        show(result, resume)
+
+
+def exit_as(results: Sequence[RunResult]) -> None:
+    """Exits as the results ended: done, interrupted, an estimator in vain, or hardly located."""
+    if any(result.status == "interrupted" for result in results):
+        raise SystemExit(signals.status())
+    if any(result.failed for result in results):
+        raise typer.Exit(EXIT_FAULT)
+    if any(result.located is not None and not result.located.enough for result in results):
+        raise typer.Exit(EXIT_NOT_LOCATED)
+
+
+def same_with_resume() -> str:
+    """This command once more, to go on with what it left."""
+    given = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
+    return shlex.join(["fgslam", *given, "--resume"])
+
+
+def existing_folder(overwrite: bool, resume: bool = False) -> ExistingFolder:
+    """What to do with results that are there. Raises ConfigError where both were asked for."""
+    from fgslam.core.errors import ConfigError
+
+    if overwrite and resume:
+        raise ConfigError("--overwrite and --resume exclude each other; give one of them")
+    return "resume" if resume else "overwrite" if overwrite else "refuse"
+
+
+# ------------------------------------------------------------------------------------------
+# Commands of routes: teach one from a recording, follow it with another, join several
+
+Recording = Annotated[
+    Path,
+    typer.Argument(
+        metavar="RECORDING",
+        help="a film, or a folder of pictures, of an omnidirectional camera",
+    ),
+]
+OmniCamera = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        metavar="FILE",
+        help="calibration of its camera: OCamCalib, BloggieUnwarp, YAML; or `equirectangular` "
+        "for whole panoramas",
+    ),
+]
+Report = Annotated[
+    Path | None, typer.Option(metavar="DIR", help="the run folder itself; default runs/NAME")
+]
+
+
+def teach(  # noqa: PLR0913 - each option is a parameter
+    recording: Recording,
+    out: Annotated[Path, typer.Option(metavar="ROUTE", help="the file to write, .fgpath")],
+    camera: OmniCamera = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="RUN/ESTIMATOR/final.tum of stereo SLAM on this drive: metres"
+        ),
+    ] = None,
+    report: Report = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Choose the path images of a drive, and write what is to be remembered of them.
+
+    Few images are chosen, each seen well from the one before; a table and the page say why each.
+    """
+    from fgslam.runs.bare import teaching
+
+    chosen = options.of_recording(start=start, stop=stop, stride=stride)
+    chosen += options.as_overrides({"poses": poses})
+    config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
+    _perform(config, report, overwrite)
+
+
+def follow(  # noqa: PLR0913 - each option is a parameter
+    route: Annotated[
+        Path, typer.Argument(metavar="ROUTE", help="a route, as fgslam teach writes it")
+    ],
+    recording: Recording,
+    camera: OmniCamera = None,
+    out: Report = None,
+    start: options.Start = None,
+    stop: options.Stop = None,
+    stride: options.Stride = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Follow a route with another recording of the way: place, homing vector and command.
+
+    What a robot would be commanded at each image, by the same follower; refusals with their reason.
+    Exits with 1 where no image is recognised. Without --camera it is the route's own.
+    """
+    from fgslam.runs.bare import following
+
+    chosen = options.of_recording(start=start, stop=stop, stride=stride)
+    config = following(route, recording, camera, [*(overrides or ()), *chosen])
+    _perform(config, out, overwrite)
+
+
+def join(
+    routes: Annotated[
+        list[Path], typer.Argument(metavar="ROUTE...", help="routes, as fgslam teach writes them")
+    ],
+    out: Annotated[Path, typer.Option(metavar="MAP", help="the file to write, .fgmap")],
+    report: Report = None,
+    overrides: options.Overrides = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Join routes where their views match: one map, with crossroads.
+
+    A place is called after its route's file and its image: monday/12. Routes may have been taught
+    on different days; where they have nothing in common they stay apart, and that is reported.
+    """
+    from fgslam.runs.bare import joining
+
+    config = joining(routes, out, overrides or ())
+    _perform(config, report, overwrite)
+
+
+def route(
+    stored: Annotated[
+        Path, typer.Argument(metavar="MAP", help="routes, as fgslam join writes them")
+    ],
+    start: Annotated[
+        str,
+        typer.Option(
+            "--from", metavar="IMAGE", help="a picture from where the robot is, or a place's name"
+        ),
+    ],
+    goal: Annotated[
+        str, typer.Option("--to", metavar="PLACE", help="a place's name; of a route: its end")
+    ],
+    camera: OmniCamera = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="ROUTE", help="write the way as a route, to be followed")
+    ] = None,
+    overwrite: options.Overwrite = False,
+) -> None:
+    """Say the shortest way on a map of routes, and write it as a route of its own.
+
+    Without --camera the picture is of the routes' own. Exits with 2 where there is no way.
+    """
+    from fgslam.runs.bare import way_said
+
+    for line in way_said(stored, start, goal, camera, out, overwrite):
+        typer.echo(line)
+
+
+def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:
+    from fgslam.runs.run import require_outputs, run_experiment
+
+    place, existing = folder or Path("runs") / config.name, existing_folder(overwrite)
+    require_outputs(config, place, existing)
+    with under_way() as (progress, stopped):
+        result = run_experiment(config, place, existing, progress, stopped)
+    show_all([result], "the same command with --overwrite")
+    exit_as([result])
+
+
+# ------------------------------------------------------------------------------------------
+# The command `fgslam sweep`
+
+
+def sweep(  # noqa: PLR0913 - each option is a parameter
+    experiments: options.Sources,
+    axes: options.Axes = None,
+    estimators: options.SweptEstimators = None,
+    metric: options.Metric = None,
+    jobs: options.Workers = None,
+    scheduler: options.Scheduler = None,
+    out: options.SweepFolder = None,
+    overwrite: options.Overwrite = False,
+    resume: options.ResumeSweep = False,
+) -> None:
+    """Run experiments over settings, recordings, estimators and seeds, on many workers.
+
+    One Parquet table holds every case, a page curves and paired tests over the seeds. Ctrl-C ends
+    it early with the table so far; the same command with --resume does what is missing.
+    """
+    from fgslam.cli.console import progress_with_table
+    from fgslam.runs.sweeps.sweep import make_plan, run_sweep, workers_of
+
+    existing = existing_folder(overwrite, resume)
+    plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
+    folder = out or plan.default_folder
+    with stop_flag() as stopped, progress_with_table() as (progress, shown):
+        tell, pool = stoppable(progress, stopped), workers_of(jobs, scheduler)
+        result = run_sweep(plan, folder, pool, existing, metric, (tell, stopped, shown))
+    show_all([result], same_with_resume())
+    exit_as([result])
+
 
 EXIT_USER = 2
 # Typer exports only the child; its parent's home differs from one Typer to the next.
@@ -82,7 +348,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
     """
-    from fgslam.runs.bare_recording import experiment_of
+    from fgslam.runs.bare import experiment_of
 
     existing = existing_folder(overwrite, resume)
     chosen = options.of_recording(
@@ -98,7 +364,7 @@ def run(  # noqa: PLR0913 - each option is a parameter
     # Not before: a wrong key is answered before any library of numbers is loaded.
     from fgslam.runs.engine import resume_command
     from fgslam.runs.run import require_outputs, run_experiment
-    from fgslam.runs.tasks.slam_calibration import corrected_camera, require_self_calibration
+    from fgslam.runs.tasks.slam_results import corrected_camera, require_self_calibration
 
     require_outputs(settings, folder, existing, (camera_out, save_rrd), config)
     if camera_out is not None:
@@ -126,7 +392,7 @@ def init(  # noqa: PLR0913 - each option is a parameter
     overrides: options.Overrides = None,
 ) -> None:
     """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
-    from fgslam.runs.bare_recording import short_config
+    from fgslam.runs.bare import short_config
 
     chosen = options.of_recording(
         topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
@@ -192,10 +458,10 @@ def compare(  # noqa: PLR0913 - each option is a parameter
 
 
 app.command()(sweep)
-app.command()(routes.teach)
-app.command()(routes.follow)
-app.command()(routes.join)
-app.command()(routes.route)
+app.command()(teach)
+app.command()(follow)
+app.command()(join)
+app.command()(route)
 
 
 @app.command()
@@ -228,13 +494,13 @@ def localize(  # noqa: PLR0913 - each option is a parameter
     A pose is given only where it is certain, with the reasons. Exits with 3 where fewer than
     half of the queries were answered, with 2 where map or recording cannot be used.
     """
-    from fgslam.runs.tasks.localisation import Wanted
+    from fgslam.runs.tasks.localisation import Wanted as export_Wanted
     from fgslam.runs.tasks.localisation import localize as locate
 
     chosen = options.of_recording(
         topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
     )
-    wanted = Wanted(
+    wanted = export_Wanted(
         map_file, recording, (*(overrides or ()), *chosen), frame, frames, out,
         existing_folder(overwrite), camera,
     )  # fmt: skip
@@ -277,9 +543,10 @@ def export(  # noqa: PLR0913 - each option is a parameter
 
     Of a saved map alone it lists what is in it.
     """
-    from fgslam.runs.export import Wanted, export_run
+    from fgslam.runs.export import Wanted as export_Wanted
+    from fgslam.runs.export import export_run
 
-    wanted = Wanted(
+    wanted = export_Wanted(
         map=map_file,
         trajectory=trajectory,
         graph=graph,
@@ -304,7 +571,7 @@ def merge(
     overwrite: options.Overwrite = False,
 ) -> None:
     """Make two saved maps of one place into one; refuses what does not surely overlap."""
-    from fgslam.runs.maps import merge_files
+    from fgslam.runs.session import merge_files
 
     for line in merge_files(first, second, out, overwrite):
         typer.echo(line)

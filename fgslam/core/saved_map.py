@@ -18,10 +18,8 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, StateArrays
 from fgslam.core.errors import MapError
-from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.files import replacing
-from fgslam.core.rig_checks import rig_fault
+from fgslam.core.log import rig_fault
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import (
     ArrayFile,
@@ -30,6 +28,13 @@ from fgslam.core.store import (
     of_rows,
     require_covariances,
     require_finite,
+)
+from fgslam.core.types import (
+    CUT_PIXELS,
+    LandmarkAppearances,
+    LandmarkMap,
+    LandmarkPatches,
+    Trajectory,
 )
 
 FILE = ArrayFile(

@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import FrameError, OdometryError
 from fgslam.core.geometry import so3_log, triangulate
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import OdometrySource
 from fgslam.datasets.recording import Recording
 

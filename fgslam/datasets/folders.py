@@ -14,8 +14,8 @@ from fgslam.cameras.formats import read_json_object
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import right_from_left_camera
+from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import files_of, find_cameras, layout_hint
 from fgslam.datasets.odometry import file_odometry, find_odometry

@@ -22,16 +22,15 @@ from fgslam.core.geometry import (
     reorthonormalise,
     right_from_left_camera,
 )
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.recordings import (
+from fgslam.core.log import (
     LANDMARK_TRUTH_FILE,
     LandmarkTruth,
+    MeasurementLog,
     MeasurementRecording,
     read_landmark_truth,
 )
-from fgslam.core.sensors import CameraRig, measurement_map
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry, measurement_map
+from fgslam.core.types import Trajectory
 from fgslam.datasets.images import require_folder
 from fgslam.datasets.recording import select_of
 from fgslam.datasets.settings import (

@@ -19,13 +19,11 @@ from fgslam.cameras.formats import read_asl_mounting
 from fgslam.cameras.trees import Values, read_tree
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse, rotation_angle, se3_exp
-from fgslam.core.measurements import BiasEffect, Odometry
-from fgslam.core.recordings import Frame
-from fgslam.core.recordings import Sequence as FrameSequence
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import Frame, ImageSequence
+from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
+from fgslam.core.types import Trajectory
 from fgslam.datasets.settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.times import (
     SLOWEST_MOTION_S,
@@ -690,7 +688,7 @@ class SyntheticOdometry:
     """
 
     def __init__(
-        self, sequence: FrameSequence, settings: SyntheticOdometrySettings, seed: int
+        self, sequence: ImageSequence, settings: SyntheticOdometrySettings, seed: int
     ) -> None:
         """Wrap ``sequence``.
 

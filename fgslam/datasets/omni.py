@@ -22,7 +22,7 @@ from fgslam.cameras.omni_files import make_camera
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.files import read_text, shown_in
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.datasets.images import read_colour_image, require_folder
 from fgslam.datasets.layouts import IMAGE_SUFFIXES, natural
 from fgslam.datasets.recording import recording_identity, select_frames

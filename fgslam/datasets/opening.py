@@ -15,7 +15,7 @@ import numpy as np
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import DatasetError
-from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.log import MeasurementRecording
 from fgslam.datasets.fit import fit_notes
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (

@@ -23,10 +23,10 @@ from fgslam.cameras.stereo_formats import (
 )
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines, read_text, shown_in
 from fgslam.core.geometry import inverse, pose, right_from_left_camera
 from fgslam.core.sensors import CameraRig, body_is_camera
+from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
 from fgslam.datasets.odometry import (

@@ -17,12 +17,11 @@ from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import StereoRig, at_size, in_metres, load_rig, rig_of
 from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig, body_is_camera
+from fgslam.core.log import Frame
+from fgslam.core.sensors import CameraRig, Odometry, body_is_camera
 from fgslam.core.settings import FrameSelection
+from fgslam.core.types import Trajectory
 from fgslam.datasets.odometry import OdometrySource, is_of_gyroscope
 from fgslam.datasets.settings import CalibratedSettings, RecordingSettings
 

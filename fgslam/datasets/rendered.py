@@ -16,10 +16,9 @@ import numpy as np
 from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
-from fgslam.core.estimates import Trajectory
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import Frame
+from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.types import Trajectory
 from fgslam.worlds.driving import PosesInTime, simulate_wheels
 from fgslam.worlds.lab import (
     PlaceChoice,
@@ -53,7 +52,7 @@ Progress = Callable[[int, int], None]
 
 
 class RenderedLabSequence:
-    """A drive through a rendered place; implements :class:`fgslam.core.recordings.Sequence`.
+    """A drive through a rendered place; implements :class:`fgslam.core.log.Sequence`.
 
     The world frame of the ground truth is the reference camera's pose at the first frame of the
     drive; of random poses, at that of the place's own drive.

@@ -16,9 +16,9 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.files import read_lines
 from fgslam.core.sides import without_side
+from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import (
     NUMBERED,
     CameraFiles,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import HomingEstimate, HomingTruth, home_vector_jacobian
-from fgslam.core.planar import wrap
+from fgslam.core.bearings import HomingEstimate, HomingTruth, home_vector_jacobian
+from fgslam.core.geometry import wrap
 from fgslam.evaluation.statistics import Consistency, Nees, judge, nees
 
 DIVERGED_RAD = float(np.deg2rad(30.0))

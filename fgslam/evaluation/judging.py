@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, student_quantile
 from fgslam.core.checks import require_flag
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.core.geometry import inverse, transform_to_world
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import LoopClosure
-from fgslam.core.quantiles import student_quantile
-from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.log import LandmarkTruth, MeasurementLog
+from fgslam.core.sensors import LoopClosure
+from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     Consistency,

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.geometry import inverse
-from fgslam.core.quantiles import chi_square_quantile
 from fgslam.evaluation.statistics import pose_nees, rotation_angles
 
 _HELD = 0.95

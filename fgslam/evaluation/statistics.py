@@ -10,10 +10,9 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import Trajectory
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
 from fgslam.core.geometry import inverse, pose, se3_log, yaw_pitch_roll
-from fgslam.core.quantiles import chi_square_quantile
+from fgslam.core.types import Trajectory
 
 SAME_TIME_S = 0.01
 """Largest difference of time between poses that belong together; evo's default, too."""

@@ -8,9 +8,8 @@ import gtsam
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import Floor, Prediction
 from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite, robust
 
 _GUESSED_WIDTH = float(np.sqrt(10.0))

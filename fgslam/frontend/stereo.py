@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
-from fgslam.core.features import PATCH_PX, Features, StereoFeatures
+from fgslam.core.correction import RigCorrection
 from fgslam.core.geometry import triangulate, triangulation_covariance
-from fgslam.core.recordings import Frame, clearance
-from fgslam.core.rig_correction import RigCorrection
+from fgslam.core.log import Frame, clearance
 from fgslam.core.sensors import (
     CameraRig,
     measurement_map,
@@ -25,6 +24,7 @@ from fgslam.core.sensors import (
     rig_map,
     vertical_to_horizontal,
 )
+from fgslam.core.types import PATCH_PX, Features, StereoFeatures
 from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
 from fgslam.frontend.features.settings import AppearanceSettings

@@ -10,8 +10,7 @@ import numpy as np
 
 from fgslam.backend.homing.parts import HomingEstimator
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     HomeVector,
     HomingEstimate,
@@ -20,7 +19,8 @@ from fgslam.core.homing import (
     TwoViewVector,
     common_rows,
 )
-from fgslam.core.planar import circular_median, wrap
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import circular_median, wrap
 from fgslam.homing.settings import HomingControlSettings
 
 MAX_ACROSS = 0.1

@@ -16,6 +16,7 @@ from fgslam.backend.homing.estimators import homing_settings_of, make_homing_est
 from fgslam.backend.homing.settings import HomingEstimatorKind
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import ByteArray, Image
+from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.checks import is_finite_number, later_time, require_seed
 from fgslam.core.errors import (
     CalibrationError,
@@ -25,7 +26,6 @@ from fgslam.core.errors import (
     SessionError,
     StoredMapError,
 )
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.settings import make_settings
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings

@@ -9,10 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.core.planar import wrap
-from fgslam.core.quantiles import student_quantile
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, student_quantile
+from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings
+from fgslam.core.geometry import wrap
 from fgslam.homing.active import ActiveHoming
 from fgslam.homing.controller import HomingChain, LegOutcome
 from fgslam.homing.settings import ClosedLoopSettings

@@ -15,10 +15,10 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import ByteArray
+from fgslam.core.bearings import HomingStart, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.checks import later_time
 from fgslam.core.errors import ConfigError, EstimatorError
-from fgslam.core.homing import HomingStart, OmniFeatures, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.homing.active import (
     CONTRADICTION_DEG,
     ActiveHoming,

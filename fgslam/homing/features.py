@@ -16,14 +16,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray, StateArrays
-from fgslam.core.errors import StoredMapError
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
     OmniFeatures,
     UprightFeatures,
 )
+from fgslam.core.errors import StoredMapError
 from fgslam.core.store import ArrayFile, joined, of_rows, offsets, require_finite, split
 
 VERSIONS = (2,)

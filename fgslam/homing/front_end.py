@@ -9,7 +9,7 @@ import numpy as np
 
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     HomingStart,
     OmniFeatures,

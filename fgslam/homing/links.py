@@ -12,7 +12,7 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     FeatureKind,
     OmniFeatures,
@@ -20,7 +20,7 @@ from fgslam.core.homing import (
     RefusalReason,
     TwoViewVector,
 )
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 
 MUTUAL_DEG = 5.0  # largest difference between the answers there and back, beyond three deviations
 MIN_SUPPORT = 12  # inliers of an edge, in either answer

@@ -21,8 +21,8 @@ from scipy.stats import t as student
 
 from fgslam.cameras.omni import Equirectangular, LensCamera, OmniCamera, RadialCamera
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import wrap
+from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.homing.active import CONTRADICTION_DEG, parallax
 from fgslam.homing.features import compacted

@@ -22,11 +22,10 @@ from scipy.sparse import csr_matrix, diags
 from fgslam.cameras.omni import OmniCamera
 from fgslam.cameras.omni_files import camera_of, camera_values
 from fgslam.core.arrays import FloatArray, Image, StateArrays
+from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.files import as_path
-from fgslam.core.geometry import is_rigid
-from fgslam.core.homing import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import circular_median, wrap
+from fgslam.core.geometry import circular_median, is_rigid, wrap
 from fgslam.core.store import (
     ArrayFile,
     Items,

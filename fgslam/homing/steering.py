@@ -9,8 +9,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import Refusal, TwoViewVector
-from fgslam.core.planar import wrap
+from fgslam.core.bearings import Refusal, TwoViewVector
+from fgslam.core.geometry import wrap
 from fgslam.homing.settings import AvoidanceSettings, SteeringSettings
 
 ACCELERATION_MPS2, TURN_ACCELERATION_DEG_S2 = 0.5, 120.0

@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason
 from fgslam.core.errors import CalibrationError, StoredMapError
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason
 from fgslam.core.store import ArrayFile, Items, of_rows, require_covariances, rows_of
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.sift import colour_image

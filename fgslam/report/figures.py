@@ -17,7 +17,7 @@ from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.types import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer, Comparable, require_named
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.report.content import (

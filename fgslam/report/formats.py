@@ -17,7 +17,7 @@ from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import clear_output_errors, write_bytes, write_text
 from fgslam.core.geometry import congruence, inverse, quaternion_from_rotation
 from fgslam.core.sensors import CameraRig
-from fgslam.core.trajectories import Trajectory, pose_rows
+from fgslam.core.types import Trajectory, pose_rows
 
 Records: TypeAlias = npt.NDArray[np.void]
 

@@ -12,7 +12,7 @@ from plotly import graph_objects as go
 from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.homing import HomingEstimate, HomingTruth
+from fgslam.core.bearings import HomingEstimate, HomingTruth
 from fgslam.report.content import (
     GREY,
     INK,

@@ -25,8 +25,8 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormat
 from matplotlib.transforms import Bbox
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
-from fgslam.core.features import Features
 from fgslam.core.files import replacing
+from fgslam.core.types import Features
 from fgslam.report.content import Figure, bulk_limits
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.

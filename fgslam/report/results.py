@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     chi_square_band,

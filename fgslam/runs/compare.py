@@ -24,8 +24,15 @@ from fgslam.backend.homing.settings import (
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.report.content import TextTable
-from fgslam.runs.config import is_homing, load_config, load_homing, make_experiment
-from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingExperiment
+from fgslam.runs.config import (
+    Experiment,
+    ExperimentConfig,
+    HomingExperiment,
+    is_homing,
+    load_config,
+    load_homing,
+    make_experiment,
+)
 from fgslam.runs.engine import (
     RunResult,
     Task,

@@ -19,14 +19,15 @@ from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import Page, TextTable, read_metrics, write_json
-from fgslam.runs.config import load_experiment
-from fgslam.runs.config_models import Experiment
+from fgslam.runs.config import Experiment, load_experiment
 from fgslam.runs.folder import (
     METRICS_FILE,
+    OWNER_NAME,
     REPORT_FILE,
     RUN_MARKER,
     STATE_FILE,
     ExistingFolder,
+    Owner,
     begin_run_folder,
     create_run_folder,
     is_empty,
@@ -34,7 +35,6 @@ from fgslam.runs.folder import (
     versions,
     write_config,
 )
-from fgslam.runs.owner import OWNER_NAME, Owner
 from fgslam.runs.units import (
     Argument,
     Done,

@@ -13,14 +13,19 @@ from scipy.spatial import cKDTree
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.files import clear_output_errors, require_output, write_bytes
 from fgslam.core.geometry import pose, triangulate, triangulation_covariance
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Observations
+from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
-from fgslam.core.sensors import CAMERA_NAMES, CameraRig, pixel_model, vertical_to_horizontal
-from fgslam.core.trajectories import read_covariances
+from fgslam.core.sensors import (
+    CAMERA_NAMES,
+    CameraRig,
+    Increment,
+    Observations,
+    pixel_model,
+    vertical_to_horizontal,
+)
+from fgslam.core.types import Trajectory, read_covariances
 from fgslam.datasets.images import encoded_png
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
@@ -37,11 +42,10 @@ from fgslam.report.formats import (
     write_map,
     write_mcap,
 )
-from fgslam.runs.config import ExperimentConfig, load_config, load_experiment
-from fgslam.runs.config_reading import read_mapping
+from fgslam.runs.config import ExperimentConfig, load_config, load_experiment, read_mapping
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
-from fgslam.runs.maps import drives_of, points_of, remark_of_map, valid_of
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.session import drives_of, points_of, remark_of_map, valid_of
 
 
 @dataclass(frozen=True, slots=True)

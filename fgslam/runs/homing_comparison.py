@@ -13,10 +13,15 @@ import numpy as np
 from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import HomingEstimatorSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.bearing_log import BearingLog
+from fgslam.core.bearings import (
+    BearingLog,
+    HomingEstimate,
+    HomingStart,
+    HomingTruth,
+    TrackedBearings,
+)
 from fgslam.core.errors import DatasetError, EstimatorError
 from fgslam.core.files import make_subfolder
-from fgslam.core.homing import HomingEstimate, HomingStart, HomingTruth, TrackedBearings
 from fgslam.evaluation.homing import (
     HomingErrors,
     HomingSummary,
@@ -26,7 +31,7 @@ from fgslam.evaluation.homing import (
 from fgslam.evaluation.statistics import Consistency, JsonValue, UpdateTime
 from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure, local_map_figure
-from fgslam.runs.config_models import HomingExperiment
+from fgslam.runs.config import HomingExperiment
 from fgslam.runs.engine import Context, RunResult, Status, Task, write_document, write_page
 from fgslam.runs.folder import COMPARISON_FILE, digest_of
 from fgslam.runs.units import each_apart

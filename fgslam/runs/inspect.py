@@ -6,8 +6,7 @@ A check returns findings as data: a code, and the values of its sentence (:mod:`
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable
-from collections.abc import Sequence as Items
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -17,15 +16,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, se3_log, so3_log
-from fgslam.core.recordings import Frame, Sequence
+from fgslam.core.log import Frame, ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import kitti_drives
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiSettings, MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.datasets.times import rows_at
-from fgslam.runs.bare_recording import dataset_of, require_no_camera
+from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import ExperimentConfig, load_config, make_config
 from fgslam.runs.findings import (
     AGAINST_TRUTH,
@@ -48,7 +47,7 @@ _READ_AT_LEAST = 300  # frames whose images are read; a few seconds
 
 def inspect_recording(
     dataset: Path,
-    overrides: Items[str] = (),
+    overrides: Sequence[str] = (),
     frames: int = 12,
     progress: Progress = lambda what, done, total: None,
     camera: Path | None = None,
@@ -84,7 +83,7 @@ def inspect_recording(
 
 
 def check_sequence(
-    sequence: Sequence,
+    sequence: ImageSequence,
     samples: int = 20,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Finding, ...]:
@@ -109,7 +108,7 @@ def check_sequence(
     )
 
 
-def _configure(dataset: Path, overrides: Items[str], camera: Path | None) -> ExperimentConfig:
+def _configure(dataset: Path, overrides: Sequence[str], camera: Path | None) -> ExperimentConfig:
     """The experiment's configuration, or the default one for a folder in a known layout.
 
     Raises:
@@ -170,7 +169,7 @@ def _kind(image: Image) -> str:
 
 
 def check_images(
-    sequence: Sequence,
+    sequence: ImageSequence,
     samples: int = 20,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> tuple[Finding, ...]:
@@ -258,7 +257,7 @@ _TANGENT_NAMES = (
 )
 
 
-def check_odometry(sequence: Sequence) -> tuple[Finding, ...]:
+def check_odometry(sequence: ImageSequence) -> tuple[Finding, ...]:
     """Whether motions are recorded, where they are missing, and whether they are all none."""
     try:
         given = [sequence.odometry(i) for i in range(1, len(sequence))]
@@ -275,7 +274,7 @@ def check_odometry(sequence: Sequence) -> tuple[Finding, ...]:
     return (covers,)
 
 
-def check_truth(sequence: Sequence) -> tuple[Finding, ...]:
+def check_truth(sequence: ImageSequence) -> tuple[Finding, ...]:
     """Whether ground truth covers the frames, its length, and jumps in it."""
     truth = sequence.ground_truth
     if truth is None or len(truth) == 0:
@@ -307,7 +306,7 @@ def _jumps(truth: Trajectory) -> list[int]:
     return [int(k) + 1 for k in np.flatnonzero(jumps)]
 
 
-def check_odometry_against_truth(sequence: Sequence) -> tuple[Finding, ...]:
+def check_odometry_against_truth(sequence: ImageSequence) -> tuple[Finding, ...]:
     """Errors of the odometry's steps against the truth's, and against the stated noise.
 
     The spread is the median absolute error, scaled to a normal distribution's standard deviation,
@@ -336,7 +335,7 @@ def check_odometry_against_truth(sequence: Sequence) -> tuple[Finding, ...]:
     return tuple(found)
 
 
-def _true_motions(sequence: Sequence) -> FloatArray:
+def _true_motions(sequence: ImageSequence) -> FloatArray:
     """Motions (n - 1, 4, 4) of the body between frames by the truth; NaN where it has gaps."""
     truth = sequence.ground_truth
     out = np.full((max(len(sequence) - 1, 0), 4, 4), np.nan)
@@ -355,7 +354,7 @@ _SIGNIFICANT_RAD = np.radians(0.005)
 _YAW = 2  # the body's z axis points up
 
 
-def check_clock(sequence: Sequence) -> tuple[Finding, ...]:
+def check_clock(sequence: ImageSequence) -> tuple[Finding, ...]:
     """Shift of the odometry's clock at which its turns agree best with the truth's.
 
     Reported where the median yaw error of a step falls by 30 % or more. A recording that never
@@ -398,7 +397,7 @@ def check_clock(sequence: Sequence) -> tuple[Finding, ...]:
 # Facts
 
 
-def facts_of(sequence: Sequence) -> Facts:
+def facts_of(sequence: ImageSequence) -> Facts:
     """Label and value of what the recording is."""
     rig, stamps = sequence.rig, sequence.timestamps
     duration = float(stamps[-1] - stamps[0])

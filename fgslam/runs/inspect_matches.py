@@ -13,10 +13,10 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import FrameError
-from fgslam.core.features import Features, StereoFeatures
 from fgslam.core.geometry import triangulate, triangulation_covariance
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
+from fgslam.core.types import Features, StereoFeatures
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
@@ -27,7 +27,7 @@ Facts: TypeAlias = tuple[tuple[str, str], ...]
 """Labels and values."""
 
 
-def spread_over(sequence: Sequence, samples: int) -> list[int]:
+def spread_over(sequence: ImageSequence, samples: int) -> list[int]:
     """Positions of up to ``samples`` frames, evenly spread, with the first and the last."""
     count = min(samples, len(sequence))
     return np.unique(np.linspace(0, len(sequence) - 1, count).astype(np.int64)).tolist()  # type: ignore[no-any-return]
@@ -123,7 +123,7 @@ class FrameMatches:
 
 
 def match_frames(
-    sequence: Sequence,
+    sequence: ImageSequence,
     settings: FrontendSettings,
     frames: int,
     progress: Callable[[int, int], None],

@@ -11,24 +11,22 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import ConfigError, DatasetError, FrameError, MeasurementLogError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.files import as_path
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Sequence
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import ImageSequence, MeasurementLog
+from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import is_recording, recognise_layout
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.runs.bare_recording import experiment_of
+from fgslam.runs.bare import experiment_of
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.live import Overrides, override_texts, slam_config
 from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
+from fgslam.runs.session import Overrides, override_texts, slam_config
 from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, make_plan, run_sweep, workers_of
-from fgslam.slam.choices import chosen_estimator, is_settings
+from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
 
@@ -50,7 +48,7 @@ class RecordedFrames:
         sequence: the recording as its reader gives it.
     """
 
-    sequence: Sequence
+    sequence: ImageSequence
 
     def __repr__(self) -> str:
         return f"<recording {self.name}: {len(self)} frames, {self.rig}>"

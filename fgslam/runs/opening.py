@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fgslam.core.errors import ConfigError
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import (
@@ -20,7 +20,7 @@ from fgslam.runs.config import ExperimentConfig
 
 def open_sequence(
     config: ExperimentConfig, progress: Callable[[int, int], None] | None = None
-) -> Sequence:
+) -> ImageSequence:
     """Opens the recording, rendered or read, with the odometry that the configuration wants.
 
     ``progress`` is called with how many frames of a rendered recording are done, and of how many.
@@ -30,7 +30,7 @@ def open_sequence(
         from fgslam.datasets.rendered import RenderedLabSequence  # the world and its textures
 
         _require_own_noise(config.odometry)
-        sequence: Sequence = RenderedLabSequence(
+        sequence: ImageSequence = RenderedLabSequence(
             dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
         )
     elif isinstance(dataset, MeasurementDatasetSettings):

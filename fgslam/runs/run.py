@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.files import require_output
-from fgslam.runs.config_models import (
+from fgslam.runs.config import (
     CrossroadsConfig,
     DrivingConfig,
     Experiment,
@@ -112,11 +112,11 @@ def opener_of(  # noqa: PLR0911 - one a task
         case TeachConfig() | FollowConfig() | JoinConfig():
             return _opener_of_routes(config)
         case HomingTrialsConfig():
-            from fgslam.runs.tasks.homing_trials import open_trials
+            from fgslam.runs.tasks.homing_drives import open_trials
 
             return open_trials
         case CrossroadsConfig():
-            from fgslam.runs.tasks.crossroads import open_crossroads
+            from fgslam.runs.tasks.homing_drives import open_crossroads
 
             return open_crossroads
         case DrivingConfig():
@@ -130,14 +130,14 @@ def opener_of(  # noqa: PLR0911 - one a task
 def _opener_of_routes(config: TeachConfig | FollowConfig | JoinConfig) -> Opener[RunResult]:
     match config:
         case TeachConfig():
-            from fgslam.runs.tasks.route_teaching import open_teaching
+            from fgslam.runs.tasks.routes import open_teaching
 
             return open_teaching
         case FollowConfig():
-            from fgslam.runs.tasks.route_following import open_following
+            from fgslam.runs.tasks.routes import open_following
 
             return open_following
         case JoinConfig():
-            from fgslam.runs.tasks.route_joining import open_joining
+            from fgslam.runs.tasks.routes import open_joining
 
             return open_joining

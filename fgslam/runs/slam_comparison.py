@@ -14,9 +14,8 @@ import numpy as np
 
 from fgslam.backend.settings import DeadReckoningSettings, EstimatorSettings
 from fgslam.core.errors import DatasetError
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.recordings import LANDMARK_TRUTH_FILE, read_landmark_truth
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementLog, read_landmark_truth
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 from fgslam.frontend.settings import EgoMotionSettings
@@ -24,7 +23,6 @@ from fgslam.report.content import read_metrics, write_metrics
 from fgslam.report.formats import MapPoints, read_ply
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, RunResult, Status, Task
-from fgslam.runs.estimator_files import write_replay
 from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, METRICS_FILE, RUN_MARKER, digest_of
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.tables import (
@@ -33,6 +31,7 @@ from fgslam.runs.tables import (
     comparison_tables,
     with_marks,
     write_comparison_csv,
+    write_replay,
 )
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.units import each_apart

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fgslam.backend.settings import EstimatorSettings
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.core.threads import one_blas_thread
 from fgslam.evaluation.judging import judge_replay
 from fgslam.evaluation.statistics import EstimatorMetrics, Nees
-from fgslam.runs.config_models import ExperimentConfig
+from fgslam.runs.config import ExperimentConfig, OutputSettings
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import LOG_FILE
-from fgslam.runs.settings import OutputSettings
 from fgslam.runs.slam_comparison import load_truth
 from fgslam.runs.tasks.slam import open_slam
 from fgslam.runs.tasks.slam_map_entry import arrival_of

@@ -19,8 +19,7 @@ from fgslam.evaluation.judging import MeanInterval, PairedTest, mean_interval, p
 from fgslam.evaluation.statistics import Consistency, EstimatorMetrics, JsonValue, judge, value_at
 from fgslam.report.content import write_metrics
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
-from fgslam.runs.config import load_experiment
-from fgslam.runs.config_models import Experiment, ExperimentConfig, HomingTrialsConfig
+from fgslam.runs.config import Experiment, ExperimentConfig, HomingTrialsConfig, load_experiment
 from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import (
     METRICS_FILE,
@@ -33,7 +32,7 @@ from fgslam.runs.folder import (
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.slam_comparison import named, with_odometry
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, trials_table, write_comparison_csv
-from fgslam.runs.tasks.homing_trials import open_trials
+from fgslam.runs.tasks.homing_drives import open_trials
 from fgslam.runs.trial import Trial, TrialTask, perform_trial
 from fgslam.runs.units import Progress, Stopped, each_apart
 

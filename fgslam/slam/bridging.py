@@ -19,7 +19,6 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.geometry import (
     adjoint,
     congruence,
@@ -31,6 +30,7 @@ from fgslam.core.geometry import (
     so3_log,
     transform_to_world,
 )
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.frontend.tracking.landmarks import MapParts
 
 _STRETCHES = 50  # of located frames that are compared, those nearest to the gap

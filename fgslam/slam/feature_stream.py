@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, Image
 from fgslam.core.errors import ConfigError, FrameError
-from fgslam.core.features import Features
-from fgslam.core.recordings import Frame, Sequence, clearance
+from fgslam.core.log import Frame, ImageSequence, clearance
+from fgslam.core.types import Features
 from fgslam.frontend.features.sift import as_bytes
 
 # Frames in work at once. Three images on two cores leave one idle at the end of each frame;
@@ -133,7 +133,10 @@ class FeatureStream:
     """Iterates over a sequence's frames in order, features found in parallel ahead of time."""
 
     def __init__(
-        self, sequence: Sequence, extract: FeatureExtractor | None, reference_only: bool = False
+        self,
+        sequence: ImageSequence,
+        extract: FeatureExtractor | None,
+        reference_only: bool = False,
     ) -> None:
         """Takes any extractor; it must be safe to call from several threads. None: only images.
 

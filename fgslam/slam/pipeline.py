@@ -4,41 +4,105 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
+from fgslam.backend.protocol import Estimator, NoiseEstimating, predicted, recalibrated, updated
 from fgslam.core.arrays import IntArray
-from fgslam.core.estimates import (
+from fgslam.core.correction import RigCorrection
+from fgslam.core.sensors import Increment, LoopClosure, Odometry
+from fgslam.core.store import Kept, has_state, put_back, snapshot
+from fgslam.core.types import (
     EgoMotion,
     EgoMotionStatus,
     Estimate,
     LandmarkMap,
     Prediction,
+    StereoFeatures,
     UpdateStats,
 )
-from fgslam.core.features import StereoFeatures
-from fgslam.core.measurements import Increment, LoopClosure, Odometry
-from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.store import Kept, has_state, put_back, snapshot
 from fgslam.frontend.camera_faults import CameraWatch
 from fgslam.frontend.stereo import RigStereo
-from fgslam.frontend.tracking.ego_motion import unmeasured
+from fgslam.frontend.tracking.ego_motion import MatchNoise, unmeasured
 from fgslam.frontend.tracking.key_frames import CarriedFrame, KeyFrameTracker, spread
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker
 from fgslam.slam.bridging import bridged
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.motion import MotionModel
-from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
+from fgslam.slam.motion import ConstantVelocityMotion, MotionModel, OdometryMotion
 
 if TYPE_CHECKING:
     from fgslam.backend.self_calibration import SelfCalibration
     from fgslam.frontend.places.recognition import PlaceRecognition
+
+
+# ------------------------------------------------------------------------------------------
+# The noise that each frame was estimated with, where the drive itself shows how large it is
+
+
+class FrameNoise(NamedTuple):
+    """Noise in use in one frame; NaN where the frame had no noise of the kind.
+
+    Attributes:
+        rotation_sigma_dps2, translation_sigma_mps2: deviation of the random acceleration by which
+            the velocity is taken to change, root mean square of the three axes; of frames that no
+            odometry measured, the translation also where a gyroscope measured the rotation.
+        gyroscope_factor: on the stated deviation of a gyroscope's turn.
+        match_factor: on the stated deviations of measurements, where the frame's pose was found.
+        single_factor: on the same, as an estimator's graph judges single measurements by.
+        correlated_factor: on the same, as the graph weighs measurements by: errors that persist
+            from frame to frame count for more than independent ones.
+    """
+
+    rotation_sigma_dps2: float = math.nan
+    translation_sigma_mps2: float = math.nan
+    gyroscope_factor: float = math.nan
+    match_factor: float = math.nan
+    single_factor: float = math.nan
+    correlated_factor: float = math.nan
+
+
+def noise_in_use(
+    motion: MotionModel, odometry: Odometry | None, matches: MatchNoise, estimator: Estimator
+) -> FrameNoise:
+    """The noise of a frame that the estimator has taken in, and that nothing has learnt from yet.
+
+    Args:
+        motion: the model that gave ``odometry``; one that is not of this package has no noise here.
+        odometry: what the frame was predicted with.
+        matches: what the ego-motion takes the noise of matches to be.
+        estimator: after its update.
+    """
+    rotation, translation = _of_motion(motion, odometry)
+    single, correlated = (
+        estimator.noise_factors if isinstance(estimator, NoiseEstimating) else (math.nan, math.nan)
+    )
+    turned = odometry is not None and odometry.turned
+    return FrameNoise(
+        rotation_sigma_dps2=rotation,
+        translation_sigma_mps2=translation,
+        gyroscope_factor=(
+            motion.gyroscope_factor if turned and isinstance(motion, OdometryMotion) else math.nan
+        ),
+        match_factor=math.sqrt(matches.variance),
+        single_factor=single,
+        correlated_factor=correlated,
+    )
+
+
+def _of_motion(motion: MotionModel, odometry: Odometry | None) -> tuple[float, float]:
+    """Deviations of the acceleration, degrees/s^2 and m/s^2, where the step stands on it."""
+    if odometry is None or odometry.measured:
+        return math.nan, math.nan
+    if not isinstance(motion, ConstantVelocityMotion | OdometryMotion):
+        return math.nan, math.nan
+    rotation, translation = np.sqrt(motion.acceleration_variance.reshape(2, 3).mean(axis=1))
+    return math.nan if odometry.turned else math.degrees(rotation), float(translation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,10 @@ from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import ConfigError, MeasurementLogError
-from fgslam.core.estimates import (
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, MeasurementType, Observations
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import (
     EgoMotion,
     EgoMotionStatus,
     Estimate,
@@ -32,19 +35,14 @@ from fgslam.core.estimates import (
     Trajectory,
     UpdateStats,
 )
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, MeasurementType, Observations
-from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection, unmeasured
 from fgslam.frontend.tracking.landmarks import MapParts
-from fgslam.slam.arrival import Arrival, take_over
 from fgslam.slam.bridging import bridged
-from fgslam.slam.factory import made_or_given
+from fgslam.slam.build import Arrival, made_or_given, take_over
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel
-from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
-from fgslam.slam.pipeline import Stopwatch, observe
+from fgslam.slam.pipeline import FrameNoise, Stopwatch, noise_in_use, observe
 from fgslam.slam.results import ESTIMATOR_FAULTS, estimate_of_failed, reason
 
 _PROC_STATUS = Path("/proc/self/status")

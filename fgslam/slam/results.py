@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -11,15 +12,17 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import WeighedCorrection
-from fgslam.core.arrays import BoolArray, Brief, FloatArray
+from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
 from fgslam.core.errors import FgslamError
-from fgslam.core.estimates import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
-from fgslam.core.features import StereoFeatures
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Observations
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Observations
 from fgslam.core.store import Kept
-from fgslam.slam.noise_in_use import FrameNoise
-from fgslam.slam.pipeline import FrameReport, SlamPipeline
+from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, StereoFeatures, Trajectory
+from fgslam.frontend.camera_faults import CameraWatch
+from fgslam.frontend.tracking.landmarks import MapParts
+from fgslam.slam.bridging import bridged_frames
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.pipeline import FrameNoise, FrameReport, SlamPipeline
 
 STAGES = (
     "load",
@@ -251,7 +254,7 @@ class SessionResult(Brief):
     def column(self, name: str) -> npt.NDArray[Any]:
         """(n,) one number of every frame: `status`, `matched`, `inliers`, `nis`, `update_ms`...
 
-        With them the :class:`~fgslam.slam.noise_in_use.FrameNoise` of each.
+        With them the :class:`~fgslam.slam.pipeline.FrameNoise` of each.
         `connected` is False where a gap that nothing bridges lies between the first frame and it.
         """
         return self.frames[name]
@@ -328,3 +331,202 @@ def _columns(recorder: RunRecorder) -> dict[str, npt.NDArray[Any]]:
         "update_ms": stage["predict"] + stage["update"],
         "solve_ms": stage["track"],
     }
+
+
+# ------------------------------------------------------------------------------------------
+# Remarks of a session on its cameras: frames whose images could not be used, unequal exposure
+
+
+def camera_remarks(recorder: RunRecorder, watch: CameraWatch | None) -> tuple[str, ...]:
+    """A line for each fault with its frames; none where the cameras are sound or not watched."""
+    frames: dict[str, list[int]] = {}
+    for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
+        if row.status == EgoMotionStatus.CAMERA_FAULT.value:
+            frames.setdefault(row.problem, []).append(number)
+    lines = [
+        f"{fault}: {len(which)} of {len(recorder)} frames, {_between(which)}, are not used; their "
+        f"poses are predicted ({'swap their images' if 'swapped' in fault else 'mend the camera'}; "
+        "frontend.watch_cameras: false uses them all)"
+        for fault, which in frames.items()
+    ]
+    return (*lines, *(() if watch is None else watch.remarks()))
+
+
+def _between(frames: list[int]) -> str:
+    """First and last of some frames in words."""
+    if len(frames) == 1:
+        return f"frame {frames[0]}"
+    return f"from {frames[0]} to {frames[-1]}"
+
+
+# ------------------------------------------------------------------------------------------
+# Remarks on images that stereo matching cannot use: swapped cameras, darkness, 12-bit values
+
+_FRAMES = 10  # judged: what is wrong with cables, drivers or calibration is wrong from the start
+_FEWEST = 3  # frames: one or two may show a blank wall
+_LEAST_MATCHED = 0.02
+"""Of the right image's features, share that finds its partner. Of swapped images only what agrees
+by chance does, under 0.01 (rendered lab with three cameras, kitti06); of sound ones a third and
+more (those two, the light field, the drone, the suburb). Of two swapped cameras up to 0.13 agree
+in the lab, 0.07 in euroc_v101: those the camera watch finds."""
+_DARK = 15
+"""Largest grey value of a dark image, of 255: 12-bit values reach 4095, of which the upper eight of
+16 bits are 15."""
+
+
+class FirstImages:
+    """What the first images of a session were like."""
+
+    def __init__(self) -> None:
+        """No image yet."""
+        self._frames = 0
+        self._left: list[int] = []  # features, where they were sought
+        self._spread = np.zeros((0, 2))  # standard deviations of grey values, right and left
+        self._brightest = 0
+        self._uint16 = False
+
+    def add(self, found: FeatureFrame, uint16: bool) -> None:
+        """Counts a frame with features; ``uint16``: they were given so."""
+        if found.frame is None or not found.features or self._frames >= _FRAMES:
+            return
+        self._frames += 1
+        self._left += [len(own) for own in found.features[1:2]]
+        spread = [float(image.std()) for image in found.frame.images[:2]]
+        self._spread = np.vstack([self._spread, spread])
+        self._brightest = max(self._brightest, *(int(image.max()) for image in found.frame.images))
+        self._uint16 |= uint16
+
+    def left(self) -> str:
+        """What the left images have: features, or contrast; empty where there was no image."""
+        if self._left or not self._frames:
+            return f"{np.mean(self._left):.0f} in the left image" if self._left else ""
+        right, left = self._spread.mean(axis=0)
+        return f"grey values vary by {right:.0f} in the right image, by {left:.0f} in the left one"
+
+    def lost_bits(self) -> str:
+        """That bits were given which are not used; empty where none were."""
+        if not self._frames or self._brightest > _DARK or not self._uint16:
+            return ""
+        return (
+            f"of uint16 the upper eight bits count, and they reach {self._brightest} of 255: "
+            "shift 12-bit values to 16 bits (image << 4)"
+        )
+
+    def fault(self) -> str:
+        """What is wrong with the grey values: bits lost, or darkness; empty where nothing is."""
+        if not self._frames or self._brightest > _DARK:
+            return ""
+        dark = f"the images are dark, their largest grey value is {self._brightest} of 255"
+        return self.lost_bits() or dark
+
+
+def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
+    """True if one of the images is an array of 16 bits a value."""
+    return any(getattr(image, "dtype", None) == np.uint16 for image in images)
+
+
+def stereo_remarks(recorder: RunRecorder, seen: FirstImages | None = None) -> tuple[str, ...]:
+    """A remark where the first frames with images have next to no stereo match, or lost bits."""
+    rows = [row for row in recorder.rows if not row.problem][:_FRAMES]
+    features, matched = sum(row.features for row in rows), sum(row.stereo for row in rows)
+    if len(rows) < _FEWEST:
+        return ()
+    seen = seen or FirstImages()
+    if matched > _LEAST_MATCHED * features:
+        return (seen.lost_bits(),) if seen.lost_bits() else ()
+    n = len(rows)
+    found = f"no stereo matches in the first {n} frames: {features / n:.0f} features in the right"
+    found += f" image, {matched / n:.0f} of them matched"
+    if seen.fault():
+        return (f"{found}; {seen.fault()}",)
+    if seen.left():
+        found += f" ({seen.left()})"
+    if not features:
+        return (f"{found}; are the images dark, or 12-bit values in 16-bit images?",)
+    return (f"{found}; are left and right swapped, or the images not rectified?",)
+
+
+# ------------------------------------------------------------------------------------------
+# Remarks on frames that a guess alone places relative to the rest, or that contradict odometry
+
+
+def located_frames(recorder: RunRecorder) -> BoolArray:
+    """(n,) frames that landmarks gave a pose; the first one, which the world is, among them."""
+    statuses = [EgoMotionStatus(status) for status in recorder.column("status").tolist()]
+    return np.array([one.measured or one is EgoMotionStatus.FIRST for one in statuses], np.bool_)
+
+
+def connected_frames(recorder: RunRecorder, parts: MapParts) -> BoolArray:
+    """(n,) frames that measurements tie to the first one; of a frame that failed, nothing."""
+    return parts.connected[: len(recorder)]
+
+
+def in_first_map(recorder: RunRecorder, parts: MapParts) -> int:
+    """How many frames are located in what measurements connect with the first one."""
+    return int((located_frames(recorder) & connected_frames(recorder, parts)).sum())
+
+
+def left_out_note(count: int) -> str:
+    """That a drive begins after its first ``count`` frames."""
+    return f"the first {count} frames could not be located: left out"
+
+
+def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+    """Lines on frames that nothing measured, that lie in parts of their own, or off odometry."""
+    return (
+        *_of_bridged(recorder, parts),
+        *_of_unconnected(recorder, parts),
+        *_of_contradicted(recorder),
+    )
+
+
+def _of_bridged(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+    """A line where final poses may be interpolated."""
+    frames = bridged_frames(parts)
+    frames = frames[frames < len(recorder)]
+    if not len(frames):
+        return ()
+    numbers = recorder.log.numbers[frames]
+    return (
+        f"{_named(numbers)}: not located in the first map; in the final trajectory interpolated "
+        "between the located frames around, where that is more certain than what the estimator "
+        "knows",
+    )
+
+
+def _of_unconnected(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
+    """A line where frames are located in parts that a guess alone joins to the first."""
+    apart = located_frames(recorder) & ~connected_frames(recorder, parts)
+    if not apart.any():
+        return ()
+    numbers = recorder.log.numbers[apart]
+    known, n = in_first_map(recorder, parts), len(recorder)
+    return (
+        f"{_named(numbers)}: located relative to each other only, not in the first map; before is "
+        f"a gap that neither landmarks nor odometry bridge; {known} of {n} frames "
+        f"({100.0 * known / n:.0f} %) are located in the first map",
+    )
+
+
+def _of_contradicted(recorder: RunRecorder) -> tuple[str, ...]:
+    """A line where landmarks place most frames elsewhere than odometry does."""
+    again = recorder.column("status") == EgoMotionStatus.RELOCALISED.value
+    if 2 * int(again.sum()) <= len(recorder):  # the log is read only where it may be so
+        return ()
+    steps = [one.odometry for one in recorder.log]
+    moved = np.array([step is not None and step.measured for step in steps], np.bool_)
+    contradicted = int((again & moved).sum())
+    if 2 * contradicted <= int(moved.sum()):
+        return ()
+    return (
+        f"the odometry contradicts the images in {contradicted} of {int(moved.sum())} frames, "
+        "which are located without it: check its unit, its clock and where the camera sits on the "
+        "robot (dataset.camera_yaw_deg, dataset.lever_arm_m)",
+    )
+
+
+def _named(numbers: IntArray) -> str:
+    """Frames by how many they are and the first and last of them."""
+    if len(numbers) == 1:
+        return f"frame {numbers[0]}"
+    return f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]}"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Self
+from threading import Condition
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -13,31 +15,243 @@ import numpy.typing as npt
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import DEFAULT_ESTIMATOR, EstimatorSettings
 from fgslam.cameras.rig import StereoRig, require_rig
-from fgslam.core.arrays import FloatArray
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import later_time, require_seed
-from fgslam.core.errors import ConfigError, FrameError, SessionError
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig
+from fgslam.core.errors import ConfigError, FrameError, OdometryError, SessionError
+from fgslam.core.geometry import compose_odometry, is_rigid
+from fgslam.core.log import Frame, MeasurementLog
+from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.threads import one_blas_thread
-from fgslam.datasets.settings import OdometrySettings
+from fgslam.datasets.odometry import pose_noise
+from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
+from fgslam.frontend.features.sift import grey_image
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.slam.arrival import Arrival, MapStart
-from fgslam.slam.camera_remarks import camera_remarks
-from fgslam.slam.choices import chosen_estimator, chosen_frontend, chosen_odometry, is_settings
-from fgslam.slam.factory import as_measured, make_describer, make_locator, make_pipeline
-from fgslam.slam.feature_stream import (
-    FeatureExtractor,
-    FeatureFrame,
-    undescribed,
+from fgslam.slam.build import (
+    Arrival,
+    MapStart,
+    as_measured,
+    chosen_estimator,
+    chosen_frontend,
+    chosen_odometry,
+    is_settings,
+    make_describer,
+    make_locator,
+    make_pipeline,
 )
-from fgslam.slam.first_images import FirstImages, any_uint16, stereo_remarks
-from fgslam.slam.inputs import Images, checked_extractor, checked_images, checked_odometry
+from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, undescribed
 from fgslam.slam.motion import MotionModel, description_of
-from fgslam.slam.part_remarks import left_out_note, part_remarks
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.slam.results import RunRecorder, SessionResult, Step, result_of
+from fgslam.slam.results import (
+    FirstImages,
+    RunRecorder,
+    SessionResult,
+    Step,
+    any_uint16,
+    camera_remarks,
+    left_out_note,
+    part_remarks,
+    result_of,
+    stereo_remarks,
+)
+
+# ------------------------------------------------------------------------------------------
+# Input of a session, checked before it touches any state
+
+Images: TypeAlias = Sequence[npt.ArrayLike]
+"""Images (left, right[, top]) of one instant."""
+
+_NAMES = ("left", "right", "top")
+_SYMMETRY = 1e-6  # relative: covariances that were added up in another order
+
+
+def checked_extractor(features: FeatureExtractor | None) -> FeatureExtractor | None:
+    """Raises ConfigError for what cannot be called."""
+    if features is not None and not callable(features):
+        raise ConfigError(
+            f"features: {type(features).__name__} cannot be called; give a function from an image "
+            "to fgslam.Features, or None for SIFT"
+        )
+    return features
+
+
+def _is_colour(image: np.ndarray) -> bool:
+    """Whether an array is one image with colours, and not several images."""
+    return image.ndim == 3 and image.shape[2] in (3, 4)
+
+
+def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
+    """Grey rectified images (right, left[, top]) of the rig's size from (left, right[, top]).
+
+    Copies: tracking needs the last images again, and a camera loop may fill the same ones again.
+
+    Raises:
+        FrameError: another number of images, or one of another size, type or shape.
+    """
+    wanted = ", ".join(_NAMES[: rig.cameras])
+    try:
+        if isinstance(images, str | bytes | Mapping):
+            raise TypeError
+        given = len(images)
+    except TypeError:
+        raise FrameError(
+            f"the images are a {type(images).__name__}; give a tuple ({wanted}), or None where the "
+            "cameras gave nothing"
+        ) from None
+    if isinstance(images, np.ndarray) and (images.ndim < 3 or _is_colour(images)):
+        raise FrameError(f"one image given instead of {rig.cameras}; give ({wanted})")
+    if given != rig.cameras:
+        other = {2: ", or a rig without vertical_baseline", 3: ", or a rig with one more camera"}
+        raise FrameError(
+            f"{given} images given, the rig has {rig.cameras} cameras; give ({wanted})"
+            f"{other.get(given, '')}"
+        )
+    grey, size = [], rig.image_size if isinstance(rig, StereoRig) else (rig.width, rig.height)
+    for name, image in zip(_NAMES, images, strict=False):
+        converted = grey_image(image, f"{name} image")
+        if converted.shape[::-1] != size:
+            height, width = converted.shape
+            raise FrameError(
+                f"{name} image is {width}x{height}, the rig's are {size[0]}x{size[1]}; give images "
+                "of that size, or the calibration of these"
+            )
+        grey.append(converted.copy())
+    left, right, *top = grey
+    inside = (right, left, *top)
+    return rig.rectified(inside) if isinstance(rig, StereoRig) else inside
+
+
+def checked_odometry(
+    given: Odometry | npt.ArrayLike | None, settings: OdometrySettings | MotionModel
+) -> Odometry | None:
+    """Motion of the body with covariance; a bare (4, 4) gets the noise of settings.
+
+    Raises:
+        OdometryError: it is not finite, of another shape, no rigid motion, or its covariance is
+            not symmetric and positive semi-definite.
+    """
+    if given is None:
+        return None
+    if isinstance(given, Odometry):
+        motion = _rigid(given.motion)
+        return replace(given, motion=motion, covariance=_covariance(given.covariance))
+    motion = _rigid(given)
+    noise = settings if isinstance(settings, RecordedOdometrySettings) else None
+    return Odometry(motion, pose_noise(motion, noise or RecordedOdometrySettings()))
+
+
+def _numbers(given: npt.ArrayLike, what: str, shape: tuple[int, int]) -> FloatArray:
+    try:
+        array = np.array(given, np.float64)
+    except (TypeError, ValueError):
+        raise OdometryError(f"odometry: the {what} is no array of numbers; give {shape}") from None
+    if array.shape != shape:
+        raise OdometryError(f"odometry: the {what} has shape {array.shape}; give {shape}")
+    if not np.isfinite(array).all():
+        raise OdometryError(
+            f"odometry: the {what} is not finite; give None where nothing was measured"
+        )
+    return array
+
+
+def _rigid(given: npt.ArrayLike) -> FloatArray:
+    motion = _numbers(given, "motion", (4, 4))
+    if not is_rigid(motion):
+        raise OdometryError(
+            "odometry: the motion is no rigid motion; give the pose (4, 4) of the body now in its "
+            "frame before: an orthonormal rotation, metres, and 0 0 0 1 below"
+        )
+    return motion
+
+
+def _covariance(given: npt.ArrayLike) -> FloatArray:
+    covariance = _numbers(given, "covariance", (6, 6))
+    scale = float(np.abs(covariance).max())
+    symmetric = np.allclose(covariance, covariance.T, rtol=0.0, atol=_SYMMETRY * scale)
+    if not symmetric or np.linalg.eigvalsh(covariance).min() < -_SYMMETRY * scale:
+        raise OdometryError(
+            "odometry: the covariance is not symmetric and positive; give that of the tangent "
+            "vector [rotation, translation], radians and metres"
+        )
+    return covariance
+
+
+# ------------------------------------------------------------------------------------------
+# Between a camera that delivers at its own pace and a session that takes what it can keep up with
+
+BodyMotion: TypeAlias = Odometry | FloatArray | npt.ArrayLike | None
+LiveFrame: TypeAlias = tuple[float, Images | None, BodyMotion]
+
+
+class NewestFrame:
+    """Holds one frame, the newest that has not been taken; safe between threads.
+
+    ::
+
+        frames = fgslam.NewestFrame()
+        threading.Thread(target=read_camera, args=(frames,)).start()  # puts, then closes
+        for t, images, odometry in frames:
+            slam.track(t, images, odometry)
+    """
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._waiting: LiveFrame | None = None
+        self._closed = False
+        self._dropped = 0
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were replaced before they were taken."""
+        return self._dropped
+
+    def put(self, t: float, images: Images | None, odometry: BodyMotion = None) -> None:
+        """Hands a frame over; never waits. Arguments as of :meth:`fgslam.Slam.track`.
+
+        They are copied: a camera loop may fill the same arrays again.
+
+        Raises:
+            SessionError: closed already.
+        """
+        images, odometry = deepcopy((images, odometry))
+        with self._changed:
+            if self._closed:
+                raise SessionError("the frames are closed; make a new NewestFrame")
+            if self._waiting is not None:
+                self._dropped += 1
+                odometry = _joined(self._waiting[2], odometry)
+            self._waiting = (t, images, odometry)
+            self._changed.notify()
+
+    def take(self, timeout: float | None = None) -> LiveFrame | None:
+        """Waits for a frame and takes it; None after ``timeout`` seconds or :meth:`close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting is not None or self._closed, timeout)
+            frame, self._waiting = self._waiting, None
+            return frame
+
+    def close(self) -> None:
+        """No frame will come any more; one that waits can still be taken. May be called twice."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def __iter__(self) -> Iterator[LiveFrame]:
+        """Frames as they come, until :meth:`close`."""
+        while (frame := self.take()) is not None:
+            yield frame
+
+
+def _joined(first: BodyMotion, second: BodyMotion) -> BodyMotion:
+    """Two motions as one: with covariance where both have one; None where one was not measured."""
+    if first is None or second is None:
+        return None
+    if isinstance(first, Odometry) and isinstance(second, Odometry):
+        return compose_odometry((first, second))
+    return np.asarray(_motion(first) @ _motion(second))
+
+
+def _motion(odometry: BodyMotion) -> FloatArray:
+    return np.asarray(odometry.motion if isinstance(odometry, Odometry) else odometry, np.float64)
 
 
 @dataclass(frozen=True)
@@ -95,7 +309,7 @@ class Session:
                 ignored. Or an own object with the members of
                 :class:`fgslam.slam.motion.MotionModel`, for this session alone.
             features: an own extractor, from a grey image (height, width) uint8 to
-                :class:`~fgslam.core.features.Features`; it is called from several threads, with two
+                :class:`~fgslam.core.types.Features`; it is called from several threads, with two
                 cameras for the right image alone (``frontend.stereo.others``). None for SIFT.
             seed: of everything random: samples of place recognition.
             beginning: a saved map: with the first frame's place in it, or to be located in by the

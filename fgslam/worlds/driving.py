@@ -18,8 +18,8 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from fgslam.core import geometry
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.measurements import Odometry
-from fgslam.core.planar import unit, wrap
+from fgslam.core.geometry import unit, wrap
+from fgslam.core.sensors import Odometry
 from fgslam.worlds.patches import RayCaster
 from fgslam.worlds.settings import DriveLimits, WheelOdometrySettings
 

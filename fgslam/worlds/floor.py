@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.planar import unit, wrap
+from fgslam.core.geometry import unit, wrap
 from fgslam.worlds.buildings.floor_plan import Room
 from fgslam.worlds.buildings.house import ROOMS
 from fgslam.worlds.driving import planar_poses

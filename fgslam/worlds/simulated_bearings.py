@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.homing import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
-from fgslam.core.planar import bearings, rotation, wrap
+from fgslam.core.bearings import BearingMatches, FeatureKind, HomingTruth, TrackedBearings
+from fgslam.core.geometry import bearings, rotation, wrap
 from fgslam.worlds.settings import SimulatedBearingsSettings
 
 _CORRELATION_S = 0.5  # of the disturbances of the drive

@@ -16,9 +16,16 @@ import numpy as np
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Trajectory
-from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig, measurement_map, pixel_model, vertical_to_horizontal
+from fgslam.core.sensors import (
+    CameraRig,
+    Increment,
+    Observations,
+    Odometry,
+    measurement_map,
+    pixel_model,
+    vertical_to_horizontal,
+)
+from fgslam.core.types import Trajectory
 from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.driving import (
     PlanarPath,

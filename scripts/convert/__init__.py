@@ -12,7 +12,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.files import write_text
-from fgslam.core.trajectories import pose_rows
+from fgslam.core.types import pose_rows
 
 
 def run(convert: Callable[[Path, Path], None], description: str | None) -> int:

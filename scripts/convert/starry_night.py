@@ -23,9 +23,8 @@ from scipy.io.matlab import MatReadError
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import DatasetError
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import LANDMARK_TRUTH_FILE, LandmarkTruth, write_landmark_truth
-from fgslam.core.sensors import CameraRig
+from fgslam.core.log import LANDMARK_TRUTH_FILE, LandmarkTruth, write_landmark_truth
+from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.datasets.measured import (
     GROUND_TRUTH_FILE,
     LOG_FILE,

@@ -13,11 +13,9 @@ import cv2
 import numpy as np
 
 import fgslam as fg
-from fgslam.core.bearing_log import BearingLog
-from fgslam.core.homing import HomingStart, TwoViewVector
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.bearings import BearingLog, HomingStart, TwoViewVector
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
 from fgslam.core.store import write_arrays
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map

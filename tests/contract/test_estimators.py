@@ -27,13 +27,13 @@ from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
-from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import Increment, LoopClosure, MeasurementType, Observations, Odometry
 from fgslam.core.store import has_state, restore, state_of
+from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.replay import replay_frame
 

@@ -38,13 +38,13 @@ from fgslam.backend.settings import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
+from fgslam.backend.smoothers.bundle import WholeGraph
+from fgslam.backend.smoothers.final import Refined
 from fgslam.backend.smoothers.isam2 import Isam2Solver
-from fgslam.backend.smoothers.refinement import Refined
-from fgslam.backend.smoothers.whole_graph import WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Estimate, Prediction
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.sensors import Increment, Odometry
+from fgslam.core.types import Estimate, Prediction
 
 PRIOR = Prediction(np.eye(4), np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2)
 LEAST_SQUARES = {

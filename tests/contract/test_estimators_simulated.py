@@ -27,14 +27,14 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
+from fgslam.core.log import Frame
+from fgslam.core.sensors import Odometry
 from fgslam.core.store import state_of
+from fgslam.core.types import Prediction
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.factory import make_estimator, make_stereo, make_tracker
+from fgslam.slam.build import make_estimator, make_stereo, make_tracker
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline

@@ -20,8 +20,8 @@ from fgslam.backend.homing.settings import (
     PaperEkfSettings,
     SnapshotSettings,
 )
+from fgslam.core.bearings import HomingEstimate, TrackedBearings
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingEstimate, TrackedBearings
 from fgslam.worlds.settings import SimulatedBearingsSettings
 
 EVERY: list[HomingEstimatorSettings] = [

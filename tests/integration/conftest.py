@@ -16,7 +16,7 @@ def _coarse_pictures() -> Iterator[None]:
     """What pictures look like is tested elsewhere; here few and coarse ones, drawn faster."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fgslam.report.pictures.DPI", 50)
-        patch.setattr("fgslam.runs.tasks.slam_outputs.SHOWN", (0.0,))
+        patch.setattr("fgslam.runs.tasks.slam_results.SHOWN", (0.0,))
         yield
 
 

@@ -18,8 +18,8 @@ import pytest
 import yaml
 
 from fgslam.cli import main as cli
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import Trajectory, read_covariances
+from fgslam.core.log import MeasurementLog
+from fgslam.core.types import Trajectory, read_covariances
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import make_config
 from fgslam.runs.engine import run_task

@@ -25,9 +25,8 @@ from running import (
 )
 
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.features import StereoFeatures
-from fgslam.core.recordings import Sequence
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.log import ImageSequence
+from fgslam.core.types import StereoFeatures, Trajectory
 
 Refusal = Callable[..., str]
 
@@ -242,7 +241,7 @@ def test_a_depth_image_that_cannot_be_read_ends_the_run_which_goes_on_later(
 ) -> None:
     values = finished.values
 
-    def unreadable(sequence: Sequence, i: int, stereo: StereoFeatures) -> float:
+    def unreadable(sequence: ImageSequence, i: int, stereo: StereoFeatures) -> float:
         if i == 6:
             raise DatasetError("depth/000006.png: cannot be read")
         return float("nan")

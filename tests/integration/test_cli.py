@@ -32,9 +32,9 @@ from running import (
 )
 
 import fgslam
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.types import Trajectory
 from fgslam.report.formats import read_ply
-from fgslam.runs.config_models import Experiment
+from fgslam.runs.config import Experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.named_experiments import experiment_names
 

@@ -25,8 +25,8 @@ from running import (
 )
 
 from fgslam.backend.settings import DeadReckoningSettings, Isam2Settings
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.trajectories import Trajectory, read_covariances
+from fgslam.core.log import MeasurementLog
+from fgslam.core.types import Trajectory, read_covariances
 from fgslam.evaluation.statistics import EstimatorMetrics
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import load_config, make_config
@@ -254,7 +254,7 @@ def test_the_command_that_an_interrupted_comparison_shows_goes_on_with_it(
         yield lambda: True
 
     with monkeypatch.context() as patch:
-        patch.setattr("fgslam.cli.performing.stop_flag", ctrl_c_at_once)
+        patch.setattr("fgslam.cli.main.stop_flag", ctrl_c_at_once)
         if existing:
             assert main(monkeypatch, *given) == 130
         assert main(monkeypatch, *given, *existing) == 130

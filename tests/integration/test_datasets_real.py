@@ -29,7 +29,7 @@ from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.findings import Level
 from fgslam.runs.inspect import check_sequence
 from fgslam.runs.inspect_matches import check_epipolar
-from fgslam.slam.factory import make_extractor
+from fgslam.slam.build import make_extractor
 from scripts.convert.light_field import convert
 
 pytestmark = pytest.mark.data

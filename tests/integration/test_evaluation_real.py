@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory, path_length
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.planar import compose
+from fgslam.core.geometry import compose
 from fgslam.homing.closed_loop import (
     DriveRecord,
     cross_track,

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image as PictureFile
 from running import main, write_config
 
-from fgslam.core.bearing_log import BearingLog
+from fgslam.core.bearings import BearingLog
 from fgslam.core.errors import DatasetError
 from fgslam.runs.config import load_homing, make_experiment
 from fgslam.runs.folder import RUN_MARKER

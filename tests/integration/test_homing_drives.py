@@ -13,7 +13,7 @@ import pytest
 from landmark_world import drive_path, make_follower, winding_path
 
 from fgslam.backend.homing.settings import HomingGraphSettings
-from fgslam.core.homing import TrackedBearings
+from fgslam.core.bearings import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.closed_loop import (
     Driver,
@@ -26,21 +26,18 @@ from fgslam.homing.closed_loop import (
 from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, Steering
-from fgslam.runs.config import make_experiment
-from fgslam.runs.config_models import HomingConfig, PathFollowingConfig
+from fgslam.runs.config import HomingConfig, PathFollowingConfig, make_experiment
 from fgslam.runs.folder import write_config
 from fgslam.runs.homing_comparison import load_bearing_logs, replay_homing
-from fgslam.runs.tasks.homing_drive_results import (
-    bearing_log,
-    drive_numbers,
-    drive_of,
-)
 from fgslam.runs.tasks.homing_drives import (
     DrivenSeed,
     DriveWatcher,
     Unwrapping,
+    bearing_log,
     displaced_start,
     draw_leg_views,
+    drive_numbers,
+    drive_of,
     finish_drives,
 )
 

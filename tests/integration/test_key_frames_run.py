@@ -17,12 +17,12 @@ import fgslam as fg
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, Image, StateArrays
 from fgslam.core.errors import ConfigError
-from fgslam.core.features import Features
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import BiasEffect, Odometry
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.core.store import state_of
+from fgslam.core.types import Features
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.slam.factory import make_extractor
+from fgslam.slam.build import make_extractor
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 FRAMES = 12

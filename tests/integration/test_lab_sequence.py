@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError, FrameError, MissingDependencyError
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets import rendered
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.worlds.settings import (
@@ -52,7 +52,7 @@ def pixel_rays(sequence: RenderedLabSequence) -> np.ndarray:
 def test_papers_drive_as_a_sequence() -> None:
     """249 frames; the last pose is the first; only the frames asked for are rendered."""
     sequence = RenderedLabSequence(QUICK, seed=0, stride=124)
-    assert isinstance(sequence, Sequence)
+    assert isinstance(sequence, ImageSequence)
     assert len(sequence) == 3
     assert sequence.timestamps.tolist() == [0.0, 62.0, 124.0]
     truth = sequence.ground_truth

@@ -13,7 +13,7 @@ from benchmarks.evidence import euroc_raw, lenses
 from benchmarks.evidence.lens_views import loaded, raw_cameras
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import se3_exp
-from fgslam.core.trajectories import Trajectory, read_covariances
+from fgslam.core.types import Trajectory, read_covariances
 from fgslam.evaluation.statistics import moved
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.settings import LabRigSettings

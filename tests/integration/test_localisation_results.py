@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from fgslam.runs.config import load_experiment
-from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.config import LocalisationConfig, load_experiment
 from fgslam.runs.engine import run_task
-from fgslam.runs.tasks.localisation import open_localisation
-from fgslam.runs.tasks.localisation_results import Scored, scored
+from fgslam.runs.tasks.localisation import Scored, open_localisation, scored
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 

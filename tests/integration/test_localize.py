@@ -15,8 +15,7 @@ from recordings import experiment, write_calibration
 from running import main, run_values
 
 from fgslam.core.errors import ConfigError
-from fgslam.runs.config import load_experiment, make_experiment
-from fgslam.runs.config_models import LocalisationConfig
+from fgslam.runs.config import LocalisationConfig, load_experiment, make_experiment
 from fgslam.runs.engine import run_task
 from fgslam.runs.tasks.localisation import open_localisation
 

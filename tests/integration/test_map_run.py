@@ -23,7 +23,7 @@ from running import (
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapError
 from fgslam.core.saved_map import load_map, save_map
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.types import Trajectory
 from fgslam.report.formats import read_ply
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 

@@ -11,8 +11,8 @@ import pytest
 
 from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.homing import BearingMatches
-from fgslam.core.planar import between
+from fgslam.core.bearings import BearingMatches
+from fgslam.core.geometry import between
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.two_view import (

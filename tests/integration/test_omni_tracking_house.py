@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.homing import BearingMatches
-from fgslam.core.planar import wrap
+from fgslam.core.bearings import BearingMatches
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable

@@ -10,7 +10,7 @@ import pytest
 from fgslam.cameras.omni_files import make_camera
 from fgslam.cameras.rings import find_mirror_circle
 from fgslam.cameras.settings import HyperbolicMirrorSettings
-from fgslam.core.homing import FeatureKind, TwoViewVector
+from fgslam.core.bearings import FeatureKind, TwoViewVector
 from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniVideoSettings

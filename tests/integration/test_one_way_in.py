@@ -19,7 +19,7 @@ from fgslam.errors import (
     OutputError,
     SessionError,
 )
-from fgslam.runs.live import slam_config
+from fgslam.runs.session import slam_config
 
 QUIET = {"output.pictures": False, "output.report": False, "output.checkpoint_seconds": 3600}
 FILES = {"trajectory": "final.tum", "map": "map.ply"}

@@ -11,11 +11,11 @@ import pytest
 from recordings import experiment
 from running import KIND, Finished, run_values
 
-from fgslam.core.estimates import Estimate
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
+from fgslam.core.types import Estimate
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import ExperimentConfig, make_config
-from fgslam.slam import factory
+from fgslam.slam import build as factory
 from fgslam.slam.replay import replay_frame
 
 

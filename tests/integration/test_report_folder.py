@@ -14,9 +14,8 @@ import pytest
 from running import KIND, Finished, main
 
 from fgslam.core.errors import DatasetError, FgslamError, MissingDependencyError, OutputError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import rotation_from_quaternion
-from fgslam.core.trajectories import read_covariances
+from fgslam.core.types import Trajectory, read_covariances
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.report.results import EstimatorReport
 from fgslam.runs.report import load_report, report_from_folder

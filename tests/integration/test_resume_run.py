@@ -34,14 +34,14 @@ from fgslam.core.errors import (
     OdometryError,
     OutputError,
 )
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
 from fgslam.core.store import load_arrays, write_arrays
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
 from fgslam.runs.config import make_config
 from fgslam.runs.engine import Opening, resume_command
-from fgslam.runs.tasks.slam_opening import begin, open_run
+from fgslam.runs.tasks.slam import begin, open_run
 
 LONG = 20
 """Frames that are enough to be interrupted for certain after the fifth."""

@@ -16,9 +16,9 @@ from running import main
 
 import fgslam as fg
 from fgslam.core.sensors import CameraRig
-from fgslam.core.trajectories import write_covariances
+from fgslam.core.types import write_covariances
 from fgslam.homing.route import PathMemory
-from fgslam.runs.bare_routes import teaching
+from fgslam.runs.bare import teaching
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.run import run_experiment
 from tests import textured_room

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import BoolArray, FloatArray
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.homing.route import PathMemory
-from fgslam.runs.bare_routes import following, teaching
+from fgslam.runs.bare import following, teaching
 from fgslam.runs.run import run_experiment
 
 pytestmark = pytest.mark.data

@@ -12,8 +12,8 @@ from running import bytes_of, main, metrics_of, run_values, stop_after
 
 import fgslam
 from fgslam.cameras.rig import rectifier_of
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.rig_correction import term_names
+from fgslam.core.correction import term_names
+from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig
 
 ROLL_DEG = 0.4

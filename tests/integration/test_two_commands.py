@@ -19,7 +19,7 @@ from running import (
     write_config,
 )
 
-from fgslam.runs.owner import OWNER_NAME
+from fgslam.runs.folder import OWNER_NAME
 
 pytestmark = pytest.mark.slow
 

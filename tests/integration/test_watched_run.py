@@ -12,7 +12,7 @@ import pytest
 from recordings import experiment
 from running import Capture, Finished, Patch, bytes_of, main, mistake, write_config
 
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.types import Trajectory
 
 chunks: Any = pytest.importorskip("rerun.chunk", reason="the extra `viewer` is not installed")
 

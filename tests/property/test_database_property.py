@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from simulated import RIG
 
-from fgslam.core.features import StereoFeatures
+from fgslam.core.types import StereoFeatures
 from fgslam.frontend.settings import DatabaseSettings, PermanenceSettings
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 

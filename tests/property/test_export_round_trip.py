@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as nps
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory, umeyama
 
 UNIT = st.floats(-1.0, 1.0, allow_subnormal=False)

@@ -15,8 +15,8 @@ from simulated import RIG
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import Floor
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor
 from fgslam.factors.noise import Whitening, positive_definite

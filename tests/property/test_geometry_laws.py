@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.core.sensors import CameraRig
 
 SINGULAR_ANGLES = [0.0, 1e-12, 1e-9, 1e-5, 0.99e-4, 1.01e-4, np.pi - 1e-6, np.pi - 1e-9, np.pi]

@@ -15,7 +15,7 @@ from fgslam.cameras.omni import (
     angles_of,
     measure,
 )
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 
 frames = st.builds(
     MirrorFrame,

@@ -238,7 +238,7 @@ def test_every_room_of_the_order_exists() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    ["core.arrays", "core.geometry", "core.measurement_log", "runs.config", "cli.main"],
+    ["core.arrays", "core.geometry", "core.log", "runs.config", "cli.main"],
 )
 def test_light_modules_load_no_heavy_library(module: str) -> None:
     # `fgslam --help` must answer at once, and work where a library cannot be loaded.

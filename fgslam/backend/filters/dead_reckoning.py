@@ -12,7 +12,6 @@ import numpy as np
 
 from fgslam.backend.filters.filtered import FilteredTrajectory, moved, placed, triangulated
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import (
     adjoint,
     inverse,
@@ -20,9 +19,9 @@ from fgslam.core.geometry import (
     reorthonormalise,
     transform_to_camera,
 )
-from fgslam.core.measurements import Increment, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, MeasurementType, Observations, Odometry
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 
 
 class DeadReckoning:

@@ -25,10 +25,8 @@ from fgslam.backend.considered import ConsiderCovariance
 from fgslam.backend.filters.filtered import FilteredTrajectory, require_finite, triangulated
 from fgslam.backend.loops import within_gate
 from fgslam.backend.settings import EkfSettings
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
-from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
     congruence,
@@ -45,10 +43,16 @@ from fgslam.core.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import (
+    CameraRig,
+    Increment,
+    LoopClosure,
+    MeasurementType,
+    Observations,
+    Odometry,
+)
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion, Estimate, Floor, LandmarkMap, Prediction, UpdateStats
 
 FRONT = 6
 """The pose's rows and columns come first."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, Prediction, Trajectory
 from fgslam.core.geometry import (
     compose_covariance,
     congruence,
@@ -18,8 +17,8 @@ from fgslam.core.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.core.measurements import Increment, Observations, Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
+from fgslam.core.types import EgoMotion, Prediction, Trajectory
 
 
 @dataclass(slots=True, eq=False)

@@ -40,11 +40,17 @@ from fgslam.backend.protocol import recalibrated
 from fgslam.backend.self_calibration import SETTLING, RigChange
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
-from fgslam.core.estimates import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.core.geometry import inverse, inverse_spd3
-from fgslam.core.measurements import Increment, LoopClosure, MeasurementType, Observations, Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import (
+    CameraRig,
+    Increment,
+    LoopClosure,
+    MeasurementType,
+    Observations,
+    Odometry,
+)
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 

@@ -20,8 +20,6 @@ from fgslam.backend.filters.landmark_update import FrameUpdate, Landmarks, Updat
 from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
-from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     congruence,
     moved_apart,
@@ -31,8 +29,15 @@ from fgslam.core.geometry import (
     transform_to_world,
     triangulate,
 )
-from fgslam.core.measurements import Increment, Observations
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, Observations
+from fgslam.core.types import (
+    EgoMotion,
+    EgoMotionStatus,
+    Floor,
+    LandmarkMap,
+    Prediction,
+    UpdateStats,
+)
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import FROM_MEASUREMENT, StereoFactors
 from fgslam.factors.noise import Whitening

@@ -22,8 +22,7 @@ from fgslam.core.geometry import (
     projection_jacobian,
     transform_to_camera,
 )
-from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations
 
 UpdateKind: TypeAlias = Literal["pixel", "world", "running_mean", "half"]
 MISS_GROWTH_M = 0.0001  # added to a landmark's deviation on a miss (6.4, which gives no number)

@@ -18,10 +18,10 @@ from scipy.linalg import lapack
 from fgslam.backend.homing.parts import TrackedFeatures
 from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings, among
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
-from fgslam.core.planar import unit, wrapped_pose
-from fgslam.factors.bearing_residuals import (
+from fgslam.core.geometry import unit, wrapped_pose
+from fgslam.factors.bearing import (
     bearing,
     bearing_jacobians,
     polar_jacobians,

@@ -20,9 +20,9 @@ from fgslam.backend.homing.settings import (
     SnapshotSettings,
 )
 from fgslam.core.arrays import FloatArray
+from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings
 from fgslam.core.errors import ConfigError, EstimatorError
-from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings
-from fgslam.core.planar import unit, wrap
+from fgslam.core.geometry import unit, wrap
 
 _KINDS: dict[str, type[HomingEstimatorKind]] = {
     kind.kind: kind

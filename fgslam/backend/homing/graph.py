@@ -32,10 +32,10 @@ from fgslam.backend.homing.parts import (
 from fgslam.backend.homing.schur import SchurSolver
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.gauss_newton import GaussNewton, Linearised
-from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, among
-from fgslam.core.planar import compose, unit, wrap
-from fgslam.factors.bearing_residuals import bearing, bearing_jacobians, polar_points, triangulated
+from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings, among
+from fgslam.core.geometry import compose, unit, wrap
+from fgslam.core.least_squares import GaussNewton, Linearised
+from fgslam.factors.bearing import bearing, bearing_jacobians, polar_points, triangulated
 
 _PRIOR_DISTANCES = 2.0  # deviation of the weak prior on a landmark's place, in initial distances
 _MOST_RELATIVE_SIGMA = 0.3  # of its distance: a feature enters once it is known better than this

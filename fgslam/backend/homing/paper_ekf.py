@@ -23,8 +23,8 @@ from fgslam.backend.homing.ekf import (
 )
 from fgslam.backend.homing.settings import PaperEkfSettings
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import HomingStart
-from fgslam.factors.bearing_residuals import target_jacobian, target_pose
+from fgslam.core.bearings import HomingStart
+from fgslam.factors.bearing import target_jacobian, target_pose
 
 
 class PaperEkf(HomingEkf):

@@ -11,9 +11,9 @@ from typing import ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings, TwoViewVector, among
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingEstimate, HomingStart, TrackedBearings, TwoViewVector, among
 from fgslam.factors.noise import KernelName
 
 

@@ -26,10 +26,10 @@ from fgslam.backend.homing.parts import (
 )
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.levenberg import Damping
-from fgslam.core.planar import wrap, wrapped_pose
-from fgslam.factors.bearing import STIFF
-from fgslam.factors.bearing_residuals import (
+from fgslam.core.geometry import wrap, wrapped_pose
+from fgslam.core.least_squares import Damping
+from fgslam.factors.bearing import (
+    STIFF,
     ChainMotion,
     bearings_from_views,
     direction_and_turn,

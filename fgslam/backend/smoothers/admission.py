@@ -17,9 +17,8 @@ from fgslam.backend.filters.filtered import placed
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import GraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import EgoMotion, LandmarkMap
-from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations
+from fgslam.core.types import EgoMotion, LandmarkMap
 
 LEAST_SIGHTINGS = 2  # frames in which a landmark is seen before it enters: one match may be wrong
 LEAST_PARALLAX = 3.0

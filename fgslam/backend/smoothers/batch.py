@@ -7,27 +7,21 @@ from typing import ClassVar
 
 from fgslam.backend.loops import Constraint
 from fgslam.backend.settings import BatchSettings, KernelSettings
-from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.loop_closing import solved
-from fgslam.backend.smoothers.marginals import reduced
-from fgslam.backend.smoothers.refinement import (
-    MINIMUM,
-    WholeGraphSolver,
-    graduated,
-    trimmed,
-)
-from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
-from fgslam.backend.smoothers.solver import (
+from fgslam.backend.smoothers.bundle import State, WholeGraph
+from fgslam.backend.smoothers.elimination import reduced
+from fgslam.backend.smoothers.final import MINIMUM, WholeGraphSolver, graduated, trimmed
+from fgslam.backend.smoothers.graph import (
     ClosedLoop,
     Drive,
+    NewFactors,
     Smoothed,
     allowed_parts,
+    solved,
 )
-from fgslam.backend.smoothers.whole_graph import State, WholeGraph
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.floor import Floor
+from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Floor, LandmarkMap, Prediction
 
 
 def batch_smoother(

@@ -10,29 +10,22 @@ import numpy as np
 from fgslam.backend.loops import Constraint
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import Isam2Settings
-from fgslam.backend.smoothers.graph_builder import NewFactors
-from fgslam.backend.smoothers.keyframes import Segments
-from fgslam.backend.smoothers.loop_closing import solved
-from fgslam.backend.smoothers.refinement import (
-    MINIMUM,
-    Refined,
-    WholeGraphSolver,
-    refine,
-    trimmed,
-)
-from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
-from fgslam.backend.smoothers.solver import (
+from fgslam.backend.smoothers.bundle import State, WholeGraph
+from fgslam.backend.smoothers.final import MINIMUM, Refined, WholeGraphSolver, refine, trimmed
+from fgslam.backend.smoothers.graph import (
     ClosedLoop,
     Drive,
+    NewFactors,
     Smoothed,
     allowed_parts,
+    solved,
     suspect,
 )
-from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.backend.smoothers.keyframes import Segments
+from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.floor import Floor
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Floor, LandmarkMap, Prediction
 from fgslam.factors.graphs import (
     is_pose,
     isam2_parameters,

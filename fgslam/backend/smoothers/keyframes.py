@@ -22,12 +22,9 @@ import gtsam
 import numpy as np
 
 from fgslam.backend.self_calibration import KnownCorrections, RigChange
-from fgslam.backend.smoothers.graph_builder import TrackedFrame
-from fgslam.backend.smoothers.solver import Solution, allowed_parts
-from fgslam.backend.smoothers.turns import Turn
+from fgslam.backend.smoothers.bundle import Turn
+from fgslam.backend.smoothers.graph import Solution, TrackedFrame, allowed_parts
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     adjoint,
     compose_odometry,
@@ -43,8 +40,8 @@ from fgslam.core.geometry import (
     transform_to_camera,
     triangulate,
 )
-from fgslam.core.measurements import Observations, Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations, Odometry
+from fgslam.core.types import Floor, LandmarkMap, Prediction
 from fgslam.factors.graphs import pose_key
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 

@@ -1,6 +1,6 @@
 """A window of poses and landmarks: a Gauss-Newton step a frame, with the landmarks eliminated.
 
-What leaves is kept as a :class:`~fgslam.backend.smoothers.window_prior.WindowPrior`. What that
+What leaves is kept as a :class:`~fgslam.backend.smoothers.window.WindowPrior`. What that
 depends on is linearised once and for all where it was when it first did (first-estimate
 Jacobians, Huang et al. 2010): linearised in two places, prior and measurements would together
 claim to know what neither measured, above all the heading. A kernel weighs an observation where it
@@ -11,50 +11,561 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
+from fgslam.backend.loops import home_changes, rotated, transported
 from fgslam.backend.settings import KernelSettings
-from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
-from fgslam.backend.smoothers.landmark_elimination import (
+from fgslam.backend.smoothers.admission import LEAST_PARALLAX
+from fgslam.backend.smoothers.elimination import (
     Eliminated,
     Equations,
+    UndeterminedError,
     UndeterminedLandmarkError,
+    scaled_cholesky,
 )
-from fgslam.backend.smoothers.window_parts import (
-    Landmarks,
-    LandmarkUndeterminedError,
-    Look,
-    Observed,
-    Solved,
-    Tie,
-    WindowValues,
+from fgslam.backend.smoothers.graph import parallax
+from fgslam.core.arrays import (
+    BoolArray,
+    FloatArray,
+    GrowingColumns,
+    IntArray,
+    Rows,
+    chi_square_quantile,
 )
-from fgslam.backend.smoothers.window_prior import WindowPrior
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
     adjoint,
+    in_front,
     inverse,
+    inverse_spd3,
     point_pose_jacobian,
+    project,
+    projection_jacobian,
     reorthonormalise,
     se3_exp,
     transform_to_camera,
     transform_to_world,
+    triangulate,
+    triangulation_covariance,
 )
 from fgslam.core.sensors import CameraRig
 from fgslam.factors.graphs import landmark_key, number, pose_key
-from fgslam.factors.landmark import (
-    LinearRows,
-    linearised,
-    products,
-    summed,
-    weighed,
-    whitening,
-)
+from fgslam.factors.landmark import LinearRows, linearised, products, summed, weighed, whitening
 from fgslam.factors.noise import kernel_weights
+
+# ------------------------------------------------------------------------------------------
+# What a window of poses and landmarks is made of, and what it answers
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observed(Rows):
+    """Observations of the window (k, ...): frame, landmark variable, numbers and whitening."""
+
+    frame: IntArray
+    variable: IntArray
+    measurement: FloatArray
+    root: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Landmarks(Rows):
+    """Landmarks of the window (m, ...): variables ascending, places, what was known beforehand.
+
+    That is a mean and its information (3, 3), zero where nothing was known.
+    """
+
+    variables: IntArray
+    points: FloatArray
+    mean: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """Observations (k,) as they are linearised now: rows of their poses and landmarks, and theirs.
+
+    Residuals are those of the estimate, weights (in the rows) those of where it is linearised.
+    """
+
+    pose: IntArray
+    point: IntArray
+    rows: LinearRows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """The window's normal equations at its solution, and what their rows are."""
+
+    eliminated: Eliminated
+    frames: list[int]
+    variables: IntArray
+
+    def rows(self, variables: list[int]) -> IntArray:
+        """Rows of landmark variables."""
+        return np.searchsorted(self.variables, variables).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """How a place that has left a window is off: by a motion in the axes of the first pose.
+
+    Attributes:
+        follows: another place by which it is known; None: the first pose.
+        gain: (6, 6) by how much it is off where the other is, in the same axes.
+        information: (6, 6) inverse covariance of the rest.
+    """
+
+    follows: int | None
+    gain: FloatArray
+    information: FloatArray
+
+
+class LandmarkUndeterminedError(UndeterminedError):
+    """``variable`` is not determined by its observations."""
+
+    def __init__(self, variable: int, message: str) -> None:
+        """The landmark's variable, and why."""
+        super().__init__(variable, message)
+        self.variable = variable
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowValues:
+    """What is asked of GTSAM's values between two frames, by key: poses (4, 4) and points (3,)."""
+
+    poses: dict[int, FloatArray]
+    points: dict[int, FloatArray]
+
+    def exists(self, key: int) -> bool:
+        """Whether the window holds a variable."""
+        return key in self.points or key in self.poses
+
+    def landmarks(self) -> tuple[IntArray, FloatArray]:
+        """As :func:`fgslam.factors.graphs.landmarks_in`."""
+        keys = np.fromiter(self.points, np.int64, len(self.points))
+        places = np.array(list(self.points.values())).reshape(-1, 3)
+        order = np.argsort(keys)
+        return keys[order] - landmark_key(0), places[order]
+
+    def atPose3(self, key: int) -> Any:
+        """A pose."""
+        return gtsam.Pose3(self.poses[key])
+
+
+# ------------------------------------------------------------------------------------------
+# Landmarks of a whole drive: where each was when it left a window, and what was known of it
+
+
+class HeldLandmarks:
+    """By variable: place, mean and information given the poses, frame with which it is off."""
+
+    def __init__(self) -> None:
+        """None yet."""
+        self._rows = GrowingColumns(
+            point=np.empty((0, 3)),
+            mean=np.empty((0, 3)),
+            information=np.empty((0, 3, 3)),
+            home=np.empty(0, np.int64),
+            saved=np.empty(0, np.bool_),
+        )
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def points(self) -> FloatArray:
+        """(m, 3) places; may be written to."""
+        return self._rows["point"]
+
+    @property
+    def homes(self) -> IntArray:
+        """(m,) the last frame that saw each before it left a window; -1: it never did."""
+        return self._rows["home"]
+
+    @property
+    def saved(self) -> BoolArray:
+        """(m,) whether it is known from a saved map, which no change of this drive moves."""
+        return self._rows["saved"]
+
+    def enter(self, point: FloatArray) -> None:
+        """A new variable, of which nothing is known."""
+        row = {"point": point, "mean": point, "information": np.zeros((3, 3))}
+        last = {"home": np.array(-1), "saved": np.array(False)}
+        self._rows.append({name: value[None] for name, value in (row | last).items()})
+
+    def know(self, variable: int, mean: FloatArray, covariance: FloatArray, saved: bool) -> None:
+        """What is known of a new variable beforehand, from a ``saved`` map or from this drive."""
+        self._rows["mean"][variable] = mean
+        self._rows["information"][variable] = np.linalg.inv(covariance)
+        self._rows["saved"][variable] = saved
+
+    def begin(self, variables: IntArray, points: FloatArray) -> None:
+        """They are elsewhere, at points (k, 3): what was known of them was of others."""
+        rows = self._rows
+        rows["point"][variables] = rows["mean"][variables] = points
+        rows["information"][variables] = 0.0
+        rows["home"][variables] = -1
+        rows["saved"][variables] = False
+
+    def carried_along(self, by_frame: FloatArray) -> None:
+        """Moves each with the frame with which it is off, by motions of the world (n, 4, 4)."""
+        by = home_changes(np.where(self.saved, -1, self.homes), by_frame)
+        self.points[:] = transported(by, self.points)
+        self._rows["information"][:] = rotated(by, self._rows["information"])
+
+    def of(self, variables: IntArray) -> Landmarks:
+        """Some of them, for a window."""
+        rows = self._rows
+        names = ("point", "mean", "information")
+        return Landmarks(variables, *(rows[name][variables] for name in names))
+
+    def left(self, landmarks: Landmarks, home: int) -> None:
+        """Takes back what has left a window, last seen in a frame."""
+        at = landmarks.variables
+        self._rows["point"][at], self._rows["mean"][at] = landmarks.points, landmarks.mean
+        self._rows["information"][at] = landmarks.information
+        self._rows["home"][at] = home
+
+
+# ------------------------------------------------------------------------------------------
+# Landmarks seen again after they left a window: which of them are surely back
+
+LEAST = 6  # landmarks that agree: as many as join two parts of a map
+_FITS = float(chi_square_quantile(0.999, 3))
+_ROUNDS = 3  # of who fits all that fit, after who fits one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenAgain(Rows):
+    """Landmarks (k,) where an observation of each has them: points (k, 3) and covariances.
+
+    Of one whose depth the observation does not tell (``near`` False) they are of first order about
+    the depth that it was known to have.
+    """
+
+    variables: IntArray
+    points: FloatArray
+    covariances: FloatArray
+    near: BoolArray
+
+    @staticmethod
+    def of(
+        sensor: CameraRig,
+        known: Landmarks,
+        poses: FloatArray,
+        measured: FloatArray,
+        noise: FloatArray,
+    ) -> SeenAgain:
+        """From measurements (n, 3) at poses (n, 4, 4), of landmarks that were known before."""
+        poses = poses.reshape(-1, 4, 4)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            local = triangulate(sensor, measured)
+            covariances = triangulation_covariance(sensor, measured, noise)
+        near = in_front(local) & np.isfinite(covariances).all(axis=(1, 2))
+        near[near] = parallax(local[near], covariances[near]) >= LEAST_PARALLAX
+        before = ((known.points - poses[:, :3, 3])[:, None] @ poses[:, :3, :3])[:, 0]
+        far = ~near & in_front(before)
+        about = _at_known_depth(sensor, before[far], measured[far], noise[far])
+        local[far], covariances[far] = about
+        kept = near | far
+        poses, turned = poses[kept], poses[kept, :3, :3]
+        points = (turned @ local[kept, :, None])[:, :, 0] + poses[:, :3, 3]
+        across = turned @ covariances[kept] @ np.swapaxes(turned, 1, 2)
+        return SeenAgain(known.variables[kept], points, across, near[kept])
+
+    def returned(self, known: Landmarks, wTf: FloatArray, drift: FloatArray) -> BoolArray:
+        """(k,) which are surely the same, at a place that has drifted.
+
+        Args:
+            known: the landmarks as they left.
+            wTf: (4, 4) frame in which the drift is a motion.
+            drift: (6, 6) its covariance.
+        """
+        here = transform_to_camera(wTf, known.points)
+        off = _Off(
+            wTf[:3, :3] @ -point_pose_jacobian(here),
+            self.points - known.points,
+            self.covariances + inverse_spd3(known.information),
+        )
+        alone = off.fit_beside(np.zeros(len(self), np.bool_), drift)
+        surely = alone & off.outweigh(drift)
+        together = off.agreeing(alone, drift)
+        return np.asarray(surely | together)
+
+
+def _at_known_depth(
+    sensor: CameraRig, before: FloatArray, measured: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Points (k, 3) of measurements, and covariances, to first order about the depths of others.
+
+    A far point itself is not normally distributed; what it is measured by is.
+    """
+    expected = measured.copy()
+    expected[:, 2] = project(sensor, before)[:, 2]
+    points = triangulate(sensor, expected)
+    jacobian = projection_jacobian(sensor, points)
+    step = np.linalg.solve(jacobian, (measured - expected)[:, :, None])[:, :, 0]
+    return points + step, triangulation_covariance(sensor, expected, noise)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Off(Rows):
+    """How far landmarks (k,) are off (k, 3): by a motion (k, 3, 6), and noise (k, 3, 3)."""
+
+    by_motion: FloatArray
+    off: FloatArray
+    noise: FloatArray
+
+    def outweigh(self, drift: FloatArray) -> BoolArray:
+        """(k,) which the drift moves by no more than a deviation of their own noise."""
+        moved = np.linalg.solve(self.noise, self._spread(drift))
+        return np.asarray(np.trace(moved, axis1=1, axis2=2) <= 1.0)
+
+    def agreeing(self, alone: BoolArray, drift: FloatArray) -> BoolArray:
+        """(k,) those that agree on one motion; none where they are fewer than LEAST.
+
+        As many as fit beside one of them that fits ``alone``, then those that fit beside all.
+        """
+        none = best = np.zeros(len(self), np.bool_)
+        for row in np.flatnonzero(alone).tolist():
+            of_one = np.arange(len(self)) == row
+            found = self.fit_beside(of_one, drift) | of_one
+            best = found if found.sum() > best.sum() else best
+        for _ in range(_ROUNDS):
+            if best.sum() < LEAST:
+                return none
+            best = self.fit_beside(best, drift)
+        return best if best.sum() >= LEAST else none
+
+    def fit_beside(self, chosen: BoolArray, drift: FloatArray) -> BoolArray:
+        """(k,) which fit the motion as the chosen ones measure it (a Kalman update)."""
+        k = int(chosen.sum())
+        by = self.by_motion[chosen].reshape(3 * k, 6)
+        innovation = by @ drift @ by.T
+        innovation.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] += self.noise[chosen]
+        gain = np.linalg.solve(innovation, by @ drift).T
+        off = self.off - self.by_motion @ (gain @ self.off[chosen].ravel())
+        covariance = self._spread(drift - gain @ by @ drift) + self.noise
+        solved = np.linalg.solve(covariance, off[:, :, None])[:, :, 0]
+        return np.asarray(np.einsum("ki,ki->k", off, solved) <= _FITS)
+
+    def _spread(self, drift: FloatArray) -> FloatArray:
+        return np.asarray(self.by_motion @ drift @ np.swapaxes(self.by_motion, 1, 2))
+
+
+# ------------------------------------------------------------------------------------------
+# What has left a window of poses and landmarks, as a quadratic over what is still in it
+
+_UNCOUPLED = 1e-9  # of a landmark's own information: a coupling that changes it by less is none
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowPrior:
+    """Half of ``z H z`` plus ``g z``, z the change since the point where it was linearised.
+
+    z is in this order: r hidden numbers, the tangents of the window's poses (6n), and landmarks.
+
+    Attributes:
+        corner: (r + 6n, r + 6n) H of hidden numbers and poses.
+        corner_gradient: (r + 6n,) g of the same.
+        variables: (p,) landmark variables that it speaks of, ascending.
+        own: (p, 3, 3) H of each landmark.
+        gradient: (p, 3) g of the same.
+        coupling: (p, 3, r) H between landmarks and hidden numbers.
+        points: (p, 3) where the landmarks were linearised.
+        kept: so many of the hidden numbers, the first, stay what they are.
+    """
+
+    corner: FloatArray
+    corner_gradient: FloatArray
+    variables: IntArray
+    own: FloatArray
+    gradient: FloatArray
+    coupling: FloatArray
+    points: FloatArray
+    kept: int = 0
+
+    @staticmethod
+    def none(poses: int = 0) -> WindowPrior:
+        """Says nothing about a window of some poses."""
+        size = 6 * poses
+        return WindowPrior(
+            np.zeros((size, size)),
+            np.zeros(size),
+            np.empty(0, np.int64),
+            np.empty((0, 3, 3)),
+            np.empty((0, 3)),
+            np.empty((0, 3, 0)),
+            np.empty((0, 3)),
+        )
+
+    @property
+    def hidden(self) -> int:
+        """How many hidden numbers there are."""
+        return int(self.coupling.shape[2])
+
+    def with_pose(self) -> WindowPrior:
+        """The same with one pose more in the window, of which it says nothing."""
+        return self._with_corner(
+            np.pad(self.corner, (0, 6)), np.pad(self.corner_gradient, (0, 6)), self.coupling
+        )
+
+    def with_leaving(self, poses: int, corner: FloatArray, gradient: FloatArray) -> WindowPrior:
+        """The first poses hidden, and this added to the corner and its gradient."""
+        coupling = np.pad(self.coupling, ((0, 0), (0, 0), (0, 6 * poses)))
+        return self._with_corner(self.corner + corner, self.corner_gradient + gradient, coupling)
+
+    def with_place(self) -> WindowPrior:
+        """With six hidden numbers more that stay what they are, behind the others that do."""
+        at = [self.kept] * 6
+        corner = np.insert(np.insert(self.corner, at, 0.0, axis=0), at, 0.0, axis=1)
+        coupling = np.insert(self.coupling, at, 0.0, axis=2)
+        new = self._with_corner(corner, np.insert(self.corner_gradient, at, 0.0), coupling)
+        return dataclasses.replace(new, kept=self.kept + 6)
+
+    def with_known(
+        self, landmark: IntArray, information: FloatArray, place: int, by_place: FloatArray
+    ) -> WindowPrior:
+        """With what is known of landmarks that lie where they were linearised, but for a place.
+
+        Args:
+            landmark: (k,) their rows.
+            information: (k, 3, 3) of each, given the place.
+            place: first of its hidden numbers.
+            by_place: (k, 3, 6) how they move along with it.
+        """
+        moving, at = information @ by_place, slice(place, place + 6)
+        corner, coupling = self.corner.copy(), self.coupling.copy()
+        corner[at, at] += (np.swapaxes(by_place, 1, 2) @ moving).sum(axis=0)
+        coupling[landmark, :, at] -= moving
+        own = self.own + summed(landmark, information, len(self.variables))
+        found = self._with_corner(corner, self.corner_gradient, coupling)
+        return dataclasses.replace(found, own=own)
+
+    def with_tie(
+        self, columns: IntArray, information: FloatArray, gradient: FloatArray
+    ) -> WindowPrior:
+        """With a quadratic (k, k) and (k,) more over some of the corner."""
+        corner, whole = self.corner.copy(), self.corner_gradient.copy()
+        corner[np.ix_(columns, columns)] += information
+        whole[columns] += gradient
+        return self._with_corner(corner, whole, self.coupling)
+
+    def without_place(self, place: int) -> WindowPrior:
+        """A place's six hidden numbers are like any others."""
+        order = np.arange(len(self.corner))
+        order[place : self.kept] = np.roll(order[place : self.kept], -6)
+        found = self._with_corner(
+            self.corner[np.ix_(order, order)],
+            self.corner_gradient[order],
+            self.coupling[:, :, order[: self.hidden]],
+        )
+        return dataclasses.replace(found, kept=self.kept - 6)
+
+    def with_rows(self, landmark: IntArray, columns: IntArray, rows: LinearRows) -> WindowPrior:
+        """With what observations (k,) said of landmarks, by row, and of hidden poses.
+
+        Args:
+            landmark: (k,) rows of the landmarks.
+            columns: (k,) first hidden number of the pose that saw it.
+            rows: linearised and weighed; what they say of poses alone is not added.
+        """
+        turned = np.swapaxes(rows.by_point, 1, 2)
+        p, coupling = len(self.variables), self.coupling.copy()
+        at = columns[:, None] + np.arange(6)
+        coupling[landmark[:, None], :, at] += np.swapaxes(turned @ rows.by_pose, 1, 2)
+        return dataclasses.replace(
+            self,
+            own=self.own + summed(landmark, turned @ rows.by_point, p),
+            gradient=self.gradient + summed(landmark, products(turned, rows.residual), p),
+            coupling=coupling,
+        )
+
+    def with_landmarks(self, variables: IntArray, points: FloatArray) -> WindowPrior:
+        """Room for landmarks (k,) at points (k, 3), of which it says nothing yet."""
+        every = np.concatenate([self.variables, variables])
+        order = np.argsort(every, kind="stable")
+        more = len(variables)
+        own = np.concatenate([self.own, np.zeros((more, 3, 3))])[order]
+        gradient = np.concatenate([self.gradient, np.zeros((more, 3))])[order]
+        coupling = np.concatenate([self.coupling, np.zeros((more, 3, self.hidden))])[order]
+        at = np.concatenate([self.points, points])[order]
+        return dataclasses.replace(
+            self,
+            variables=every[order],
+            own=own,
+            gradient=gradient,
+            coupling=coupling,
+            points=at,
+        )
+
+    def without(self, gone: BoolArray) -> WindowPrior:
+        """Landmarks eliminated, by a mask (p,): what they say about the rest stays."""
+        own, coupling, gradient = self.own[gone], self.coupling[gone], self.gradient[gone]
+        gain = inverse_spd3(own) @ coupling
+        r = self.hidden
+        corner, corner_gradient = self.corner.copy(), self.corner_gradient.copy()
+        rows = 3 * len(own)
+        less = coupling.reshape(rows, r).T @ gain.reshape(rows, r)
+        corner[:r, :r] -= 0.5 * (less + less.T)
+        corner_gradient[:r] -= gain.reshape(rows, r).T @ gradient.ravel()
+        left = ~gone
+        return dataclasses.replace(
+            self._with_corner(corner, corner_gradient, self.coupling[left]),
+            variables=self.variables[left],
+            own=self.own[left],
+            gradient=self.gradient[left],
+            points=self.points[left],
+        )
+
+    def compressed(self) -> WindowPrior:
+        """The same with no more hidden numbers than the landmarks depend on.
+
+        Hidden numbers are turned so that each has unit information and a coupling of its own
+        strength, the singular values of the whitened coupling; those without one are eliminated.
+        """
+        q, r = self.kept, self.hidden
+        if r == q:
+            return self
+        rest = np.r_[:q, r : len(self.corner)]
+        factor, size = scaled_cholesky(self.corner[q:r, q:r])
+        factor = size[:, None] * np.tril(factor)
+        by_landmark = self._whitened(factor)
+        strength, turn = np.linalg.eigh(by_landmark.T @ by_landmark)
+        right = np.column_stack([self.corner[q:r, rest], self.corner_gradient[q:r]])
+        turned = turn.T @ solve_triangular(factor, right, lower=True, check_finite=False)
+        stays = strength > _UNCOUPLED
+        gone, own = turned[~stays], turned[stays]
+        corner = self.corner[np.ix_(rest, rest)] - gone[:, :-1].T @ gone[:, :-1]
+        gradient = self.corner_gradient[rest] - gone[:, :-1].T @ gone[:, -1]
+        back = solve_triangular(factor, turn[:, stays], trans="T", lower=True, check_finite=False)
+        coupling = np.concatenate([self.coupling[:, :, :q], self.coupling[:, :, q:] @ back], axis=2)
+        order = np.r_[len(own) : len(own) + q, : len(own), len(own) + q : len(own) + len(rest)]
+        whole = np.block([[np.eye(len(own)), own[:, :-1]], [own[:, :-1].T, corner]])
+        return self._with_corner(
+            whole[np.ix_(order, order)],
+            np.concatenate([own[:, -1], gradient])[order],
+            coupling,
+        )
+
+    def _whitened(self, factor: FloatArray) -> FloatArray:
+        """(3p, r) coupling of landmarks and hidden numbers, both of unit information."""
+        root = np.linalg.cholesky(self.own)
+        half = np.linalg.solve(root, self.coupling[:, :, self.kept :])
+        half = half.reshape(3 * len(root), self.hidden - self.kept)
+        whitened = solve_triangular(factor, half.T, lower=True, check_finite=False)
+        return np.asarray(whitened.T)
+
+    def _with_corner(
+        self, corner: FloatArray, gradient: FloatArray, coupling: FloatArray
+    ) -> WindowPrior:
+        return dataclasses.replace(self, corner=corner, corner_gradient=gradient, coupling=coupling)
+
 
 _SHORT = 0.01
 """Radians and metres of a pose, iSAM2's threshold of linearising anew: covariances are those of

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
-from fgslam.core.features import Words
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
+from fgslam.core.types import Words
 from fgslam.frontend.features.settings import AppearanceSettings
 
 # ------------------------------------------------------------------------------------------

@@ -23,9 +23,9 @@ from fgslam.cameras.omni import (
     unwrap_maps,
 )
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray, Rows
+from fgslam.core.bearings import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.core.errors import FrameError
-from fgslam.core.homing import ColumnSegments, OmniFeatures, UprightFeatures
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features.settings import OmniFeatureSettings, UprightSiftSettings
 
 # ------------------------------------------------------------------------------------------

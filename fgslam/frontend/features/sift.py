@@ -16,7 +16,7 @@ from scipy.linalg import hadamard
 
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
-from fgslam.core.features import Features
+from fgslam.core.types import Features
 from fgslam.frontend.features.settings import Appearance, SiftSettings
 
 # ------------------------------------------------------------------------------------------

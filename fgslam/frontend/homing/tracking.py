@@ -17,10 +17,10 @@ from scipy.fft import next_fast_len
 
 from fgslam.cameras.omni import Equirectangular, Float32, OmniCamera, require_own_image, unwrap_maps
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
+from fgslam.core.bearings import BearingMatches, FeatureKind, OmniFeatures, TrackedBearings
 from fgslam.core.checks import later_time
 from fgslam.core.errors import EstimatorError, FrameError
-from fgslam.core.homing import BearingMatches, FeatureKind, OmniFeatures, TrackedBearings
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.core.store import Kept
 from fgslam.frontend.features.omni import pixels_a_radian, wrapping_period
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor

@@ -31,9 +31,7 @@ import numpy.typing as npt
 
 from fgslam.cameras.omni import OmniCamera, measure, unit_rays
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
-from fgslam.core.gauss_newton import GaussNewton, Linearised
-from fgslam.core.geometry import skew
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
@@ -42,7 +40,8 @@ from fgslam.core.homing import (
     TwoViewVector,
     UprightFeatures,
 )
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import skew, wrap
+from fgslam.core.least_squares import GaussNewton, Linearised
 from fgslam.frontend.features.omni import up_in_image, whitened
 from fgslam.frontend.features.settings import OmniMatchingSettings
 

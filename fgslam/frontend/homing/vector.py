@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from scipy.stats import chi2
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     OmniFeatures,
     Refusal,
@@ -23,7 +23,7 @@ from fgslam.core.homing import (
     TwoViewVector,
     UprightFeatures,
 )
-from fgslam.core.planar import circular_median, unit, wrap
+from fgslam.core.geometry import circular_median, unit, wrap
 from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import (

@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
-from fgslam.core.floor import Floor
-from fgslam.core.geometry import project, transform_to_camera
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import project, transform_to_camera, wrap
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Floor, LandmarkAppearances, LandmarkMap, StereoFeatures
 from fgslam.frontend.features.matching import AppearanceIndex, Neighbours
 
 _NEAREST_M = 0.3

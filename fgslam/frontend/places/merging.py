@@ -13,8 +13,6 @@ from scipy.spatial import cKDTree
 
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import MapError
-from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import LandmarkAppearances, LandmarkPatches
 from fgslam.core.geometry import (
     congruence,
     inverse_spd3,
@@ -24,6 +22,7 @@ from fgslam.core.geometry import (
     transform_to_world,
 )
 from fgslam.core.saved_map import SavedMap
+from fgslam.core.types import LandmarkAppearances, LandmarkMap, LandmarkPatches, Trajectory
 from fgslam.frontend.features.matching import AppearanceIndex
 from fgslam.frontend.tracking.ego_motion import align_in_space
 

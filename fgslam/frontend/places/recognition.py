@@ -17,11 +17,18 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
-from fgslam.core.estimates import EgoMotion, LandmarkMap, Prediction, Relocalisation, UpdateStats
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import adjoint, congruence, inverse, se3_log
-from fgslam.core.measurements import Increment, LoopClosure, Observations
+from fgslam.core.sensors import Increment, LoopClosure, Observations
 from fgslam.core.store import Kept
+from fgslam.core.types import (
+    EgoMotion,
+    LandmarkAppearances,
+    LandmarkMap,
+    Prediction,
+    Relocalisation,
+    StereoFeatures,
+    UpdateStats,
+)
 from fgslam.frontend.features.matching import choose
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem, Resection

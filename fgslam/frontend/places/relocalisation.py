@@ -7,9 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.estimates import LandmarkMap, Relocalisation, RelocalisationStatus
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
-from fgslam.core.floor import Floor
 from fgslam.core.geometry import (
     inverse_spd3,
     point_pose_jacobian,
@@ -18,6 +15,14 @@ from fgslam.core.geometry import (
     so3_exp,
 )
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import (
+    Floor,
+    LandmarkAppearances,
+    LandmarkMap,
+    Relocalisation,
+    RelocalisationStatus,
+    StereoFeatures,
+)
 from fgslam.frontend.places.known_map import MAX_DISTANCE, KnownMap, Tentative, gated, specific
 from fgslam.frontend.settings import RelocalisationSettings
 from fgslam.frontend.tracking.ego_motion import align, rigid, rounded, sample_size

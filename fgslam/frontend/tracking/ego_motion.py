@@ -14,9 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
-from fgslam.core.floor import Floor
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
 from fgslam.core.geometry import (
     congruence,
     in_front,
@@ -34,10 +32,9 @@ from fgslam.core.geometry import (
     triangulate,
     triangulation_covariance,
 )
-from fgslam.core.measurements import Observations
-from fgslam.core.quantiles import chi_square_quantile
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations
 from fgslam.core.store import Kept
+from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
 
 # ------------------------------------------------------------------------------------------

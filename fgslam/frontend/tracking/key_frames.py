@@ -16,18 +16,19 @@ import cv2
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray, Rows
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.features import (
+from fgslam.core.correction import RigCorrection
+from fgslam.core.sensors import CameraRig
+from fgslam.core.store import Kept
+from fgslam.core.types import (
     CUT_PIXELS,
     PATCH_PX,
     WHOLE_PX,
     Features,
+    LandmarkMap,
     LandmarkPatches,
+    Prediction,
     StereoFeatures,
 )
-from fgslam.core.rig_correction import RigCorrection
-from fgslam.core.sensors import CameraRig
-from fgslam.core.store import Kept
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor_at, crowding, cut_out
 from fgslam.frontend.features.sift import FineImage, Float32
 from fgslam.frontend.stereo import DEFORMATION, GREY_NOISE, StereoMatcher, across

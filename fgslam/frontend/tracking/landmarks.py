@@ -24,12 +24,16 @@ from fgslam.core.arrays import (
     StateArrays,
 )
 from fgslam.core.errors import MapError
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances, LandmarkPatches, StereoFeatures, Words
-from fgslam.core.measurements import Increment
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment
 from fgslam.core.store import Kept
+from fgslam.core.types import (
+    LandmarkAppearances,
+    LandmarkMap,
+    LandmarkPatches,
+    StereoFeatures,
+    Words,
+)
 from fgslam.frontend.features.matching import pairs_within, words_of
 from fgslam.frontend.settings import DatabaseSettings, PermanenceSettings
 from fgslam.frontend.tracking.map_matching import (

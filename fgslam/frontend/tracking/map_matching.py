@@ -9,8 +9,6 @@ from typing import TypeAlias
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
-from fgslam.core.estimates import Prediction
-from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import (
     congruence,
     point_pose_jacobian,
@@ -20,6 +18,7 @@ from fgslam.core.geometry import (
     transform_to_camera,
 )
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Prediction, StereoFeatures
 from fgslam.frontend.features.matching import alike, pairs_within, pick, resembling
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import DatabaseSettings, MapMatchingSettings

@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray, Rows
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
 from fgslam.core.geometry import (
     in_front,
     project,
@@ -18,9 +16,16 @@ from fgslam.core.geometry import (
     transform_to_camera,
     transform_to_world,
 )
-from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations
 from fgslam.core.store import Kept
+from fgslam.core.types import (
+    EgoMotion,
+    EgoMotionStatus,
+    LandmarkAppearances,
+    LandmarkMap,
+    Prediction,
+    StereoFeatures,
+)
 from fgslam.frontend.features.matching import mutual_nearest
 from fgslam.frontend.tracking.ego_motion import (
     EgoMotionSolver,

@@ -15,8 +15,7 @@ from fgslam.core.errors import ConfigError, FgslamError
 from fgslam.evaluation.statistics import JsonValue, value_at
 from fgslam.report.content import plain, read_metrics
 from fgslam.runs.compare import Choice, choose
-from fgslam.runs.config import make_experiment
-from fgslam.runs.config_models import Experiment, ExperimentConfig
+from fgslam.runs.config import Experiment, ExperimentConfig, make_experiment
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import METRICS_FILE, versions
 from fgslam.runs.run import opener_of

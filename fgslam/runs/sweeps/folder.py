@@ -11,8 +11,7 @@ import yaml
 
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, require_writable, write_text
-from fgslam.runs.folder import REPORT_FILE, ExistingFolder, versions
-from fgslam.runs.owner import OWNER_NAME, Owner
+from fgslam.runs.folder import OWNER_NAME, REPORT_FILE, ExistingFolder, Owner, versions
 from fgslam.runs.sweeps.grid import Grid
 from fgslam.runs.sweeps.table import TABLE_FILE, TIMES_FILE
 

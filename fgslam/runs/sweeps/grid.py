@@ -14,11 +14,10 @@ import yaml
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.yaml_text import plain_values
-from fgslam.runs.bare_recording import bare_experiment
-from fgslam.runs.config import make_experiment
-from fgslam.runs.config_reading import read_mapping
-from fgslam.runs.live import override_texts
+from fgslam.runs.bare import bare_experiment
+from fgslam.runs.config import make_experiment, read_mapping
 from fgslam.runs.named_experiments import find_experiment, suggestion
+from fgslam.runs.session import override_texts
 
 Setting: TypeAlias = int | float | bool | str
 """A value of an axis as the table has it."""

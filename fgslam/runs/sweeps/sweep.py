@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias, overload
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import SimulatedMeasurementsSettings
 from fgslam.report.content import TextTable
-from fgslam.runs.config_models import Experiment
+from fgslam.runs.config import Experiment
 from fgslam.runs.engine import Opening, RunResult, Status
-from fgslam.runs.folder import REPORT_FILE, ExistingFolder, digest_of, versions
-from fgslam.runs.owner import Owner
+from fgslam.runs.folder import REPORT_FILE, ExistingFolder, Owner, digest_of, versions
 from fgslam.runs.run import opener_of
 from fgslam.runs.sweeps.case import CaseResult, CaseTask, perform_case
 from fgslam.runs.sweeps.findings import Findings, find

@@ -18,7 +18,7 @@ from fgslam.evaluation.statistics import JsonValue, UpdateTime
 from fgslam.frontend.homing.tracking import ReplenishedTracker, TrackedImage
 from fgslam.report.content import Column, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure
-from fgslam.runs.config_models import OmniVideoConfig
+from fgslam.runs.config import OmniVideoConfig
 from fgslam.runs.engine import (
     Context,
     Opening,

@@ -18,10 +18,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from fgslam.cameras.omni import OmniCamera
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
-from fgslam.core.errors import ConfigError, OutputError, StoredMapError
-from fgslam.core.files import make_subfolder
-from fgslam.core.homing import (
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
+from fgslam.core.bearings import (
     BearingMatches,
     FeatureKind,
     OmniFeatures,
@@ -29,8 +27,9 @@ from fgslam.core.homing import (
     RefusalReason,
     TwoViewVector,
 )
-from fgslam.core.planar import wrap
-from fgslam.core.quantiles import chi_square_quantile
+from fgslam.core.errors import ConfigError, OutputError, StoredMapError
+from fgslam.core.files import make_subfolder
+from fgslam.core.geometry import wrap
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
 from fgslam.datasets.opening import open_omni
@@ -52,7 +51,7 @@ from fgslam.report.homing_figures import (
     sorted_errors,
     unfolded,
 )
-from fgslam.runs.config_models import HomingPairsConfig, TopologicalMapConfig
+from fgslam.runs.config import HomingPairsConfig, TopologicalMapConfig
 from fgslam.runs.engine import (
     Context,
     Opening,

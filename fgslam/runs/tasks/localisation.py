@@ -7,46 +7,756 @@ a picture, the page. Numbers: queries answered, right, inexact and false ones, e
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Iterator, Mapping
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fgslam.core.errors import ConfigError, FgslamError, OutputError
-from fgslam.core.geometry import yaw_pitch_roll
-from fgslam.core.recordings import Sequence
+from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import ConfigError, FgslamError, MapError, OutputError
+from fgslam.core.files import make_subfolder
+from fgslam.core.geometry import (
+    congruence,
+    project,
+    projection_jacobian,
+    rotate_covariances,
+    transform_to_camera,
+    yaw_pitch_roll,
+)
+from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
+from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.localisation import localisation_errors
-from fgslam.runs.bare_recording import dataset_of, require_no_camera
+from fgslam.core.types import (
+    Floor,
+    LandmarkAppearances,
+    LandmarkMap,
+    Relocalisation,
+    StereoFeatures,
+)
+from fgslam.datasets.settings import OdometrySettings
+from fgslam.evaluation.localisation import (
+    Answers,
+    Bounds,
+    LocalisationErrors,
+    LocalisationScore,
+    Spread,
+    enough,
+    localisation_errors,
+    score,
+)
+from fgslam.evaluation.statistics import JsonValue
+from fgslam.frontend.places.relocalisation import Relocaliser
+from fgslam.frontend.settings import FrontendSettings
+from fgslam.frontend.stereo import RigStereo
+from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv, write_json
+from fgslam.report.homing_figures import Located, located_figure
+from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import (
     ExperimentConfig,
+    LocalisationConfig,
     as_task,
     load_config,
     load_experiment,
     make_experiment,
 )
-from fgslam.runs.config_models import LocalisationConfig
-from fgslam.runs.engine import Context, LocatedShare, Opening, Task, provenance_of
-from fgslam.runs.folder import ExistingFolder, begin_run_folder, is_run_folder, write_config
-from fgslam.runs.opening import open_sequence
-from fgslam.runs.owner import Owner
-from fgslam.runs.tasks.localisation_queries import Attempt, ask_all, nothing_asked
-from fgslam.runs.tasks.localisation_results import (
-    LocalisationResult,
-    answers_of,
-    in_frames,
-    result_of,
-    sigmas_of,
-    status_of,
-    write_results,
+from fgslam.runs.engine import (
+    Context,
+    LocatedShare,
+    Opening,
+    RunResult,
+    Task,
+    provenance_of,
+    write_page,
 )
+from fgslam.runs.folder import (
+    METRICS_FILE,
+    ExistingFolder,
+    Owner,
+    begin_run_folder,
+    is_run_folder,
+    write_config,
+)
+from fgslam.runs.opening import open_sequence
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
+from fgslam.runs.tasks.slam_results import Sighted, TrueSights, TruthInMap, truth_in_map
 from fgslam.runs.units import Progress, UnitStore
 from fgslam.runs.workers import InProcess
+from fgslam.slam.build import make_pipeline, make_relocaliser, make_stereo, make_stream, trusted
+from fgslam.slam.feature_stream import FeatureFrame
+from fgslam.slam.motion import body_motion
+from fgslam.slam.pipeline import SlamPipeline
+
+# ------------------------------------------------------------------------------------------
+# Asks a map where the frames of a recording were taken: one by one, or in short submaps
+
+_STREAM = 13  # of random numbers, beside those of the recording
+_STAGE = "queries"
+SAVE_EVERY_S = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One query and its answer.
+
+    Attributes:
+        i: place of the query's last frame among the selected ones.
+        frame: its number in the recording.
+        frames: how many frames it had.
+        features: that were looked up.
+        found: the answer; of a frame that could not be read None.
+        problem: why it could not; empty where it could.
+        truth: (4, 4) true pose in the map's world; NaN where unknown.
+        sighted: landmarks truly in view of it.
+        milliseconds: for the answer, without features.
+        frontend_ms: for the frame's features in all images, and for matching them.
+    """
+
+    i: int
+    frame: int
+    frames: int
+    features: int
+    found: Relocalisation | None
+    problem: str
+    truth: FloatArray
+    sighted: Sighted
+    milliseconds: float
+    frontend_ms: float
+
+    @property
+    def accepted(self) -> bool:
+        """Whether there is a pose to be believed."""
+        return self.found is not None and self.found.found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """All queries of a run.
+
+    Attributes:
+        attempts: by frames of a query, then in order.
+        landmarks: that could be recognised.
+        alignment: how truth and map were brought together, in words.
+        whole: whether all that was wanted has been done.
+    """
+
+    attempts: tuple[Attempt, ...]
+    landmarks: LandmarkMap
+    alignment: str
+    whole: bool
+
+    def of(self, frames: int) -> tuple[Attempt, ...]:
+        """The queries of so many frames."""
+        return tuple(one for one in self.attempts if one.frames == frames)
+
+
+def nothing_asked(why: str) -> Asked:
+    """No query at all, and why."""
+    none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    return Asked((), none, why, whole=False)
+
+
+_ANSWERS = tuple[Attempt, ...]
+
+
+class Asker:
+    """A map that has been learnt, and what it takes to ask it."""
+
+    def __init__(
+        self, config: LocalisationConfig, given: GivenMap, sequence: ImageSequence
+    ) -> None:
+        """Learns the map.
+
+        Raises:
+            MapError: other cameras made it, or it holds no landmark.
+        """
+        require_rig(given.saved, sequence.rig, str(given.path))
+        frontend = config.frontend
+        self.landmarks, looks = trusted(given.saved, frontend.database.valid_hits)
+        if not len(self.landmarks):
+            raise MapError(f"{given.path}: holds no trusted landmark; make the map again")
+        self._config, self._sequence = config, sequence
+        self._stereo: RigStereo = make_stereo(sequence.rig, frontend)
+        self._relocaliser: Relocaliser = make_relocaliser(sequence.rig, frontend)
+        self._relocaliser.learn(self.landmarks, looks)
+        self._floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
+        self.truth: TruthInMap = truth_in_map(given.saved, sequence, config.as_experiment())
+        self._sights = TrueSights(given.saved, self.landmarks, sequence, frontend)
+
+    def ask(self, found: list[FeatureFrame], sighted: Sighted) -> Attempt:
+        """One query: consecutive frames, the last of which is to be located.
+
+        Args:
+            found: the frames with their features.
+            sighted: landmarks truly in view of the last one.
+        """
+        last = found[-1]
+        frame = self._frame_number(last.i)
+        blank = Attempt(
+            i=last.i,
+            frame=frame,
+            frames=len(found),
+            features=0,
+            found=None,
+            problem=last.problem,
+            truth=self.truth.poses[last.i],
+            sighted=sighted,
+            milliseconds=float("nan"),
+            frontend_ms=last.sift_ms,
+        )
+        if last.frame is None:
+            return blank
+        rng = np.random.default_rng([self._config.seed, _STREAM, frame, len(found)])
+        start = time.perf_counter()
+        if len(found) == 1:
+            features, spread = self._stereo.match(last.frame, last.features).whole, None
+        else:
+            features, spread = submap_features(
+                self._sequence, found, self._config.frontend, self._config.odometry
+            )
+        matched = time.perf_counter()
+        answer = self._relocaliser.locate(features, rng)
+        done = time.perf_counter()
+        if spread is not None and np.isfinite(answer.covariance).all():
+            own = self._floor.allowed_part(answer.wTc, spread)
+            answer = dataclasses.replace(answer, covariance=answer.covariance + own)
+        return dataclasses.replace(
+            blank,
+            features=len(features),
+            found=answer,
+            milliseconds=1e3 * (done - matched),
+            frontend_ms=last.sift_ms + 1e3 * (matched - start),
+        )
+
+    def sighted(self, i: int) -> Sighted:
+        """Landmarks truly in view of the selected frame ``i``."""
+        return self._sights.of(i, self.truth.poses[i])
+
+    def _frame_number(self, i: int) -> int:
+        dataset = self._config.dataset
+        return dataset.start + i * dataset.stride
+
+
+def ask_all(
+    config: LocalisationConfig, given: GivenMap, sequence: ImageSequence, context: Context
+) -> Asked:
+    """All queries of a configuration; those of an earlier session are not asked again.
+
+    Raises:
+        MapError: the map cannot be used with these cameras, or is empty.
+        ConfigError: the recording is shorter than a query.
+    """
+    wanted = config.localisation
+    if len(sequence) < max(wanted.frames):
+        raise ConfigError(
+            f"{sequence.name}: {len(sequence)} frames are selected, and a query takes "
+            f"{max(wanted.frames)}; lower the frames of a query, or select more"
+        )
+    asker = Asker(config, given, sequence)
+    queries = len(range(max(wanted.frames) - 1, len(sequence), wanted.every))
+    answered = _answered(asker, config, sequence, queries, context)
+    attempts = [attempt for answers in answered.values() for attempt in answers]
+    attempts.sort(key=lambda one: (wanted.frames.index(one.frames), one.i))
+    whole = len(answered) == queries
+    return Asked(tuple(attempts), asker.landmarks, asker.truth.alignment, whole)
+
+
+def _answered(
+    asker: Asker,
+    config: LocalisationConfig,
+    sequence: ImageSequence,
+    queries: int,
+    context: Context,
+) -> dict[int, tuple[Attempt, ...]]:
+    """Answers by number of the query, in the order asked; kept in the run folder now and then."""
+    kept: dict[int, tuple[Attempt, ...]] = context.store.load(_STAGE, _ANSWERS)
+    # Killed while it tidied up, a run has lost the first answers, but not the last ones.
+    first = next(k for k in range(queries + 1) if k not in kept)
+    done, fresh = {k: kept[k] for k in range(first)}, dict[int, tuple[Attempt, ...]]()
+    context.progress("localising", len(done), queries)
+    saved = time.perf_counter()
+    for k, found in _queries(config, sequence, first):
+        sighted = asker.sighted(found[-1].i)
+        frames = config.localisation.frames
+        fresh[k] = tuple(asker.ask(found[len(found) - n :], sighted) for n in frames)
+        context.progress("localising", len(done) + len(fresh), queries)
+        stopped = context.stopped()
+        if stopped or k == queries - 1 or time.perf_counter() - saved >= SAVE_EVERY_S:
+            done |= context.store.add(_STAGE, fresh, _ANSWERS)
+            fresh, saved = {}, time.perf_counter()
+        if stopped:
+            break
+    return done
+
+
+def _queries(
+    config: LocalisationConfig, sequence: ImageSequence, first: int
+) -> Iterator[tuple[int, list[FeatureFrame]]]:
+    """Number and frames of each query from the ``first`` on, the longest submap's.
+
+    Each frame's features are found once.
+    """
+    longest, every = max(config.localisation.frames), config.localisation.every
+    held: deque[FeatureFrame] = deque(maxlen=longest)
+    start = first * every
+    if start + longest > len(sequence):
+        return
+    stream = make_stream(sequence, config.frontend)(start=start)
+    try:
+        for found in stream:
+            held.append(found)
+            k, rest = divmod(found.i - longest + 1, every)
+            if found.i >= start + longest - 1 and not rest:
+                yield k, list(held)
+    finally:
+        stream.close()
+
+
+_NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
+
+
+def submap_features(
+    sequence: ImageSequence,
+    found: Sequence[FeatureFrame],
+    frontend: FrontendSettings,
+    odometry: OdometrySettings,
+) -> tuple[StereoFeatures, FloatArray]:
+    """Landmarks of a few consecutive frames that the ordinary loop has tracked.
+
+    Args:
+        sequence: the recording.
+        found: the frames' features, in order, at least one.
+        frontend: the configuration's; neither loops are closed nor lost cameras found, and every
+            frame's features are used: a sub-map is to show as much as it can.
+        odometry: the configuration's; what was before the first of the frames is not used.
+
+    Returns:
+        The submap's landmarks in the last camera's frame, with fused covariances and their last
+        looks; those outside its image, too. And the covariance (6, 6) of that camera in the
+        submap, which whoever is located by the submap has beside the map's.
+    """
+    plain = dataclasses.replace(frontend, tracking="sift", loops=False, lost=False)
+    pipeline = make_pipeline(sequence.rig, plain, odometry, LandmarkKalmanSettings())
+    for k, one in enumerate(found):
+        timestamp = float(sequence.timestamps[one.i])
+        body = body_motion(sequence, one.i, pipeline.motion) if k else None
+        stats = pipeline.process(dataclasses.replace(one, i=k), k, timestamp, body).stats
+    return _as_features(pipeline, sequence.rig, stats.wTc), stats.covariance
+
+
+def _as_features(pipeline: SlamPipeline, rig: CameraRig, wTc: FloatArray) -> StereoFeatures:
+    """The landmarks as the camera at ``wTc`` would measure them, were its image large enough."""
+    landmarks = pipeline.estimator.landmarks()
+    looks = _last_looks(pipeline.tracker.database.appearances(landmarks.ids))
+    points = transform_to_camera(wTc, landmarks.positions)
+    covariances = rotate_covariances(wTc[:3, :3].T, landmarks.covariances)
+    keep = np.abs(points[:, 2]) > _NEAREST_M
+    points, covariances = points[keep], covariances[keep]
+    looks = looks.of(landmarks.ids[keep])
+    measurement, noise = _measured(rig, points, covariances)
+    pixels = np.full((len(points), 3, 2), np.nan)
+    pixels[:, 0] = measurement[:, :2]
+    return StereoFeatures(
+        measurement=measurement,
+        measurement_covariance=noise,
+        scale=looks.size / np.abs(points[:, 2]),
+        orientation=looks.orientation,
+        descriptors=looks.descriptors,
+        position=points,
+        position_covariance=covariances,
+        pixels=pixels,
+    )
+
+
+def _last_looks(appearances: LandmarkAppearances) -> LandmarkAppearances:
+    """The view of each landmark that was seen last."""
+    last = np.flatnonzero(np.diff(appearances.ids, append=-1))
+    return LandmarkAppearances(
+        appearances.ids[last],
+        appearances.descriptors[last],
+        appearances.size[last],
+        appearances.orientation[last],
+        appearances.direction[last],
+    )
+
+
+def _measured(
+    rig: CameraRig, points: FloatArray, covariances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Image measurements (n, 3) of points and their covariances; NaN of those behind the camera."""
+    before = points[:, 2] > 0.0
+    measurement = np.full((len(points), 3), np.nan)
+    noise = np.full((len(points), 3, 3), np.nan)
+    measurement[before] = project(rig, points[before])
+    noise[before] = congruence(projection_jacobian(rig, points[before]), covariances[before])
+    return measurement, noise
+
+
+# ------------------------------------------------------------------------------------------
+# The answers of a localisation run judged: sentences, tables, and the files of the run
+
+LOCALISATION_FILE = "localisation.csv"
+_UNKNOWN = "-"
+_WRONG_M, _WRONG_DEG = 0.30, 5.0  # an accepted pose farther off than this is false
+_LEAST_VISIBLE = 20
+"""A pose from which fewer of the map's landmarks are visible is counted apart; where depth is not
+known all count."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalisationResult(RunResult):
+    """How a localisation run ended; ``asked`` are all queries with their answers."""
+
+    config: LocalisationConfig
+    asked: Asked = field(kw_only=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """The queries of one length.
+
+    Attributes:
+        frames: of a query.
+        attempts: all of them.
+        answers: the same as arrays.
+        errors: of the accepted ones.
+        counts: of those from which enough landmarks are visible.
+        familiar: of those from which enough are visible from about where they were seen before.
+        apart: of those from which too few are visible.
+    """
+
+    frames: int
+    attempts: tuple[Attempt, ...]
+    answers: Answers
+    errors: LocalisationErrors
+    counts: LocalisationScore
+    familiar: LocalisationScore
+    apart: LocalisationScore
+
+
+def bounds_of(config: LocalisationConfig) -> Bounds:
+    """What the configuration calls right and false."""
+    wanted = config.localisation
+    within, wrong = np.deg2rad([wanted.within_deg, _WRONG_DEG]).tolist()
+    return Bounds(wanted.within_m, within, _WRONG_M, wrong, _LEAST_VISIBLE)
+
+
+def scored(config: LocalisationConfig, asked: Asked) -> tuple[Scored, ...]:
+    """The answers judged, by frames of a query."""
+    bounds = bounds_of(config)
+    out = []
+    for frames in config.localisation.frames:
+        attempts = asked.of(frames)
+        answers = answers_of(attempts)
+        visible, familiar = (enough(n, bounds) for n in (answers.visible, answers.familiar))
+        out.append(
+            Scored(
+                frames,
+                attempts,
+                answers,
+                localisation_errors(answers),
+                score(answers.select(visible), bounds),
+                score(answers.select(familiar), bounds),
+                score(answers.select(~visible), bounds),
+            )
+        )
+    return tuple(out)
+
+
+def answers_of(attempts: Sequence[Attempt]) -> Answers:
+    """The same as arrays; NaN where there is no covariance or no truth."""
+    found = [one.found for one in attempts]
+    nowhere = np.full((6, 6), np.nan)
+    return Answers(
+        accepted=np.array([one.accepted for one in attempts], np.bool_),
+        poses=_stacked([np.eye(4) if f is None else f.wTc for f in found], (4, 4)),
+        covariances=_stacked([nowhere if f is None else f.covariance for f in found], (6, 6)),
+        truth=_stacked([one.truth for one in attempts], (4, 4)),
+        visible=np.array([one.sighted.visible for one in attempts], np.int64),
+        familiar=np.array([one.sighted.familiar for one in attempts], np.int64),
+    )
+
+
+def _stacked(arrays: Sequence[FloatArray], shape: tuple[int, int]) -> FloatArray:
+    return np.array(arrays, np.float64).reshape(-1, *shape)
+
+
+# --------------------------------------------------------------------------------------------
+# Words
+
+
+def result_of(
+    config: LocalisationConfig, folder: Path | None, asked: Asked, notes: Sequence[str]
+) -> LocalisationResult:
+    """Sentences and tables of a run."""
+    judged = scored(config, asked)
+    tables = (_score_table(config, judged), _refusal_table(judged))
+    return LocalisationResult(
+        config=config,
+        folder=folder or Path(),
+        status="finished" if asked.whole else "interrupted",
+        lines=tuple(_sentence(config, one) for one in judged),
+        tables=tables,
+        notes=(*notes, asked.alignment),
+        particulars=() if folder is None else (("queries", str(folder / LOCALISATION_FILE)),),
+        written=folder is not None,
+        asked=asked,
+    )
+
+
+def in_frames(count: int) -> str:
+    """``1 frame``, ``3 frames``."""
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+def _sentence(config: LocalisationConfig, judged: Scored) -> str:
+    counts, wanted = judged.counts, config.localisation
+    start = f"from {in_frames(judged.frames)}: {counts.accepted} of {counts.queries} queries found"
+    if not counts.known:
+        return f"{start}; their errors are not known"
+    apart = ""
+    if judged.apart.queries:
+        apart = (
+            f"; counted apart: {judged.apart.queries} poses from which fewer than "
+            f"{_LEAST_VISIBLE} landmarks are visible, {judged.apart.accepted} of them found, "
+            f"{judged.apart.false} false"
+        )
+    return (
+        f"{start}, {counts.right} ({_percent(counts.share_right)}) within "
+        f"{100 * wanted.within_m:g} cm and {wanted.within_deg:g} degrees, {counts.inexact} less "
+        f"exact, {counts.false} false{apart}"
+    )
+
+
+def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTable:
+    wanted = config.localisation
+    right = f"accepted, within {100 * wanted.within_m:g} cm and {wanted.within_deg:g} degrees"
+    columns = (
+        Column("queries", "asked; those with too few landmarks in view are counted apart"),
+        Column("right", right),
+        Column("less exact", "accepted, neither right nor false"),
+        Column("false", f"accepted, off by more than {_WRONG_M:g} m or {_WRONG_DEG:g} deg"),
+        Column("refused", "no pose was to be believed"),
+        Column("cm: 50, 95, 100 %", "errors of accepted positions: median, 95 %, largest"),
+        Column("deg: 50, 95, 100 %", "the same of rotations"),
+        Column("NEES", "mean normalised error squared per degree of freedom; 1 is consistent"),
+        Column("in 95 %", "share of the true poses in the 95 % region of the covariance"),
+        Column("ms: 50, 95 %", "time of an answer, without the features"),
+    )
+    rows = []
+    for one in judged:
+        ms = Spread.of(np.array([a.milliseconds for a in one.attempts]))
+        times = f"{_number(ms.median, 0)}, {_number(ms.p95, 0)}"
+        rows.append((in_frames(one.frames), (*_score_cells(one.counts), times)))
+        if one.apart.queries or one.familiar.queries != one.counts.queries:
+            least, name = _LEAST_VISIBLE, in_frames(one.frames)
+            familiar = f"{name}, {least} in view from familiar sides"
+            rows.append((familiar, (*_score_cells(one.familiar), _UNKNOWN)))
+            few = f"{name}, fewer than {least} in view"
+            rows.append((few, (*_score_cells(one.apart), _UNKNOWN)))
+    return TextTable("score", "Localisation", "query", columns, tuple(rows))
+
+
+def _score_cells(counts: LocalisationScore) -> tuple[str, ...]:
+    judged = [str(n) for n in (counts.right, counts.inexact, counts.false)]
+    return (
+        str(counts.queries),
+        *(judged if counts.known else [_UNKNOWN] * 3),
+        str(counts.queries - counts.accepted),
+        _spread(counts.metres, 100.0, 1),
+        _spread(counts.degrees, 1.0, 2),
+        _number(counts.nees_per_dof, 2),
+        _percent(counts.held),
+    )
+
+
+def _refusal_table(judged: Sequence[Scored]) -> TextTable:
+    """How many queries ended with which status of relocalisation."""
+    counts = [Counter(status_of(one) for one in j.attempts) for j in judged]
+    names = sorted({name for count in counts for name in count})
+    columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
+    rows = tuple((name, tuple(str(count[name]) for count in counts)) for name in names)
+    return TextTable("verdicts", "Verdicts", "verdict", columns, rows)
+
+
+def status_of(attempt: Attempt) -> str:
+    """Name of the relocalisation status; ``no_image`` of a frame that could not be read."""
+    return "no_image" if attempt.found is None else attempt.found.status.value
+
+
+def _percent(share: float | None) -> str:
+    return _UNKNOWN if share is None else f"{100 * share:.1f} %"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return _UNKNOWN if value is None else f"{value:.{digits}f}"
+
+
+def _spread(values: Spread, factor: float, digits: int) -> str:
+    if values.median is None or values.p95 is None or values.largest is None:
+        return _UNKNOWN
+    parts = (values.median, values.p95, values.largest)
+    return ", ".join(f"{factor * part:.{digits}f}" for part in parts)
+
+
+def sigmas_of(found: Relocalisation) -> tuple[float, float]:
+    """Standard deviation of position and of rotation, metres and degrees."""
+    variances = np.diagonal(found.covariance)
+    turned, moved = np.sqrt(variances[:3].sum()), np.sqrt(variances[3:].sum())
+    return float(moved), float(np.rad2deg(turned))
+
+
+# --------------------------------------------------------------------------------------------
+# Files
+
+TIMING_FILE = "timing.csv"
+_COLUMNS = (
+    "frame",
+    "frames",
+    "verdict",
+    "x_m",
+    "y_m",
+    "z_m",
+    "yaw_deg",
+    "pitch_deg",
+    "roll_deg",
+    "sigma_position_m",
+    "sigma_rotation_deg",
+    "features",
+    "candidates",
+    "inliers",
+    "expected",
+    "second",
+    "residual_px",
+    "visible",
+    "familiar",
+    "error_m",
+    "error_deg",
+    "nees",
+    "nees_dof",
+    "why",
+)
+
+
+def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) -> None:
+    """All files of a run into its folder, which holds its config.yaml. Raises OutputError."""
+    folder = result.folder
+    if not result.written:
+        return
+    judged = scored(result.config, result.asked)
+    rows = (row for one in judged for row in _rows(one))
+    write_csv(folder / LOCALISATION_FILE, _COLUMNS, rows)
+    timing = ((a.frame, a.frames, a.milliseconds, a.frontend_ms) for a in result.asked.attempts)
+    write_csv(folder / TIMING_FILE, ("frame", "frames", "locate_ms", "frontend_ms"), timing)
+    write_json(folder / METRICS_FILE, _document(result, judged))
+    output = result.config.output
+    bounds = bounds_of(result.config)
+    figures = {one.frames: _figure(given, one, bounds) for one in judged}
+    if output.pictures:
+        from fgslam.report.pictures import draw_figure  # Matplotlib takes a second
+
+        pictures = make_subfolder(folder, "pictures")
+        for frames, figure in figures.items():
+            draw_figure(pictures / f"localisation_{frames}.png", figure, figure.heading)
+    write_page(result, subtitle, figures=tuple(figures.values()))
+
+
+def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
+    for k, attempt in enumerate(judged.attempts):
+        errors = judged.errors
+        judgement = errors.metres[k], np.rad2deg(errors.radians[k]), errors.nees[k], errors.dof[k]
+        found = attempt.found
+        sighted = attempt.sighted
+        in_view = [n if n >= 0 else None for n in (sighted.visible, sighted.familiar)]
+        if found is None:
+            nothing = [None] * (len(_COLUMNS) - 4)
+            yield (attempt.frame, attempt.frames, "no_image", *nothing, attempt.problem)
+            continue
+        posed = np.isfinite(found.covariance).all()
+        pose = (*found.wTc[:3, 3], *np.rad2deg(yaw_pitch_roll(found.wTc)), *sigmas_of(found))
+        yield (
+            attempt.frame,
+            attempt.frames,
+            found.status.value,
+            *(pose if posed else [None] * len(pose)),
+            attempt.features,
+            found.candidates,
+            len(found.ids),
+            found.expected,
+            found.second,
+            found.residual_px,
+            *in_view,
+            *judgement,
+            found.why,
+        )
+
+
+def _document(result: LocalisationResult, judged: Sequence[Scored]) -> dict[str, JsonValue]:
+    return {
+        "name": result.config.name,
+        "task": result.config.task,
+        "status": result.status,
+        "landmarks": len(result.asked.landmarks),
+        "alignment": result.asked.alignment,
+        "notes": list(result.notes),
+        "queries": {str(one.frames): _numbers(one) for one in judged},
+    }
+
+
+def _numbers(judged: Scored) -> dict[str, JsonValue]:
+    milliseconds = np.array([a.milliseconds for a in judged.attempts])
+    frontend = np.array([a.frontend_ms for a in judged.attempts])
+    return {
+        **_score_numbers(judged.counts),
+        "familiar_view": _score_numbers(judged.familiar),
+        "too_few_in_view": _score_numbers(judged.apart),
+        "verdicts": dict(sorted(Counter(status_of(a) for a in judged.attempts).items())),
+        "locate_ms": _spread_numbers(Spread.of(milliseconds)),
+        "frontend_ms": _spread_numbers(Spread.of(frontend)),
+    }
+
+
+def _score_numbers(counts: LocalisationScore) -> dict[str, JsonValue]:
+    return {
+        "asked": counts.queries,
+        "accepted": counts.accepted,
+        "with_truth": counts.known,
+        "right": counts.right,
+        "inexact": counts.inexact,
+        "false": counts.false,
+        "share_right": counts.share_right,
+        "error_m": _spread_numbers(counts.metres),
+        "error_deg": _spread_numbers(counts.degrees),
+        "nees_per_dof": counts.nees_per_dof,
+        "share_in_95_percent": counts.held,
+    }
+
+
+def _spread_numbers(values: Spread) -> dict[str, JsonValue]:
+    return {"median": values.median, "p95": values.p95, "max": values.largest}
+
+
+def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
+    answers, errors = judged.answers, judged.errors
+    false = (errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad)
+    located = Located(
+        landmarks=given.saved.landmarks.positions,
+        path=given.saved.trajectory.poses,
+        found=answers.accepted,
+        poses=answers.poses,
+        covariances=answers.covariances,
+        truth=answers.truth,
+        false=np.asarray(false),
+    )
+    title = f"Found from {in_frames(judged.frames)}"
+    return located_figure(located, f"localisation-{judged.frames}", title)
 
 
 def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[LocalisationResult]:
@@ -60,7 +770,7 @@ def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[Loca
 
 
 def _run(
-    config: LocalisationConfig, given: GivenMap | None, sequence: Sequence, context: Context
+    config: LocalisationConfig, given: GivenMap | None, sequence: ImageSequence, context: Context
 ) -> LocalisationResult:
     """The drive that makes the map, where the run asks for one, and all queries."""
     folder = context.folder
@@ -78,14 +788,14 @@ def _run(
     return result
 
 
-def open_queries(config: LocalisationConfig, progress: Progress) -> Sequence:
+def open_queries(config: LocalisationConfig, progress: Progress) -> ImageSequence:
     """Opens the recording whose frames are sought. Raises FgslamError."""
     return open_sequence(
         config.as_experiment(), lambda done, total: progress("rendering", done, total)
     )
 
 
-def _provenance(given: GivenMap | None, sequence: Sequence) -> dict[str, Any]:
+def _provenance(given: GivenMap | None, sequence: ImageSequence) -> dict[str, Any]:
     """What it takes to repeat the run, beside its configuration."""
     out = provenance_of(sequence)
     if given is not None:
@@ -269,7 +979,7 @@ def _of_one_frame(config: LocalisationConfig, wanted: Wanted) -> LocalisationCon
     return config.model_copy(update={"dataset": one})
 
 
-def _open(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> Sequence:
+def _open(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> ImageSequence:
     frame = wanted.frame
     if frame is None:
         return open_queries(config, progress)

@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 
 from fgslam.core.errors import ConfigError, MapError
-from fgslam.core.estimates import Prediction, Relocalisation
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, load_map
+from fgslam.core.types import Prediction, Relocalisation
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
-from fgslam.slam.arrival import Arrival, MapStart
-from fgslam.slam.factory import make_locator, make_stream
-from fgslam.slam.map_settings import MapSettings
-from fgslam.slam.part_remarks import left_out_note
+from fgslam.slam.build import Arrival, MapStart, make_locator, make_stream
+from fgslam.slam.results import left_out_note
+from fgslam.slam.settings import MapSettings
 
 FIRST_FOLDER = "first"
 MAP_FILE = "map.fgmap"
@@ -109,7 +108,7 @@ def open_map(path: Path) -> GivenMap:
     return GivenMap(path, hashlib.sha256(path.read_bytes()).hexdigest(), saved)
 
 
-def enter(config: ExperimentConfig, given: GivenMap, sequence: Sequence) -> Entry:
+def enter(config: ExperimentConfig, given: GivenMap, sequence: ImageSequence) -> Entry:
     """Where the recording begins in the map.
 
     Raises:
@@ -125,7 +124,7 @@ def enter(config: ExperimentConfig, given: GivenMap, sequence: Sequence) -> Entr
 
 
 def _locate(
-    config: ExperimentConfig, given: GivenMap, sequence: Sequence
+    config: ExperimentConfig, given: GivenMap, sequence: ImageSequence
 ) -> tuple[int, Relocalisation]:
     """The first frame that the map's landmarks place beyond doubt, and its number."""
     locate = make_locator(sequence.rig, config.frontend, given.saved, config.seed)

@@ -8,14 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Estimate, LandmarkMap
-from fgslam.core.recordings import (
-    LANDMARK_TRUTH_FILE,
-    MeasurementRecording,
-    write_landmark_truth,
-)
+from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementRecording, write_landmark_truth
 from fgslam.core.sensors import vertical_of
-from fgslam.core.trajectories import Trajectory, read_covariances
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.judging import predicted_poses
@@ -24,11 +19,11 @@ from fgslam.report.content import StageTime, write_timing
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
-from fgslam.runs.estimator_files import FRAMES_FILE, read_frames
 from fgslam.runs.folder import LOG_FILE
+from fgslam.runs.report import spread
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
-from fgslam.runs.tasks.slam_metrics import spread
-from fgslam.runs.tasks.slam_outputs import RunFigures, draw_run
+from fgslam.runs.tables import FRAMES_FILE, read_frames
+from fgslam.runs.tasks.slam_results import RunFigures, draw_run
 from fgslam.slam.replay import ReplayRow
 
 

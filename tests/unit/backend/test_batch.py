@@ -26,9 +26,9 @@ from smoothing import (
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from fgslam.backend.settings import BatchSettings
-from fgslam.backend.smoothers import refinement
+from fgslam.backend.smoothers import final as refinement
+from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.smoother import MapSmoother
-from fgslam.backend.smoothers.whole_graph import State, WholeGraph
 from fgslam.core.errors import EstimatorError
 from fgslam.core.store import restore, state_of
 from fgslam.evaluation.statistics import judge

@@ -9,13 +9,12 @@ import pytest
 from simulated import RIG, Simulation
 from smoothing import drawn
 
-from fgslam.backend.smoothers.graph_builder import TrackedFrame
+from fgslam.backend.smoothers.graph import Solution, TrackedFrame
 from fgslam.backend.smoothers.keyframes import fill_between
-from fgslam.backend.smoothers.solver import Solution
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import Floor
 
 FREE = Floor.under(RIG, 6)
 KNOWN = [0, 4, 8]

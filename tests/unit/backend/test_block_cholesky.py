@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import bsr_matrix, csr_matrix
 
-from fgslam.backend.smoothers.block_cholesky import BlockCholesky, groups_of, least_degree
+from fgslam.backend.smoothers.elimination import BlockCholesky, groups_of, least_degree
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import EstimatorError
 

@@ -12,7 +12,7 @@ from fgslam.backend.filters.dead_reckoning import DeadReckoning
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction
+from fgslam.core.types import Prediction
 from fgslam.evaluation.statistics import judge, nees, pose_nees
 
 DRIVE = Drive(frames=10, points=60, odometry_sigma=(1e-3,) * 3 + (2e-3,) * 3)

@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from fgslam.backend.smoothers.dense_cholesky import DenseFactor, UndeterminedError
+from fgslam.backend.smoothers.elimination import DenseFactor, UndeterminedError
 from fgslam.core.arrays import FloatArray
 
 

@@ -22,10 +22,9 @@ from fgslam.backend.settings import EkfSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction, UpdateStats
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.store import state_of
+from fgslam.core.types import Floor, Prediction, UpdateStats
 from fgslam.evaluation.statistics import judge, landmark_nees, pose_nees
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors

@@ -9,11 +9,15 @@ import pytest
 from simulated import assert_same_bits
 
 from fgslam.backend.self_calibration import FieldSize
-from fgslam.core.measurements import Observations
-from fgslam.core.rig_correction import displacements, prior_information
-from fgslam.core.rig_field import field_displacements, field_modes
+from fgslam.core.correction import (
+    displacements,
+    field_displacements,
+    field_modes,
+    prior_information,
+)
 from fgslam.core.sensors import (
     CameraRig,
+    Observations,
     measurement_map,
     pixel_model,
     vertical_to_horizontal,

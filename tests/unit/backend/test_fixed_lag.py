@@ -23,14 +23,14 @@ from smoothing import (
 )
 
 from fgslam.backend.settings import FixedLagSettings
-from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
-from fgslam.backend.smoothers.fixed_lag import FixedLagSolver
+from fgslam.backend.smoothers.elimination import UndeterminedError
+from fgslam.backend.smoothers.lag import FixedLagSolver
 from fgslam.backend.smoothers.smoother import Smoother
-from fgslam.backend.smoothers.window_parts import LandmarkUndeterminedError
+from fgslam.backend.smoothers.window import LandmarkUndeterminedError
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Prediction
 
 LAG = FixedLagSettings(lag_frames=5)
 

@@ -26,12 +26,11 @@ from smoothing import (
 
 from fgslam.backend.settings import BatchSettings, GraphSettings
 from fgslam.backend.smoothers import admission
-from fgslam.backend.smoothers.graph_builder import GraphBuilder, NewFactors, TrackedFrame
+from fgslam.backend.smoothers.graph import GraphBuilder, NewFactors, TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Estimate, LandmarkMap, Prediction
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.sensors import Increment, Odometry
+from fgslam.core.types import Estimate, Floor, LandmarkMap, Prediction
 from fgslam.evaluation.statistics import judge, landmark_nees
 from fgslam.factors.graphs import is_pose, landmark_key, pose_key
 

@@ -28,9 +28,9 @@ from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotionStatus, Prediction
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import EgoMotionStatus, Prediction
 from fgslam.frontend.tracking.ego_motion import unmeasured
 
 SIGMA = np.array([0.3, 0.4, 0.2])

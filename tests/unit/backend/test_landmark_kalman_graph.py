@@ -27,9 +27,9 @@ from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanS
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
-from fgslam.core.measurements import Increment
+from fgslam.core.sensors import Increment
 from fgslam.core.store import state_of
+from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import pose_prior

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.backend.filters.kalman import LandmarkRows
 from fgslam.core.arrays import IntArray
-from fgslam.core.estimates import LandmarkMap
+from fgslam.core.types import LandmarkMap
 
 
 def fill(rows: LandmarkRows, ids: IntArray, rng: np.random.Generator, home: int) -> None:

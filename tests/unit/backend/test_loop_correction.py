@@ -9,10 +9,10 @@ import pytest
 
 from fgslam.backend.loops import DriveRecord
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus
 from fgslam.core.geometry import pose
-from fgslam.core.measurements import LoopClosure, Observations, Odometry
+from fgslam.core.sensors import LoopClosure, Observations, Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import EgoMotion, EgoMotionStatus
 
 _TRACKED = np.diag([1e-6] * 6)
 _WHEELS = np.diag([1e-4] * 6)

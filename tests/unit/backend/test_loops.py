@@ -33,15 +33,15 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
-from fgslam.backend.smoothers.loop_closing import LONG_UNSEEN, found_again
-from fgslam.backend.smoothers.sliding_window import SlidingWindowSolver
+from fgslam.backend.smoothers.graph import LONG_UNSEEN, found_again
+from fgslam.backend.smoothers.lag import SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Estimate
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.sensors import Increment, Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Estimate
 from fgslam.evaluation.statistics import pose_nees
 from fgslam.factors.graphs import landmark_key, poses_of_frame
 

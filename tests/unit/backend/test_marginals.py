@@ -13,19 +13,19 @@ from factor_specifications import RawPixelFactors
 from simulated import RIG, points_in_view
 
 from fgslam.backend.settings import KernelSettings
-from fgslam.backend.smoothers.dense_cholesky import from_cholesky, scaled_cholesky
-from fgslam.backend.smoothers.marginals import (
+from fgslam.backend.smoothers.bundle import PLAIN, WholeGraph
+from fgslam.backend.smoothers.elimination import (
     ChainMarginals,
     GraphMarginals,
+    from_cholesky,
     reduced,
+    scaled_cholesky,
 )
-from fgslam.backend.smoothers.whole_graph import PLAIN, WholeGraph
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.estimates import Prediction
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import Floor, Prediction
 from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior

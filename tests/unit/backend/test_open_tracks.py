@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, OpenTracks
-from fgslam.core.measurements import Observations
+from fgslam.core.sensors import Observations
 from fgslam.core.store import restore, state_of
 
 

@@ -13,12 +13,8 @@ from smoothing import SMOOTHERS, answer, ate, counting, drawn, run, wrong_matche
 
 from fgslam.backend.settings import BatchSettings, EstimatorSettings, KernelSettings
 from fgslam.backend.smoothers import admission
-from fgslam.backend.smoothers.refinement import (
-    MINIMUM,
-    graduated,
-    trimmed,
-)
-from fgslam.backend.smoothers.whole_graph import WholeGraph
+from fgslam.backend.smoothers.bundle import WholeGraph
+from fgslam.backend.smoothers.final import MINIMUM, graduated, trimmed
 from fgslam.core.arrays import FloatArray
 
 CAUCHY = KernelSettings("cauchy", 3.0)

@@ -16,13 +16,12 @@ from fgslam.backend.settings import (
     GraphSettings,
     Isam2Settings,
 )
-from fgslam.backend.smoothers.graph_builder import GraphBuilder, TrackedFrame
+from fgslam.backend.smoothers.graph import GraphBuilder, TrackedFrame
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Observations, Odometry
+from fgslam.core.sensors import Observations, Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Floor, LandmarkMap, Prediction
 from fgslam.factors.noise import plain
 
 SIGMA = np.array([0.2, 0.2, 0.15])  # of (column, row, disparity), pixels, as stated

@@ -32,14 +32,13 @@ from fgslam.backend.settings import (
 )
 from fgslam.core import geometry as g
 from fgslam.core.arrays import StateArrays
-from fgslam.core.estimates import EgoMotionStatus, Prediction
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import EgoMotionStatus, Prediction
 from fgslam.frontend.places.recognition import difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.arrival import Arrival, take_over
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import Arrival, make_estimator, take_over
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.replay import replay_frame
 

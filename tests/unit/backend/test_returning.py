@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from simulated import RIG
 
-from fgslam.backend.smoothers.returning import LEAST, SeenAgain
-from fgslam.backend.smoothers.window_parts import Landmarks
+from fgslam.backend.smoothers.window import LEAST, Landmarks, SeenAgain
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray
 

@@ -21,13 +21,12 @@ from fgslam.backend.settings import (
 )
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.measurements import Increment, SettledRig
-from fgslam.core.rig_correction import displacements, term_names
-from fgslam.core.sensors import pixel_model, rig_map
+from fgslam.core.correction import displacements, term_names
+from fgslam.core.sensors import Increment, SettledRig, pixel_model, rig_map
 from fgslam.core.settings import RigPlaces
 from fgslam.core.store import restore, state_of
-from fgslam.slam.factory import make_estimator
+from fgslam.core.types import LandmarkMap
+from fgslam.slam.build import make_estimator
 
 SETTINGS: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),

@@ -24,27 +24,24 @@ from fgslam.backend.settings import (
     LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
-from fgslam.backend.smoothers.border import Bordered
-from fgslam.backend.smoothers.refinement import Refined
-from fgslam.backend.smoothers.rig_doubt import doubted, shifts
+from fgslam.backend.smoothers.elimination import Bordered
+from fgslam.backend.smoothers.final import Refined, doubted, shifts
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction, UpdateStats
-from fgslam.core.floor import Floor
-from fgslam.core.measurements import Increment, SettledRig
-from fgslam.core.rig_correction import (
+from fgslam.core.correction import (
     SHARED,
     RigCorrection,
+    field_modes,
     prior_information,
     shared_displacements,
     shared_information,
     term_names,
 )
-from fgslam.core.rig_field import field_modes
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, SettledRig
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Floor, Prediction, UpdateStats
 from fgslam.evaluation.statistics import pose_errors, pose_nees, within
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
 CALIBRATED = RigCorrection.none(dataclasses.replace(RIG, exact=False))

@@ -7,8 +7,7 @@ from scipy.linalg import block_diag
 
 from fgslam.backend.self_calibration import RigEvidence, RigFilter
 from fgslam.core.arrays import FloatArray
-from fgslam.core.rig_correction import prior_information
-from fgslam.core.rig_field import field_modes
+from fgslam.core.correction import field_modes, prior_information
 from fgslam.core.sensors import CameraRig
 
 PAIR = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))

@@ -18,8 +18,8 @@ from fgslam.backend.persistence import StatedNoise
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.measurements import Increment
+from fgslam.core.sensors import Increment
+from fgslam.core.types import LandmarkMap, Prediction
 from fgslam.evaluation.statistics import landmark_nees, nees, pose_errors, pose_nees, within
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem

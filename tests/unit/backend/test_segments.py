@@ -20,12 +20,12 @@ from smoothing import (
 )
 
 from fgslam.backend.settings import Isam2Settings
-from fgslam.backend.smoothers.graph_builder import TrackedFrame
+from fgslam.backend.smoothers.graph import TrackedFrame
 from fgslam.backend.smoothers.keyframes import Segments, summarise
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.measurements import Observations
+from fgslam.core.sensors import Observations
+from fgslam.core.types import LandmarkMap
 
 KEYFRAMES = Isam2Settings(keyframe_every=5)
 

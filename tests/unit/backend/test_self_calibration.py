@@ -10,9 +10,7 @@ import pytest
 from fgslam.backend.self_calibration import WINDOW, SelfCalibration, weighed
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.features import Features
-from fgslam.core.measurements import Increment, Observations
-from fgslam.core.rig_correction import (
+from fgslam.core.correction import (
     RigCorrection,
     displacements,
     early_terms,
@@ -22,13 +20,16 @@ from fgslam.core.rig_correction import (
 from fgslam.core.sensors import (
     CAMERA_NAMES,
     CameraRig,
+    Increment,
+    Observations,
     pixel_covariance,
     pixel_model,
     rig_map,
     vertical_to_horizontal,
 )
 from fgslam.core.store import restore, state_of
-from fgslam.runs.tasks.slam_calibration import calibration_note
+from fgslam.core.types import Features
+from fgslam.runs.tasks.slam_results import calibration_note
 
 RIG = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
 PATCHES = replace(RIG, places="reference")

@@ -13,19 +13,16 @@ from fgslam.backend.loops import Constraint
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import BatchSettings, SlidingWindowSettings
-from fgslam.backend.smoothers.dense_cholesky import UndeterminedError
-from fgslam.backend.smoothers.held_landmarks import HeldLandmarks
-from fgslam.backend.smoothers.landmark_elimination import Eliminated
-from fgslam.backend.smoothers.sliding_window import SlidingWindowSolver
+from fgslam.backend.smoothers.elimination import Eliminated, UndeterminedError
+from fgslam.backend.smoothers.graph import Drive
+from fgslam.backend.smoothers.lag import SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother
-from fgslam.backend.smoothers.solver import Drive
-from fgslam.backend.smoothers.window import Window
-from fgslam.backend.smoothers.window_parts import Solved
+from fgslam.backend.smoothers.window import HeldLandmarks, Solved, Window
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.measurements import Increment
-from fgslam.core.rig_correction import term_names
+from fgslam.core.correction import term_names
+from fgslam.core.sensors import Increment
+from fgslam.core.types import LandmarkMap, Prediction
 from fgslam.evaluation.statistics import pose_nees
 
 SHORT = SlidingWindowSettings(window=6, update_every=2)

@@ -24,7 +24,7 @@ from fgslam.backend.loops import (
 )
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.measurements import LoopClosure
+from fgslam.core.sensors import LoopClosure
 from fgslam.core.store import pack, unpack
 
 COUNT = 41

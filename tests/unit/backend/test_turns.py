@@ -17,25 +17,28 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
-from fgslam.backend.smoothers import loop_closing
-from fgslam.backend.smoothers.border import Bordered
-from fgslam.backend.smoothers.loop_closing import solved
-from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, with_border
-from fgslam.backend.smoothers.refinement import Refined
-from fgslam.backend.smoothers.turns import Turn, TurnedStep, Turns
-from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.backend.smoothers import graph as loop_closing
+from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, Turns, WholeGraph
+from fgslam.backend.smoothers.elimination import (
+    Bordered,
+    ChainMarginals,
+    GraphMarginals,
+    with_border,
+)
+from fgslam.backend.smoothers.final import Refined
+from fgslam.backend.smoothers.graph import solved
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import BiasEffect, Increment, LoopClosure, Odometry
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import BiasEffect, Increment, LoopClosure, Odometry
 from fgslam.core.store import restore, state_of
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.statistics import judge
 from fgslam.evaluation.statistics import nees as normalised
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
-from fgslam.slam.factory import made_or_given
+from fgslam.slam.build import made_or_given
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 from fgslam.slam.replay import Replay, replay, replay_frame
 

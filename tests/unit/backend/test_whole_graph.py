@@ -13,10 +13,10 @@ from smoothing import drawn, run, wrong_matches
 
 from fgslam.backend.loops import Constraint, constraint_factor
 from fgslam.backend.settings import BatchSettings, KernelSettings
-from fgslam.backend.smoothers.graph_builder import GraphBuilder
-from fgslam.backend.smoothers.marginals import ChainMarginals, GraphMarginals, reduced
-from fgslam.backend.smoothers.refinement import MINIMUM
-from fgslam.backend.smoothers.whole_graph import State, WholeGraph
+from fgslam.backend.smoothers.bundle import State, WholeGraph
+from fgslam.backend.smoothers.elimination import ChainMarginals, GraphMarginals, reduced
+from fgslam.backend.smoothers.final import MINIMUM
+from fgslam.backend.smoothers.graph import GraphBuilder
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import inverse, se3_exp
 from fgslam.factors.graphs import poses_of_frame, solver_parameters

@@ -10,8 +10,8 @@ from simulated import play
 from smoothing import FREE, build, drawn
 
 from fgslam.backend.settings import FixedLagSettings
-from fgslam.backend.smoothers.fixed_lag import FixedLagSolver
-from fgslam.backend.smoothers.landmark_elimination import Eliminated
+from fgslam.backend.smoothers.elimination import Eliminated
+from fgslam.backend.smoothers.lag import FixedLagSolver
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.backend.smoothers.window import Window
 from fgslam.core.arrays import FloatArray, IntArray

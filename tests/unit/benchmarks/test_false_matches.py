@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[3]))
 
 from benchmarks.evidence.false_matches import KINDS, FalseMatches, Kind, drive
 from benchmarks.runs import experiment, find_features
-from fgslam.core.features import StereoFeatures
+from fgslam.core.types import StereoFeatures
 from fgslam.frontend.tracking.map_matching import MapMatches
 
 LAB = experiment("lab_loop")

@@ -11,7 +11,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[3]))
 
 from benchmarks.evidence.street_world import RIG, Street
-from fgslam.core.rig_correction import term_names
+from fgslam.core.correction import term_names
 
 
 @pytest.mark.slow

@@ -21,15 +21,15 @@ from fgslam.cameras.rig import (
 )
 from fgslam.cameras.write_formats import raw_values, write_calibration
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp
-from fgslam.core.rig_correction import (
+from fgslam.core.correction import (
     SHARED,
     RigCorrection,
     camera_displacements,
     shared_displacements,
     term_names,
 )
+from fgslam.core.errors import CalibrationError
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, se3_exp
 from fgslam.core.sensors import CameraRig
 
 PAIR = CameraRig(160, 120, 130.0, 131.0, 79.5, 59.5, 0.1, None, np.diag([-1.0, 1.0, -1.0, 1.0]))

@@ -16,7 +16,7 @@ from fgslam.cameras.omni import (
     measure,
     unwrap_maps,
 )
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 
 MIRROR = HyperbolicMirror.with_view((640, 480), 0.92, (np.radians(-70), np.radians(25)))
 

@@ -16,7 +16,7 @@ from fgslam.cameras.omni import (
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 
 
 def mirror(**changes: float) -> HyperbolicMirror:

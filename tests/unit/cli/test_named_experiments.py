@@ -12,7 +12,7 @@ import pytest
 
 import fgslam
 from fgslam.core.errors import ConfigError
-from fgslam.runs.config_reading import read_mapping
+from fgslam.runs.config import read_mapping
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
 
 ROOT = Path(__file__).parents[3]

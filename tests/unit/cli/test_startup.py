@@ -70,7 +70,7 @@ def test_a_wrong_setting_is_answered_before_arrays_are_loaded() -> None:
 
 def test_a_run_of_the_paper_s_filter_loads_no_solver_of_graphs_and_nothing_that_draws() -> None:
     """Pictures, page, statistics of trials and the world's renderer are imported when used."""
-    modules = "fgslam.runs.run, fgslam.runs.tasks.slam, fgslam.slam.factory"
+    modules = "fgslam.runs.run, fgslam.runs.tasks.slam, fgslam.slam.build"
     slow_parts = {"scipy.stats", "scipy.interpolate", "scipy.spatial.transform"}
     code = f"import sys, {modules}; assert not {slow_parts} & set(sys.modules); print(*sys.modules)"
     assert loaded(code) == {"numpy", "scipy", "cv2", "yaml"}

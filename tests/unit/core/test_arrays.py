@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray, Rows
-from fgslam.core.estimates import LandmarkMap
 from fgslam.core.store import pack, unpack
-from fgslam.core.trajectories import Trajectory
+from fgslam.core.types import LandmarkMap, Trajectory
 
 
 def test_arrays_are_shown_by_their_shapes() -> None:

@@ -9,7 +9,7 @@ import pytest
 from homings import trial
 
 from fgslam.core.arrays import StateArrays
-from fgslam.core.bearing_log import BearingLog
+from fgslam.core.bearings import BearingLog
 from fgslam.core.errors import MeasurementLogError
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.gauss_newton import GaussNewton, Linearised
+from fgslam.core.least_squares import GaussNewton, Linearised
 
 TIMES = np.linspace(0.0, 2.0, 30)
 TRUE = np.array([[2.0, 0.7], [0.5, 1.5]])

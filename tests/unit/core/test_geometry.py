@@ -10,7 +10,7 @@ import pytest
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.core.sensors import CameraRig
 
 RIG = CameraRig(

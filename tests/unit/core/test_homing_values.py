@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.homing import among
+from fgslam.core.bearings import among
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from fgslam.core.levenberg import Damping
+from fgslam.core.least_squares import Damping
 
 
 def tried(needed: float, dampings: list[float]) -> Callable[[float], tuple[float, str]]:

@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 from simulated import assert_same_bits
 
+from fgslam.core.correction import term_names
 from fgslam.core.errors import MeasurementLogError
 from fgslam.core.geometry import se3_exp
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import (
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import (
     BiasEffect,
+    CameraRig,
     Increment,
     LoopClosure,
     Observations,
     Odometry,
     SettledRig,
 )
-from fgslam.core.rig_correction import term_names
-from fgslam.core.sensors import CameraRig
 from fgslam.core.settings import RigPlaces
 from fgslam.core.store import load_arrays, write_arrays
 

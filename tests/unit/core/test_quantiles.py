@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from fgslam.core.quantiles import chi_square_quantile, student_quantile
+from fgslam.core.arrays import chi_square_quantile, student_quantile
 
 
 def test_quantiles_are_those_of_scipy_to_the_bit() -> None:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.rig_correction import TERMS, displacements
-from fgslam.core.rig_field import field_displacements, field_modes
+from fgslam.core.correction import TERMS, displacements, field_displacements, field_modes
 from fgslam.core.sensors import CameraRig
 
 PAIR = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))

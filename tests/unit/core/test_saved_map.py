@@ -17,12 +17,17 @@ from fgslam.core import geometry as g
 from fgslam.core import saved_map as map_file
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import MapError, OutputError
-from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map, require_rig, save_map
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import load_arrays
+from fgslam.core.types import (
+    CUT_PIXELS,
+    LandmarkAppearances,
+    LandmarkMap,
+    LandmarkPatches,
+    Trajectory,
+)
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 

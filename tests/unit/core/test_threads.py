@@ -24,7 +24,7 @@ from pathlib import Path
 from threadpoolctl import threadpool_info
 from fgslam.runs.config import load_config
 from fgslam.datasets.opening import open_measurements
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.slam.replay import replay
 from fgslam.backend.settings import EkfSettings
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import se3_exp
-from fgslam.core.trajectories import read_covariances, write_covariances
+from fgslam.core.types import Trajectory, read_covariances, write_covariances
 
 
 def trajectory(seed: int = 1, n: int = 50) -> Trajectory:

@@ -29,7 +29,7 @@ from fgslam.datasets.depth import BASELINE_M
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 
 SHIFT = 10  # pixels, by which what is seen from the left is further right
 DEPTH_M = CALIBRATION["fx"] * BASELINE_M / SHIFT

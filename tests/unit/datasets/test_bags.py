@@ -32,7 +32,7 @@ from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 from fgslam.runs.calibrating import Asked, convert_calibration
 from fgslam.runs.inspect import check_odometry
 

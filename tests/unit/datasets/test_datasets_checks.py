@@ -10,9 +10,9 @@ import pytest
 from dataset_builders import curve, image_folder, picture, save, write_tum
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Trajectory
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Trajectory
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -221,7 +221,7 @@ class WithTruth:
 @pytest.mark.parametrize("flying", [6, 40])
 def test_a_short_flight_after_long_standing_is_no_jump(rate: float, flying: int) -> None:
     truth = flight(300, flying, rate)
-    assert "moves suddenly" not in texts(check_truth(cast(Sequence, WithTruth(truth))))
+    assert "moves suddenly" not in texts(check_truth(cast(ImageSequence, WithTruth(truth))))
 
 
 @pytest.mark.parametrize("rate", [0.7, 3.3, 20.0, 200.0])
@@ -230,13 +230,13 @@ def test_a_jump_is_found_while_standing_and_while_flying(rate: float, at: int) -
     truth = flight(300, 40, rate)
     fastest = 0.8 / rate
     truth.poses[at:, 1, 3] += 0.1 + 20.0 * fastest
-    assert f"before its poses {at}:" in texts(check_truth(cast(Sequence, WithTruth(truth))))
+    assert f"before its poses {at}:" in texts(check_truth(cast(ImageSequence, WithTruth(truth))))
 
 
 def test_one_bad_pose_is_found() -> None:
     truth = flight(300, 40, 20.0)
     truth.poses[50, 2, 3] += 1.0
-    assert "before its poses 50, 51:" in texts(check_truth(cast(Sequence, WithTruth(truth))))
+    assert "before its poses 50, 51:" in texts(check_truth(cast(ImageSequence, WithTruth(truth))))
 
 
 def test_sound_odometry_agrees_with_truth(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from fgslam.datasets.settings import RgbdSettings
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 
 FOCAL = 250.0  # at 2 m the view is shifted by 10 px
 DEPTH_M = 2.0

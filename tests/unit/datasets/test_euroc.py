@@ -24,7 +24,7 @@ from fgslam.cameras.rig import load_rig, read_calibration_file
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import EurocSettings
@@ -88,7 +88,7 @@ def test_rectified_pixels_look_where_the_raw_cameras_saw_the_points(tmp_path: Pa
 @pytest.mark.parametrize("swapped", [False, True])
 def test_left_and_right_are_found_whatever_their_numbers(tmp_path: Path, swapped: bool) -> None:
     recording = opened(euroc(tmp_path, (RIGHT, LEFT) if swapped else (LEFT, RIGHT)))
-    assert isinstance(recording, Sequence)
+    assert isinstance(recording, ImageSequence)
     assert recording.rig.baseline == pytest.approx(np.linalg.norm(LEFT[:3, 3] - RIGHT[:3, 3]))
     np.testing.assert_allclose(recording.rig.bTc[:3, 3], RIGHT[:3, 3], atol=1e-12)
     # Stamps are those of the right camera: cam1 is 1 ms late.

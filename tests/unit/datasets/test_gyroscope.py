@@ -13,7 +13,7 @@ from dataset_builders import START_NS as EUROC_START_NS
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, OdometryError
 from fgslam.core.geometry import rotation_angle, so3_exp, so3_log
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import (
     GyroscopeLog,
     GyroscopeNoise,
@@ -30,7 +30,7 @@ from fgslam.datasets.settings import (
     ImageFolderSettings,
     RecordedOdometrySettings,
 )
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 
 LIMITS = RecordedOdometrySettings()
 RATE = np.array([0.3, -0.2, 0.5])  # rad/s

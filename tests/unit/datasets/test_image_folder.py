@@ -21,7 +21,7 @@ from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.cameras.write_formats import raw_values
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, right_from_left_camera
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.images import read_grey_image
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -44,7 +44,7 @@ def assert_one_line(message: str, *parts: str) -> None:
 
 def test_stereo_folder_gives_right_then_left_images_with_stamps(tmp_path: Path) -> None:
     recording = opened(image_folder(tmp_path / "drive"))
-    assert isinstance(recording, Sequence)
+    assert isinstance(recording, ImageSequence)
     assert recording.name == "drive"
     assert len(recording) == 6
     np.testing.assert_allclose(recording.timestamps, 0.1 * np.arange(6))

@@ -7,7 +7,7 @@ import pytest
 from dataset_builders import kitti, picture, save
 
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiSettings
@@ -20,7 +20,7 @@ def opened(root: Path, **settings: object) -> Recording:
 def test_native_layout(tmp_path: Path) -> None:
     root, left = kitti(tmp_path)
     recording = opened(root)
-    assert isinstance(recording, Sequence)
+    assert isinstance(recording, ImageSequence)
     assert recording.name == "KITTI 06"
     assert [int(image[0, 0]) for image in recording.frame(3).images] == [13, 63]
     rig = recording.rig

@@ -37,7 +37,7 @@ from fgslam.datasets.settings import (
     KittiRawSettings,
 )
 from fgslam.datasets.times import pair_files, written_stamps
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 
 STAMP = 1_403_715_273_262_142_976
 NAMES: dict[str, Callable[[int], tuple[str, str]]] = {

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError, DatasetError, MeasurementLogError
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.log import MeasurementLog, MeasurementRecording
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,

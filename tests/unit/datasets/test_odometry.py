@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.geometry import inverse
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import (
     SpeedLog,
     file_odometry,

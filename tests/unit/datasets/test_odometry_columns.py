@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import OdometryError
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import file_odometry
 from fgslam.datasets.settings import RecordedOdometrySettings
 

@@ -30,7 +30,7 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SyntheticOdometrySettings,
 )
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 

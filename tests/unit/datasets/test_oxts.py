@@ -15,7 +15,7 @@ from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import KittiRawSettings
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 
 FRAMES, PERIOD = 12, 0.1
 SPEED, TURN = 8.0, 0.4  # m/s, rad/s to the left

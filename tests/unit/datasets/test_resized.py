@@ -24,7 +24,7 @@ from dataset_builders import (
 from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose
 from fgslam.datasets.recording import Recording
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.opening import open_sequence
 

@@ -17,9 +17,9 @@ from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.estimates import Prediction
-from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.log import MeasurementRecording
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Prediction
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, StereoTracksSettings
 from fgslam.evaluation.statistics import evaluate_trajectory

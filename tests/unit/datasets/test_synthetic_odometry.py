@@ -10,8 +10,8 @@ from scipy import stats
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
+from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
@@ -57,7 +57,7 @@ def errors(sequence: SyntheticOdometry) -> FloatArray:
 def test_synthetic_odometry_is_a_sequence_and_noted_as_synthetic(folder: Path) -> None:
     recording = opened(folder)
     sequence = SyntheticOdometry(recording, SETTINGS, 3)
-    assert isinstance(sequence, Sequence)
+    assert isinstance(sequence, ImageSequence)
     assert (sequence.name, sequence.identity) == (recording.name, recording.identity)
     assert len(sequence) == FRAMES
     np.testing.assert_array_equal(sequence.timestamps, recording.timestamps)

@@ -26,7 +26,7 @@ from fgslam.datasets.opening import open_omni, open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import OmniVideoSettings, VideoSettings
 from fgslam.datasets.video import VideoFrames
-from fgslam.runs.bare_recording import bare_experiment
+from fgslam.runs.bare import bare_experiment
 from tests import textured_wall
 
 SIZE = (64, 48)

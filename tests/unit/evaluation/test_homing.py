@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import HomingEstimate, HomingTruth
-from fgslam.core.planar import between
+from fgslam.core.bearings import HomingEstimate, HomingTruth
+from fgslam.core.geometry import between
 from fgslam.evaluation.homing import homing_errors, summarise_homings
 
 TRUTH = HomingTruth(

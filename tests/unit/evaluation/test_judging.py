@@ -15,11 +15,10 @@ from fgslam.backend.settings import DeadReckoningSettings, EkfSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
 from fgslam.core.geometry import inverse, se3_exp, transform_to_world
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, LoopClosure, Observations
-from fgslam.core.recordings import LandmarkTruth
+from fgslam.core.log import LandmarkTruth, MeasurementLog
+from fgslam.core.sensors import Increment, LoopClosure, Observations
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.judging import (
     COLUMNS,
     Answer,
@@ -31,13 +30,7 @@ from fgslam.evaluation.judging import (
 )
 from fgslam.evaluation.statistics import estimate_from_truth, time_growth
 from fgslam.runs.library import replay
-from fgslam.runs.tasks.slam_metrics import (
-    LOOPS_FILE,
-    closures_of,
-    place_numbers,
-    read_closures,
-    write_closures,
-)
+from fgslam.runs.report import LOOPS_FILE, closures_of, place_numbers, read_closures, write_closures
 from fgslam.slam.results import RunRecorder
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
+from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     Nees,

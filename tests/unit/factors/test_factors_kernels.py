@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from factor_specifications import constant_velocity, constant_velocity_covariance
 
-from fgslam.factors.bearing_residuals import ChainMotion, motion_informations
+from fgslam.factors.bearing import ChainMotion, motion_informations
 from fgslam.factors.noise import KernelName, kernel_losses, kernel_weights
 
 NAMES: list[KernelName] = ["none", "huber", "cauchy", "geman_mcclure", "tukey"]

@@ -20,9 +20,8 @@ from factor_checks import (
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
-from fgslam.core.floor import DegreesOfFreedom, Floor
-from fgslam.core.measurements import Odometry
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import DegreesOfFreedom, Floor, Prediction
 from fgslam.factors.motion import (
     floor_factors,
     odometry_factor,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.features import PATCH_PX, LandmarkPatches
 from fgslam.core.geometry import project
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import PATCH_PX, LandmarkPatches
 from fgslam.frontend.features.patches import ReferencePatches, crowding
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.features.sift import FineImage

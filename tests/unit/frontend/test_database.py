@@ -11,10 +11,9 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap, Prediction
-from fgslam.core.features import LandmarkPatches, StereoFeatures
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import LandmarkMap, LandmarkPatches, Prediction, StereoFeatures
 from fgslam.frontend.settings import DatabaseSettings
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.map_matching import predicted_covariance

@@ -13,9 +13,8 @@ from simulated import RIG, assert_same_bits, points_in_view
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
-from fgslam.core.measurements import Observations
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Observations
+from fgslam.core.types import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, unmeasured
 

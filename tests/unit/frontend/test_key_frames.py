@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import IntArray
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus
-from fgslam.core.features import CUT_PIXELS, StereoFeatures
 from fgslam.core.store import state_of
+from fgslam.core.types import CUT_PIXELS, EgoMotion, EgoMotionStatus, StereoFeatures
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import DatabaseSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher

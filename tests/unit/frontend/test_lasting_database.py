@@ -12,10 +12,9 @@ from test_database import at_pixels, database_of, landmark_map, stereo_features
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import MapError
-from fgslam.core.estimates import Trajectory
-from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import CUT_PIXELS, LandmarkAppearances, LandmarkPatches, Trajectory
 from fgslam.frontend.settings import (
     DatabaseSettings,
     PermanenceSettings,

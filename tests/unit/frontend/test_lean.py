@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.geometry import transform_to_camera
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import transform_to_camera, wrap
 from fgslam.core.sensors import CameraRig
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor

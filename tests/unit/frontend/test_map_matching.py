@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.features import StereoFeatures
+from fgslam.core.types import StereoFeatures
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import MapMatchingSettings
 from fgslam.frontend.tracking import map_matching

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fgslam.core.measurements import Increment, LoopClosure, Observations, Odometry
+from fgslam.core.sensors import Increment, LoopClosure, Observations, Odometry
 from fgslam.core.store import restore, state_of
 from fgslam.frontend.tracking.landmarks import MapParts
 

@@ -8,14 +8,14 @@ import numpy as np
 
 from fgslam.backend.persistence import Persistence, learn_from
 from fgslam.backend.settings import BatchSettings, LandmarkKalmanSettings
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, Prediction
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, MatchNoise, unmeasured
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 from fgslam.slam.replay import replay, replay_frame, replay_motion
 from fgslam.worlds.settings import (
     DetectionSettings,

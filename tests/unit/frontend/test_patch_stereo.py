@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.features import Features, StereoFeatures
-from fgslam.core.recordings import Frame
+from fgslam.core.log import Frame
+from fgslam.core.types import Features, StereoFeatures
 from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
 from fgslam.frontend.stereo import PatchStereo, StereoMatcher
-from fgslam.slam.factory import as_measured, make_describer, make_stereo
+from fgslam.slam.build import as_measured, make_describer, make_stereo
 from tests.textured_wall import HERE, RIG, WALL_M, pictures
 
 

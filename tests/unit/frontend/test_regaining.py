@@ -12,7 +12,7 @@ from test_tracker import CERTAIN, SETTINGS, Scene
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import EgoMotionStatus, Prediction
+from fgslam.core.types import EgoMotionStatus, Prediction
 from fgslam.frontend.tracking import tracker as regaining
 from fgslam.frontend.tracking.tracker import Tracked, log_false_poses, places
 

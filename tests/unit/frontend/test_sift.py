@@ -12,8 +12,8 @@ from scipy import ndimage
 from simulated import assert_same_bits
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.features import Features
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
+from fgslam.core.types import Features
 from fgslam.frontend.features import sift
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import EDGE_THRESHOLD, OCTAVE_LAYERS, SiftExtractor

@@ -10,11 +10,11 @@ import pytest
 from simulated import RIG, assert_same_bits
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.features import Features, StereoFeatures
-from fgslam.core.planar import wrap
-from fgslam.core.rig_correction import RigCorrection, term_names
+from fgslam.core.correction import RigCorrection, term_names
+from fgslam.core.geometry import wrap
 from fgslam.core.sensors import SHIFT_SHARE, CameraRig
 from fgslam.core.settings import RigPlaces
+from fgslam.core.types import Features, StereoFeatures
 from fgslam.frontend.features import matching
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import StereoSettings

@@ -13,8 +13,8 @@ from simulated import RIG, FeatureWorld, assert_same_bits, points_in_view
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.core.store import TREE, restore, state_of
+from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import (
     DatabaseSettings,
@@ -26,7 +26,7 @@ from fgslam.frontend.settings import (
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking import map_matching
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
-from fgslam.slam.factory import make_tracker
+from fgslam.slam.build import make_tracker
 
 COUNT = 60
 IMAGE = np.tile(np.arange(240, dtype=np.uint8)[:, None], (1, 320))  # grey value is the row

@@ -11,8 +11,8 @@ from test_tracker import CERTAIN, IMAGE, SETTINGS
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap, Prediction
 from fgslam.core.store import state_of
+from fgslam.core.types import LandmarkMap, Prediction
 from fgslam.frontend.settings import (
     DatabaseSettings,
     FrontendSettings,
@@ -21,7 +21,7 @@ from fgslam.frontend.settings import (
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.tracker import Association
-from fgslam.slam.factory import make_tracker
+from fgslam.slam.build import make_tracker
 
 DISTANCE = 3.0  # metres, from the camera to the middle of the things
 HERE = 0.0

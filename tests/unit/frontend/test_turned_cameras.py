@@ -13,8 +13,8 @@ from _pytest.mark import ParameterSet
 
 import fgslam as fg
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.correction import TERMS, camera_displacements
 from fgslam.core.geometry import so3_exp
-from fgslam.core.rig_correction import TERMS, camera_displacements
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import restore, state_of
 from fgslam.frontend.camera_faults import (

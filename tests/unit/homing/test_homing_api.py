@@ -11,6 +11,7 @@ import pytest
 
 import fgslam as fg
 from fgslam.core.arrays import Image
+from fgslam.core.bearings import RefusalReason
 from fgslam.core.errors import (
     CalibrationError,
     ConfigError,
@@ -20,7 +21,6 @@ from fgslam.core.errors import (
     SessionError,
     StoredMapError,
 )
-from fgslam.core.homing import RefusalReason
 from fgslam.homing.steering import HomingState
 
 CAMERA = fg.load_camera("equirectangular", size=(256, 128))

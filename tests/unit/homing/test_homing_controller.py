@@ -17,8 +17,7 @@ from fgslam.backend.homing.settings import (
     SnapshotSettings,
 )
 from fgslam.core.arrays import ByteArray, FloatArray
-from fgslam.core.errors import ConfigError, EstimatorError
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     HomingEstimate,
     HomingStart,
     LocalMap,
@@ -28,7 +27,8 @@ from fgslam.core.homing import (
     TrackedBearings,
     TwoViewVector,
 )
-from fgslam.core.planar import bearings, between, unit, wrap
+from fgslam.core.errors import ConfigError, EstimatorError
+from fgslam.core.geometry import bearings, between, unit, wrap
 from fgslam.homing.active import (
     MAX_ACROSS,
     MIN_TRACKS,

@@ -18,15 +18,9 @@ from fgslam.cameras.omni import (
     OmniCamera,
 )
 from fgslam.core.arrays import Image
+from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.errors import StoredMapError
 from fgslam.core.geometry import pose, so3_exp
-from fgslam.core.homing import (
-    BearingMatches,
-    OmniFeatures,
-    Refusal,
-    RefusalReason,
-    TwoViewVector,
-)
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.homing import places as path_places
 from fgslam.homing.places import (

@@ -21,9 +21,9 @@ from fgslam.cameras.omni import (
     RadialPolynomial,
 )
 from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.bearings import BearingMatches, ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.core.errors import ConfigError, StoredMapError
-from fgslam.core.homing import BearingMatches, ColumnSegments, OmniFeatures, UprightFeatures
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.homing.features import (
     MOST_COLUMNS,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.omni import Equirectangular
-from fgslam.core.homing import FeatureKind, Refusal, RefusalReason
+from fgslam.core.bearings import FeatureKind, Refusal, RefusalReason
 from fgslam.homing.front_end import ImageFrontEnd, mixed_with_wrong, surest_all_around
 from fgslam.homing.settings import FrontEndSettings
 from tests.homing import two_views

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import to_robot, wrap
+from fgslam.core.geometry import to_robot, wrap
 from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings, SteeringSettings
 from fgslam.homing.steering import (
     ACCELERATION_MPS2,

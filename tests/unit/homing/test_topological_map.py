@@ -14,9 +14,9 @@ import pytest
 import fgslam as fg
 from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.errors import CalibrationError, StoredMapError
-from fgslam.core.homing import OmniFeatures, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import between, wrap
+from fgslam.core.geometry import between, wrap
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import estimate_homing_vector
 from fgslam.homing.links import (

@@ -15,9 +15,9 @@ from simulated import Drive, simulate
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.estimates import Trajectory
 from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_exp
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
+from fgslam.core.types import Trajectory
 from fgslam.report.formats import (
     EXACT_SIGMA,
     FRAME,

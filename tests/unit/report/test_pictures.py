@@ -16,9 +16,8 @@ from matplotlib.image import imread
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import OutputError
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
-from fgslam.core.features import Features
 from fgslam.core.geometry import pose, se3_exp, so3_exp
+from fgslam.core.types import Estimate, Features, LandmarkMap, Trajectory
 from fgslam.report.content import SIGMAS, bulk_limits, exaggeration, world_position_covariances
 from fgslam.report.figures import (
     LANDMARK_ELLIPSES,
@@ -38,7 +37,7 @@ from fgslam.report.pictures import (
     oriented_squares,
 )
 from fgslam.report.results import ReportData, judged_report
-from fgslam.runs.tasks.slam_outputs import RunFigures
+from fgslam.runs.tasks.slam_results import RunFigures
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 

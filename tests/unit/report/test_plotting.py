@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from reports import landmark_map, loop
 
-from fgslam.core.estimates import Estimate, Trajectory
+from fgslam.core.types import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer
 from fgslam.report.figures import plot
 

@@ -25,7 +25,7 @@ from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.geometry import pose
 from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.settings import ConstantVelocitySettings, RecordedOdometrySettings
-from fgslam.runs.bare_recording import bare_experiment, experiment_of, short_config
+from fgslam.runs.bare import bare_experiment, experiment_of, short_config
 from fgslam.runs.config import ExperimentConfig, make_config
 from fgslam.runs.opening import open_sequence
 

@@ -19,17 +19,15 @@ from fgslam.backend.settings import Isam2Settings, LandmarkKalmanSettings
 from fgslam.cli.console import rich_table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Observations
-from fgslam.core.recordings import LandmarkTruth, read_landmark_truth, write_landmark_truth
+from fgslam.core.log import LandmarkTruth, MeasurementLog, read_landmark_truth, write_landmark_truth
+from fgslam.core.sensors import Increment, Observations
+from fgslam.core.types import LandmarkMap, Trajectory
 from fgslam.evaluation.judging import Answer, seen_often
 from fgslam.evaluation.statistics import EstimatorMetrics, Nees, UpdateTime, value_at
 from fgslam.report.content import TextTable
 from fgslam.report.formats import MapPoints
 from fgslam.runs.compare import Choice, all_kinds, choose
 from fgslam.runs.config import ExperimentConfig, make_config
-from fgslam.runs.estimator_files import points_from_log
 from fgslam.runs.slam_comparison import judged_apart, named
 from fgslam.runs.tables import (
     RESULT_COLUMNS,
@@ -39,10 +37,11 @@ from fgslam.runs.tables import (
     comparison_tables,
     marked,
     page_tables,
+    points_from_log,
     trials_table,
     write_comparison_csv,
 )
-from fgslam.runs.tasks.truth import (
+from fgslam.runs.tasks.slam_results import (
     at_edges,
     medians_of,
     points_under,

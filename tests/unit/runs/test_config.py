@@ -10,8 +10,13 @@ import yaml
 
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import ConstantVelocitySettings, ImageFolderSettings
-from fgslam.runs.config import ExperimentConfig, load_config, make_config, make_experiment
-from fgslam.runs.config_reading import read_mapping
+from fgslam.runs.config import (
+    ExperimentConfig,
+    load_config,
+    make_config,
+    make_experiment,
+    read_mapping,
+)
 from fgslam.worlds.settings import RenderedLabSettings
 
 EXPERIMENTS = [

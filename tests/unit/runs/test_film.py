@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.runs.film import Row, command_text, follow_rows, frame_rate
+from fgslam.runs.view import Row, command_text, follow_rows, frame_rate
 
 ROW = {
     "image": "3",

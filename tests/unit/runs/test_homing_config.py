@@ -11,15 +11,17 @@ import yaml
 from fgslam.backend.homing.settings import HomingEkfSettings, HomingGraphSettings
 from fgslam.core.errors import ConfigError
 from fgslam.runs.config import (
+    TASKS,
+    Experiment,
     ExperimentConfig,
+    HomingTrialsConfig,
     is_homing,
     load_config,
     load_experiment,
     load_homing,
     make_experiment,
+    read_mapping,
 )
-from fgslam.runs.config_models import TASKS, Experiment, HomingTrialsConfig
-from fgslam.runs.config_reading import read_mapping
 
 EXPERIMENTS = [
     path

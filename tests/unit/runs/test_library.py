@@ -14,7 +14,7 @@ from recordings import write_recording
 import fgslam as fg
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
-from fgslam.core.estimates import Prediction
+from fgslam.core.types import Prediction
 from fgslam.errors import (
     CalibrationError,
     ConfigError,
@@ -26,7 +26,7 @@ from fgslam.errors import (
     MeasurementLogError,
     OutputError,
 )
-from fgslam.runs.live import override_texts
+from fgslam.runs.session import override_texts
 
 FRAMES = 6
 
@@ -156,8 +156,7 @@ def test_frames_that_a_recording_does_not_have_are_named(folder: Path) -> None:
 def test_an_estimator_brought_along_is_replayed_and_named(
     driven: tuple[fg.Slam, fg.Result],
 ) -> None:
-    from fgslam.slam.choices import chosen_estimator
-    from fgslam.slam.factory import made_or_given
+    from fgslam.slam.build import chosen_estimator, made_or_given
 
     log = driven[0].log
     own = made_or_given(log.rig, chosen_estimator("ekf"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core import geometry as g
-from fgslam.runs.tasks.truth import alignment_slack
+from fgslam.runs.tasks.slam_results import alignment_slack
 
 
 def test_a_straight_drive_leaves_the_roll_open_and_a_bent_one_does_not() -> None:

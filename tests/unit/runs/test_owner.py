@@ -11,8 +11,7 @@ import pytest
 
 from fgslam.core.errors import OutputError
 from fgslam.core.files import remove_unfinished_files, replacing, write_bytes
-from fgslam.runs.folder import create_run_folder
-from fgslam.runs.owner import OWNER_NAME, Owner
+from fgslam.runs.folder import OWNER_NAME, Owner, create_run_folder
 
 
 def in_another_process(do: Callable[[], object]) -> int:

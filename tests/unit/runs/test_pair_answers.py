@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import Refusal, RefusalReason, TwoViewVector
-from fgslam.core.planar import compose, wrap
+from fgslam.core.bearings import Refusal, RefusalReason, TwoViewVector
+from fgslam.core.geometry import compose, wrap
 from fgslam.runs.tasks.homing_views import (
     PairAnswer,
     answer_numbers,

@@ -8,27 +8,25 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fgslam.core.estimates import (
+from fgslam.core.geometry import se3_exp
+from fgslam.core.log import Frame, MeasurementLog
+from fgslam.core.sensors import CameraRig, Increment, Observations
+from fgslam.core.store import load_arrays, restore, state_of, write_arrays
+from fgslam.core.types import (
     EgoMotion,
     EgoMotionStatus,
     Estimate,
+    Features,
     LandmarkMap,
+    StereoFeatures,
     Trajectory,
     UpdateStats,
 )
-from fgslam.core.features import Features, StereoFeatures
-from fgslam.core.geometry import se3_exp
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Observations
-from fgslam.core.recordings import Frame
-from fgslam.core.sensors import CameraRig
-from fgslam.core.store import load_arrays, restore, state_of, write_arrays
 from fgslam.evaluation.judging import Truth
 from fgslam.evaluation.statistics import value_at
-from fgslam.runs.tasks.slam_metrics import estimator_metrics, frame_problems, run_numbers
+from fgslam.runs.report import estimator_metrics, frame_problems, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
-from fgslam.slam.noise_in_use import FrameNoise
-from fgslam.slam.pipeline import FrameReport
+from fgslam.slam.pipeline import FrameNoise, FrameReport
 from fgslam.slam.results import STAGES, FrameRow, RunRecorder
 
 RIG = CameraRig(32, 24, 30.0, 30.0, 15.5, 11.5, 0.1, None, np.eye(4))

@@ -10,8 +10,7 @@ import pytest
 
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.runs.engine import Task
-from fgslam.runs.folder import ExistingFolder
-from fgslam.runs.owner import OWNER_NAME, Owner
+from fgslam.runs.folder import OWNER_NAME, ExistingFolder, Owner
 from fgslam.runs.sweeps import sweep
 from fgslam.runs.sweeps.case import CaseTask
 from fgslam.runs.sweeps.folder import JOURNAL_FILE, Plan, begin_sweep

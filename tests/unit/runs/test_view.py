@@ -6,9 +6,9 @@ import numpy as np
 from numpy.testing import assert_array_equal
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import LandmarkMap
 from fgslam.core.geometry import rotation_from_quaternion
-from fgslam.core.measurements import Increment, Observations, moved_pixels
+from fgslam.core.sensors import Increment, Observations, moved_pixels
+from fgslam.core.types import LandmarkMap
 from fgslam.runs.view import ChangedBlocks, half_axes, seen_pixels
 
 

@@ -11,7 +11,7 @@ from dataset_builders import save
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import project, transform_to_camera
-from fgslam.core.recordings import Sequence
+from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import ImageFolderSettings
@@ -86,7 +86,7 @@ def expected_in_first_frame(grid: Path, recording: Recording, k: int) -> FloatAr
 def test_frames_are_a_rigid_trinocular_walk(grid: Path) -> None:
     """One rigid set of points explains all views of all frames, with the true poses."""
     recording = converted(grid)
-    assert isinstance(recording, Sequence)
+    assert isinstance(recording, ImageSequence)
     assert len(recording) == COLUMNS - 4
     rig, truth = recording.rig, recording.ground_truth
     assert truth is not None

@@ -13,8 +13,8 @@ from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.errors import DatasetError
-from fgslam.core.estimates import Prediction, Trajectory
-from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.log import MeasurementRecording
+from fgslam.core.types import Prediction, Trajectory
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,

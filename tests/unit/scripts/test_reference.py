@@ -8,8 +8,7 @@ import pytest
 import typer
 
 from fgslam.cli.main import app
-from fgslam.runs.config import ExperimentConfig
-from fgslam.runs.config_models import HOMING_TASKS, TASKS, LocalisationConfig
+from fgslam.runs.config import HOMING_TASKS, TASKS, ExperimentConfig, LocalisationConfig
 from scripts import reference_experiments, reference_settings
 from scripts.make_reference import DOCS, EXAMPLES, commands_of, commands_page, pages, tutorial_page
 from scripts.reference_experiments import unreasoned

@@ -27,14 +27,18 @@ from fgslam.backend.settings import (
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import EgoMotion, EgoMotionStatus, LandmarkMap, Prediction, Trajectory
-from fgslam.core.features import LandmarkAppearances
-from fgslam.core.measurements import Increment, Observations
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.store import restore, state_of
-from fgslam.slam.arrival import Arrival, require_map_user, take_over
-from fgslam.slam.factory import make_estimator
+from fgslam.core.types import (
+    EgoMotion,
+    EgoMotionStatus,
+    LandmarkAppearances,
+    LandmarkMap,
+    Prediction,
+    Trajectory,
+)
+from fgslam.slam.build import Arrival, make_estimator, require_map_user, take_over
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 WTC = g.se3_exp(np.array([0.02, 0.3, -0.01, 0.4, 0.02, -0.2]))

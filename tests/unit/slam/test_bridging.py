@@ -6,7 +6,7 @@ import numpy as np
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import Estimate, LandmarkMap, Trajectory
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.bridging import bridged, bridged_frames
 

@@ -9,10 +9,10 @@ import pytest
 
 import fgslam as fg
 from fgslam.core.arrays import Image
-from fgslam.core.features import Features
+from fgslam.core.types import Features
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
-from fgslam.slam.factory import make_extractor
+from fgslam.slam.build import make_extractor
 
 BEGINS, FRAMES = 14, 22
 

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from fgslam.core.errors import CalibrationError, ConfigError, MeasurementLogError
-from fgslam.core.measurements import MeasurementType
+from fgslam.core.sensors import MeasurementType
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.runs.library import replay
-from fgslam.slam.choices import chosen_estimator, chosen_frontend
+from fgslam.slam.build import chosen_estimator, chosen_frontend
 from fgslam.slam.session import Session
 
 

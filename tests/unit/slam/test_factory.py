@@ -6,11 +6,10 @@ from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA
-from fgslam.core.measurements import MeasurementType
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, MeasurementType
 from fgslam.runs.config import make_config
 from fgslam.runs.opening import open_sequence
-from fgslam.slam.factory import make_estimator, require_support
+from fgslam.slam.build import make_estimator, require_support
 
 RIG = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, BODY_FORWARD_LEFT_UP_FROM_CAMERA)
 

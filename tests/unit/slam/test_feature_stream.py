@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import Image
-from fgslam.core.features import Features
-from fgslam.core.recordings import Frame
+from fgslam.core.log import Frame
+from fgslam.core.types import Features
 from fgslam.slam.feature_stream import FrameDescriber
 
 PLACES = np.array([[10.0, 10.0], [20.0, 10.0], [30.4, 10.0]])

@@ -9,10 +9,10 @@ import pytest
 from rings import assert_same_increments, on_ring, pipeline_of, seen
 from simulated import RIG, assert_same_bits
 
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.runs.tasks.slam_state import restore, state_of
-from fgslam.slam.arrival import saved_map
+from fgslam.runs.tasks.slam import restore, state_of
+from fgslam.slam.build import saved_map
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import SlamPipeline

@@ -11,14 +11,18 @@ from simulated import RIG, Drive, assert_same_bits, simulate
 from fgslam.backend.settings import Isam2Settings, LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import BiasEffect, Odometry
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Prediction
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.slam.gyroscope import GyroscopeError, turn_of_camera
-from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
+from fgslam.slam.motion import (
+    ConstantVelocityMotion,
+    GyroscopeError,
+    OdometryMotion,
+    turn_of_camera,
+)
 from fgslam.slam.replay import replay
 
 SETTINGS = ConstantVelocitySettings()

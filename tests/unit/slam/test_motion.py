@@ -12,10 +12,9 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Prediction
-from fgslam.core.measurements import Odometry
-from fgslam.core.sensors import CameraRig
+from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import Prediction
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
 

@@ -9,16 +9,16 @@ import pytest
 from simulated import RIG, Drive, simulate
 
 from fgslam.backend.settings import EstimatorSettings, Isam2Settings, LandmarkKalmanSettings
-from fgslam.core.estimates import Prediction
 from fgslam.core.geometry import se3_exp
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Odometry
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import Prediction
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import MatchNoise
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion, OdometryMotion
-from fgslam.slam.noise_in_use import FrameNoise, noise_in_use
+from fgslam.slam.pipeline import FrameNoise, noise_in_use
 from fgslam.slam.replay import Replay, replay
 
 FILTER = make_estimator(RIG, LandmarkKalmanSettings())

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from simulated import RIG
 
-from fgslam.core.features import StereoFeatures
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, Odometry
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, Odometry
+from fgslam.core.types import StereoFeatures
 from fgslam.frontend.tracking.landmarks import MapParts
-from fgslam.slam.part_remarks import in_first_map, part_remarks
-from fgslam.slam.results import FrameRow, RunRecorder
+from fgslam.slam.results import FrameRow, RunRecorder, in_first_map, part_remarks
 
 NONE = np.empty(0, np.int64)
 

@@ -14,12 +14,12 @@ from simulated import RIG, Drive, assert_same_bits, play, simulate
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
 from fgslam.core.errors import EstimatorError, MeasurementLogError
-from fgslam.core.estimates import Estimate, Trajectory, UpdateStats
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
+from fgslam.core.types import Estimate, Trajectory, UpdateStats
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.judging import Truth, judge_replay
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.slam import factory
+from fgslam.slam import build as factory
 from fgslam.slam import replay as module
 from fgslam.slam.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
 

@@ -27,18 +27,16 @@ from fgslam.core.errors import (
     OdometryError,
     SessionError,
 )
-from fgslam.core.estimates import EgoMotionStatus, Prediction
-from fgslam.core.features import Features
-from fgslam.core.measurements import Odometry
-from fgslam.core.recordings import Frame
+from fgslam.core.log import Frame
+from fgslam.core.sensors import Odometry
+from fgslam.core.types import EgoMotionStatus, Features, Prediction
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import Tracked
-from fgslam.slam.inputs import checked_images
 from fgslam.slam.pipeline import FrameReport
 from fgslam.slam.replay import replay
 from fgslam.slam.results import SessionResult
-from fgslam.slam.session import Session
+from fgslam.slam.session import Session, checked_images
 
 FRAMES = 7
 RIGHT, LEFT, TOP = range(3)

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError
-from fgslam.core.planar import between
+from fgslam.core.geometry import between
 from fgslam.worlds import driving
 from fgslam.worlds.driving import (
     MAX_ACCELERATION_M_S2,

@@ -7,7 +7,7 @@ import pytest
 
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError, DatasetError
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.worlds.buildings.house import DEPTH, PLAN, WIDTH, build_house
 from fgslam.worlds.driving import RangeSensor

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import ConfigError
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.worlds.buildings import corridors as alike
 from fgslam.worlds.buildings import office
 from fgslam.worlds.buildings.lab import build_lab

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fgslam.core.planar import bearings, wrap
+from fgslam.core.geometry import bearings, wrap
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import (
     NO_OUTLIERS,

@@ -15,9 +15,9 @@ from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
-from fgslam.core.estimates import Prediction, Trajectory
-from fgslam.core.recordings import MeasurementRecording
+from fgslam.core.log import MeasurementRecording
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import Prediction, Trajectory
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import ConstantVelocitySettings, SyntheticOdometrySettings
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory

@@ -24,10 +24,10 @@ from fgslam.backend.homing.estimators import AverageDisplacement, AverageLandmar
 from fgslam.backend.homing.paper_ekf import PaperEkf, seen_from_target, separate_initial_state
 from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.arrays import FloatArray
+from fgslam.core.bearings import HomingStart, LocalMap, TrackedBearings, TwoViewVector
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingStart, LocalMap, TrackedBearings, TwoViewVector
-from fgslam.core.planar import bearings, wrap
-from fgslam.factors.bearing_residuals import (
+from fgslam.core.geometry import bearings, wrap
+from fgslam.factors.bearing import (
     bearing_jacobians,
     polar_jacobians,
     polar_points,

@@ -14,9 +14,9 @@ from fgslam.backend.homing.graph import HomingGraph
 from fgslam.backend.homing.schur import Factored, SchurSolver, State
 from fgslam.backend.homing.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray
+from fgslam.core.bearings import HomingEstimate
 from fgslam.core.errors import EstimatorError
-from fgslam.core.homing import HomingEstimate
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import HomingOutliers
 

@@ -7,8 +7,8 @@ import pytest
 
 from fgslam.cameras.omni import Cylinder
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.homing import ColumnSegments
-from fgslam.core.planar import wrap
+from fgslam.core.bearings import ColumnSegments
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import COVARIANCE, ColumnSegmentFinder, dct_rows, whitened
 from fgslam.frontend.features.settings import (
     OmniMatchingSettings,

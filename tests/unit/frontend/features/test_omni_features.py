@@ -10,9 +10,9 @@ import pytest
 
 from fgslam.cameras.omni import Cylinder, Equirectangular, HyperbolicMirror, unwrap_maps
 from fgslam.core.arrays import Image
+from fgslam.core.bearings import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.errors import FrameError
-from fgslam.core.homing import FeatureKind, OmniFeatures, UprightFeatures
-from fgslam.core.planar import wrap
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features import omni as colour_sift
 from fgslam.frontend.features.omni import (
     SIGMA_PX,

@@ -9,8 +9,7 @@ from scipy import ndimage
 
 from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import EstimatorError, FrameError
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
     FeatureKind,
@@ -18,7 +17,8 @@ from fgslam.core.homing import (
     TrackedBearings,
     UprightFeatures,
 )
-from fgslam.core.planar import wrap
+from fgslam.core.errors import EstimatorError, FrameError
+from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import empty_features, empty_segments
 from fgslam.frontend.homing.tracking import (
     DISTINCT_PX,

@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2, norm
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.homing import (
+from fgslam.core.bearings import (
     BearingMatches,
     LocalMap,
     OmniFeatures,
@@ -19,7 +19,7 @@ from fgslam.core.homing import (
     TwoViewVector,
     UprightFeatures,
 )
-from fgslam.core.planar import bearings, wrap
+from fgslam.core.geometry import bearings, wrap
 from fgslam.frontend.features.omni import empty_segments
 from fgslam.frontend.features.settings import OmniMatchingSettings
 from fgslam.frontend.homing.settings import HomingVectorSettings

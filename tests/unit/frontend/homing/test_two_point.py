@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.planar import unit, wrap
+from fgslam.core.geometry import unit, wrap
 from fgslam.frontend.homing.two_view import (
     TwoPointSamples,
     TwoPointSolutions,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import IntArray
-from fgslam.core.estimates import LandmarkMap, RelocalisationStatus
+from fgslam.core.types import LandmarkMap, RelocalisationStatus
 from fgslam.frontend.places.known_map import Tentative
 from fgslam.frontend.places.relocalisation import (
     ENOUGH_INLIERS,

@@ -13,7 +13,7 @@ from fgslam.core.geometry import inverse
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.places.recognition import PlaceRecognition
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.slam.factory import make_motion, make_places
+from fgslam.slam.build import make_motion, make_places
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 
 GAP = 8

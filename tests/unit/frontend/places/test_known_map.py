@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances
 from fgslam.core.geometry import project, transform_to_camera
+from fgslam.core.types import LandmarkAppearances, LandmarkMap
 from fgslam.frontend.places.known_map import KnownMap
 from tests.known_places import RIG, looks, planar
 

@@ -11,13 +11,18 @@ import pytest
 from fgslam.core import geometry as g
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.errors import MapError, OutputError
-from fgslam.core.estimates import LandmarkMap, Trajectory
-from fgslam.core.features import CUT_PIXELS, LandmarkAppearances, LandmarkPatches
 from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.sensors import CameraRig
+from fgslam.core.types import (
+    CUT_PIXELS,
+    LandmarkAppearances,
+    LandmarkMap,
+    LandmarkPatches,
+    Trajectory,
+)
 from fgslam.frontend.places import merging as map_alignment
 from fgslam.frontend.places.merging import Alignment, align_maps, merge_maps, tentative_pairs
-from fgslam.runs.maps import merge_files
+from fgslam.runs.session import merge_files
 
 RIG = CameraRig(320, 240, 277.1, 277.3, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 BTA = g.se3_exp(np.array([0.02, 0.7, -0.01, 1.5, 0.1, -2.0]))

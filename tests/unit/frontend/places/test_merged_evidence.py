@@ -20,11 +20,10 @@ from smoothing import answer
 from fgslam.backend.settings import BatchSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import LandmarkAppearances
 from fgslam.core.saved_map import SavedMap, load_map, save_map
+from fgslam.core.types import LandmarkAppearances, LandmarkMap
 from fgslam.frontend.places.merging import align_maps, merge_maps
-from fgslam.runs.maps import merge_files
+from fgslam.runs.session import merge_files
 
 POINTS = 250
 HALF_BAND = (

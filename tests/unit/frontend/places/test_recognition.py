@@ -26,16 +26,16 @@ from fgslam.backend import loops
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, StateArrays
-from fgslam.core.estimates import EgoMotionStatus
-from fgslam.core.measurement_log import MeasurementLog
+from fgslam.core.log import MeasurementLog
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import EgoMotionStatus
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.features.matching import AppearanceIndex
 from fgslam.frontend.places import known_map
 from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, difference
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
-from fgslam.slam.factory import make_estimator
+from fgslam.slam.build import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
 from fgslam.slam.replay import replay_frame

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from fgslam.core import geometry
-from fgslam.core.estimates import LandmarkMap
-from fgslam.core.features import StereoFeatures
+from fgslam.core.types import LandmarkMap, StereoFeatures
 from fgslam.frontend.features.matching import Neighbours
 from fgslam.frontend.places.known_map import KnownMap
 from fgslam.frontend.places.relocalisation import (

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.estimates import Relocalisation, RelocalisationStatus
-from fgslam.core.features import StereoFeatures
 from fgslam.core.geometry import pose, so3_exp
+from fgslam.core.types import Relocalisation, RelocalisationStatus, StereoFeatures
 from fgslam.frontend.places import relocalisation as relocaliser
 from fgslam.frontend.places.relocalisation import LEAST_INLIERS, Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings

@@ -10,11 +10,17 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.estimates import EgoMotionStatus, LandmarkMap, Relocalisation, RelocalisationStatus
-from fgslam.core.features import LandmarkAppearances, StereoFeatures
-from fgslam.core.measurement_log import MeasurementLog
-from fgslam.core.measurements import Increment, LoopClosure, Observations
+from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import Increment, LoopClosure, Observations
 from fgslam.core.store import restore, state_of
+from fgslam.core.types import (
+    EgoMotionStatus,
+    LandmarkAppearances,
+    LandmarkMap,
+    Relocalisation,
+    RelocalisationStatus,
+    StereoFeatures,
+)
 from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places.recognition import (
     Confirmation,

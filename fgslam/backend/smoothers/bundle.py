@@ -1,0 +1,773 @@
+"""A whole graph in arrays: its cost, its linear system, and the way to its minimum.
+
+Landmark observations, which are many, are arrays (:mod:`sightings`); the few other factors (prior,
+odometry, floor, loops, what is known of single landmarks) stay GTSAM's, which linearises them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial, reduce
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy.sparse import bsr_matrix, csr_matrix
+
+from fgslam.backend.settings import KernelSettings
+from fgslam.backend.smoothers.elimination import (
+    BlockCholesky,
+    Border,
+    Bordered,
+    EliminatedBorder,
+    GraphMarginals,
+    LinearSystem,
+    block_diagonal,
+    reduced,
+    with_border,
+)
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import adjoint, compose_covariance, inverse
+from fgslam.core.least_squares import Damping
+from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
+from fgslam.factors.graphs import is_pose, number
+from fgslam.factors.landmark import FROM_MEASUREMENT, LinearRows, linearised, residuals, whitening
+from fgslam.factors.noise import kernel_losses, kernel_weights, positive_definite
+
+# ------------------------------------------------------------------------------------------
+# Landmark observations of a whole graph in arrays: whitened residuals and their derivatives
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StereoSightings:
+    """Observations of one rig.
+
+    Attributes:
+        rows: of their factors in the graph that they come from (k,).
+        poses: rows (k,) of their poses.
+        points: rows (k,) of their landmarks.
+        measured: (k, 3) column, row, disparity, pixels.
+        roots: (k, 3, 3) square roots of their informations.
+        rig: the cameras; their images' size is not known.
+    """
+
+    rows: IntArray
+    poses: IntArray
+    points: IntArray
+    measured: FloatArray
+    roots: FloatArray
+    rig: CameraRig
+
+    @staticmethod
+    def of(
+        factors: list[Any], rows: IntArray, poses: IntArray, points: IntArray
+    ) -> StereoSightings:
+        """Of stereo factors, with or without kernels."""
+        left, right, row = np.array([factor.measured().vector() for factor in factors]).T
+        roots = np.empty((len(factors), 3, 3))
+        for root, factor in zip(roots, factors, strict=True):
+            model = factor.noiseModel()
+            bare: Any = model.noise() if isinstance(model, gtsam.noiseModel.Robust) else model
+            root[:] = bare.R()
+        k = factors[0].calibration()
+        rig = CameraRig(0, 0, k.fx(), k.fy(), k.px(), k.py(), k.baseline(), None, np.eye(4))
+        measured = np.column_stack([right, row, left - right])
+        return StereoSightings(rows, poses, points, measured, roots @ FROM_MEASUREMENT, rig)
+
+    def of_points(self, kept: BoolArray) -> StereoSightings:
+        """Those of some landmarks, a mask (m,), whose rows are renumbered."""
+        own, number = kept[self.points], np.cumsum(kept) - 1
+        return StereoSightings(
+            self.rows[own],
+            self.poses[own],
+            number[self.points[own]],
+            self.measured[own],
+            self.roots[own],
+            self.rig,
+        )
+
+    def residuals(self, poses: FloatArray, points: FloatArray) -> FloatArray:
+        """Whitened residuals (k, 3) at all poses (n, 4, 4) and points (m, 3)."""
+        own, seen = poses[self.poses], points[self.points]
+        return residuals(self.rig, own, seen, self.measured, self.roots)
+
+    def look(self, poses: FloatArray, points: FloatArray) -> LinearRows:
+        """The same, with derivatives."""
+        own, seen = poses[self.poses], points[self.points]
+        return linearised(self.rig, own, seen, self.measured, self.roots)
+
+
+def values_of(keys: dict[int, int], poses: FloatArray, points: FloatArray) -> Any:
+    """GTSAM values of variables, given by their rows among poses (n, 4, 4) and points (m, 3)."""
+    values = gtsam.Values()
+    for key, row in keys.items():
+        values.insert(key, gtsam.Pose3(poses[row]) if is_pose(key) else points[row])
+    return values
+
+
+# ------------------------------------------------------------------------------------------
+# Turns of a gyroscope in a whole graph, whose bias is a variable of it
+
+_MOST_NODES = 17  # a bound for the work: every two minutes in a drive of half an hour
+_NO_WALK = 0.01  # of the time after which the walk counts: less than 1e-4 of the variance is its
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """What a bias does to a step of the graph, which may be of several frames.
+
+    Attributes:
+        jacobian: (6, 3) of the step's tangent vector, at its end, by the bias.
+        applied: (6,) what the step's motion contains of that.
+        unknown: (6, 6) what the step's covariance contains of it.
+        start_variance, walk: as :class:`fgslam.core.sensors.BiasEffect`.
+    """
+
+    jacobian: FloatArray
+    applied: FloatArray
+    unknown: FloatArray
+    start_variance: float
+    walk: float
+
+    @staticmethod
+    def of(steps: Sequence[Odometry | None]) -> Turn | None:
+        """Of consecutive steps; None where a bias plays no part."""
+        biases = [step.bias for step in steps if step is not None and step.bias is not None]
+        if not biases:
+            return None
+        jacobian, applied, unknown = np.zeros((6, 3)), np.zeros(6), np.zeros((6, 6))
+        for step in steps:
+            if step is None:
+                continue
+            back, own = adjoint(inverse(step.motion)), _by_bias(step.bias)
+            left = np.zeros((3, 3)) if step.bias is None else step.bias.left
+            unknown = compose_covariance(step.motion, unknown, own @ left @ own.T)
+            bias = np.zeros(3) if step.bias is None else step.bias.applied
+            jacobian, applied = back @ jacobian + own, back @ applied + own @ bias
+        walk = float(sum(bias.walk for bias in biases))
+        return Turn(jacobian, applied, unknown, biases[0].start_variance, walk)
+
+
+def _by_bias(bias: BiasEffect | None) -> FloatArray:
+    """(6, 3) of a single step."""
+    return np.zeros((6, 3)) if bias is None else np.pad(bias.jacobian, ((0, 3), (0, 0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnedStep:
+    """A step between two frames of the graph, and what a bias does to it."""
+
+    before: int
+    after: int
+    step: Odometry
+    turn: Turn
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turns:
+    """All k steps of a graph that a gyroscope measured; its bias is at q nodes.
+
+    Attributes:
+        before, after: (k,) rows of their poses.
+        motions: (k, 4, 4) by the bias that was applied.
+        applied: (k, 6) its effect.
+        jacobians: (k, 6, 3) by the bias.
+        roots: (k, 6, 6) whitening of what is no bias.
+        nodes: (k, q) weights of the nodes in the bias of each step.
+        known: (3q, 3q) information of the nodes beforehand, about zero.
+    """
+
+    before: IntArray
+    after: IntArray
+    motions: FloatArray
+    applied: FloatArray
+    jacobians: FloatArray
+    roots: FloatArray
+    nodes: FloatArray
+    known: FloatArray
+
+    @staticmethod
+    def of(steps: Sequence[TurnedStep], frames: Sequence[int], persistence: float) -> Turns | None:
+        """Of a graph's steps in time order; None where there are none.
+
+        Args:
+            steps: with noise as stated.
+            frames: of the graph's poses, ascending.
+            persistence: multiplies the variance of their translation, which matches made.
+        """
+        if not steps:
+            return None
+        scale = np.sqrt(np.repeat([1.0, persistence], 3))
+        white = np.array([s.step.covariance - s.turn.unknown for s in steps])
+        jacobians = np.array([s.turn.jacobian for s in steps])
+        nodes, known, between = _nodes([s.turn for s in steps], jacobians, white)
+        noise = scale[:, None] * white * scale + between
+        return Turns(
+            np.searchsorted(frames, [s.before for s in steps]).astype(np.int64),
+            np.searchsorted(frames, [s.after for s in steps]).astype(np.int64),
+            np.array([s.step.motion for s in steps]),
+            np.array([s.turn.applied for s in steps]),
+            jacobians,
+            whitening(np.array([positive_definite(each) for each in noise])),
+            nodes,
+            known,
+        )
+
+    def cost(self, poses: FloatArray, bias: FloatArray) -> float:
+        """Half the sum of squares, with what is known of the bias (3q,) beforehand."""
+        residuals = self.residuals(poses, bias)
+        return 0.5 * float((residuals**2).sum() + bias @ self.known @ bias)
+
+    def residuals(self, poses: FloatArray, bias: FloatArray) -> FloatArray:
+        """(k, 6) whitened: how far each pose (n, 4, 4) is off from where its step leads."""
+        from scipy.spatial.transform import Rotation
+
+        rates = self.nodes @ bias.reshape(-1, 3)
+        by = np.einsum("kij,kj->ki", self.jacobians, rates) - self.applied
+        stepped = np.array(self.motions)
+        turned = Rotation.from_rotvec(by[:, :3]).as_matrix()
+        stepped[:, :3, 3] += np.einsum("kij,kj->ki", stepped[:, :3, :3], by[:, 3:])
+        stepped[:, :3, :3] = stepped[:, :3, :3] @ turned
+        off = inverse(stepped) @ inverse(poses[self.before]) @ poses[self.after]
+        angles = Rotation.from_matrix(off[:, :3, :3]).as_rotvec()
+        apart = np.concatenate([angles, off[:, :3, 3]], axis=1)
+        return np.asarray(np.einsum("kij,kj->ki", self.roots, apart))
+
+    def start(self, poses: FloatArray) -> FloatArray:
+        """(3q,) the likeliest bias for these poses.
+
+        Raises:
+            EstimatorError: the noise that is stated for the gyroscope leaves it open.
+        """
+        none = np.zeros(len(self.known))
+        by_bias = self._by_bias()
+        gradient = by_bias.T @ self.residuals(poses, none).ravel()
+        try:
+            return np.asarray(-np.linalg.solve(by_bias.T @ by_bias + self.known, gradient))
+        except np.linalg.LinAlgError:
+            raise EstimatorError(
+                "the gyroscope's bias is not determined by its stated noise; correct "
+                "gyroscope_noise_density and gyroscope_random_walk of its file"
+            ) from None
+
+    def joined(self, system: LinearSystem, poses: FloatArray, bias: FloatArray) -> LinearSystem:
+        """Normal equations with these steps, at a state; derivatives as of a small residual."""
+        k, n = len(self.before), len(poses)
+        back = adjoint(inverse(poses[self.after]) @ poses[self.before])
+        blocks = np.stack([-self.roots @ back, self.roots], axis=1).reshape(-1, 6, 6)
+        columns = np.column_stack([self.before, self.after]).ravel()
+        by_pose = bsr_matrix((blocks, columns, 2 * np.arange(k + 1)), (6 * k, 6 * n)).tocsr()
+        residual, by_bias = self.residuals(poses, bias).ravel(), self._by_bias()
+        border = Border(
+            by_pose.T @ by_bias,
+            by_bias.T @ by_bias + self.known,
+            by_bias.T @ residual + self.known @ bias,
+        )
+        return dataclasses.replace(
+            system,
+            poses=system.poses + (by_pose.T @ by_pose).tocsr(),
+            pose_gradient=system.pose_gradient + by_pose.T @ residual,
+            border=border,
+        )
+
+    def _by_bias(self) -> FloatArray:
+        """(6k, 3q) of all residuals by the nodes."""
+        whitened = -self.roots @ self.jacobians
+        spread = whitened[:, :, None, :] * self.nodes[:, None, :, None]
+        return np.asarray(spread.reshape(6 * len(whitened), -1))
+
+
+def _nodes(
+    turns: Sequence[Turn], jacobians: FloatArray, white: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weights (k, q) of the nodes in each step, what is known of them, what they leave open.
+
+    After a time of sqrt(3) times white noise over walk, the random walk is as large as the mean of
+    the white noise (where their Allan deviations cross); two nodes lie in each such time.
+
+    Args:
+        turns: k of them, in time order.
+        jacobians: (k, 6, 3) theirs.
+        white: (k, 6, 6) noise of the steps that is no bias.
+
+    Returns:
+        Weights (k, q), information (3q, 3q) of the nodes beforehand, and (k, 6, 6) by how much the
+        walk between two nodes adds to the steps' noise.
+    """
+    duration = np.linalg.norm(jacobians[:, :3], axis=(1, 2)) / np.sqrt(3.0)
+    end, walk = np.cumsum(duration), sum(turn.walk for turn in turns)
+    noise = float(np.trace(white[:, :3, :3], axis1=1, axis2=2).sum()) / 3.0
+    first = np.eye(3) / turns[0].start_variance
+    if end[-1] ** 2 * walk <= _NO_WALK**2 * 3.0 * noise:
+        return np.ones((len(turns), 1)), first, np.zeros_like(white)
+    most = end[-1] / (_MOST_NODES - 1)
+    intervals = int(np.ceil(end[-1] / max(0.5 * np.sqrt(3.0 * noise / walk), most)))
+    at = intervals * (end - 0.5 * duration) / end[-1]
+    nodes = np.maximum(1.0 - np.abs(at[:, None] - np.arange(intervals + 1)), 0.0)
+    steps = np.diff(np.eye(intervals + 1), axis=0) * np.sqrt(intervals / walk)
+    known = np.kron(steps.T @ steps, np.eye(3))
+    known[:3, :3] += first
+    return nodes, known, _between(jacobians, duration, walk * end[-1] / intervals**2)
+
+
+def _between(jacobians: FloatArray, duration: FloatArray, walk: float) -> FloatArray:
+    """(k, 6, 6) what a walk between nodes adds to the noise of steps, as if new in each.
+
+    There it is a Brownian bridge; over an interval L its integral has the variance K^2 L^3 / 12, as
+    white noise of the density K^2 L^2 / 12 has (at most a sixteenth of the gyroscope's own, where
+    the number of nodes is not bounded). Over parts of the interval that is more than the truth.
+
+    Args:
+        jacobians: (k, 6, 3) of the steps by the bias.
+        duration: (k,) of the steps, seconds.
+        walk: K^2 L^2.
+    """
+    each = walk / 12.0 / np.maximum(duration, np.finfo(np.float64).tiny)
+    return np.asarray(each[:, None, None] * (jacobians @ np.swapaxes(jacobians, 1, 2)))
+
+
+# ------------------------------------------------------------------------------------------
+# The factors of a whole graph that are no observations: GTSAM's, and a gyroscope's turns
+
+
+@dataclass(frozen=True, eq=False)
+class OtherFactors:
+    """Prior, odometry, floor, loops, what is known of single landmarks.
+
+    Attributes:
+        graph: GTSAM's, without empty slots.
+        pose_keys, landmark_keys: of all variables, ascending.
+        turns: odometry of a gyroscope; None where there is none.
+    """
+
+    graph: Any
+    pose_keys: list[int]
+    landmark_keys: list[int]
+    turns: Turns | None = None
+
+    def plus(self, factor: Any) -> OtherFactors:
+        """With one more."""
+        graph = self.graph.clone()
+        graph.add(factor)
+        return dataclasses.replace(self, graph=graph)
+
+    def without(self, gone: set[int]) -> OtherFactors:
+        """Without landmarks, by key, and what is said of them."""
+        graph = gtsam.NonlinearFactorGraph()
+        for row in range(self.graph.size()):
+            if gone.isdisjoint(self.graph.at(row).keys()):
+                graph.add(self.graph.at(row))
+        left = [key for key in self.landmark_keys if key not in gone]
+        return dataclasses.replace(self, graph=graph, landmark_keys=left)
+
+    def cost(self, poses: FloatArray, points: FloatArray, bias: FloatArray) -> float:
+        """Half the sum of squares at poses (n, 4, 4), points (m, 3) and biases (3q,)."""
+        cost = float(self.graph.error(values_of(self._rows, poses, points)))
+        return cost if self.turns is None else cost + self.turns.cost(poses, bias)
+
+    def linear(self, poses: FloatArray, points: FloatArray, bias: FloatArray) -> LinearSystem:
+        """Their normal equations there."""
+        system = self._linear(poses, points)
+        return system if self.turns is None else self.turns.joined(system, poses, bias)
+
+    @cached_property
+    def _rows(self) -> dict[int, int]:
+        """Rows of the variables of GTSAM's factors, by key, ascending."""
+        rows = {key: row for row, key in enumerate(self.landmark_keys)}
+        rows |= {key: row for row, key in enumerate(self.pose_keys)}
+        return {key: rows[key] for key in sorted(self.graph.keyVector())}
+
+    def _linear(self, poses: FloatArray, points: FloatArray) -> LinearSystem:
+        """Those of GTSAM."""
+        n, m = len(self.pose_keys), len(self.landmark_keys)
+        linear = self.graph.linearize(values_of(self._rows, poses, points))
+        row, column, value = linear.sparseJacobian_()
+        places = [
+            3 * m + 6 * row + np.arange(6) if is_pose(key) else 3 * row + np.arange(3)
+            for key, row in self._rows.items()
+        ]
+        # GTSAM counts from 1 and puts the right-hand side in the last column.
+        place = np.concatenate([*places, [3 * m + 6 * n]])
+        at = row.astype(np.int64) - 1, place[column.astype(np.int64) - 1]
+        rows = int(row.max(initial=0))
+        whole = csr_matrix((value, at), (rows, 3 * m + 6 * n + 1))
+        jacobian, right = whole[:, :-1], whole[:, [-1]].toarray()[:, 0]
+        information = (jacobian.T @ jacobian).tocsr()
+        gradient = -(jacobian.T @ right)
+        own, links = _apart(information[: 3 * m, : 3 * m])
+        coupling = information[3 * m :, : 3 * m]
+        return LinearSystem(
+            np.array(self.pose_keys, np.int64),
+            np.array(self.landmark_keys, np.int64),
+            information[3 * m :, 3 * m :],
+            coupling.tobsr((6, 3)) if n and m else bsr_matrix((6 * n, 3 * m), blocksize=(6, 3)),
+            own,
+            links,
+            gradient[3 * m :],
+            gradient[: 3 * m],
+        )
+
+
+def _apart(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
+    """The (m, 3, 3) diagonal blocks of a sparse matrix (3m, 3m), and what is beside them."""
+    entries = matrix.tocoo()
+    own = np.zeros((matrix.shape[0] // 3, 3, 3))
+    inside = entries.row // 3 == entries.col // 3
+    row, column = entries.row[inside], entries.col[inside]
+    own[row // 3, row % 3, column % 3] = entries.data[inside]
+    beside = entries.data[~inside], (entries.row[~inside], entries.col[~inside])
+    return own, csr_matrix(beside, matrix.shape)
+
+
+PLAIN = KernelSettings("none")
+_NONE: IntArray = np.empty(0, np.int64)
+_SLOW = 0.1  # of the last step's gain: beyond, a kept system has become another
+_AT_ONCE = 20_000  # observations, of which each takes some kilobytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Poses ``wTc`` (n, 4, 4) and landmarks (m, 3), by the keys' order; a gyroscope's biases (3q,).
+
+    The biases are in rad/s, about the axes of the body.
+    """
+
+    poses: FloatArray
+    points: FloatArray
+    bias: FloatArray = dataclasses.field(default_factory=lambda: np.empty(0))
+
+    @staticmethod
+    def of(values: Any) -> State:
+        """Those of GTSAM values, without biases."""
+        flat = gtsam.utilities.extractPose3(values)
+        poses = np.tile(np.eye(4), (len(flat), 1, 1))
+        poses[:, :3, :3], poses[:, :3, 3] = flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
+        return State(poses, np.array(gtsam.utilities.extractPoint3(values)).reshape(-1, 3))
+
+    def moved(self, step: FloatArray) -> State:
+        """After a step (3m + 6n + 3q,) of landmarks, in the poses' tangent spaces, of biases."""
+        points = 3 * len(self.points)
+        end = points + 6 * len(self.poses)
+        pairs = zip(self.poses, step[points:end].reshape(-1, 6), strict=True)
+        poses = np.array([gtsam.Pose3(pose).retract(by).matrix() for pose, by in pairs])
+        return State(poses, self.points + step[:points].reshape(-1, 3), self.bias + step[end:])
+
+
+@dataclass(frozen=True, eq=False)
+class WholeGraph:
+    """Factors, and what each observation weighs.
+
+    Attributes:
+        pose_keys, landmark_keys: of the variables, ascending.
+        seen: the observations; None without any.
+        weights: (k,) of the observations; 0: left out.
+        rest: the other factors.
+        kernel: around each observation.
+    """
+
+    pose_keys: list[int]
+    landmark_keys: list[int]
+    seen: StereoSightings | None
+    weights: FloatArray
+    rest: OtherFactors
+    kernel: KernelSettings
+
+    @staticmethod
+    def of(graph: Any, values: Any, kernel: KernelSettings = PLAIN) -> tuple[WholeGraph, State]:
+        """A graph of GTSAM's without empty slots, whose observations have this kernel."""
+        poses, landmarks = keys_of(values)
+        rows = {key: row for keys in (poses, landmarks) for row, key in enumerate(keys)}
+        rest, found = gtsam.NonlinearFactorGraph(), list[tuple[Any, int, int, int]]()
+        for row in range(graph.size()):
+            factor = graph.at(row)
+            if isinstance(factor, gtsam.GenericStereoFactor3D):
+                pose, landmark = factor.keys()
+                found.append((factor, row, rows[pose], rows[landmark]))
+            else:
+                rest.add(factor)
+        seen = None
+        if found:
+            factors, *which = zip(*found, strict=True)
+            seen = StereoSightings.of(list(factors), *(np.array(w, np.int64) for w in which))
+        weights = np.ones(len(found))
+        others = OtherFactors(rest, poses, landmarks)
+        return WholeGraph(poses, landmarks, seen, weights, others, kernel), State.of(values)
+
+    @staticmethod
+    def of_rig(
+        others: Any,
+        values: Any,
+        kernel: KernelSettings,
+        keys: tuple[IntArray, IntArray],
+        measured: tuple[FloatArray, FloatArray],
+        rig: CameraRig,
+    ) -> tuple[WholeGraph, State]:
+        """Observations of a rig, and other factors.
+
+        Args:
+            others: GTSAM's, without empty slots.
+            values: of all variables.
+            kernel: around each observation.
+            keys: (k,) of the observations' poses and landmarks.
+            measured: (k, 3) column, row, disparity, and (k, 3, 3) roots of their information.
+            rig: the cameras.
+        """
+        poses, landmarks = keys_of(values)
+        of_pose, of_landmark = (
+            np.searchsorted(np.array(have, np.int64), which).astype(np.int64)
+            for have, which in zip((poses, landmarks), keys, strict=True)
+        )
+        rows = others.size() + np.arange(len(of_pose))
+        seen = StereoSightings(rows, of_pose, of_landmark, *measured, rig) if len(rows) else None
+        rest = OtherFactors(others, poses, landmarks)
+        graph = WholeGraph(poses, landmarks, seen, np.ones(len(rows)), rest, kernel)
+        return graph, State.of(values)
+
+    def with_turns(
+        self, steps: list[TurnedStep], state: State, persistence: float
+    ) -> tuple[WholeGraph, State]:
+        """With steps that a gyroscope measured, and the state with a bias for its poses."""
+        turns = Turns.of(steps, [number(key) for key in self.pose_keys], persistence)
+        if turns is None:
+            return self, state
+        rest = dataclasses.replace(self.rest, turns=turns)
+        start = dataclasses.replace(state, bias=turns.start(state.poses))
+        return dataclasses.replace(self, rest=rest), start
+
+    # -- other graphs --------------------------------------------------------------------------
+
+    def weighed(self, weights: FloatArray | BoolArray) -> WholeGraph:
+        """Without kernel, its observations with weights (k,)."""
+        new = np.asarray(weights, np.float64)
+        return dataclasses.replace(self, weights=new, kernel=PLAIN)
+
+    def heeding(self, rows: BoolArray) -> WholeGraph:
+        """Without the other observations (k,), with its kernel."""
+        return dataclasses.replace(self, weights=self.weights * rows)
+
+    def without(self, rows: IntArray, state: State) -> tuple[WholeGraph, State]:
+        """Without landmarks, by row, and their factors, at the state (of all) without them."""
+        kept = np.ones(len(self.landmark_keys), np.bool_)
+        kept[rows] = False
+        gone = {self.landmark_keys[row] for row in rows.tolist()}
+        left = dataclasses.replace(
+            self,
+            landmark_keys=[key for key in self.landmark_keys if key not in gone],
+            seen=self.seen and self.seen.of_points(kept),
+            weights=self.weights[kept[self._points]],
+            rest=self.rest.without(gone),
+        )
+        return left, dataclasses.replace(state, points=state.points[kept])
+
+    def plus(self, factor: Any) -> WholeGraph:
+        """With one factor more, of poses alone."""
+        return dataclasses.replace(self, rest=self.rest.plus(factor))
+
+    def unseen(self) -> IntArray:
+        """Rows of the landmarks of which no observation counts."""
+        return np.setdiff1d(np.arange(len(self.landmark_keys)), self._points[self.weights > 0.0])
+
+    # -- at a state ------------------------------------------------------------------------------
+
+    def values(self, state: State) -> Any:
+        """GTSAM values of all variables."""
+        keys = [*enumerate(self.pose_keys), *enumerate(self.landmark_keys)]
+        return values_of({key: row for row, key in keys}, state.poses, state.points)
+
+    def squared(self, state: State) -> FloatArray:
+        """(k,) squared whitened residuals of the observations, without weights and kernel."""
+        if self.seen is None:
+            return np.empty(0)
+        residuals = self.seen.residuals(state.poses, state.points)
+        return np.asarray(np.einsum("ki,ki->k", residuals, residuals))
+
+    def cost(self, state: State) -> float:
+        """Half the robust sum of squares of all that counts."""
+        squared = self.weights * self.squared(state)
+        losses = kernel_losses(self.kernel.name, self.kernel.width, squared)
+        return float(losses.sum()) + self.rest.cost(state.poses, state.points, state.bias)
+
+    def linear(self, state: State) -> LinearSystem:
+        """Normal equations at a state, robust weights as they are there."""
+        rest = self.rest.linear(state.poses, state.points, state.bias)
+        if self.seen is None:
+            return rest
+        rows = self.seen.look(state.poses, state.points)
+        residual, by_pose, by_point = rows.residual, rows.by_pose, rows.by_point
+        squared = self.weights * np.einsum("ki,ki->k", residual, residual)
+        weights = self.weights * kernel_weights(self.kernel.name, self.kernel.width, squared)
+        known = weights[:, None, None] * np.swapaxes(by_pose, 1, 2)  # (k, 6, 3)
+        of_point = weights[:, None, None] * np.swapaxes(by_point, 1, 2)
+        poses, points = self._incidence
+        column = residual[:, :, None]
+        blocks = _summed(poses, known @ by_pose)
+        return dataclasses.replace(
+            rest,
+            poses=rest.poses + block_diagonal(blocks),
+            coupling=rest.coupling + self._coupled(known @ by_point),
+            landmarks=rest.landmarks + _summed(points, of_point @ by_point),
+            pose_gradient=rest.pose_gradient + _summed(poses, known @ column).ravel(),
+            landmark_gradient=rest.landmark_gradient + _summed(points, of_point @ column).ravel(),
+        )
+
+    def pulled(
+        self, state: State, shifts: Callable[[FloatArray], FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """What shifts of a rig's measurements do to the normal equations at a state.
+
+        Args:
+            state: where to linearise.
+            shifts: from measurements (k, 3) to their displacements by p parameters (k, 3, p).
+
+        Returns:
+            Gradients (3m + 6n, p) by the parameters, and the parameters' own information (p, p).
+        """
+        seen = self.seen
+        if seen is None:
+            raise ValueError("without observations there is nothing to shift")
+        rows, parts = seen.look(state.poses, state.points), []
+        for few in np.array_split(np.arange(len(seen.rows)), len(seen.rows) // _AT_ONCE + 1):
+            by = -seen.roots[few] @ shifts(seen.measured[few])
+            known = self.weights[few, None, None] * by
+            poses, points = (which[:, few] for which in self._incidence)
+            of_points = _summed(points, np.swapaxes(rows.by_point[few], 1, 2) @ known)
+            of_poses = _summed(poses, np.swapaxes(rows.by_pose[few], 1, 2) @ known)
+            own = np.einsum("kip,kiq->pq", by, known)
+            parts.append(np.concatenate([*of_points, *of_poses, own]))
+        found = reduce(np.add, parts)
+        p = found.shape[1]
+        return found[:-p], found[-p:]
+
+    def minimum(
+        self,
+        state: State,
+        iterations: int,
+        tolerance: float,
+        enough: float = 0.0,
+        descent: Descent | None = None,
+    ) -> State:
+        """The state at the minimum of the cost.
+
+        Args:
+            state: where to start.
+            iterations: at most.
+            tolerance: the end, where the cost falls by a smaller part of it.
+            enough: the end, too, where it falls by less.
+            descent: goes on with this one, which has made steps on much the same graph.
+        """
+        descent = descent or Descent(keeps=False)
+        cost, gain = self.cost(state), np.inf
+        for _ in range(iterations):
+            found = descent.step(self, cost, state, gain)
+            if found is None:
+                break
+            before, (cost, state) = cost, found
+            gain = before - cost
+            if gain <= max(tolerance * before, enough):
+                break
+        return state
+
+    # -- its parts -------------------------------------------------------------------------------
+
+    @cached_property
+    def _poses(self) -> IntArray:
+        """(k,) rows of the observations' poses."""
+        return _NONE if self.seen is None else self.seen.poses
+
+    @cached_property
+    def _points(self) -> IntArray:
+        """(k,) rows of the observations' landmarks."""
+        return _NONE if self.seen is None else self.seen.points
+
+    @cached_property
+    def _incidence(self) -> tuple[csr_matrix, csr_matrix]:
+        """(n, k) and (m, k): which observation is which pose's and which landmark's."""
+        every, k = np.arange(len(self._poses)), len(self._poses)
+        one = np.ones(k)
+        return (
+            csr_matrix((one, (self._poses, every)), (len(self.pose_keys), k)),
+            csr_matrix((one, (self._points, every)), (len(self.landmark_keys), k)),
+        )
+
+    def _coupled(self, blocks: FloatArray) -> bsr_matrix:
+        """Sparse (6n, 3m) of each observation's block (k, 6, 3)."""
+        n, m = len(self.pose_keys), len(self.landmark_keys)
+        order = np.lexsort((self._points, self._poses))
+        start = np.searchsorted(self._poses[order], np.arange(n + 1))
+        return bsr_matrix((blocks[order], self._points[order], start), (6 * n, 3 * m))
+
+
+class Descent:
+    """Steps towards the minimum, Gauss and Newton's or damped.
+
+    Near the minimum the poses' own system hardly changes from step to step: where it is kept, the
+    landmarks are eliminated anew, and its factor, which is most of the work, serves on.
+    """
+
+    def __init__(self, keeps: bool = True) -> None:
+        """No step yet; whether it keeps the poses' system."""
+        self._keeps = keeps
+        self._damping = Damping()
+        self._factor: BlockCholesky | None = None
+
+    def step(
+        self, graph: WholeGraph, cost: float, state: State, last_gain: float
+    ) -> tuple[float, State] | None:
+        """Cost and state after one step that does not raise the cost; None where none does.
+
+        Args:
+            graph: what is minimised.
+            cost: at the state.
+            state: before.
+            last_gain: by how much the step before lowered the cost; a kept system goes on as long
+                as each step gains a small part of that.
+        """
+        system = graph.linear(state)
+        if self._factor is not None:
+            found = self._kept(graph, state, system, self._factor)
+            if found is not None and 0.0 <= cost - found[0] <= _SLOW * last_gain:
+                return found
+            self._factor = None
+        return self._damping.step(cost, partial(self._tried, graph, state, system))
+
+    def _kept(
+        self, graph: WholeGraph, state: State, system: LinearSystem, factor: BlockCholesky
+    ) -> tuple[float, State] | None:
+        """The step by a kept system; None where a landmark has become undetermined."""
+        try:
+            kept = GraphMarginals.of(system.damped(0.0), factor)
+            return _after(graph, state, with_border(kept))
+        except EstimatorError:
+            return None
+
+    def _tried(
+        self, graph: WholeGraph, state: State, system: LinearSystem, damping: float
+    ) -> tuple[float, State]:
+        solved = reduced(system.damped(damping))
+        held = solved.held if isinstance(solved, Bordered) else solved
+        if self._keeps and damping == 0.0 and isinstance(held, GraphMarginals):
+            self._factor = held.factor
+        return _after(graph, state, solved)
+
+
+def _after(graph: WholeGraph, state: State, solved: EliminatedBorder) -> tuple[float, State]:
+    ahead = state.moved(solved.step())
+    return graph.cost(ahead), ahead
+
+
+def keys_of(values: Any) -> tuple[list[int], list[int]]:
+    """Keys of the poses and of the landmarks among GTSAM values, ascending."""
+    poses: list[int] = []
+    landmarks: list[int] = []
+    for key in values.keys():  # noqa: SIM118 - GTSAM's values do not iterate
+        (poses if is_pose(key) else landmarks).append(key)
+    return poses, landmarks
+
+
+def _summed(incidence: csr_matrix, each: FloatArray) -> FloatArray:
+    """Sums (g, ...) of what each observation (k, ...) adds to its group, one after another."""
+    found = incidence @ each.reshape(len(each), -1)
+    return np.asarray(found.reshape(-1, *each.shape[1:]))

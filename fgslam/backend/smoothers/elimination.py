@@ -1,0 +1,1036 @@
+"""Marginal covariances of a whole graph at once, from its reduced pose system.
+
+One by one, GTSAM's marginals of 4,000 landmarks take 25 s. Here landmarks are eliminated first, all
+together (their block of the information matrix is block-diagonal, 3x3 each), the poses' dense
+system is inverted, and each landmark takes its own covariance back from the poses that saw it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded, lapack, solve_triangular
+from scipy.sparse import block_array, bsr_matrix, csc_matrix, csr_matrix, diags_array, identity
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import splu
+
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import inverse_spd3
+from fgslam.factors.landmark import summed
+
+# ------------------------------------------------------------------------------------------
+# Sparse systems of poses in blocks of 6 x 6: solved, and inverted where poses are linked
+
+_UNDETERMINED = "the measurements do not determine all variables; no covariances"
+_SPARE = 0.3  # of a group's blocks may be zeros that a smaller group would not hold
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Poses that are eliminated together, by their places in the order.
+
+    Attributes:
+        start, stop: their places.
+        rows: (r,) ascending places of the later poses that they hang on.
+        parent: number of the group of the first of these; -1: there is none.
+    """
+
+    start: int
+    stop: int
+    rows: IntArray
+    parent: int
+
+    @property
+    def front(self) -> IntArray:
+        """Places of all poses in the group's matrix, ascending."""
+        return np.concatenate([np.arange(self.start, self.stop), self.rows])
+
+
+class BlockCholesky:
+    """Cholesky factor of a symmetric positive definite matrix, scaled to a unit diagonal.
+
+    Without the scaling, digits would be lost beside poses that are held stiffly.
+    """
+
+    def __init__(self, matrix: bsr_matrix) -> None:
+        """Takes a matrix (6n, 6n) in blocks of 6 x 6 apart.
+
+        Raises:
+            EstimatorError: it is not positive definite.
+        """
+        n = matrix.shape[0] // 6
+        diagonal = matrix.diagonal()
+        if not (diagonal > 0.0).all():
+            raise EstimatorError(_UNDETERMINED)
+        self._scale = np.sqrt(diagonal).reshape(n, 6)
+        links = csr_matrix((np.ones(len(matrix.indices)), matrix.indices, matrix.indptr), (n, n))
+        self._place = least_degree(links)
+        self._groups = groups_of(links, self._place)
+        self._own: list[FloatArray] = []
+        self._below: list[FloatArray] = []
+        self._factorise(matrix)
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """(6n, k) the matrix' inverse times (6n, k)."""
+        n, k = len(self._place), right.shape[1]
+        x = np.empty((n, 6, k))
+        x[self._place] = right.reshape(n, 6, k) / self._scale[:, :, None]
+        factors = list(zip(self._groups, self._own, self._below, strict=True))
+        for group, own, below in factors:
+            at = slice(group.start, group.stop)
+            here = solve_triangular(own, x[at].reshape(-1, k), lower=True, check_finite=False)
+            x[at] = here.reshape(-1, 6, k)
+            x[group.rows] -= (below @ here).reshape(-1, 6, k)
+        for group, own, below in reversed(factors):
+            at = slice(group.start, group.stop)
+            here = x[at].reshape(-1, k) - below.T @ x[group.rows].reshape(-1, k)
+            here = solve_triangular(own, here, lower=True, trans=1, check_finite=False)
+            x[at] = here.reshape(-1, 6, k)
+        return np.asarray((x[self._place] / self._scale[:, :, None]).reshape(6 * n, k))
+
+    def inverse_blocks(self, row: IntArray, column: IntArray) -> FloatArray:
+        """(k, 6, 6) of the inverse, at poses (k,) that are linked, or the same."""
+        names, blocks = self._inverse
+        one, other = self._place[row], self._place[column]
+        name = np.minimum(one, other) * len(self._place) + np.maximum(one, other)
+        out = blocks[np.searchsorted(names, name)]
+        turned = one < other
+        out[turned] = np.swapaxes(out[turned], 1, 2)
+        out /= self._scale[row][:, :, None] * self._scale[column][:, None, :]
+        return out
+
+    def _factorise(self, matrix: bsr_matrix) -> None:
+        row, column, data, start = self._entries(matrix)
+        waiting: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+        for number, group in enumerate(self._groups):
+            front, size = group.front, 6 * (group.stop - group.start)
+            full = np.zeros((len(front), 6, len(front), 6))
+            some = slice(start[group.start], start[group.stop])
+            at = np.searchsorted(front, row[some])
+            full[at, :, column[some] - group.start, :] = data[some]
+            flat = full.reshape(6 * len(front), 6 * len(front))
+            for rows, update in waiting.pop(number, []):
+                among = _expanded(np.searchsorted(front, rows))
+                flat[among[:, None], among] += update
+            own, status = lapack.dpotrf(flat[:size, :size], lower=1, clean=1)
+            if status != 0:
+                raise EstimatorError(_UNDETERMINED)
+            below = flat[size:, :size]
+            if len(group.rows):
+                below = solve_triangular(own, below.T, lower=True, check_finite=False).T
+                update = flat[size:, size:] - below @ below.T
+                waiting.setdefault(group.parent, []).append((group.rows, update))
+            self._own.append(own)
+            self._below.append(np.ascontiguousarray(below))
+
+    def _entries(self, matrix: bsr_matrix) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
+        """Lower blocks by places, scaled, column after column, and where each column starts."""
+        n = len(self._place)
+        of_row = np.repeat(np.arange(n), np.diff(matrix.indptr))
+        row, column = self._place[of_row], self._place[matrix.indices]
+        chosen = np.flatnonzero(row >= column)
+        chosen = chosen[np.argsort(column[chosen], kind="stable")]
+        by_row, by_column = self._scale[of_row[chosen]], self._scale[matrix.indices[chosen]]
+        data = matrix.data[chosen] / (by_row[:, :, None] * by_column[:, None, :])
+        start = np.searchsorted(column[chosen], np.arange(n + 1)).astype(np.int64)
+        return row[chosen], column[chosen], data, start
+
+    @cached_property
+    def _inverse(self) -> tuple[IntArray, FloatArray]:
+        """Names (k,) ascending, of column and row, and blocks (k, 6, 6) of the scaled inverse."""
+        n, known = len(self._place), dict[int, FloatArray]()
+        names, blocks = [], []
+        first = {group.parent: k for k, group in reversed(list(enumerate(self._groups)))}
+        for number in range(len(self._groups) - 1, -1, -1):
+            group, front = self._groups[number], self._groups[number].front
+            size = 6 * (group.stop - group.start)
+            whole = np.empty((6 * len(front), 6 * len(front)))
+            inverse, _ = lapack.dpotri(self._own[number], lower=1)
+            whole[:size, :size] = inverse + np.tril(inverse, -1).T
+            if len(group.rows):
+                parent = self._groups[group.parent]
+                among = _expanded(np.searchsorted(parent.front, group.rows))
+                rest = known[group.parent][among[:, None], among]
+                gain = solve_triangular(
+                    self._own[number], self._below[number].T, lower=True, trans=1
+                ).T
+                whole[size:, size:], whole[size:, :size] = rest, -rest @ gain
+                whole[:size, size:] = whole[size:, :size].T
+                whole[:size, :size] -= gain.T @ whole[size:, :size]
+            if first.get(group.parent) == number:  # nobody asks for it any more
+                known.pop(group.parent, None)
+            if number in first:
+                known[number] = whole
+            columns = whole.reshape(len(front), 6, len(front), 6)[:, :, : size // 6]
+            blocks.append(columns.transpose(2, 0, 1, 3).reshape(-1, 6, 6))
+            names.append((front[: size // 6, None] * n + front).ravel())
+        return np.concatenate(names[::-1]), np.concatenate(blocks[::-1])
+
+
+def _expanded(places: IntArray) -> IntArray:
+    """Rows of blocks of six."""
+    return (6 * places[:, None] + np.arange(6)).ravel()
+
+
+def least_degree(links: csr_matrix) -> IntArray:
+    """Places (n,) of rows in an order of least degree of their links (n, n).
+
+    SuperLU finds it; what it takes apart for that is a matrix of ones.
+    """
+    n = links.shape[0]
+    pattern = csc_matrix((-np.ones(links.nnz), links.indices, links.indptr), (n, n))
+    found = splu(
+        csc_matrix(pattern + 2.0 * n * identity(n)),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    return np.asarray(found.perm_c, np.int64)
+
+
+def groups_of(links: csr_matrix, place: IntArray) -> list[Group]:
+    """Groups of poses by their places, each before the group that it hangs on."""
+    hang = _hanging(links, place)
+    starts, held = [0], 0
+    for j in range(1, len(hang)):
+        held += len(hang[j - 1]) + 1
+        width = j + 1 - starts[-1]
+        filled = width * (len(hang[j]) + 1) + width * (width - 1) // 2
+        follows = len(hang[j - 1]) > 0 and hang[j - 1][0] == j
+        if not follows or filled > (1.0 + _SPARE) * (held + len(hang[j]) + 1):
+            starts.append(j)
+            held = 0
+    stops = [*starts[1:], len(hang)]
+    number = np.repeat(np.arange(len(starts)), np.subtract(stops, starts))
+    out = []
+    for start, stop in zip(starts, stops, strict=True):
+        rows = hang[stop - 1]
+        out.append(Group(start, stop, rows, int(number[rows[0]]) if len(rows) else -1))
+    return out
+
+
+def _hanging(links: csr_matrix, place: IntArray) -> list[IntArray]:
+    """For each place the later ones that it hangs on when all before it are eliminated."""
+    n = len(place)
+    row = place[np.repeat(np.arange(n), np.diff(links.indptr))]
+    column = place[links.indices]
+    later = row > column
+    order = np.lexsort((row[later], column[later]))
+    row, column = row[later][order], column[later][order]
+    start = np.searchsorted(column, np.arange(n + 1))
+    children: list[list[IntArray]] = [[] for _ in range(n)]
+    out: list[IntArray] = []
+    for j in range(n):
+        own = row[start[j] : start[j + 1]]
+        found = np.unique(np.concatenate([own, *children[j]])).astype(np.int64)
+        out.append(found)
+        if len(found):
+            children[found[0]].append(found[1:])
+        children[j] = []
+    return out
+
+
+def order(links: csr_matrix) -> tuple[IntArray, int]:
+    """Places (n,) of rows that keep linked ones (n, n) near, and how far apart they are at most."""
+    found = reverse_cuthill_mckee(links, symmetric_mode=True).astype(np.int64)
+    place = np.empty_like(found)
+    place[found] = np.arange(len(found))
+    row = np.repeat(np.arange(len(place)), np.diff(links.indptr))
+    apart = np.abs(place[row] - place[links.indices])
+    return place, int(apart.max(initial=1))
+
+
+# ------------------------------------------------------------------------------------------
+# A few numbers on which all poses of a graph may depend: its border
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Border:
+    """What the p numbers add to the normal equations.
+
+    Attributes:
+        by_pose: (6n, p) their coupling to the poses.
+        own: (p, p) their information.
+        gradient: (p,).
+    """
+
+    by_pose: FloatArray
+    own: FloatArray
+    gradient: FloatArray
+
+    def damped(self, by: float) -> Border:
+        """With so many times the diagonal added to itself."""
+        return replace(self, own=self.own + by * np.diag(np.diagonal(self.own)))
+
+
+class EliminatedBorder(Protocol):
+    """A solved system, landmarks (3m) before poses (6n)."""
+
+    @property
+    def system(self) -> Any:
+        """The normal equations (``LinearSystem``)."""
+        ...
+
+    def step(self) -> FloatArray:
+        """From where the graph was linearised to its minimum; (3m + 6n,), then a border."""
+        ...
+
+    def solve(self, gradients: FloatArray) -> FloatArray:
+        """The steps for other gradients (3m + 6n, c)."""
+        ...
+
+    def poses(self) -> FloatArray:
+        """(n, 6, 6) marginals."""
+        ...
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals."""
+        ...
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Bordered:
+    """A solved system with a border more.
+
+    Attributes:
+        held: the same with the border held as it is.
+        gain: (3m + 6n, p) how landmarks and poses follow the border; then how a border does that
+            ``held`` has itself.
+        covariance: (p, p) of the border.
+        moved: (p,) its step; zero of one that is considered, not estimated.
+    """
+
+    held: EliminatedBorder
+    gain: FloatArray
+    covariance: FloatArray
+    moved: FloatArray
+
+    @staticmethod
+    def of(held: EliminatedBorder, gradient: FloatArray, border: Border) -> Bordered:
+        """A solved system (its gradient (3m + 6n,)) with the border that was held.
+
+        Raises:
+            EstimatorError: the border is not determined.
+        """
+        p, columns = len(border.gradient), held.system.columns
+        coupling = np.concatenate([np.zeros((columns, p)), border.by_pose])
+        gain = held.solve(coupling)
+        information = border.own + coupling.T @ gain
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(0.5 * (information + information.T)))
+        except np.linalg.LinAlgError:
+            raise EstimatorError("the measurements do not determine a gyroscope's bias") from None
+        covariance = root.T @ root
+        return Bordered(held, gain, covariance, -covariance @ (border.gradient + gain.T @ gradient))
+
+    def step(self) -> FloatArray:
+        """(3m + 6n + p,) from where the graph was linearised to its minimum."""
+        return np.concatenate([self.held.step() + self.gain @ self.moved, self.moved])
+
+    def solve(self, gradients: FloatArray) -> FloatArray:
+        """(3m + 6n + p, c) the steps for other gradients (3m + 6n, c), none of the border's own."""
+        moved = -self.covariance @ (self.gain.T @ gradients)
+        return np.concatenate([self.held.solve(gradients) + self.gain @ moved, moved])
+
+    def poses(self) -> FloatArray:
+        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
+        found, first = self.held.poses(), self.held.system.columns
+        return found + self._of(self.gain[first : first + 6 * len(found)], 6)
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
+        return self.held.landmarks() + self._of(self.gain[: self.held.system.columns], 3)
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
+        at = self.held.system.columns + 6 * pose + np.arange(6)
+        rows = np.concatenate([at, (3 * landmarks[:, None] + np.arange(3)).ravel()])
+        gain = self.gain[rows]
+        return np.asarray(self.held.joint(pose, landmarks) + gain @ self.covariance @ gain.T)
+
+    @property
+    def estimated(self) -> FloatArray:
+        """(b, b) covariance of the border that the system itself has."""
+        if not isinstance(self.held, Bordered):
+            return self.covariance
+        gain = self.gain[-len(self.held.covariance) :]
+        return np.asarray(self.held.estimated + gain @ self.covariance @ gain.T)
+
+    @property
+    def system(self) -> Any:
+        """The normal equations."""
+        return self.held.system
+
+    def _of(self, gain: FloatArray, size: int) -> FloatArray:
+        """(k, size, size) what the border's covariance is in rows (size k, p)."""
+        gain = gain.reshape(-1, size, len(self.covariance))
+        return np.asarray(gain @ self.covariance @ np.swapaxes(gain, 1, 2))
+
+
+# ------------------------------------------------------------------------------------------
+# Dense symmetric systems: a scaled Cholesky factor, and the inverse in its place
+
+UNDETERMINED = "the measurements do not determine all variables; no covariances"
+_ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
+
+
+class UndeterminedError(EstimatorError):
+    """The measurements do not determine all variables; ``row`` of the first one's, as ordered."""
+
+    def __init__(self, row: int, message: str) -> None:
+        """Row of the information matrix and the message."""
+        super().__init__(message)
+        self.row = row
+
+
+class DenseFactor:
+    """A positive definite matrix, factored in its own place, and later inverted there.
+
+    It may be the largest thing in memory by far: there is never a second one.
+    """
+
+    def __init__(self, matrix: FloatArray) -> None:
+        """Takes a matrix (n, n), which is overwritten.
+
+        Raises:
+            UndeterminedError: it is not positive definite.
+        """
+        self._held, self._size = scaled_cholesky(matrix, in_place=True)
+        self._inverted = False
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """The matrix' inverse times (n,) or (n, c)."""
+        if self._inverted:
+            return np.asarray(self._held @ right)
+        scale = self._size if right.ndim == 1 else self._size[:, None]
+        found = cho_solve((self._held, True), right / scale, check_finite=False)
+        return np.asarray(found / scale)
+
+    @property
+    def inverse(self) -> FloatArray:
+        """(n, n), which takes the factor's place when it is first asked for."""
+        if not self._inverted:
+            self._held = from_cholesky(self._held, self._size, in_place=True)
+            self._inverted = True
+        return self._held
+
+
+def scaled_cholesky(
+    information: FloatArray, in_place: bool = False
+) -> tuple[FloatArray, FloatArray]:
+    """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
+
+    Without the scaling, digits would be lost beside poses that are held stiffly. A large matrix is
+    better overwritten.
+    """
+    size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
+    if not (size > 0.0).all():
+        raise UndeterminedError(int(np.argmin(size > 0.0)), UNDETERMINED)
+    scaled = information if in_place else information.copy()
+    scaled /= size[:, None]
+    scaled /= size
+    factor, status = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
+    if status != 0:
+        raise UndeterminedError(int(status) - 1, UNDETERMINED)
+    pivots = np.diagonal(factor)
+    if len(pivots) and pivots.min() ** 2 < _ROUNDING:
+        raise UndeterminedError(int(pivots.argmin()), UNDETERMINED)
+    return factor, size
+
+
+def from_cholesky(factor: FloatArray, size: FloatArray, in_place: bool = False) -> FloatArray:
+    """The inverse of the matrix that :func:`scaled_cholesky` took apart; in place of the factor."""
+    if not len(size):  # LAPACK would complain on the terminal
+        return np.zeros((0, 0))
+    inverse, _ = lapack.dpotri(factor, lower=1, overwrite_c=in_place)
+    for row in range(len(size)):  # in place: it may be large
+        inverse[row, row + 1 :] = inverse[row + 1 :, row]
+    inverse /= size[:, None]
+    inverse /= size
+    return np.asarray(inverse)
+
+
+# ------------------------------------------------------------------------------------------
+# Normal equations with the landmarks eliminated: steps, and covariances of poses and landmarks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Equations:
+    """A quadratic in a corner (hidden numbers and poses) and landmarks.
+
+    Attributes:
+        corner: (c, c) information of the corner, hidden numbers first.
+        corner_gradient: (c,).
+        own: (m, 3, 3) each landmark's.
+        gradient: (m, 3).
+        coupling: (m, 3, 6n) of landmarks and the poses, which are the last of the corner.
+        tied: (p,) rows of the landmarks that depend on hidden numbers, too.
+        hidden: (p, 3, c - 6n) their coupling to those.
+    """
+
+    corner: FloatArray
+    corner_gradient: FloatArray
+    own: FloatArray
+    gradient: FloatArray
+    coupling: FloatArray
+    tied: IntArray
+    hidden: FloatArray
+
+
+class UndeterminedLandmarkError(UndeterminedError):
+    """A landmark's observations do not determine it; ``row`` among the landmarks."""
+
+
+class Eliminated:
+    """Equations factored once: the step to the minimum, and covariances there."""
+
+    def __init__(self, equations: Equations) -> None:
+        """Eliminates the landmarks and factors what is left.
+
+        Raises:
+            UndeterminedLandmarkError: one landmark is not determined.
+            UndeterminedError: the corner is not.
+        """
+        e, self._tied = equations, equations.tied
+        self._root = _roots(e.own)
+        m, poses = len(e.own), e.coupling.shape[2]
+        self._r: int = len(e.corner) - poses
+        r = self._r
+        self._by_pose = _forward(self._root, e.coupling)
+        self._by_hidden = _forward(self._root[:, e.tied], e.hidden)
+        half = _forward(self._root, e.gradient[:, :, None])
+        flat, tied = (
+            self._by_pose.reshape(3 * m, poses),
+            self._by_hidden.reshape(3 * len(e.tied), r),
+        )
+        corner, right = e.corner.copy(), e.corner_gradient.copy()
+        corner[r:, r:] -= flat.T @ flat
+        corner[:r, :r] -= tied.T @ tied
+        corner[:r, r:] -= tied.T @ self._by_pose[e.tied].reshape(len(tied), poses)
+        corner[r:, :r] = corner[:r, r:].T
+        right[r:] -= flat.T @ half.ravel()
+        right[:r] -= tied.T @ half[e.tied].ravel()
+        self._factor, self._size = scaled_cholesky(corner)
+        self.corner = -lapack.dpotrs(self._factor, right / self._size, lower=1)[0] / self._size
+        along = self._along(self.corner[:, None])
+        self.points = -_backward(self._root, half + along)[:, :, 0]
+        fall = e.corner_gradient @ self.corner + float((e.gradient * self.points).sum())
+        self.decrement = float(np.sqrt(max(-fall, 0.0)))
+        """Length of the step in its own deviations."""
+
+    @property
+    def hidden(self) -> int:
+        """How many hidden numbers there are."""
+        return self._r
+
+    def pose(self, row: int) -> FloatArray:
+        """(6, 6) marginal of the window's pose in a row."""
+        return self.joint(row, np.empty(0, np.int64))
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by rows."""
+        k, at = len(landmarks), self._r + 6 * pose + np.arange(6)
+        gain = np.zeros((len(self._size), 6 + 3 * k))
+        gain[at, np.arange(6)] = 1.0
+        for column, row in enumerate(landmarks.tolist()):
+            gain[:, 6 + 3 * column : 9 + 3 * column] = -self._follows(row).T
+        half = solve_triangular(
+            self._factor, gain / self._size[:, None], lower=True, check_finite=False
+        )
+        out = half.T @ half
+        own = self._own(landmarks)
+        for column in range(k):
+            rows = slice(6 + 3 * column, 9 + 3 * column)
+            out[rows, rows] += own[column]
+        return np.asarray(0.5 * (out + out.T))
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals of all landmarks."""
+        covariance = self._covariance
+        r = self._r
+        follows = _backward(self._root, self._by_pose)
+        out = self._own(np.arange(len(follows)))
+        out += follows @ covariance[r:, r:] @ np.swapaxes(follows, 1, 2)
+        if len(self._tied):
+            tied = _backward(self._root[:, self._tied], self._by_hidden)
+            cross = tied @ covariance[:r, r:] @ np.swapaxes(follows[self._tied], 1, 2)
+            own = tied @ covariance[:r, :r] @ np.swapaxes(tied, 1, 2)
+            out[self._tied] += own + cross + np.swapaxes(cross, 1, 2)
+        return np.asarray(0.5 * (out + np.swapaxes(out, 1, 2)))
+
+    @cached_property
+    def _covariance(self) -> FloatArray:
+        return from_cholesky(self._factor, self._size)
+
+    def _own(self, landmarks: IntArray) -> FloatArray:
+        """(k, 3, 3) covariances of landmarks given the corner."""
+        eye = np.broadcast_to(np.eye(3), (len(landmarks), 3, 3))
+        inverse = _forward(self._root[:, landmarks], eye)
+        return np.asarray(np.swapaxes(inverse, 1, 2) @ inverse)
+
+    def _follows(self, row: int) -> FloatArray:
+        """(3, c) how a landmark's mean follows the corner, negated."""
+        at = np.array([row])
+        whole = np.zeros((1, 3, len(self._size)))
+        whole[0, :, self._r :] = self._by_pose[row]
+        tied = np.flatnonzero(self._tied == row)
+        if len(tied):
+            whole[0, :, : self._r] = self._by_hidden[tied[0]]
+        return np.asarray(_backward(self._root[:, at], whole)[0])
+
+    def _along(self, corner: FloatArray) -> FloatArray:
+        """(m, 3, 1) how the landmarks' halves follow a step of the corner (c, 1)."""
+        out = self._by_pose @ corner[self._r :]
+        out[self._tied] += self._by_hidden @ corner[: self._r]
+        return np.asarray(out)
+
+
+def _roots(own: FloatArray) -> FloatArray:
+    """(6, m) entries 00, 10, 11, 20, 21, 22 of the lower Cholesky factors of (m, 3, 3)."""
+    out = np.empty((6, len(own)))
+    with np.errstate(all="ignore"):
+        out[0] = np.sqrt(own[:, 0, 0])
+        out[1], out[3] = own[:, 1, 0] / out[0], own[:, 2, 0] / out[0]
+        out[2] = np.sqrt(own[:, 1, 1] - out[1] ** 2)
+        out[4] = (own[:, 2, 1] - out[3] * out[1]) / out[2]
+        out[5] = np.sqrt(own[:, 2, 2] - out[3] ** 2 - out[4] ** 2)
+    bad = ~np.isfinite(out).all(axis=0) | ~(out[[0, 2, 5]] > 0.0).all(axis=0)
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise UndeterminedLandmarkError(row, "a landmark's observations do not determine it")
+    return out
+
+
+def _forward(root: FloatArray, right: FloatArray) -> FloatArray:
+    """(m, 3, c) solutions of lower triangular systems."""
+    a, b, c, d, e, f = root[:, :, None]
+    out = np.empty(right.shape)
+    out[:, 0] = right[:, 0] / a
+    out[:, 1] = (right[:, 1] - b * out[:, 0]) / c
+    out[:, 2] = (right[:, 2] - d * out[:, 0] - e * out[:, 1]) / f
+    return out
+
+
+def _backward(root: FloatArray, right: FloatArray) -> FloatArray:
+    """(m, 3, c) solutions of the transposed systems."""
+    a, b, c, d, e, f = root[:, :, None]
+    out = np.empty(right.shape)
+    out[:, 2] = right[:, 2] / f
+    out[:, 1] = (right[:, 1] - e * out[:, 2]) / c
+    out[:, 0] = (right[:, 0] - b * out[:, 1] - d * out[:, 2]) / a
+    return out
+
+
+# ------------------------------------------------------------------------------------------
+# Stretches of a long chain of poses, each eliminated by a banded Cholesky decomposition
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """Neighbouring poses, eliminated together: they hang on what they see and on their ends.
+
+    Attributes:
+        rows: (6k,) of the system's poses.
+        columns: (c,) of what is kept that they hang on.
+        own: (k, 6, 6) their covariances if those are held.
+        gain: (6k, c) how their mean follows those, negated.
+        factor, size: of their information, scaled: Cholesky's band (12, 6k) and the scale (6k,).
+    """
+
+    rows: IntArray
+    columns: IntArray
+    own: FloatArray
+    gain: FloatArray
+    factor: FloatArray
+    size: FloatArray
+
+    @staticmethod
+    def of(rows: IntArray, chain: csr_matrix, coupling: csr_matrix) -> tuple[Stretch, FloatArray]:
+        """Of rows of the poses' block, and their coupling with all that is kept.
+
+        Returns:
+            The stretch, and the information (c, c) that it takes from its columns.
+
+        Raises:
+            EstimatorError: the poses are not determined.
+        """
+        band, size = _scaled_band(chain)
+        try:
+            factor = cholesky_banded(band, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            raise EstimatorError(UNDETERMINED) from None
+        columns = np.unique(coupling.indices).astype(np.int64)
+        scaled = coupling[:, columns].toarray() / size[:, None]
+        gain = cho_solve_banded((factor, True), scaled, check_finite=False)
+        blocks = size.reshape(-1, 6)
+        own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
+        return Stretch(rows, columns, own, gain / size[:, None], factor, size), scaled.T @ gain
+
+    def alone(self, gradients: FloatArray) -> FloatArray:
+        """(6k, c) their steps for gradients (6k, c) if what they hang on is held."""
+        scaled = gradients / self.size[:, None]
+        found = cho_solve_banded((self.factor, True), scaled, check_finite=False)
+        return np.asarray(-found / self.size[:, None])
+
+
+def _scaled_band(matrix: csr_matrix) -> tuple[FloatArray, FloatArray]:
+    """Lower band (12, 6n) of a chain's information, scaled to a unit diagonal, and the scale."""
+    entries = matrix.tocoo()
+    distance = entries.row - entries.col
+    size = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
+    if not (size > 0.0).all():
+        raise EstimatorError(UNDETERMINED)
+    band = np.zeros((12, len(size)))
+    lower = distance >= 0
+    row, column = entries.row[lower], entries.col[lower]
+    band[distance[lower], column] = entries.data[lower] / (size[row] * size[column])
+    return band, size
+
+
+def _inverse_blocks(factor: FloatArray) -> FloatArray:
+    """(n, 6, 6) diagonal blocks of the inverse of a matrix with banded Cholesky factor (12, 6n)."""
+    n = factor.shape[1] // 6
+    row, column = np.tril_indices(6)
+    below, beside = np.indices((6, 6)).reshape(2, -1)
+    starts = 6 * np.arange(n)[:, None]
+    own, next_to = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    own[:, row, column] = factor[row - column, starts + column]
+    next_to[:, below, beside] = factor[6 + below - beside, starts + beside]
+    inverse = np.linalg.inv(own)
+    carried = next_to @ inverse
+    out = np.swapaxes(inverse, 1, 2) @ inverse
+    for k in range(n - 2, -1, -1):
+        out[k] += carried[k].T @ out[k + 1] @ carried[k]
+    return out
+
+
+_POSES_A_LANDMARK = 4
+"""How many times more numbers landmarks have than the poses that cut a long chain: cuts make each
+stretch see little, and the system that is left larger."""
+_PAIRS_AT_ONCE = 1 << 16
+"""Of poses that see one landmark: a bound for memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """Normal equations of a graph: half the Hessian of its cost, and the gradient.
+
+    Attributes:
+        pose_keys, landmark_keys: ascending.
+        poses: (6n, 6n) sparse block of the poses.
+        coupling: (6n, 3m) of poses and landmarks, in blocks of 6 x 3.
+        landmarks: (m, 3, 3) each landmark's own block.
+        links: (3m, 3m) of landmarks and each other, empty but for odd graphs.
+        pose_gradient, landmark_gradient: (6n,) and (3m,).
+        border: a few numbers that all poses may depend on; None: there are none.
+    """
+
+    pose_keys: IntArray
+    landmark_keys: IntArray
+    poses: csr_matrix
+    coupling: bsr_matrix
+    landmarks: FloatArray
+    links: csr_matrix
+    pose_gradient: FloatArray
+    landmark_gradient: FloatArray
+    border: Border | None = None
+
+    @property
+    def columns(self) -> int:
+        """How many rows and columns are landmarks'."""
+        return 3 * len(self.landmark_keys)
+
+    @property
+    def information(self) -> csr_matrix:
+        """All of it, landmarks before poses."""
+        own = block_diagonal(self.landmarks) + self.links
+        coupling = self.coupling.tocsr()
+        return block_array([[own, coupling.T], [coupling, self.poses]], format="csr")
+
+    def damped(self, by: float) -> LinearSystem:
+        """With so many times the diagonal added to itself; unseen landmarks are held."""
+        own = self.landmarks.copy()
+        every = np.arange(3)
+        own[:, every, every] *= 1.0 + by
+        own[~own.any(axis=(1, 2))] = np.eye(3)
+        poses = self.poses + diags_array(by * self.poses.diagonal()) if by else self.poses
+        border = None if self.border is None else self.border.damped(by)
+        return replace(self, landmarks=own, poses=poses, border=border)
+
+    @property
+    def gradient(self) -> FloatArray:
+        """(3m + 6n,) landmarks before poses."""
+        return np.concatenate([self.landmark_gradient, self.pose_gradient])
+
+
+def reduced(system: LinearSystem) -> GraphMarginals | ChainMarginals | Bordered:
+    """The system with one group of variables eliminated, whichever leaves less to do.
+
+    Raises:
+        EstimatorError: the measurements do not determine all variables.
+    """
+    band = 12 * order(_seen_together(system))[1]
+    chain = system.links.nnz or min(band, 6 * len(system.pose_keys)) > system.columns
+    return with_border(ChainMarginals.of(system) if chain else GraphMarginals.of(system))
+
+
+def with_border(
+    held: GraphMarginals | ChainMarginals,
+) -> GraphMarginals | ChainMarginals | Bordered:
+    """The system with its border, where it has one.
+
+    Raises:
+        EstimatorError: the border is not determined.
+    """
+    border = held.system.border
+    return held if border is None else Bordered.of(held, held.system.gradient, border)
+
+
+@dataclass(frozen=True, eq=False)
+class GraphMarginals:
+    """A linearised graph without its landmarks: its solution, and covariances.
+
+    Attributes:
+        system: the graph.
+        inverse: (m, 3, 3) of each landmark's own block.
+        factor: of the poses' information (6n, 6n), reduced.
+    """
+
+    system: LinearSystem
+    inverse: FloatArray
+    factor: BlockCholesky
+
+    @staticmethod
+    def of(system: LinearSystem, factor: BlockCholesky | None = None) -> GraphMarginals:
+        """Eliminates the landmarks.
+
+        Args:
+            system: the graph.
+            factor: that of a system much like it, where steps are all that is asked for.
+
+        Raises:
+            EstimatorError: a landmark is not determined by its observations, or the poses are not.
+        """
+        if system.links.nnz:
+            raise EstimatorError("landmarks depend on each other directly; no joint elimination")
+        with np.errstate(all="ignore"):
+            inverse = inverse_spd3(system.landmarks)
+        if not (np.isfinite(inverse).all() and (inverse[:, [0, 1, 2], [0, 1, 2]] > 0.0).all()):
+            raise EstimatorError("a landmark's observations do not determine it; no covariances")
+        if factor is not None:
+            return GraphMarginals(system, inverse, factor)
+        information = system.poses.tobsr((6, 6))
+        if system.coupling.nnz:
+            information = information - _times(system.coupling, inverse) @ system.coupling.T
+        return GraphMarginals(system, inverse, BlockCholesky(information))
+
+    def step(self) -> FloatArray:
+        """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
+        return self.solve(self.system.gradient[:, None])[:, 0]
+
+    def solve(self, gradients: FloatArray) -> FloatArray:
+        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
+        s, m, c = self.system, self.system.columns, gradients.shape[1]
+        own = "mij,mjc->mic", self.inverse
+        pull = np.einsum(*own, gradients[:m].reshape(-1, 3, c)).reshape(m, c)
+        poses = -self.factor.solve(gradients[m:] - s.coupling @ pull)
+        follows = (s.coupling.T @ poses).reshape(-1, 3, c)
+        landmarks = -pull - np.einsum(*own, follows).reshape(m, c)
+        return np.concatenate([landmarks, poses])
+
+    def poses(self) -> FloatArray:
+        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
+        every = np.arange(len(self.system.pose_keys))
+        return self.factor.inverse_blocks(every, every)
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
+        coupling = _times(self.system.coupling, self.inverse)
+        pose = np.repeat(np.arange(len(self.system.pose_keys)), np.diff(coupling.indptr))
+        order = np.argsort(coupling.indices, kind="stable")
+        pose, point, gain = pose[order], coupling.indices[order], coupling.data[order]
+        half, m = np.zeros_like(self.inverse), len(self.inverse)
+        for one, other in _pairs(point, m):
+            covariance = self.factor.inverse_blocks(pose[one], pose[other])
+            covariance[one == other] *= 0.5
+            half += summed(point[one], np.swapaxes(gain[one], 1, 2) @ covariance @ gain[other], m)
+        return np.asarray(self.inverse + half + np.swapaxes(half, 1, 2))
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
+        k, s = len(landmarks), self.system
+        gain = np.zeros((6 * len(s.pose_keys), 6 + 3 * k))
+        gain[6 * pose + np.arange(6), np.arange(6)] = 1.0
+        columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
+        seen = s.coupling.tocsc()[:, columns].toarray().reshape(len(gain), k, 3)
+        inverse = self.inverse[landmarks]
+        gain[:, 6:] = -np.einsum("pki,kij->pkj", seen, inverse).reshape(len(gain), 3 * k)
+        out = gain.T @ self.factor.solve(gain)
+        at = 6 + 3 * np.arange(k)[:, None] + np.arange(3)
+        out[at[:, :, None], at[:, None, :]] += inverse
+        return np.asarray(0.5 * (out + out.T))
+
+
+def _seen_together(system: LinearSystem) -> csr_matrix:
+    """(n, n) which poses are linked, by a factor or by a landmark."""
+    seen, own = system.coupling, system.poses.tobsr((6, 6))
+    n, m = len(system.pose_keys), len(system.landmark_keys)
+    by = csr_matrix((np.ones(len(seen.indices)), seen.indices, seen.indptr), (n, m))
+    return by @ by.T + csr_matrix((np.ones(len(own.indices)), own.indices, own.indptr), (n, n))
+
+
+def _times(coupling: bsr_matrix, blocks: FloatArray) -> bsr_matrix:
+    """Blocks of 6 x 3, each times its landmark's (m, 3, 3)."""
+    data = coupling.data @ blocks[coupling.indices]
+    return bsr_matrix((data, coupling.indices, coupling.indptr), coupling.shape)
+
+
+def _pairs(group: IntArray, groups: int) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs of rows of one group, each once, and each row with itself; a few groups a time.
+
+    Groups (k,) are in ascending order; the first row of a pair is not after the second.
+    """
+    size = np.bincount(group, minlength=groups)
+    first = np.concatenate([[0], np.cumsum(size)])
+    until = np.cumsum(size * (size + 1) // 2)
+    low = 0
+    while low < groups:
+        done = until[low - 1] if low else 0
+        high = max(low + 1, int(np.searchsorted(until, done + _PAIRS_AT_ONCE, "right")))
+        rows = np.arange(first[low], first[high])
+        repeated = first[group[rows] + 1] - rows
+        one = np.repeat(rows, repeated)
+        yield one, one + np.arange(len(one)) - np.repeat(np.cumsum(repeated) - repeated, repeated)
+        low = high
+
+
+@dataclass(frozen=True, eq=False)
+class ChainMarginals:
+    """The same where poses are many and landmarks few: the poses are eliminated first.
+
+    Poses are tied to their neighbours by odometry, so their block is a band, and its Cholesky
+    decomposition and the diagonal blocks of its inverse cost a constant a pose. The few poses to
+    which a loop leads back are kept with the landmarks instead: without them the rest is a chain.
+    Some more are kept that cut it into stretches, each of which hangs on the landmarks seen from
+    there and on no others.
+
+    Attributes:
+        system: the graph.
+        stretches: poses that are eliminated.
+        kept: (3m + 6k,) rows in the system's information of all landmarks and the k poses kept.
+        border: their information.
+    """
+
+    system: LinearSystem
+    stretches: list[Stretch]
+    kept: IntArray
+    border: DenseFactor
+
+    @staticmethod
+    def of(system: LinearSystem) -> ChainMarginals:
+        """Eliminates the poses.
+
+        Raises:
+            EstimatorError: the poses are not determined.
+        """
+        columns, information, n = system.columns, system.information, len(system.pose_keys)
+        among = information[columns:, columns:]
+        cuts = np.arange(n)[:: _POSES_A_LANDMARK * 6 * n // max(columns, 1) + 2][1:]
+        apart = np.union1d(_led_back_to(among), cuts)
+        rows = np.arange(6 * n).reshape(-1, 6)
+        kept = np.concatenate([np.arange(columns), columns + rows[apart].ravel()])
+        coupling = information[columns:][:, kept]
+        border = information[kept][:, kept].toarray()
+        left = np.delete(np.arange(n), apart)
+        stretches = []
+        for chosen in np.split(left, np.flatnonzero(np.diff(left) > 1) + 1):
+            if not len(chosen):
+                continue
+            own = rows[chosen].ravel()
+            stretch, taken = Stretch.of(own, among[own][:, own], coupling[own])
+            border[np.ix_(stretch.columns, stretch.columns)] -= taken
+            stretches.append(stretch)
+        return ChainMarginals(system, stretches, kept, DenseFactor(border))
+
+    def step(self) -> FloatArray:
+        """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
+        return self.solve(self.system.gradient[:, None])[:, 0]
+
+    def solve(self, gradients: FloatArray) -> FloatArray:
+        """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
+        of_poses, pull = gradients[self.system.columns :], gradients[self.kept]
+        for stretch in self.stretches:
+            pull[stretch.columns] -= stretch.gain.T @ of_poses[stretch.rows]
+        moved = -self.border.solve(pull)
+        out = np.empty_like(gradients)
+        out[self.kept] = moved
+        for stretch in self.stretches:
+            alone = stretch.alone(of_poses[stretch.rows])
+            out[self.system.columns + stretch.rows] = alone - stretch.gain @ moved[stretch.columns]
+        return out
+
+    def poses(self) -> FloatArray:
+        """(n, 6, 6) marginals, in the order of ``pose_keys``."""
+        columns, covariance = self.system.columns, self.border.inverse
+        out = np.empty((len(self.system.pose_keys), 6, 6))
+        out[(self.kept[columns::6] - columns) // 6] = _diagonal(covariance[columns:, columns:], 6)
+        for stretch in self.stretches:
+            gain = stretch.gain.reshape(len(stretch.own), 6, -1)
+            among = covariance[np.ix_(stretch.columns, stretch.columns)]
+            out[stretch.rows[::6] // 6] = stretch.own + gain @ among @ np.swapaxes(gain, 1, 2)
+        return out
+
+    def landmarks(self) -> FloatArray:
+        """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
+        columns = self.system.columns
+        return _diagonal(self.border.inverse[:columns, :columns], 3)
+
+    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks, by row of the key lists."""
+        columns = (3 * landmarks[:, None] + np.arange(3)).ravel()
+        on, gain, alone = self._hangs(pose)
+        covariance = self.border.inverse
+        cross = -(gain @ covariance[np.ix_(on, columns)])
+        own = alone + gain @ covariance[np.ix_(on, on)] @ gain.T
+        return np.block([[own, cross], [cross.T, covariance[np.ix_(columns, columns)]]])
+
+    def _hangs(self, pose: int) -> tuple[IntArray, FloatArray, FloatArray]:
+        """What of the kept a pose hangs on, how (6, c), and its covariance if that is held."""
+        for stretch in self.stretches:
+            at = np.flatnonzero(stretch.rows == 6 * pose)
+            if len(at):
+                first = int(at[0])
+                return stretch.columns, stretch.gain[first : first + 6], stretch.own[first // 6]
+        first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
+        return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
+
+
+def _diagonal(matrix: FloatArray, size: int) -> FloatArray:
+    """(k, size, size) blocks on the diagonal of a matrix (k size, k size)."""
+    k = len(matrix) // size
+    every = np.arange(k)
+    return np.asarray(matrix.reshape(k, size, k, size)[every, :, every, :])
+
+
+def _led_back_to(matrix: csr_matrix) -> IntArray:
+    """Poses that share a factor with one that is no neighbour: the earlier one of each pair."""
+    entries = matrix.tocoo()
+    one, other = entries.row // 6, entries.col // 6
+    return np.unique(np.minimum(one, other)[np.abs(one - other) > 1]).astype(np.int64)
+
+
+def block_diagonal(blocks: FloatArray) -> csr_matrix:
+    """Sparse (sm, sm) matrix of diagonal blocks (m, s, s)."""
+    m, size, _ = blocks.shape
+    if not m:
+        return csr_matrix((0, 0))
+    return bsr_matrix((blocks, np.arange(m), np.arange(m + 1)), (size * m, size * m)).tocsr()

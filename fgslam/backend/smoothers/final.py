@@ -1,0 +1,456 @@
+"""The final solution of a graph: what does not fit is left out, the rest solved once more.
+
+Wrong matches go by a kernel and then a trim, or by graduated non-convexity. Either way the last
+solution is plain least squares over the observations that fit, so that its covariances mean what
+they say. Neither the builder nor the solver that it starts from is changed, so that asking for an
+estimate in the middle of a run leaves the run as it was.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, TypeAlias
+
+import gtsam
+import numpy as np
+from scipy.linalg import block_diag
+
+from fgslam.backend.considered import fused, pixels_of, shared_covariance
+from fgslam.backend.loops import Constraint
+from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, Tracks, tracks_of
+from fgslam.backend.persistence import STATED, Fitted
+from fgslam.backend.self_calibration import RigChange
+from fgslam.backend.settings import KernelSettings
+from fgslam.backend.smoothers.bundle import Descent, State, WholeGraph
+from fgslam.backend.smoothers.elimination import Bordered, EliminatedBorder, reduced
+from fgslam.backend.smoothers.graph import (
+    Acceptance,
+    ClosedLoop,
+    Drive,
+    GraphBuilder,
+    GraphLoops,
+    Minimum,
+    Smoothed,
+    Solution,
+    allowed_joint,
+    allowed_parts,
+    solver_failed,
+)
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
+from fgslam.core.correction import (
+    RigCorrection,
+    displacements,
+    field_displacements,
+    field_modes,
+    prior_information,
+    shared_displacements,
+)
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import reorthonormalise
+from fgslam.core.sensors import CameraRig
+from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Floor, GyroscopeBias, Prediction
+from fgslam.factors.graphs import number, poses_of_frame
+
+# ------------------------------------------------------------------------------------------
+# What the doubt about a rig's calibration adds to the covariances of a solved graph
+
+
+def doubted(graph: WholeGraph, state: State, rig: RigCorrection) -> Bordered:
+    """Marginals at a solution, with the doubt about its rig.
+
+    Its border are the correction's terms, those that all cameras share, and the field's modes.
+
+    Args:
+        graph: the factors.
+        state: its minimum.
+        rig: with the correction that was applied to it.
+
+    Raises:
+        EstimatorError: the measurements do not determine all variables.
+    """
+    held, prior, shared = (
+        reduced(graph.linear(state)),
+        prior_information(rig.rig),
+        shared_covariance(rig),
+    )
+    modes = field_modes(rig.rig) if rig.field_px and not rig.rig.exact else 0
+    p, terms = len(prior), slice(len(prior) + len(shared) + modes)
+    pull, own = graph.pulled(
+        state, lambda measured: shifts(rig.rig, measured, modes > 0)[..., terms]
+    )
+    gain = held.solve(pull)
+    information = own + pull.T @ gain[: len(pull)]
+    of_terms = information[:p, :p] + prior
+    correction = np.linalg.inv(0.5 * (of_terms + of_terms.T))
+    # What was applied leant with the field, too: as much, but by other frames, as a graph's would.
+    lean = rig.field_px * correction @ information[:p, p + len(shared) :]
+    correction = correction + lean @ lean.T
+    covariance = np.asarray(block_diag(correction, shared, rig.field_px**2 * np.eye(modes)))
+    return Bordered(held, gain, covariance, np.zeros(len(covariance)))
+
+
+def shifts(rig: CameraRig, measured: FloatArray, field: bool = False) -> FloatArray:
+    """(k, 3, p + q) by which a unit of each term displaces measurements (k, 3): TERMS, SHARED.
+
+    Then, with ``field``, by its modes.
+    """
+    pixels = pixels_of(rig, measured)
+    of_pixels = [displacements(rig, pixels), shared_displacements(rig, pixels)]
+    if field:
+        of_pixels.append(field_displacements(rig, pixels))
+    return fused(rig, np.concatenate(of_pixels, axis=2))
+
+
+# ------------------------------------------------------------------------------------------
+# Noise of measurements along a graph's solved poses
+
+
+def power_ratio(graph: WholeGraph, state: State) -> float:
+    """By how much tracks lean at a solution, over what the graph takes them to: a variance.
+
+    Tracks are as :class:`~fgslam.backend.persistence.Persistence` judges them.
+    """
+    if graph.seen is None:
+        return 1.0
+    frame_of = np.array([number(key) for key in graph.pose_keys])
+    order, tracks = _in_tracks(graph.seen.points, frame_of[graph.seen.poses], graph.weights > 0.0)
+    if not len(order):
+        return 1.0
+    look = graph.seen.look(state.poses, state.points)
+    fitted = Fitted.of(tracks, look.residual[order], look.by_point[order])
+    if fitted is None:
+        return 1.0
+    sums = STATED[1] + fitted.powers()[1]
+    return float(sums[0] / sums[1])
+
+
+def _in_tracks(points: IntArray, frames: IntArray, counts: BoolArray) -> tuple[IntArray, Tracks]:
+    """Rows (n,) of the sightings (k,) that count, by landmark and frame, and their tracks."""
+    order = np.flatnonzero(counts)
+    order = order[np.lexsort((frames[order], points[order]))]
+    begins = np.ones(len(order), np.bool_)
+    begins[1:] = (np.diff(points[order]) != 0) | (np.diff(frames[order]) > ENDED_AFTER)
+    first = np.flatnonzero(begins)
+    since = np.arange(len(order)) - np.repeat(first, np.diff(np.append(first, len(order))))
+    first = np.flatnonzero(since % LONGEST == 0)
+    sightings = np.diff(np.append(first, len(order)))
+    long = sightings >= LEAST_SIGHTINGS
+    return order[np.repeat(long, sightings)], tracks_of(sightings[long])
+
+
+_GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
+_BEYOND = (4.0 / 1.538) ** 2
+"""Variance over the stated one from which on most matches lie beyond the four stated deviations
+within which ego-motion takes them (1.538 is the median length of three normal numbers)."""
+_KEPT = 0.5  # weights end at 0 or 1
+_ROUNDS = 20  # trims until the observations that fit do not change any more
+_ROUGH = 1e-2  # of the cost: the minimum with the kernel only says roughly what fits
+_CONTROL_GROWS, _CONTROL_ENDS = 1.4, 1e6  # Yang et al.; with the latter all weights are 0 or 1
+_NEAR_BEGINS, _NEAR_GROWS, _NEAR_ENDS = 0.3, 4.0, 20.0
+"""From a robust solution the convex beginning is left out and the rest taken in larger steps: at
+first what fits by half the gate's width counts in full, and nothing beyond twice of it."""
+_DECIDED = 1e-4
+_LEAST = 1e-12
+_SOLUTIONS = 5  # solutions until no landmark lies behind a camera any more
+_BEHIND = "came out behind a camera"
+_UNSEEN = "has no observation that fits the others"
+
+Minimise: TypeAlias = Callable[[WholeGraph, State], tuple[State, WholeGraph]]
+"""From a graph and initial values to those at the minimum and the factors that count there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How far a minimum is followed: iterations, and the part of the cost that is let go."""
+
+    iterations: int
+    tolerance: float
+
+
+MINIMUM = Effort(100, 1e-9)
+"""A bound, for graphs that do not settle; the estimate then moves by less than a micrometre."""
+
+
+def graduated(
+    graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
+) -> tuple[State, WholeGraph]:
+    """Graduated non-convexity (Yang et al. 2020, eqs. 12 to 14) with truncated least squares.
+
+    Landmark observations are the possible outliers.
+
+    Args:
+        graph: factors without kernels.
+        state: initial values.
+        effort: of each of its solutions.
+        noise_factor: by which the factors' deviations exceed the stated ones.
+
+    Returns:
+        Values at the minimum, and the graph without the observations that were rejected.
+    """
+    gate = _GATE / noise_factor**2
+    state = graph.minimum(state, effort.iterations, _ROUGH)
+    ratio = graph.squared(state) / gate
+    worst = 2.0 * float(ratio.max(initial=0.0)) - 1.0
+    control = 1.0 / worst if worst > 0.0 else np.inf
+    weights = np.ones(len(ratio))
+    while worst > 0.0 and control < _CONTROL_ENDS:
+        weights = truncated_weights(graph.squared(state) / gate, control)
+        state = graph.weighed(weights).minimum(state, 1, effort.tolerance)
+        if np.minimum(weights, 1.0 - weights).max() < _DECIDED:
+            break
+        control *= _CONTROL_GROWS
+    kept = graph.weighed(weights > _KEPT)
+    return kept.minimum(state, effort.iterations, effort.tolerance), kept
+
+
+def truncated_weights(ratio: FloatArray, control: float) -> FloatArray:
+    """Weights (k,) of squared residuals over the gate's square (k,): Yang et al., eq. 14."""
+    middle = np.sqrt(control * (control + 1.0) / np.maximum(ratio, _LEAST)) - control
+    return np.asarray(np.clip(middle, 0.0, 1.0))
+
+
+def trimmed(
+    graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
+) -> tuple[State, WholeGraph]:
+    """Minimises roughly with the graph's own kernel, then without it over what fits.
+
+    In between the weights go from the kernel's to 0 and 1 by the last part of the graduation: cut
+    at once, what the kernel has let go a little too far would stay out. The sum of squares, each at
+    most the gate's, ends lower than after a cut at a closely followed minimum with the kernel, in
+    a third of the steps (docs/derivations/smoothers.md). Loops keep their kernels: they are too few
+    to be separated by a trim.
+
+    Args:
+        graph: factors, landmark observations with a kernel.
+        state: initial values.
+        effort: of the last solution.
+        noise_factor: by which the factors' deviations exceed the stated ones, which judge.
+
+    Returns:
+        Values at the minimum, and the plain factors that were kept.
+    """
+    gate, descent = _GATE / noise_factor**2, Descent()
+    if graph.weights.all():  # else it is known already what fits, but for a few
+        state = graph.minimum(state, effort.iterations, _ROUGH)
+        control = _NEAR_BEGINS
+        while control < _NEAR_ENDS:
+            weights = truncated_weights(graph.squared(state) / gate, control)
+            weighed = graph.weighed(weights)
+            state = weighed.minimum(state, 1, effort.tolerance, descent=descent)
+            control *= _NEAR_GROWS
+    return _settled(graph, state, gate, effort, descent)
+
+
+def _settled(
+    graph: WholeGraph, state: State, gate: float, effort: Effort, descent: Descent
+) -> tuple[State, WholeGraph]:
+    """The minimum over what fits there: chosen and solved for by turns, until that is the same."""
+    fits, kept = graph.weights > 0.0, graph.weighed(graph.weights)
+    for _ in range(_ROUNDS):
+        before, fits = fits, graph.squared(state) <= gate
+        if (fits == before).all():
+            break
+        kept = graph.weighed(fits)
+        state = kept.minimum(state, 1, effort.tolerance, descent=descent)
+    return kept.minimum(state, effort.iterations, effort.tolerance, descent=descent), kept
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A solved graph.
+
+    Attributes:
+        graph: the factors that count.
+        state: of all variables that are left.
+        remarks: what was left out, in words.
+        doubted: what was applied last to a rig that calibrates itself; None for a known one.
+        noise_ratio: variance of the measurements over what the builder takes it to be.
+    """
+
+    graph: WholeGraph
+    state: State
+    remarks: tuple[str, ...] = ()
+    doubted: RigCorrection | None = None
+    noise_ratio: float = 1.0
+
+    @property
+    def variables(self) -> list[int]:
+        """Landmark variables that are left, ascending."""
+        return [number(key) for key in self.graph.landmark_keys]
+
+    @property
+    def values(self) -> Any:
+        """GTSAM values of all variables."""
+        return self.graph.values(self.state)
+
+    def points(self) -> dict[int, FloatArray]:
+        """Positions (3,) of the landmark variables."""
+        return dict(zip(self.variables, self.state.points, strict=True))
+
+    def poses(self) -> FloatArray:
+        """(n, 4, 4) by frame, up to the last; NaN for those that are no variables."""
+        frames = [number(key) for key in self.graph.pose_keys]
+        out = np.full((frames[-1] + 1, 4, 4), np.nan)
+        out[frames] = self.state.poses
+        return out
+
+    @cached_property
+    def marginals(self) -> EliminatedBorder:
+        """Of all variables.
+
+        Raises:
+            EstimatorError: the measurements do not determine all variables.
+        """
+        if self.doubted is not None and self.graph.seen is not None:
+            return doubted(self.graph, self.state, self.doubted)
+        return reduced(self.graph.linear(self.state))
+
+    @property
+    def gyroscope(self) -> GyroscopeBias | None:
+        """Its bias at the end; None where it is no variable, raises as :meth:`marginals`."""
+        found = self.marginals
+        if self.graph.rest.turns is None or not isinstance(found, Bordered):
+            return None
+        return GyroscopeBias(self.state.bias[-3:], found.estimated[-3:, -3:])
+
+
+def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
+    """Solves; where poses were tracked by the fewer matches, weighs these by what they err now.
+
+    Not where only key frames are variables, whose tracks were judged in all frames.
+    The observations alone are weighed anew: guessed steps and the translations of a gyroscope's
+    keep the noise of the way, and which landmarks lie behind a camera is not asked again.
+    """
+    found = _solved(builder, values, minimise)
+    if builder.noise.spread < _BEYOND or len(builder.frames) <= builder.frames[-1]:
+        return found
+    ratio = power_ratio(found.graph, found.state)
+    weighed = dataclasses.replace(found.graph, weights=found.graph.weights / ratio)
+    state = weighed.minimum(found.state, MINIMUM.iterations, MINIMUM.tolerance)
+    return dataclasses.replace(found, graph=weighed, state=state, noise_ratio=ratio)
+
+
+def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
+    """Without landmarks that come out behind a camera or that nothing supports."""
+    graph, state = builder.whole_graph(values, settled=True)
+    remarks: list[str] = []
+    for _ in range(_SOLUTIONS):
+        state, kept = minimise(graph, state)
+        found = Refined(kept, state, tuple(remarks), builder.doubted)
+        lost = lost_landmarks(builder, found)
+        if not lost:
+            return found
+        remarks += [f"{builder.describe(v)} {why}: left out" for v, why in lost.items()]
+        rows = np.searchsorted(found.variables, sorted(lost)).astype(np.int64)
+        graph, state = kept.without(rows, state)
+    state, kept = minimise(graph, state)
+    return Refined(kept, state, tuple(remarks), builder.doubted)
+
+
+class WholeGraphSolver:
+    """What solvers of a graph that keeps every pose share: loops, and the answer for the whole run.
+
+    The answer is solved for once, until the graph changes.
+    """
+
+    kind: ClassVar[str]
+
+    def __init__(
+        self, builder: GraphBuilder, floor: Floor, kernel: KernelSettings | None = None
+    ) -> None:
+        """Nothing to solve yet; loops are judged with the builder's kernel or with another."""
+        self.builder, self._floor = builder, floor
+        self.loops = GraphLoops(builder, kernel)
+        self.values = gtsam.Values()
+        self._answer: Refined | None = None
+        self.remarks: list[str] = []
+
+    def recalibrate(self, change: RigChange) -> None:
+        """The next answer is that of the new measurements."""
+        self._answer = None
+
+    @one_blas_thread()
+    def solution(self) -> Solution:
+        """All poses and landmarks at the minimum over all that was measured, with marginals."""
+        return solution(self.refined(), self.builder.frames, self._floor)
+
+    @one_blas_thread()
+    def joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance of the graph's last pose and landmark variables.
+
+        Raises:
+            EstimatorError: a landmark was left out of the last solution.
+        """
+        refined = self.refined()
+        lost = set(variables) - set(refined.variables)
+        if lost:
+            raise EstimatorError(f"{self.builder.describe(min(lost))} was left out of the graph")
+        rows = np.searchsorted(refined.variables, variables).astype(np.int64)
+        joint = refined.marginals.joint(len(refined.state.poses) - 1, rows)
+        return allowed_joint(self._floor, refined.state.poses[-1], joint)
+
+    def refined(self) -> Refined:
+        """The graph's last solution."""
+        if self._answer is None:
+            try:
+                self._answer = self.solve_whole()
+            except RuntimeError as error:
+                raise self._failed(error, "after") from None
+        return self._answer
+
+    def solve_whole(self) -> Refined:
+        """The minimum of the whole graph from the values of now."""
+        return refine(self.builder, self.values, self._minimise)
+
+    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
+        """Values at the minimum, and the factors that count there."""
+        raise NotImplementedError
+
+    @one_blas_thread()
+    def _accepted(
+        self, loop: Constraint, drive: Drive, what: str, minimum: Minimum
+    ) -> Acceptance | None:
+        """The loop in the graph; None, and a remark, if it is refused. See GraphLoops.judge."""
+        found = self.loops.judge(loop, drive, self.values, minimum, what)
+        self.remarks.append(found.remark)
+        if not found.closed:
+            return None
+        self._answer = None  # it may have been solved in this very frame, without the loop
+        return found
+
+    def _after_loop(self, covariance: FloatArray) -> ClosedLoop:
+        """The values that a loop has moved, and the covariance (6, 6) of their last pose."""
+        here = reorthonormalise(poses_of_frame(self.values, self.builder.frames[-1]))
+        return ClosedLoop(Smoothed(self.values, Prediction(here, covariance), by_loop=True))
+
+    def _failed(self, error: Exception, when: str = "at") -> Exception:
+        return solver_failed(self.kind, error, self.builder.frames[-1], when)
+
+
+def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
+    """Everything about frames of a solved graph and its landmark variables."""
+    poses, points, variables = refined.poses(), refined.points(), refined.variables
+    ratio = refined.noise_ratio
+    kept = np.full((len(poses), 6, 6), np.nan)
+    try:
+        marginals = refined.marginals
+        covariances = dict(zip(variables, marginals.landmarks(), strict=True))
+        kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
+    except EstimatorError as error:
+        missing = {v: np.full((3, 3), np.nan) for v in variables}
+        remarks = (*refined.remarks, str(error))
+        return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio)
+    bias = refined.gyroscope
+    remarks = refined.remarks if bias is None else (*refined.remarks, bias.words)
+    return Solution(poses, kept, points, covariances, remarks, True, ratio, bias)
+
+
+def lost_landmarks(builder: GraphBuilder, found: Refined) -> dict[int, str]:
+    """Landmark variables behind a camera or without an observation that counts, and why."""
+    behind = dict.fromkeys(builder.behind(found.poses(), found.points()), _BEHIND)
+    variables = found.variables
+    return behind | {variables[row]: _UNSEEN for row in found.graph.unseen().tolist()}

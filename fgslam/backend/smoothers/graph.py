@@ -1,0 +1,889 @@
+"""Loops in a smoother's graph: a first guess that keeps every place as it is, then the solution.
+
+The graph as solved before the loop and as it must be with it lie far apart. Linearised in between,
+landmarks would fly and kernels drop what is right: so poses and landmarks are first brought to
+where backward correction (:mod:`fgslam.backend.loops`) has them, each landmark
+along with the frame that saw it first. There every observation fits as before, and what is left is
+small.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Protocol, TypeAlias
+
+import gtsam
+import numpy as np
+
+from fgslam.backend.loops import (
+    Chain,
+    Constraint,
+    changes,
+    constraint_factor,
+    corrected,
+    nearest_positive,
+    refusal,
+)
+from fgslam.backend.persistence import MeasurementNoise, Persistence, StatedNoise
+from fgslam.backend.self_calibration import KnownCorrections, RigChange
+from fgslam.backend.settings import GraphSettings, KernelSettings
+from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
+from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, WholeGraph
+from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, chi_square_quantile
+from fgslam.core.correction import RigCorrection
+from fgslam.core.errors import EstimatorError
+from fgslam.core.geometry import (
+    adjoint,
+    congruence,
+    inverse,
+    se3_exp,
+    se3_log,
+    transform_to_world,
+    triangulate,
+)
+from fgslam.core.sensors import CameraRig, LoopClosure, Observations, Odometry
+from fgslam.core.types import EgoMotion, Floor, GyroscopeBias, LandmarkMap, Prediction
+from fgslam.factors.graphs import landmark_key, pose_key, poses_of_frame
+from fgslam.factors.landmark import StereoFactors, whitening
+from fgslam.factors.motion import floor_factors, point_prior, pose_prior, step_factor
+from fgslam.factors.noise import Whitening, scaled
+
+# ------------------------------------------------------------------------------------------
+# A loop closure in a window: what its last pose has drifted by, undone as far as is measured
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Undone:
+    """The last pose by a loop; None where that is refused; and what became of it, in words."""
+
+    last: Prediction | None
+    remark: str
+
+
+def drift_undone(
+    floor: Floor, before: Prediction, last: Prediction, known: Constraint, what: str
+) -> Undone:
+    """The last pose moved to where a loop has it.
+
+    The earlier frame's pose is known as it was when it left. What the last pose is less certain
+    by than that one is drift, and the loop measures the drift: a Kalman correction of one pose.
+
+    Args:
+        floor: on which nothing drifts, and nothing is measured, in the other directions.
+        before: the earlier pose.
+        last: the last one.
+        known: the loop.
+        what: begins the remark.
+    """
+    shared = congruence(adjoint(inverse(known.motion)), before.covariance)
+    drift = nearest_positive(last.covariance - shared)
+    basis = floor.basis(last.wTc) if floor.rigid_dof < 6 else np.eye(6)
+    off = basis.T @ se3_log(inverse(last.wTc) @ before.wTc @ known.motion)
+    drift = basis.T @ drift @ basis
+    innovation = drift + basis.T @ known.covariance @ basis
+    gain = np.linalg.solve(innovation, drift).T
+    refused = refusal(what, float(off @ np.linalg.solve(innovation, off)))
+    if refused:
+        return Undone(None, refused)
+    target = last.wTc @ se3_exp(basis @ gain @ off)
+    target = floor.constrain(target) if floor.rigid_dof < 6 else target
+    covariance = shared + congruence(basis, nearest_positive(drift - gain @ drift))
+    shift = float(np.linalg.norm(target[:3, 3] - last.wTc[:3, 3]))
+    remark = f"{what}: the camera moved by {shift:.2f} m"
+    return Undone(Prediction(target, floor.allowed_part(target, covariance)), remark)
+
+
+# ------------------------------------------------------------------------------------------
+# Turns a run's measurements into a factor graph, frame by frame; every smoother starts from it
+
+WEAK_PARALLAX = 8.0  # range over its deviation below which a landmark gets a weak prior
+_WEAK_PRIOR_RANGES = 2.0  # keeps a first step before the camera: docs/derivations/smoothers.md
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedFrame:
+    """A frame as the tracker has it.
+
+    Attributes:
+        frame: counted from 0.
+        wTc: (4, 4) its pose.
+        motion: from the frame before; None for the first.
+        accepted: observations that fit.
+        turn: what the bias of a gyroscope does to the motion.
+        located: (6, 6) covariance with which it was found in the map without a prior; else None.
+    """
+
+    frame: int
+    wTc: FloatArray
+    motion: Odometry | None
+    accepted: Observations
+    turn: Turn | None = None
+    located: FloatArray | None = None
+
+
+@dataclass(slots=True, eq=False)
+class NewFactors:
+    """What one frame adds.
+
+    Attributes:
+        frame: counted from 0.
+        graph: the factors, but for observations.
+        values: initial values of the new variables.
+        priors: landmark variables, mean (3,) and covariance (3, 3) of what is known of them
+            beforehand; where no factors are made of it.
+        sightings: landmark variables and what was seen of them.
+    """
+
+    frame: int
+    graph: Any
+    values: Any
+    priors: list[tuple[int, FloatArray, FloatArray]] = field(default_factory=list)
+    sightings: list[tuple[int, Sighting]] = field(default_factory=list)
+
+
+class GraphBuilder:
+    """Poses, landmarks and factors of a run so far.
+
+    Attributes:
+        graph: all factors but observations; one taken out leaves an empty slot.
+        observed: the observations: frame, variable, measurement, covariance, whether taken out.
+        admission: the landmarks, and which of them the graph holds.
+        frames: those whose poses are in the graph, in time order.
+        noise: of its landmark observations.
+    """
+
+    def __init__(
+        self,
+        sensor: CameraRig,
+        settings: GraphSettings,
+        floor: Floor,
+        prior: Prediction,
+        remember: bool = True,
+    ) -> None:
+        """An empty graph; ``prior`` will be that of the first pose.
+
+        With ``remember`` off, for a bounded lag, nothing is kept: factors of poses are handed out,
+        and observations as they are.
+        """
+        self._remember = remember
+        self._sensor = sensor
+        self._settings = settings
+        self._floor = floor
+        self._prior = prior
+        given = settings.noise_factor
+        self.noise: MeasurementNoise = Persistence(sensor) if given is None else StatedNoise(given)
+        self.corrections = KnownCorrections()
+        self._variance_of: dict[int, float] = {}
+        self._turned: dict[int, TurnedStep] = {}
+        self._weigh()
+        self._rows: dict[int, list[int]] = {}
+        self.identities = array("q")  # of variables: all that a bounded lag keeps of one
+        self.observed = GrowingColumns(
+            frame=np.empty(0, np.int64),
+            variable=np.empty(0, np.int64),
+            measurement=np.empty((0, 3)),
+            covariance=np.empty((0, 3, 3)),
+            gone=np.empty(0, np.bool_),
+        )
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.admission = LandmarkAdmission(sensor, settings)
+        self.frames: list[int] = []
+
+    @property
+    def kernel(self) -> KernelSettings:
+        """Around each observation, its width in the factors' deviations."""
+        kernel = self._settings.kernel
+        return KernelSettings(kernel.name, kernel.width / self.noise_factor)
+
+    @property
+    def noise_factor(self) -> float:
+        """By which the factors' deviations exceed those by which wrong matches are judged."""
+        return float(np.sqrt(self.noise.power / self.noise.spread))
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Corrects all observations so far anew."""
+        self.observed["measurement"][:] = change.measured(self.observed["measurement"])
+        self.corrections.recalibrate(change)
+        self.admission.recalibrate(change)
+
+    @property
+    def doubted(self) -> RigCorrection | None:
+        """A rig that calibrates itself, with the correction applied last; None for a known one."""
+        applied = self.corrections.applied
+        if not applied:
+            return None
+        none, px = RigCorrection.none(self._sensor), self.corrections.field_px
+        return dataclasses.replace(none, values=applied[-1], field_px=px)
+
+    @property
+    def variables(self) -> int:
+        """Number of landmark variables made so far."""
+        return len(self.identities)
+
+    def add(self, tracked: TrackedFrame, landmarks: LandmarkMap) -> NewFactors:
+        """Adds a frame's pose and observations.
+
+        Args:
+            tracked: initial value of the pose, motion from the graph's last frame, observations.
+            landmarks: the tracker's map after this frame: initial values, and how well each
+                landmark is known given the poses.
+        """
+        self._weigh()
+        new = NewFactors(tracked.frame, gtsam.NonlinearFactorGraph(), gtsam.Values())
+        self._add_pose(new, tracked)
+        self.frames.append(tracked.frame)
+        self._add_observations(new, tracked, landmarks)
+        if self._remember:
+            self._remember_observed(new.sightings)
+        return new
+
+    def take_out(self, variable: int) -> str:
+        """Removes a landmark from the graph; it waits until it is known twice as well.
+
+        Returns:
+            Its identity and sightings, in words.
+        """
+        for row in self._rows.pop(variable, []):
+            self.graph.remove(row)
+        self.observed["gone"][self.observed["variable"] == variable] = True
+        words = self.describe(variable)
+        self.admission.taken_out(self.identities[variable], variable)
+        return words
+
+    def describe(self, variable: int) -> str:
+        """A landmark variable's identity and sightings, in words."""
+        return self.admission.describe(self.identities[variable], variable)
+
+    def forget_before(self, frame: int) -> list[tuple[int, Track]]:
+        """For a bounded lag: earlier frames, and landmarks last seen in them, have left the graph.
+
+        Returns:
+            Identity and track of those landmarks; their next sighting begins a new variable.
+        """
+        left = self.admission.leave_before(frame)
+        for _, track in left:
+            self._rows.pop(track.variable, None)
+            track.variable = -1
+        return left
+
+    def first_frames(self) -> IntArray:
+        """(variables,) the first frame that saw each landmark variable; 0 where none is kept."""
+        first = np.full(self.variables, np.iinfo(np.int64).max)
+        np.minimum.at(first, self.observed["variable"], self.observed["frame"])
+        return np.where(first < np.iinfo(np.int64).max, first, 0)
+
+    def add_factor(self, factor: Any) -> int:
+        """Adds a factor between variables of the graph, as of a loop; returns its row."""
+        self.graph.add(factor)
+        return int(self.graph.size()) - 1
+
+    def of_saved_map(self, variable: int) -> bool:
+        """Whether a landmark variable is on the prior of a saved map's landmark."""
+        return self.admission.saved(self.identities[variable]) is not None
+
+    def in_graph(self, variable: int) -> bool:
+        """Whether a landmark variable still has its factors."""
+        return variable in self._rows
+
+    def behind(self, poses: FloatArray, points: dict[int, FloatArray]) -> list[int]:
+        """Variables that lie behind a camera that saw them, where a stereo factor says nothing.
+
+        Args:
+            poses: (n, 4, 4) ``wTc`` by frame, those of the graph at least.
+            points: positions (3,) by variable.
+        """
+        if not points:
+            return []
+        frames, seen = self.observed["frame"], self.observed["variable"]
+        position = np.full((self.variables, 3), np.nan)
+        position[list(points)] = list(points.values())
+        offset = position[seen] - poses[frames, :3, 3]
+        depth = np.einsum("ki,ki->k", offset, poses[frames, :3, 2])
+        # A variable that was taken out has no position, and NaN is not below zero.
+        return [int(variable) for variable in np.unique(seen[depth <= 0.0])]
+
+    def seen_last(self, poses: FloatArray) -> dict[int, FloatArray]:
+        """Places (3,) of the graph's landmark variables as each was seen last, from such poses."""
+        tracks = [t for _, t in self.admission.in_graph() if np.isfinite(poses[t.last.frame, 0, 0])]
+        if not tracks:
+            return {}
+        seen = np.array([track.last.measurement for track in tracks])
+        wTc = poses[[track.last.frame for track in tracks]]
+        local = triangulate(self._sensor, seen)
+        places = np.einsum("kij,kj->ki", wTc[:, :3, :3], local) + wTc[:, :3, 3]
+        return {track.variable: place for track, place in zip(tracks, places, strict=True)}
+
+    def kept_factors(self) -> Any:
+        """All factors as one graph of GTSAM's, weighed as is known now, observations last."""
+        out = self._other_factors()
+        seen = self.kept_observed()
+        for frame, variable, measurement, covariance in zip(*seen, strict=True):
+            out.add(self._observation(int(variable), Sighting(int(frame), measurement, covariance)))
+        return out
+
+    def observation_factors(self, sightings: list[tuple[int, Sighting]]) -> Any:
+        """Factors of observations of landmark variables, weighed as is known now."""
+        out = gtsam.NonlinearFactorGraph()
+        for variable, sighting in sightings:
+            out.add(self._observation(variable, sighting))
+        return out
+
+    def whole_graph(
+        self, values: Any, kernel: KernelSettings | None = None, settled: bool = False
+    ) -> tuple[WholeGraph, State]:
+        """The same in arrays, at values of all variables; with another kernel where given.
+
+        With ``settled`` all measurements are corrected by what was known last of the rig.
+        """
+        graph, state = self._whole_graph(values, kernel or self.kernel, settled)
+        return graph.with_turns(list(self._turned.values()), state, self._persistence)
+
+    def _whole_graph(
+        self, values: Any, kernel: KernelSettings, settled: bool
+    ) -> tuple[WholeGraph, State]:
+        """Without turns of a gyroscope."""
+        others = self._other_factors(turned=False)
+        frames, variables, measured, covariances = self.kept_observed()
+        if settled:
+            measured = self.corrections.settle(self._sensor, frames, measured)
+        return WholeGraph.of_rig(
+            others,
+            values,
+            kernel,
+            (pose_key(0) + frames, landmark_key(0) + variables),
+            (measured, whitening(self._power * covariances)),
+            self._sensor,
+        )
+
+    def kept_observed(self) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Frames (k,), variables (k,), measurements and covariances of what was not taken out."""
+        kept, seen = ~self.observed["gone"], self.observed
+        return (
+            seen["frame"][kept],
+            seen["variable"][kept],
+            seen["measurement"][kept],
+            seen["covariance"][kept],
+        )
+
+    def _other_factors(self, turned: bool = True) -> Any:
+        """Those that are no observations, without empty slots, weighed as is known now.
+
+        Steps of a gyroscope whose bias is of account are among them where ``turned``.
+        """
+        self._weigh()
+        out = gtsam.NonlinearFactorGraph()
+        for row in range(self.graph.size()):
+            if self.graph.exists(row) and (turned or row not in self._turned):
+                factor, then = self.graph.at(row), self._variance_of.get(row)
+                out.add(factor if then is None else self._weighed(factor, then))
+        return out
+
+    # ----------------------------------------------------------------------------------------
+
+    def _weigh(self) -> None:
+        """New factors weigh what depends on the noise as is known now."""
+        kernel = self.kernel
+        self._power, self._persistence = self.noise.power, self.noise_factor**2
+        self._factors = StereoFactors(self._sensor, Whitening(kernel.name, kernel.width))
+
+    def _weighed(self, step: Any, then: float) -> Any:
+        """A guessed step as is known now; ``then`` multiplied its variance when it was made."""
+        return step if self._persistence == then else scaled(step, self._persistence / then)
+
+    def _add_pose(self, new: NewFactors, tracked: TrackedFrame) -> None:
+        key = pose_key(new.frame)
+        new.values.insert(key, gtsam.Pose3(tracked.wTc))
+        if not self.frames:
+            self._push(new, pose_prior(key, self._prior))
+        elif tracked.motion is None:
+            raise ValueError(f"frame {new.frame}: no motion from the frame before")
+        else:
+            self._add_step(new, tracked.motion, tracked.turn)
+            if tracked.located is not None and not self._remember:
+                # The map it was found in has left the lag: nothing else holds it there.
+                self._push(new, pose_prior(key, Prediction(tracked.wTc, tracked.located)))
+        for factor in floor_factors(key, self._floor, tracked.wTc):
+            self._push(new, factor)
+
+    def _add_step(self, new: NewFactors, motion: Odometry, turn: Turn | None) -> None:
+        """From the frame before; the errors of one that goes on as before persist like images'.
+
+        Its velocity comes from nothing but matches, and its noise from how far they scatter.
+        """
+        stated = motion
+        if not motion.measured:
+            covariance = self._persistence * motion.covariance
+            motion = dataclasses.replace(motion, covariance=covariance)
+        before, after = pose_key(self.frames[-1]), pose_key(new.frame)
+        row = self._push(new, step_factor(before, after, motion))
+        if not motion.measured:
+            self._variance_of[row] = self._persistence
+        if turn is not None and self._remember:
+            self._turned[row] = TurnedStep(self.frames[-1], new.frame, stated, turn)
+
+    def _add_observations(
+        self, new: NewFactors, tracked: TrackedFrame, landmarks: LandmarkMap
+    ) -> None:
+        accepted, wTc = tracked.accepted, tracked.wTc
+        rows = landmarks.rows(accepted.ids)
+        positions = landmarks.positions[rows]
+        known = parallax(positions - wTc[:3, 3], landmarks.covariances[rows])
+        for i, identity in enumerate(accepted.ids.tolist()):
+            sighting = Sighting(new.frame, accepted.measurement[i], accepted.covariance[i])
+            track = self.admission.sighted(identity, sighting)
+            if track.variable >= 0:
+                new.sightings.append((track.variable, sighting))
+            else:
+                track.waiting.append(sighting)
+                if self.admission.admits(identity, float(known[i])):
+                    self._enter(new, identity, positions[i], wTc, float(known[i]))
+
+    def _enter(
+        self,
+        new: NewFactors,
+        identity: int,
+        position: FloatArray,
+        wTc: FloatArray,
+        parallax: float,
+    ) -> None:
+        """A landmark's variable, its prior if it needs one, and all its sightings so far."""
+        track = self.admission.tracks[identity]
+        track.variable = len(self.identities)
+        self.identities.append(identity)
+        self._rows[track.variable] = []
+        key = landmark_key(track.variable)
+        new.values.insert(key, position)
+        saved = self.admission.saved(identity)
+        if saved is not None:
+            self._add_prior(new, track.variable, *saved)
+        elif parallax < WEAK_PARALLAX:
+            sigma = _WEAK_PRIOR_RANGES * float(np.linalg.norm(position - wTc[:3, 3]))
+            self._add_prior(new, track.variable, position, sigma**2 * np.eye(3))
+        new.sightings += [(track.variable, sighting) for sighting in track.waiting]
+        track.waiting = []
+
+    def _add_prior(
+        self, new: NewFactors, variable: int, mean: FloatArray, covariance: FloatArray
+    ) -> None:
+        if self._remember:
+            factor = point_prior(landmark_key(variable), mean, covariance)
+            self._rows[variable].append(self._push(new, factor))
+        else:
+            new.priors.append((variable, mean, covariance))
+
+    def _observation(self, variable: int, sighting: Sighting) -> Any:
+        return self._factors.factor(
+            pose_key(sighting.frame),
+            landmark_key(variable),
+            sighting.measurement,
+            self._power * sighting.covariance,
+        )
+
+    def _remember_observed(self, sightings: list[tuple[int, Sighting]]) -> None:
+        if not sightings:
+            return
+        self.observed.append(
+            {
+                "frame": np.array([s.frame for _, s in sightings]),
+                "variable": np.array([variable for variable, _ in sightings]),
+                "measurement": np.array([s.measurement for _, s in sightings]),
+                "covariance": np.array([s.covariance for _, s in sightings]),
+                "gone": np.zeros(len(sightings), np.bool_),
+            }
+        )
+
+    def _push(self, new: NewFactors, factor: Any) -> int:
+        new.graph.add(factor)
+        if self._remember:
+            self.graph.add(factor)
+        return int(self.graph.size()) - 1
+
+
+def parallax(rays: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Range over its standard deviation (k,), of points at ``rays`` (k, 3) from the camera."""
+    distance = np.linalg.norm(rays, axis=1)
+    directions = rays / np.maximum(distance, 1e-12)[:, None]
+    variance = np.einsum("ki,kij,kj->k", directions, covariances, directions)
+    return np.asarray(distance / np.sqrt(np.maximum(variance, 1e-300)))
+
+
+# ------------------------------------------------------------------------------------------
+# What a smoother asks of a solver: the part to write for another way of solving the graph
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The graph's answer.
+
+    Attributes:
+        poses: (n, 4, 4) by frame; NaN for those between keyframes.
+        pose_covariances: (n, 6, 6); NaN where they cannot be had.
+        points: positions (3,) of landmark variables.
+        point_covariances: (3, 3) of the same.
+        remarks: what was left out, why covariances are missing; in words.
+        considers_rig: covariances contain what is open of the rig's calibration; else what was
+            open when each frame came is added.
+        noise_ratio: variance of the measurements over what the builder takes it to be.
+        gyroscope: its bias, where it is a variable of the graph.
+    """
+
+    poses: FloatArray
+    pose_covariances: FloatArray
+    points: dict[int, FloatArray]
+    point_covariances: dict[int, FloatArray]
+    remarks: tuple[str, ...] = ()
+    considers_rig: bool = False
+    noise_ratio: float = 1.0
+    gyroscope: GyroscopeBias | None = None
+
+
+def poses_of(values: Any, frames: list[int]) -> FloatArray:
+    """Poses (n, 4, 4) by frame, up to the last of ``frames``; NaN for those not among them."""
+    out = np.full((frames[-1] + 1, 4, 4), np.nan)
+    for frame in frames:
+        out[frame] = values.atPose3(pose_key(frame)).matrix()
+    return out
+
+
+def points_of(values: Any, variables: list[int]) -> dict[int, FloatArray]:
+    """Positions of landmark variables in GTSAM values."""
+    return {v: np.asarray(values.atPoint3(landmark_key(v))) for v in variables}
+
+
+def allowed_parts(floor: Floor, poses: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariances (n, 6, 6) without what a hard floor excludes, which the graph holds stiffly."""
+    if floor.rigid_dof == 6:
+        return covariances
+    pairs = zip(poses, covariances, strict=True)
+    return np.array([floor.allowed_part(pose, covariance) for pose, covariance in pairs])
+
+
+def allowed_joint(floor: Floor, wTc: FloatArray, joint: FloatArray) -> FloatArray:
+    """Joint covariance of a pose ``wTc`` and others without what a hard floor excludes of it."""
+    if floor.rigid_dof == 6:
+        return joint
+    basis = floor.basis(wTc)
+    project = np.eye(len(joint))
+    project[:6, :6] = basis @ basis.T
+    return congruence(project, joint)
+
+
+def suspect(error: Exception) -> int | None:
+    """Key of the variable near which GTSAM says that the system was indeterminate, if it does."""
+    words = str(error).split("variable", 1)
+    digits = "".join(c for c in words[-1].strip().split(" ")[0] if c.isdigit())
+    return int(digits) if len(words) == 2 and digits else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed:
+    """A solution between two frames, for the tracker to go on from.
+
+    Attributes:
+        values: GTSAM values of the poses and landmarks that the solver holds.
+        last: pose ``wTc`` (4, 4) and covariance (6, 6) of the frame that entered last.
+        since: frame; the values hold no landmark that was seen last before it.
+        by_loop: a loop moved the map: landmarks that the solver does not hold move with the camera.
+    """
+
+    values: Any
+    last: Prediction
+    since: int = 0
+    by_loop: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClosedLoop:
+    """A loop closure that was accepted; ``smoothed`` where the tracker is to go on from it."""
+
+    smoothed: Smoothed | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Drive:
+    """The drive as it was tracked: its chain of steps, and the present pose ``wTc`` (4, 4)."""
+
+    chain: Chain
+    wTc: FloatArray
+
+
+class GraphSolver(Protocol):
+    """Solves the growing graph of a :class:`~fgslam.backend.smoothers.smoother.Smoother`.
+
+    A failure that taking a landmark out does not cure raises EstimatorError in any of these.
+    """
+
+    @property
+    def kind(self) -> str:
+        """Names the estimator in configurations, tables and messages."""
+        ...
+
+    @property
+    def remarks(self) -> list[str]:
+        """What became of loops, and which landmarks were taken out, in words."""
+        ...
+
+    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+        """Takes in a frame's factors.
+
+        Args:
+            new: of the frame; the builder keeps them, too.
+            landmarks: the tracker's map after that frame.
+            timestamp: of the frame, seconds.
+        """
+        ...
+
+    def recalibrate(self, change: RigChange) -> None:
+        """The builder has corrected its observations anew."""
+        ...
+
+    def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
+        """The solution with all that was added, if it is time for one at this frame.
+
+        ``closes_loop``: :meth:`close` follows, and may take all in at once.
+        """
+        ...
+
+    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+        """Takes in a loop closure of the frame added last; None, and a remark, if it is refused.
+
+        Args:
+            loop: between two frames of the graph.
+            drive: as tracked, without the loop.
+            what: begins the remark.
+        """
+        ...
+
+    def solution(self) -> Solution:
+        """All poses and landmarks of the graph, with marginal covariances; changes nothing."""
+        ...
+
+    def joint(self, variables: list[int]) -> FloatArray:
+        """Joint covariance (6 + 3k, 6 + 3k) of the graph's last pose and landmark variables."""
+        ...
+
+
+def solver_failed(kind: str, error: Exception, frame: int, when: str = "at") -> EstimatorError:
+    """What to raise where a solver's failure cannot be repaired."""
+    return EstimatorError(
+        f"{kind}: the solver failed {when} frame {frame} "
+        f"({' '.join(str(error).split())}); look at that frame with fgslam inspect"
+    )
+
+
+_AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
+_OBSERVED = float(chi_square_quantile(0.999, 3))  # of an observation that fits
+LONG_UNSEEN = 60  # frames, as the front-end's LoopGates.forgotten_after
+_ITERATIONS = 20
+_ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
+_TOLERANCE = 1e-6  # of the cost, where that is small
+_EXACT = 1e-4  # radians and metres: a pose that is given
+
+Minimum: TypeAlias = Callable[[WholeGraph, State], State]
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Acceptance:
+    """What became of a loop closure in a graph that keeps every pose.
+
+    Attributes:
+        closed: it was accepted, and its factor is in the builder's graph.
+        values: of all variables with the loop closed; None where nothing had to move.
+        remark: in words.
+    """
+
+    closed: bool
+    values: Any | None
+    remark: str
+
+
+class GraphLoops:
+    """The loops of a graph that keeps every pose: which were accepted, and at what cost."""
+
+    def __init__(self, builder: GraphBuilder, kernel: KernelSettings | None = None) -> None:
+        """No loop yet; the kernel is that of the observations where the graph is solved."""
+        self.builder, self._kernel = builder, kernel
+        self.accepted: list[Constraint] = []
+
+    def judge(
+        self,
+        known: Constraint,
+        drive: Drive,
+        values: Any,
+        minimum: Minimum,
+        what: str,
+    ) -> Acceptance:
+        """Whether the measurements allow a loop closure, which is then a factor of the graph.
+
+        One that the graph meets anyway is a factor more. Otherwise the graph is solved with it, and
+        it is refused where that raises the cost by more than measurement noise explains: a true
+        loop's rise is chi-square with six degrees of freedom, whatever the drift.
+
+        Args:
+            known: the loop, between two frames of the graph.
+            drive: as tracked, without it.
+            values: of all variables, as they are now.
+            minimum: gives the graph's minimum without the loop, from these values.
+            what: begins the remark.
+        """
+        if misfit(constraint_factor(known), values) <= _AGREES:
+            self.accept(known)
+            return Acceptance(True, None, f"{what}: as expected, nothing moved")
+        graph, state = self.builder.whole_graph(values, self._kernel)
+        state = minimum(graph, state)
+        loops = [*self.accepted, known]
+        guess = first_guess(self.builder, graph.values(state), drive.chain, loops)
+        closed = graph.plus(constraint_factor(known))
+        solution = solved(closed, dataclasses.replace(State.of(guess), bias=state.bias))
+        refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
+        competing = self._competing(closed.squared(solution))
+        if refused and 0 < competing.sum() < known.matches:
+            graph, closed = graph.heeding(~competing), closed.heeding(~competing)
+            solution = solved(closed, solution)
+            rise = 2.0 * (closed.cost(solution) - graph.cost(solved(graph, state)))
+            refused = refusal(what, rise)
+        if refused:
+            return Acceptance(False, None, refused)
+        self.accept(known)
+        found = closed.values(solution)
+        here = poses_of_frame(found, known.after)[:3, 3]
+        shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
+        remark = f"{what}: the camera moved by {shift:.2f} m, the graph with it"
+        return Acceptance(True, found, remark)
+
+    def _competing(self, squared: FloatArray) -> BoolArray:
+        """(k,) observations that claim another return than the loop's, by their residuals with it.
+
+        A landmark that was long out of view was found again by its looks and by where the drifted
+        camera expected it. That is a loop closure, too, of a few matches, and false where the
+        drift is large; so the larger number of matches says which of both is believed.
+        """
+        gate = _OBSERVED / self.builder.noise_factor**2
+        frames, variables, *_ = self.builder.kept_observed()
+        return found_again(frames, variables) & (squared > gate)
+
+    def accept(self, known: Constraint) -> None:
+        """Believed now, it is doubted when later ones contradict it."""
+        known = dataclasses.replace(known, doubted=True)
+        self.builder.add_factor(constraint_factor(known))
+        self.accepted.append(known)
+
+    def last_factor(self) -> Any:
+        """The factor of the loop accepted last."""
+        return constraint_factor(self.accepted[-1])
+
+
+def found_again(frames: IntArray, variables: IntArray) -> BoolArray:
+    """(k,) which observations, by frame and landmark, are of landmarks that were long unseen."""
+    order = np.lexsort((frames, variables))
+    same = np.diff(variables[order], prepend=-1) == 0
+    returns = np.cumsum(same & (np.diff(frames[order], prepend=0) >= LONG_UNSEEN))
+    starts = np.flatnonzero(~same)
+    before = np.repeat(returns[starts], np.diff(np.append(starts, len(returns))))
+    out = np.zeros(len(frames), np.bool_)
+    out[order] = returns > before
+    return out
+
+
+def misfit(factor: Any, values: Any) -> float:
+    """Squared residual of a factor, in its deviations."""
+    return 2.0 * float(factor.error(values))
+
+
+def carried_to(
+    frame: int, loop: LoopClosure, tracked: Callable[[int], Prediction | EgoMotion], last: int
+) -> Constraint:
+    """The closure as one to a neighbour of the earlier frame, by how both were tracked.
+
+    Args:
+        frame: of the neighbour, tracked against the same map; may be the earlier frame itself.
+        loop: the closure.
+        tracked: gives a frame's pose as it was tracked.
+        last: the present frame.
+    """
+    matches = len(loop.observations)
+    if frame == loop.frame:
+        return Constraint(frame, last, loop.oTc, loop.covariance, matches=matches)
+    neighbour, earlier = tracked(frame), tracked(loop.frame)
+    kTo = inverse(neighbour.wTc) @ earlier.wTc
+    own = earlier.covariance + congruence(adjoint(inverse(kTo)), neighbour.covariance)
+    covariance = loop.covariance + congruence(adjoint(inverse(loop.oTc)), own)
+    return Constraint(frame, last, kTo @ loop.oTc, covariance, matches=matches)
+
+
+def first_guess(builder: GraphBuilder, values: Any, chain: Chain, loops: list[Constraint]) -> Any:
+    """Values of all variables with the last of ``loops`` closed, each place moved as a whole.
+
+    Args:
+        builder: the graph so far.
+        values: its solution without that loop.
+        chain: the drive as tracked, for the uncertainty of its steps and for what ties it.
+        loops: all that are closed; those before the last are held as the values have them.
+    """
+    frames = np.array(builder.frames)
+    poses = np.array([poses_of_frame(values, frame) for frame in builder.frames])
+    ends = [_row(frames, loops[-1].before), _row(frames, loops[-1].after)]
+    new = dataclasses.replace(loops[-1], before=ends[0], after=ends[1])
+    found = _closed(frames, poses, chain, loops[:-1], new)
+    return _moved(builder, values, frames, found, changes(poses, found))
+
+
+def closed_chain(
+    poses: FloatArray, chain: Chain, loops: list[Constraint], last: FloatArray
+) -> FloatArray:
+    """Poses (n, 4, 4) of all frames where the last of ``loops`` has brought the last one.
+
+    Args:
+        poses: (n, 4, 4) before.
+        chain: as for :func:`first_guess`, as is ``loops``.
+        loops: all that are closed.
+        last: (4, 4) where the last pose is now.
+    """
+    before = loops[-1].before
+    motion = inverse(poses[before]) @ last
+    new = Constraint(before, len(poses) - 1, motion, _EXACT**2 * np.eye(6))
+    return _closed(np.arange(len(poses)), poses, chain, loops[:-1], new)
+
+
+def _closed(
+    frames: IntArray, poses: FloatArray, chain: Chain, loops: list[Constraint], new: Constraint
+) -> FloatArray:
+    held = [_as_solved(known, frames, poses) for known in (*chain.constraints, *loops)]
+    constraints = [known for known in held if known.before != known.after]
+    return corrected(poses, chain.steps_between(frames), [*constraints, new])[0]
+
+
+def solved(graph: WholeGraph, state: State) -> State:
+    """The minimum of a graph with its kernels."""
+    return graph.minimum(state, _ITERATIONS, _TOLERANCE, _ENOUGH)
+
+
+def _row(frames: IntArray, frame: int) -> int:
+    """Row of the graph's frame that is nearest to a frame."""
+    return int(np.argmin(np.abs(frames - frame)))
+
+
+def _as_solved(known: Constraint, frames: IntArray, poses: FloatArray) -> Constraint:
+    """A constraint between rows of the graph's frames, met as the solution meets it."""
+    before, after = _row(frames, known.before), _row(frames, known.after)
+    motion = inverse(poses[before]) @ poses[after]
+    return Constraint(before, after, motion, known.covariance)
+
+
+def _moved(
+    builder: GraphBuilder, values: Any, frames: IntArray, poses: FloatArray, by: FloatArray
+) -> Any:
+    """Values with these poses (m, 4, 4), each landmark moved as the frame that saw it first."""
+    out = gtsam.Values(values)
+    for frame, pose in zip(frames.tolist(), poses, strict=True):
+        out.update(pose_key(frame), gtsam.Pose3(pose))
+    homes = np.searchsorted(frames, builder.first_frames())
+    for variable, home in enumerate(homes.tolist()):
+        key = landmark_key(variable)
+        if out.exists(key):
+            point = transform_to_world(by[home], out.atPoint3(key)[None])[0]
+            out.update(key, point)
+    return out

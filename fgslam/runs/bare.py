@@ -1,0 +1,380 @@
+"""The experiments that `fgslam teach`, `follow` and `join` are; what `fgslam route` says."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from math import degrees, isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import yaml
+
+from fgslam.backend.settings import DEFAULT_ESTIMATOR
+from fgslam.core.errors import CalibrationError, ConfigError, DatasetError, StoredMapError
+from fgslam.core.files import require_output
+from fgslam.datasets.layouts import LAYOUTS, is_recording, recognise_layout
+from fgslam.datasets.settings import CalibratedSettings, FileRecordingSettings
+from fgslam.runs.config import (
+    Experiment,
+    ExperimentConfig,
+    apply_overrides,
+    load_experiment,
+    make_config,
+    make_experiment,
+)
+from fgslam.runs.named_experiments import find_experiment, suggestion
+
+if TYPE_CHECKING:
+    from fgslam.core.log import ImageSequence
+    from fgslam.datasets.clock import Judged
+    from fgslam.homing.links import Link
+    from fgslam.homing.topological_map import MapPlace, RouteMap
+
+
+# ------------------------------------------------------------------------------------------
+# The experiment that a recording alone is: everything else is recognised, or the default
+
+_SETTINGS = {each.kind: each for each in get_args(FileRecordingSettings)}
+
+_NOT_IN_NAMES = re.compile(r"[^\w.-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Bare:
+    """A recording as an experiment.
+
+    Attributes:
+        values: the short configuration.
+        config: the same, checked, with overrides.
+        said: what the recording is and how it is taken, in one line; then a line for each thing
+            that was tolerated.
+    """
+
+    values: dict[str, Any]
+    config: ExperimentConfig
+    said: str
+
+
+def bare_experiment(
+    folder: Path, camera: Path | None = None, overrides: Iterable[str] = ()
+) -> Bare:
+    """Opens a recording and says what it is.
+
+    Its odometry is used where it has some, else the motion is predicted by constant velocity.
+
+    Args:
+        folder: a recording in any known layout.
+        camera: calibration in place of the folder's own.
+        overrides: ``a.b=value``.
+
+    Raises:
+        FgslamError: the layout is not known, or the recording cannot be opened.
+    """
+    from fgslam.runs.opening import open_sequence  # loads arrays; a configuration needs none
+
+    overrides = tuple(overrides)
+    values: dict[str, Any] = {
+        "name": _name(folder),
+        "dataset": dataset_of(folder, camera, overrides),
+        "odometry": {"kind": "recorded"},
+        "estimator": {"kind": DEFAULT_ESTIMATOR},
+    }
+    where = str(folder)
+    sequence = open_sequence(make_config(values, where, overrides))
+    judged = _judged_odometry(sequence, overrides)
+    if judged.fault or not has_odometry(sequence):
+        values["odometry"] = {"kind": "constant_velocity"}
+    elif judged.time_offset_s:
+        values["odometry"]["time_offset_s"] = judged.time_offset_s
+    if (noise := getattr(sequence, "disparity_sigma_px", None)) is not None:
+        values["frontend"] = {"stereo": {"disparity_sigma_px": noise}}
+    config = make_config(values, where, overrides)
+    return Bare(values, config, _said(config, sequence, judged.note))
+
+
+def experiment_of(
+    given: Path, camera: Path | None = None, overrides: Iterable[str] = ()
+) -> tuple[Experiment, str]:
+    """The experiment that is meant, and, for a recording, what it is in a line or a few.
+
+    Args:
+        given: a configuration, the name of a shipped one, or else a recording's folder.
+        camera: of a recording: calibration in place of its own.
+        overrides: ``a.b=value``.
+
+    Raises:
+        FgslamError: it is none of these, or cannot be used.
+    """
+    path = find_experiment(given)
+    if is_recording(path):
+        bare = bare_experiment(path, camera, overrides)
+        return bare.config, bare.said
+    require_no_camera(path, camera)
+    if not path.exists():
+        raise ConfigError(f"{path}: no such file or folder; {suggestion(path)}")
+    return load_experiment(path, overrides), ""
+
+
+def require_no_camera(experiment: Path, camera: Path | None) -> None:
+    """Raises ConfigError where an experiment, which says its own, is given a calibration."""
+    if camera is not None:
+        raise ConfigError(
+            f"{experiment}: --camera is for a recording; in an experiment it is dataset.camera_file"
+        )
+
+
+def short_config(folder: Path, camera: Path | None = None, overrides: Iterable[str] = ()) -> str:
+    """YAML of the configuration that repeats the run of a bare recording. Raises FgslamError."""
+    overrides = tuple(overrides)
+    bare = bare_experiment(folder, camera, overrides)
+    values = deepcopy(bare.values)
+    apply_overrides(values, overrides)
+    said = bare.said.replace("\n", "\n# ")
+    return f"# {said}\n{yaml.safe_dump(values, sort_keys=False)}"
+
+
+def has_odometry(sequence: ImageSequence) -> bool:
+    """Whether any step of the recording has odometry. Raises OdometryError where it is damaged."""
+    return any(sequence.odometry(i) is not None for i in range(1, len(sequence)))
+
+
+def _judged_odometry(sequence: ImageSequence, overrides: tuple[str, ...]) -> Judged:
+    """What the images say of the odometry; nothing where an override says more."""
+    from fgslam.datasets.clock import Judged, judged_turns
+    from fgslam.datasets.recording import Recording
+
+    asked = any(each.partition("=")[0].strip().startswith("odometry.") for each in overrides)
+    if asked or not isinstance(sequence, Recording):
+        return Judged()
+    return judged_turns(sequence)
+
+
+def _odometry_in_words(sequence: ImageSequence) -> str:
+    steps = (sequence.odometry(i) for i in range(1, len(sequence)))
+    known = [step for step in steps if step is not None]
+    return "a gyroscope, no odometry" if known and known[0].turned else "odometry"
+
+
+def _name(recording: Path) -> str:
+    """Of a folder its name, of a file its name without ending."""
+    path = recording.resolve()
+    return (
+        _NOT_IN_NAMES.sub("_", path.name if path.is_dir() else path.stem).strip("_") or "recording"
+    )
+
+
+def dataset_of(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
+    """The keys of ``dataset`` that open a bare recording; overrides are regarded, not applied.
+
+    Raises:
+        FgslamError: the layout is not known, or cannot take that calibration or rate.
+    """
+    dataset = recognise_layout(folder, _asked_kind(overrides))
+    if _asked(overrides, "dataset.fps") and "fps" not in _fields(dataset["kind"]):
+        raise ConfigError(
+            f"{folder}: {LAYOUTS[dataset['kind']].name} states its own times; leave --fps out, "
+            "--stride uses fewer frames"
+        )
+    if camera is None:
+        return dataset
+    if not issubclass(_SETTINGS[dataset["kind"]], CalibratedSettings):
+        raise ConfigError(
+            f"{folder}: {LAYOUTS[dataset['kind']].name} holds its own calibration; leave --camera "
+            "out"
+        )
+    if not camera.exists():
+        raise DatasetError(f"{camera}: no such calibration file; check --camera")
+    return {**dataset, "camera_file": str(camera)}
+
+
+def _asked_kind(overrides: tuple[str, ...]) -> str | None:
+    """The layout that an override names; None where none does."""
+    asked = _asked(overrides, "dataset.kind")
+    if asked and asked[-1] not in LAYOUTS:
+        raise ConfigError(
+            f"dataset.kind={asked[-1]} is no layout of a folder of images; use one of "
+            f"{', '.join(LAYOUTS)}"
+        )
+    return asked[-1] if asked else None
+
+
+def _fields(kind: str) -> set[str]:
+    return {field.name for field in fields(_SETTINGS[kind])}
+
+
+def _asked(overrides: tuple[str, ...], key: str) -> list[str]:
+    """Values that overrides give to a key."""
+    pairs = [override.partition("=") for override in overrides]
+    return [value.strip() for name, _, value in pairs if name.strip() == key]
+
+
+def _said(config: ExperimentConfig, sequence: ImageSequence, more: str) -> str:
+    rig, stamps = sequence.rig, sequence.timestamps
+    duration = float(stamps[-1] - stamps[0])
+    rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
+    lenses = ", unrectified" if getattr(sequence, "unrectified", False) else ""
+    motion = {"recorded": _odometry_in_words(sequence), "constant_velocity": "no odometry"}
+    truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
+    line = (
+        f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "
+        f"{rig.width}x{rig.height}{lenses}; {len(stamps)} frames{rate}; "
+        f"{motion.get(config.odometry.kind, config.odometry.kind)}{truth}; estimator "
+        f"{config.estimator.kind}"
+    )
+    return "\n".join(
+        (line, *(f"note: {note}" for note in (*sequence.notes, *filter(None, [more]))))
+    )
+
+
+def teaching(
+    recording: Path, camera: str | None, route: Path, overrides: Iterable[str] = ()
+) -> Experiment:
+    """The experiment that teaches a route.
+
+    Args:
+        recording: a film, or a folder of pictures.
+        camera: calibration file, or the kind of camera; of a mirror it must be given.
+        route: the file to write.
+        overrides: ``a.b=value``.
+
+    Raises:
+        FgslamError: recording or camera cannot be used.
+    """
+    if camera is None:
+        raise CalibrationError(
+            f"{recording}: no camera is given; add --camera FILE, its calibration, or --camera "
+            "equirectangular for whole panoramas"
+        )
+    values = {
+        "task": "teach",
+        "name": f"teach_{_named(recording)}",
+        "dataset": _dataset(recording, camera),
+        "route": str(route),
+    }
+    return make_experiment(values, str(recording), overrides)
+
+
+def following(
+    route: Path, recording: Path, camera: str | None = None, overrides: Iterable[str] = ()
+) -> Experiment:
+    """The experiment that follows a route; ``camera`` None is the one that it was taught with.
+
+    Raises:
+        FgslamError: recording or camera cannot be used.
+    """
+    values = {
+        "task": "follow",
+        "name": f"follow_{_named(recording)}",
+        "dataset": _dataset(recording, camera or "equirectangular"),
+        "route": str(route),
+        "taught_camera": camera is None,
+    }
+    return make_experiment(values, str(recording), overrides)
+
+
+def joining(routes: Sequence[Path], out: Path, overrides: Iterable[str] = ()) -> Experiment:
+    """The experiment that joins routes into the map ``out``. Raises ConfigError."""
+    values = {
+        "task": "join",
+        "name": f"join_{_named(out)}",
+        "routes": [str(route) for route in routes],
+        "map": str(out),
+    }
+    return make_experiment(values, "join", overrides)
+
+
+def way_said(
+    stored: Path,
+    start: str,
+    goal: str,
+    camera: str | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> list[str]:
+    """The shortest way on a map, in lines.
+
+    Args:
+        stored: the map's file.
+        start: a picture from where the robot is, or the name of a place.
+        goal: name of a place or a route.
+        camera: of the picture; None: the routes' own.
+        out: where the way is written as a route; None: nowhere.
+        overwrite: replace a file that is there.
+
+    Raises:
+        FgslamError: file, picture or place cannot be used, or there is no way.
+    """
+    from fgslam.homing.topological_map import RouteMap  # loads arrays
+
+    if out is not None:
+        require_output(out, overwrite, (stored, Path(start)))
+    joined = RouteMap.load(stored)
+    lines = []
+    if joined.knows(start):
+        way = joined.way(start, goal)
+    else:
+        place = _place(joined, Path(start), camera)
+        near = f"near {place.name}, {place.inliers} features in common"
+        lines.append(f"{start}: {f'at {place.name}' if place.at else near}")
+        way = joined.way(place, goal)
+    lines += [f"{len(way)} path images:", *_legs(joined, way.names)]
+    if out is not None:
+        way.save(out)
+        lines.append(f"written as a route: {out}")
+    return lines
+
+
+def _place(joined: RouteMap, picture: Path, camera: str | None) -> MapPlace:
+    from fgslam.cameras.omni_files import load_camera
+    from fgslam.core.bearings import Refusal
+    from fgslam.datasets.images import read_colour_image
+
+    if not picture.is_file():
+        raise StoredMapError(
+            f"{picture}: neither a picture nor a place of the map; its places are "
+            f"{joined.names[0]} to {joined.names[-1]}"
+        )
+    image = read_colour_image(picture)
+    size = (image.shape[1], image.shape[0])
+    place = joined.locate(image, None if camera is None else load_camera(camera, size))
+    if isinstance(place, Refusal):
+        raise StoredMapError(f"{picture}: {place.details}; go on a little, and take another one")
+    return place
+
+
+def _legs(joined: RouteMap, names: tuple[str, ...]) -> list[str]:
+    """A line for each path image: its name, and where it lies as seen from the one before."""
+    links = (joined.link(before, name) for before, name in pairwise(names))
+    return [
+        f"  {names[0]}",
+        *(f"  {name}: {_seen(link)}" for name, link in zip(names[1:], links, strict=True)),
+    ]
+
+
+def _seen(link: Link) -> str:
+    if not link.support:
+        return "driven before, but without a homing vector"
+    if isnan(link.direction):
+        return "the same place"
+    return f"at {round(degrees(link.direction))} degrees, {link.support} features in common"
+
+
+def _named(recording: Path) -> str:
+    return _NOT_IN_NAMES.sub("_", recording.resolve().stem).strip("_") or "recording"
+
+
+def _dataset(recording: Path, camera: str) -> dict[str, Any]:
+    from fgslam.cameras.omni_files import camera_keys  # loads arrays
+
+    if not recording.exists():
+        raise DatasetError(f"{recording}: no such film or folder; check the path")
+    keys = camera_keys(camera)
+    panoramas = keys["kind"] == "equirectangular"
+    kind = "panoramas" if panoramas else "omni_path"
+    if recording.is_file():
+        kind = "omni_video"
+    return {"kind": kind, "path": str(recording), "camera": keys}

@@ -1,0 +1,633 @@
+"""Builds the parts of a session from what a user names; the only place that distinguishes kinds.
+
+An estimator is imported when its kind is made: a filter needs no solver of graphs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from fgslam.backend.protocol import Estimator, FullEstimator, MapUser
+from fgslam.backend.settings import (
+    BatchSettings,
+    DeadReckoningSettings,
+    EkfSettings,
+    EstimatorSettings,
+    FixedLagSettings,
+    FloorMode,
+    Isam2Settings,
+    LandmarkKalmanGraphSettings,
+    LandmarkKalmanSettings,
+    SlidingWindowSettings,
+)
+from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.errors import ConfigError, MapError
+from fgslam.core.log import ImageSequence
+from fgslam.core.saved_map import SavedMap, require_rig
+from fgslam.core.sensors import CameraRig, MeasurementType
+from fgslam.core.types import (
+    CUT_PIXELS,
+    DegreesOfFreedom,
+    Estimate,
+    Floor,
+    LandmarkAppearances,
+    LandmarkMap,
+    Prediction,
+    Relocalisation,
+)
+from fgslam.datasets.settings import (
+    ConstantVelocitySettings,
+    OdometrySettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
+from fgslam.frontend.camera_faults import CameraWatch
+from fgslam.frontend.features.sift import SiftExtractor
+from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
+from fgslam.frontend.stereo import PatchStereo, RigStereo, StereoMatcher
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.frontend.tracking.key_frames import KeyFrameTracker, LandmarkCarrier
+from fgslam.frontend.tracking.landmarks import LandmarkDatabase
+from fgslam.frontend.tracking.map_matching import MapMatcher
+from fgslam.frontend.tracking.tracker import LandmarkTracker
+from fgslam.slam.feature_stream import FeatureExtractor, FeatureFrame, FeatureStream, FrameDescriber
+from fgslam.slam.motion import MOTION_MEMBERS, ConstantVelocityMotion, MotionModel, OdometryMotion
+from fgslam.slam.pipeline import SlamPipeline
+from fgslam.slam.results import RunRecorder
+from fgslam.slam.settings import MapSettings
+
+if TYPE_CHECKING:
+    from fgslam.backend.self_calibration import SelfCalibration
+    from fgslam.frontend.places.recognition import PlaceRecognition
+    from fgslam.frontend.places.relocalisation import Relocaliser
+
+
+# ------------------------------------------------------------------------------------------
+# Saved maps of sessions: where one begins, what its estimator takes over, and what is saved
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrival:
+    """The first pose of a run in a map.
+
+    Attributes:
+        saved: the map; its world is the run's.
+        prior: pose expected of the first frame, and how well it is known before its landmarks
+            are seen.
+        relocalised: it was found by these landmarks, and adds nothing to them.
+        extends: the run adds to the map and corrects it; else it leaves it as it is.
+    """
+
+    saved: SavedMap
+    prior: Prediction
+    relocalised: bool
+    extends: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapStart:
+    """A saved map in which a session begins, and how it finds its first pose there.
+
+    Attributes:
+        saved: the map; its world is the session's.
+        settings: ``start`` (`relocalise`, `origin` or `last`), ``extend`` and ``begin`` count.
+        name: of the map, for messages.
+    """
+
+    saved: SavedMap
+    settings: MapSettings
+    name: str = "the map"
+
+    def require_usable(self, rig: CameraRig) -> None:
+        """Refuses a map of other cameras, and an empty one. Raises MapError."""
+        require_rig(self.saved, rig, self.name)
+        if not len(self.saved):
+            raise MapError(f"{self.name}: holds no landmark; make the map again")
+
+    def known(self) -> Arrival | None:
+        """Where the map itself states the first pose; None where a frame is to be located in it.
+
+        Raises:
+            MapError: it is to be the map's last pose, and the map has no trajectory.
+        """
+        if self.settings.start == "relocalise":
+            return None
+        if self.settings.start != "last":
+            return self.at(np.eye(4), relocalised=False)
+        if not len(self.saved.trajectory):
+            raise MapError(f"{self.name}: knows no last pose; use map.start relocalise")
+        return self.at(self.saved.trajectory.poses[-1], relocalised=False)
+
+    def at(self, wTc: FloatArray, relocalised: bool) -> Arrival:
+        """A first pose that is known roughly: what is known better its landmarks will tell."""
+        begin = self.settings.begin
+        sigma = np.repeat([np.deg2rad(begin.sigma_deg), begin.sigma_m], 3)
+        prior = Prediction(wTc, np.diag(sigma**2))
+        return Arrival(self.saved, prior, relocalised, self.settings.extend)
+
+
+def trusted(saved: SavedMap, valid_hits: int) -> tuple[LandmarkMap, LandmarkAppearances]:
+    """Landmarks seen often enough to be there (Se et al. 6.1), with their appearances."""
+    sure = saved.permanent | (saved.hits >= valid_hits)
+    landmarks = saved.landmarks.select(sure)
+    return landmarks, saved.appearances.of(landmarks.ids)
+
+
+def take_over(estimator: Estimator, arrival: Arrival) -> None:
+    """Gives a new estimator the map's landmarks.
+
+    Raises:
+        ConfigError: it cannot begin in a saved map, or cannot leave one as it is.
+        EstimatorError: the map is too large for it.
+    """
+    user = require_map_user(estimator, arrival.extends)
+    user.begin_in(arrival.saved.landmarks, arrival.saved.hits, fixed=not arrival.extends)
+
+
+def require_map_user(estimator: Estimator, extends: bool) -> MapUser:
+    """The estimator, if it can begin in a saved map, and leave it as it is unless it ``extends``.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if not isinstance(estimator, MapUser):
+        raise ConfigError(
+            f"estimator.kind {estimator.kind} cannot begin in a saved map; use landmark_kalman, "
+            "ekf, isam2, sliding_window or batch"
+        )
+    if not extends and not estimator.keeps_maps:
+        raise ConfigError(
+            f"estimator.kind {estimator.kind} cannot leave a map as it is; use landmark_kalman or "
+            "ekf, or map.extend true"
+        )
+    return estimator
+
+
+def saved_map(
+    pipeline: SlamPipeline,
+    rig: CameraRig,
+    estimate: Estimate,
+    about: dict[str, Any],
+    evidence: IntArray,
+) -> SavedMap:
+    """The estimator's geometry joined with the database's appearances and counts.
+
+    Args:
+        pipeline: the parts as they are now.
+        rig: the cameras that saw the map.
+        estimate: the estimator's.
+        about: where the map comes from; plain JSON values.
+        evidence: the frames that are in it (:func:`evidence_of`).
+    """
+    database, places = pipeline.tracker.database, pipeline.places
+    landmarks = estimate.landmarks
+    if places is not None:  # no later frame of this run ends them
+        landmarks = landmarks.without(places.ending)
+    rows, patches = database.rows(landmarks.ids), database.patches(landmarks.ids)
+    return SavedMap(
+        rig=rig,
+        landmarks=landmarks,
+        appearances=database.appearances(landmarks.ids),
+        hits=database.hits[rows],
+        misses=database.misses[rows],
+        permanent=database.lasting[rows],
+        colour=database.colour[rows],
+        patches=patches if patches.kept else None,
+        trajectory=estimate.trajectory,
+        about=about,
+        evidence=evidence,
+    )
+
+
+def evidence_of(pipeline: SlamPipeline, recorder: RunRecorder, before: SavedMap | None) -> IntArray:
+    """Frames (f,) whose measurements are in a session's map, ascending.
+
+    Those of the map that it began in count, too; a map that is only localised in takes in nothing.
+    """
+    own = np.array([d for d in recorder.frame_digests if d], np.int64)
+    if pipeline.tracker.keeps_map:
+        own = own[:0]
+    return np.unique(own) if before is None else np.union1d(before.evidence, own)
+
+
+# ------------------------------------------------------------------------------------------
+# Reads what a user names or hands over: an estimator, settings of the front-end, odometry
+
+_ESSENTIAL = ("kind", "supports", "predict", "landmarks", "update", "estimate")
+"""What the loop needs of an estimator; the protocol's other members serve resuming and tests."""
+
+
+def estimator_kinds() -> tuple[str, ...]:
+    """Names of the estimators, the simplest first."""
+    return tuple(str(settings.kind) for settings in _classes())
+
+
+def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
+    """True if the value is the settings of an estimator of this package."""
+    return isinstance(value, _classes())
+
+
+def _classes() -> tuple[type[Any], ...]:
+    return _members(EstimatorSettings)
+
+
+def _members(tagged: Any) -> tuple[type[Any], ...]:
+    """Settings classes of a tagged union."""
+    union, _ = get_args(tagged)
+    return get_args(union)
+
+
+def chosen_estimator(
+    estimator: str | EstimatorSettings | Estimator,
+) -> EstimatorSettings | Estimator:
+    """Settings of the estimator that is named, or what was given.
+
+    Raises:
+        ConfigError: there is no such kind, or the object lacks members of an estimator.
+    """
+    if isinstance(estimator, str):
+        return _named(estimator)
+    if is_settings(estimator):
+        return estimator
+    if isinstance(estimator, type):
+        raise ConfigError(
+            f"estimator: {estimator.__name__} is a class; give an object of it, made for this rig"
+        )
+    lacking = [name for name in _ESSENTIAL if not hasattr(estimator, name)]
+    if lacking:
+        raise ConfigError(
+            f"estimator: {type(estimator).__name__} lacks {', '.join(lacking)}; give a kind "
+            f"({', '.join(estimator_kinds())}), its settings, or an object with the members of "
+            "fgslam.Estimator"
+        )
+    _require_supports(estimator)
+    return cast("Estimator", estimator)
+
+
+def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> FrontendSettings:
+    """Settings of the front-end as given; None: the defaults; a mapping: what differs from these.
+
+    Raises:
+        ConfigError: a key of the mapping is not known, or its value is not usable.
+    """
+    if isinstance(given, FrontendSettings):
+        return given
+    adapter: TypeAdapter[FrontendSettings] = TypeAdapter(FrontendSettings)
+    try:
+        return adapter.validate_python(dict(given or {}))
+    except (ValidationError, TypeError, ValueError) as error:
+        first = error.errors()[0] if isinstance(error, ValidationError) else None
+        what = "not a mapping" if first is None else f"{_dotted(first['loc'])}: {first['msg']}"
+        raise ConfigError(
+            f"frontend: {what}; give settings by group, e.g. "
+            '{"stereo": {"max_disparity_px": 80}}, as in the settings reference'
+        ) from None
+
+
+def chosen_odometry(
+    given: OdometrySettings | MotionModel | None,
+) -> OdometrySettings | MotionModel:
+    """Settings of the odometry, or a motion model, as given; None: the default settings.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    if given is None:
+        return RecordedOdometrySettings()
+    if _is_odometry_settings(given):
+        return given
+    lacking = [name for name in MOTION_MEMBERS if not hasattr(given, name)]
+    if lacking or isinstance(given, type):
+        why = f"lacks {', '.join(lacking)}" if lacking else "is a class"
+        name = given.__name__ if isinstance(given, type) else type(given).__name__
+        raise ConfigError(
+            f"odometry: {name} {why}; give settings, e.g. "
+            "fgslam.datasets.settings.ConstantVelocitySettings(), or an object with the members of "
+            "fgslam.MotionModel"
+        )
+    return given
+
+
+def _is_odometry_settings(value: object) -> TypeGuard[OdometrySettings]:
+    return isinstance(value, _members(OdometrySettings))
+
+
+def _dotted(location: tuple[int | str, ...]) -> str:
+    return ".".join(map(str, location))
+
+
+def _require_supports(estimator: object) -> None:
+    supports = getattr(estimator, "supports", None)
+    known = isinstance(supports, set | frozenset) and all(
+        isinstance(one, MeasurementType) for one in supports
+    )
+    if not known:
+        raise ConfigError(
+            f"estimator: supports of {type(estimator).__name__} is {supports!r}; give a frozenset "
+            "of fgslam.core.sensors.MeasurementType"
+        )
+
+
+def _named(kind: str) -> EstimatorSettings:
+    known = estimator_kinds()
+    if kind not in known:
+        close = difflib.get_close_matches(kind, known, n=1, cutoff=0.4)
+        hint = f"did you mean {close[0]}? " if close else ""
+        raise ConfigError(f"estimator: no kind {kind!r}; {hint}known: {', '.join(known)}")
+    adapter: TypeAdapter[Any] = TypeAdapter(EstimatorSettings)
+    settings: EstimatorSettings = adapter.validate_python({"kind": kind})
+    return settings
+
+
+_SOFT_HEIGHT_M, _SOFT_TILT_DEG = 0.005, 0.2  # deviations a frame of a soft floor
+_LOCATING_STREAM = 12  # of random numbers, next to those of the recording
+
+
+def as_measured(rig: CameraRig, settings: FrontendSettings) -> CameraRig:
+    """The rig as the front-end measures with it: which images tell a place."""
+    by_patches = settings.stereo.by_patches(rig.cameras)
+    return dataclasses.replace(rig, places="reference" if by_patches else "all")
+
+
+def make_stream(
+    sequence: ImageSequence, settings: FrontendSettings, ahead: bool = True
+) -> FeatureStream:
+    """Features of the sequence's frames, found ahead of the loop; its images alone if not so."""
+    extract = make_extractor(settings) if ahead else None
+    return FeatureStream(sequence, extract, settings.stereo.by_patches(sequence.rig.cameras))
+
+
+def make_describer(
+    rig: CameraRig, settings: FrontendSettings, extract: FeatureExtractor | None = None
+) -> FrameDescriber:
+    """What finds the features of single frames, by an own extractor or SIFT."""
+    by_patches = settings.stereo.by_patches(rig.cameras)
+    return FrameDescriber(extract or make_extractor(settings), by_patches)
+
+
+def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
+    """Feature extractor by the settings: SIFT."""
+    return SiftExtractor(settings.sift, settings.appearance.mode).extract
+
+
+def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMatcher:
+    """Stereo matcher of the rig, for features of all images."""
+    return StereoMatcher(as_measured(rig, settings), settings.stereo, settings.appearance)
+
+
+def make_stereo(rig: CameraRig, settings: FrontendSettings) -> RigStereo:
+    """What measures a frame's features in all images of the rig."""
+    matcher = make_stereo_matcher(rig, settings)
+    patches = PatchStereo(rig, matcher, settings.stereo.largest_disparity_px)
+    return RigStereo(matcher, patches, settings.stereo.by_patches(rig.cameras))
+
+
+def make_tracker(rig: CameraRig, settings: FrontendSettings) -> LandmarkTracker:
+    """The landmark database with its matchers and the ego-motion."""
+    pixels = 0 if settings.tracking == "sift" else CUT_PIXELS
+    largest = settings.stereo.largest_disparity_px
+    database = LandmarkDatabase(rig, settings.database, largest, pixels)
+    solver = EgoMotionSolver(rig, settings.ego_motion)
+    matcher = MapMatcher(settings.matching, settings.appearance)
+    tracker = LandmarkTracker(rig, database, matcher, solver)
+    tracker.expects_returns = settings.loops
+    return tracker
+
+
+def make_key_frames(
+    rig: CameraRig, settings: FrontendSettings, tracker: LandmarkTracker
+) -> KeyFrameTracker | None:
+    """Tracking between key frames; None where every frame is one."""
+    if settings.tracking == "sift":
+        return None
+    return KeyFrameTracker(tracker, LandmarkCarrier(rig, make_stereo_matcher(rig, settings)))
+
+
+def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> MotionModel:
+    """Motion model by the settings; one that is given is taken as it is."""
+    if isinstance(settings, ConstantVelocitySettings):
+        return ConstantVelocityMotion(settings)
+    if not isinstance(settings, RecordedOdometrySettings | SyntheticOdometrySettings):
+        return settings
+    gap = settings.gap if isinstance(settings, RecordedOdometrySettings) else None
+    stand_in = ConstantVelocityMotion(gap or ConstantVelocitySettings())
+    return OdometryMotion(rig.bTc, settings.kind, stand_in)
+
+
+def make_estimator(
+    rig: CameraRig,
+    settings: EstimatorSettings,
+    ego_motion: EgoMotionSettings | None = None,
+    prior: Prediction | None = None,
+) -> FullEstimator:
+    """The estimator, at the prior pose; without one the world is the first camera frame, exactly.
+
+    ``ego_motion`` are the front-end's settings: ``floor: auto`` takes their degrees of freedom
+    over, ``landmark_kalman_graph`` their whole cost.
+    """
+    prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
+    ego_motion = ego_motion or EgoMotionSettings()
+    estimator: FullEstimator
+    match settings:
+        case DeadReckoningSettings():
+            from fgslam.backend.filters.dead_reckoning import DeadReckoning
+
+            estimator = DeadReckoning(rig, prior)
+        case LandmarkKalmanSettings():
+            from fgslam.backend.filters.kalman import LandmarkKalman
+
+            estimator = LandmarkKalman(rig, settings, prior, ego_motion)
+        case LandmarkKalmanGraphSettings():
+            from fgslam.backend.filters.kalman_graph import LandmarkKalmanGraph
+
+            estimator = LandmarkKalmanGraph(rig, settings, prior, ego_motion)
+        case EkfSettings():
+            from fgslam.backend.filters.ekf import FullEkf
+
+            estimator = FullEkf(
+                rig, settings, make_floor(rig, settings.floor, ego_motion.dof), prior
+            )
+        case FixedLagSettings():
+            from fgslam.backend.smoothers.lag import fixed_lag_smoother
+
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = fixed_lag_smoother(rig, settings, floor, prior)
+        case Isam2Settings():
+            from fgslam.backend.smoothers.isam2 import isam2_smoother
+
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = isam2_smoother(rig, settings, floor, prior)
+        case SlidingWindowSettings():
+            from fgslam.backend.smoothers.lag import sliding_window_smoother
+
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = sliding_window_smoother(rig, settings, floor, prior)
+        case BatchSettings():
+            from fgslam.backend.smoothers.batch import batch_smoother
+
+            floor = make_floor(rig, settings.floor, ego_motion.dof)
+            estimator = batch_smoother(rig, settings, floor, prior)
+    return estimator
+
+
+def made_or_given(
+    rig: CameraRig,
+    estimator: EstimatorSettings | Estimator,
+    ego_motion: EgoMotionSettings | None = None,
+    prior: Prediction | None = None,
+) -> Estimator:
+    """As :func:`make_estimator`; an estimator that is made already is handed back."""
+    if is_settings(estimator):
+        return make_estimator(rig, estimator, ego_motion, prior)
+    return cast("Estimator", estimator)
+
+
+def make_floor(rig: CameraRig, mode: FloorMode, dof: DegreesOfFreedom) -> Floor:
+    """The floor as an estimator is to use it."""
+    if mode == "auto":
+        return Floor.under(rig, dof)
+    if mode == "none":
+        return Floor.under(rig, 6)
+    return dataclasses.replace(
+        Floor.under(rig, 3 if dof == 6 else dof),
+        hard=mode == "hard",
+        height_sigma_m=_SOFT_HEIGHT_M,
+        tilt_sigma_rad=float(np.deg2rad(_SOFT_TILT_DEG)),
+    )
+
+
+def make_pipeline(
+    rig: CameraRig,
+    frontend: FrontendSettings,
+    odometry: OdometrySettings | MotionModel,
+    estimator_settings: EstimatorSettings | Estimator,
+    seed: int = 0,
+    arrival: Arrival | None = None,
+) -> SlamPipeline:
+    """All parts of a session for one rig.
+
+    Args:
+        rig: the rectified cameras.
+        frontend: settings of all that measures.
+        odometry: settings of what predicts the motion; or what predicts it.
+        estimator_settings: which estimator to make; or one already made, at its prior pose.
+        seed: of place recognition's samples.
+        arrival: where the run begins in a saved map; None begins with an empty one.
+    """
+    rig = as_measured(rig, frontend)
+    prior = None if arrival is None else arrival.prior
+    estimator = made_or_given(rig, estimator_settings, frontend.ego_motion, prior)
+    measured_odometry = not isinstance(odometry, ConstantVelocitySettings)
+    require_support(estimator, measured_odometry, loops=frontend.loops)
+    tracker = make_tracker(rig, frontend)
+    if arrival is not None:
+        take_over(estimator, arrival)
+        tracker.database.load(arrival.saved)
+        tracker.keeps_map = not arrival.extends
+    return SlamPipeline(
+        stereo=make_stereo(rig, frontend),
+        tracker=tracker,
+        motion=make_motion(rig, odometry),
+        estimator=estimator,
+        places=make_places(
+            rig, frontend, tracker, seed, MeasurementType.LOOP in estimator.supports
+        ),
+        calibration=make_calibration(rig, frontend),
+        key_frames=make_key_frames(rig, frontend, tracker),
+        watch=CameraWatch(rig) if frontend.watch_cameras else None,
+        located=prior if arrival is not None and arrival.relocalised else None,
+    )
+
+
+def calibrates_itself(settings: FrontendSettings) -> bool:
+    """Whether the rig is to be calibrated from the drive.
+
+    The paper's measurement is not the least squares over all images that a correction changes.
+    """
+    return settings.self_calibration and settings.stereo.measurement == "fused"
+
+
+def make_calibration(rig: CameraRig, settings: FrontendSettings) -> SelfCalibration | None:
+    """Calibration of the rig from the drive; None where the calibration is to be taken as it is."""
+    if not calibrates_itself(settings):
+        return None
+    from fgslam.backend.self_calibration import SelfCalibration
+
+    return SelfCalibration(rig, settings.stereo.pixel_sigma)
+
+
+def make_places(
+    rig: CameraRig,
+    settings: FrontendSettings,
+    tracker: LandmarkTracker,
+    seed: int,
+    joins: bool = False,
+) -> PlaceRecognition | None:
+    """Place recognition: loop closures and relocalisation; None where neither is wanted.
+
+    Where the estimator takes closures it joins parts of the map (``joins``).
+    """
+    if not (settings.loops or settings.lost or joins):
+        return None
+    from fgslam.frontend.places.recognition import (
+        LoopGates,
+        LostRules,
+        PlaceRecognition,
+        RecognitionParts,
+    )
+
+    parts = RecognitionParts(
+        joins=joins,
+        loops=LoopGates() if settings.loops else None,
+        lost=LostRules() if settings.lost else None,
+        appearance=settings.appearance,
+        relocaliser=make_relocaliser(rig, settings),
+        seed=seed,
+    )
+    return PlaceRecognition(parts, tracker)
+
+
+def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:
+    """Relocaliser without a prior, for the poses that the ego-motion allows."""
+    from fgslam.frontend.places.relocalisation import Relocaliser
+
+    floor = Floor.under(rig, settings.ego_motion.dof)
+    return Relocaliser(rig, floor, settings.relocalisation)
+
+
+def make_locator(
+    rig: CameraRig, settings: FrontendSettings, saved: SavedMap, seed: int
+) -> Callable[[FeatureFrame], Relocalisation]:
+    """Locates the frames of a recording in a saved map, each alone and without a prior."""
+    relocaliser = make_relocaliser(rig, settings)
+    relocaliser.learn(*trusted(saved, settings.database.valid_hits))
+    stereo = make_stereo(rig, settings)
+
+    def locate(found: FeatureFrame) -> Relocalisation:
+        rng = np.random.default_rng([seed, _LOCATING_STREAM, found.i])
+        return relocaliser.locate(stereo.match(found.frame, found.features).whole, rng)
+
+    return locate
+
+
+def require_support(estimator: Estimator, measured_odometry: bool, loops: bool = False) -> None:
+    """Refuses, before a run starts, an estimator that cannot use what the run will measure."""
+    needed = {MeasurementType.STEREO}
+    if measured_odometry:
+        needed.add(MeasurementType.ODOMETRY)
+    if loops:
+        needed.add(MeasurementType.LOOP)
+    lacking = sorted(kind.value for kind in needed - estimator.supports)
+    if lacking:
+        raise ConfigError(
+            f"estimator.kind {estimator.kind} cannot use {' and '.join(lacking)} measurements; "
+            "choose another estimator; one of your own names in `supports` all that it is handed, "
+            "used or not"
+        )
