@@ -18,7 +18,7 @@ import time
 import types
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
@@ -336,11 +336,10 @@ def _local_cluster() -> Iterator[LocalCluster]:
             tempfile.TemporaryDirectory(prefix=prefix, ignore_cleanup_errors=True)
         )
         threads = ("OMP", "OPENBLAS", "MKL", "NUMEXPR")
+        environment = {"TMPDIR": folder} | {f"{library}_NUM_THREADS": 1 for library in threads}
+        stack.enter_context(_environment_restored(environment))
         rules = {
-            "distributed.nanny.pre-spawn-environ": {
-                "TMPDIR": folder,
-                **{f"{library}_NUM_THREADS": 1 for library in threads},
-            },
+            "distributed.nanny.pre-spawn-environ": environment,
             # A unit waits at the scheduler, not behind one that may end the worker.
             "distributed.scheduler.worker-saturation": 1.0,
             "distributed.scheduler.allowed-failures": 1,
@@ -374,6 +373,19 @@ def _local_cluster() -> Iterator[LocalCluster]:
         stack.callback(cluster.close)
         stack.callback(_kill_workers, cluster)
         yield cluster
+
+
+@contextmanager
+def _environment_restored(names: Iterable[str]) -> Iterator[None]:
+    """Dask sets its workers' variables in this process, and leaves them there."""
+    before = {name: os.environ.get(name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
 
 
 def _kill_workers(cluster: LocalCluster) -> None:

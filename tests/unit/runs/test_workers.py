@@ -225,6 +225,14 @@ def own_number(value: int) -> int:
     return os.getpid()
 
 
+def test_the_environment_is_as_before_when_workers_have_ended() -> None:
+    """Dask leaves its workers' TMPDIR in this process, and the folder is gone with them."""
+    before = dict(os.environ)
+    with Pool(1) as pool:
+        assert list(pool.run(doubled, [1], never)) == [(0, 2)]
+    assert dict(os.environ) == before
+
+
 def test_workers_are_used_again_except_for_what_wants_a_fresh_process() -> None:
     with Pool(1) as pool:
         first, second = dict(pool.run(own_number, [1, 2], never)).values()
