@@ -83,8 +83,8 @@ HOUSE: dict[str, Any] = {
 }
 IN_SMALL_BLOCKS = """
 from fgslam.cli.main import main
-from fgslam.runs.tasks import homing_trials, homing_views
-homing_trials.TRIALS_A_BLOCK = 1
+from fgslam.runs.tasks import homing_drives, homing_views
+homing_drives.TRIALS_A_BLOCK = 1
 homing_views.VIEWS_A_BLOCK = 2
 main()
 """
