@@ -386,7 +386,6 @@ def shared_covariance(correction: RigCorrection) -> FloatArray:
 
 SAMPLES = 48
 """A variance from them is known to the root of 2 / SAMPLES, a deviation to 10 %."""
-_NOISE = "noise_"  # of names in a state
 _STREAM = 17  # of random numbers, beside those of the recording
 _FARTHEST_M = 1e9  # beyond, a point has no derivative; and nothing to tell
 _FLAT, _PADDING = 1e-20, 1e-9  # of the variances' sum: far below any landmark's, above rounding

@@ -494,13 +494,13 @@ def localize(  # noqa: PLR0913 - each option is a parameter
     A pose is given only where it is certain, with the reasons. Exits with 3 where fewer than
     half of the queries were answered, with 2 where map or recording cannot be used.
     """
-    from fgslam.runs.tasks.localisation import Wanted as export_Wanted
+    from fgslam.runs.tasks.localisation import Wanted
     from fgslam.runs.tasks.localisation import localize as locate
 
     chosen = options.of_recording(
         topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
     )
-    wanted = export_Wanted(
+    wanted = Wanted(
         map_file, recording, (*(overrides or ()), *chosen), frame, frames, out,
         existing_folder(overwrite), camera,
     )  # fmt: skip
@@ -543,10 +543,9 @@ def export(  # noqa: PLR0913 - each option is a parameter
 
     Of a saved map alone it lists what is in it.
     """
-    from fgslam.runs.export import Wanted as export_Wanted
-    from fgslam.runs.export import export_run
+    from fgslam.runs.export import Wanted, export_run
 
-    wanted = export_Wanted(
+    wanted = Wanted(
         map=map_file,
         trajectory=trajectory,
         graph=graph,

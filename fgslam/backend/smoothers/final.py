@@ -408,7 +408,7 @@ class WholeGraphSolver:
 
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
-        raise NotImplementedError
+        return trimmed(graph, state, MINIMUM, self.builder.noise_factor)
 
     @one_blas_thread()
     def _accepted(

@@ -11,7 +11,7 @@ from fgslam.backend.loops import Constraint
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.bundle import State, WholeGraph
-from fgslam.backend.smoothers.final import MINIMUM, Refined, WholeGraphSolver, refine, trimmed
+from fgslam.backend.smoothers.final import Refined, WholeGraphSolver, refine
 from fgslam.backend.smoothers.graph import (
     ClosedLoop,
     Drive,
@@ -113,10 +113,6 @@ class Isam2Solver(WholeGraphSolver):
         values = gtsam.Values(self.values)
         values.insert(self.new_values)
         return refine(self.builder, values, self._minimise)
-
-    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
-        """Values at the minimum, and the factors that count there."""
-        return trimmed(graph, state, MINIMUM, self.builder.noise_factor)
 
     def _join(self, found: Any | None) -> None:
         """Goes on with the graph that has the loop; from these values where they are given."""

@@ -20,9 +20,8 @@ from fgslam.backend.loops import Constraint, changes, constraint_factor, nearest
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.admission import Track
-from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.elimination import UndeterminedError
-from fgslam.backend.smoothers.final import MINIMUM, WholeGraphSolver, trimmed
+from fgslam.backend.smoothers.final import WholeGraphSolver
 from fgslam.backend.smoothers.graph import (
     ClosedLoop,
     Drive,
@@ -633,7 +632,3 @@ class SlidingWindowSolver(WholeGraphSolver):
             if self.builder.in_graph(variable):
                 values.insert(landmark_key(variable), point)
         return values
-
-    def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
-        """Values at the minimum, and the factors that count there."""
-        return trimmed(graph, state, MINIMUM, self.builder.noise_factor)

@@ -303,11 +303,6 @@ def _inside(places: FloatArray, margin: float, size: tuple[int, int]) -> BoolArr
     return np.asarray(((places >= margin) & (places <= last)).all(axis=1))
 
 
-_POINTS = Points.__slots__
-_BEGUN = ("cut", "growth", "known")
-_PATCH_ARRAYS = ("first", "light", "step", "contrast", "maps")
-
-
 def _aligned(
     patches: ReferencePatches, view: FineImage, places: FloatArray, times: int
 ) -> tuple[ReferencePatches, FloatArray, FloatArray]:

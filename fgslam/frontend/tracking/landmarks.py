@@ -385,7 +385,6 @@ class ViewPool:
 _COUNTS = ("hits", "misses", "missed", "unlooked", "seen", "contradicted")
 _PATCH = ("patch", "patch_distance")
 _PLACES = "places"
-_VIEWS = ("size", "orientation", "descriptors", "direction", "used")
 
 
 def _no_columns(max_views: int, patch_pixels: int) -> GrowingColumns:
