@@ -20,6 +20,16 @@ from scripts.reference_settings import item, paragraph, settings_page
 
 DOCS = Path(__file__).parents[1] / "docs"
 EXAMPLES = Path(__file__).parents[1] / "examples"
+TUTORIALS = {
+    "homing": ("Homing: one vector, then a drive home", ("homing_vector", "drive_home")),
+    "own_parts": (
+        "Your own parts",
+        ("own_estimator", "own_features", "own_motion", "own_camera"),
+    ),
+    "live_robot": ("A live robot, with and without ROS 2", ("live_robot", "ros2_node")),
+}
+"""Tutorials made from several examples: the page's title, and the examples in order."""
+
 _CELL = re.compile(r"^# %%(?P<kind> \[markdown\])?.*\n", re.MULTILINE)
 _NOTE = "<!-- Made by `python -m scripts.make_reference` from examples/{}: edit that. -->"
 _END = """Run it: `python examples/{}` (a notebook in VS Code, by jupytext in Jupyter).
@@ -56,8 +66,12 @@ def pages() -> dict[str, Callable[[], str]]:
         "reference/commands.md": commands_page,
         "reference/experiments.md": experiments_page,
     }
+    joined = {name for _, names in TUTORIALS.values() for name in names}
+    for page in TUTORIALS:
+        made[f"tutorials/{page}.md"] = partial(joined_tutorials, page)
     for example in sorted(EXAMPLES.glob("*.py")):
-        made[f"tutorials/{example.stem}.md"] = partial(tutorial_page, example.stem)
+        if example.stem not in joined:
+            made[f"tutorials/{example.stem}.md"] = partial(tutorial_page, example.stem)
     return made
 
 
@@ -135,6 +149,15 @@ def tutorial_page(name: str) -> str:
     title, _, rest = parts[0].partition("\n")
     head = [title, _NOTE.format(f"{name}.py"), rest.strip()]
     return "\n\n".join([*head, *parts[1:], _END.format(f"{name}.py")])
+
+
+def joined_tutorials(page: str) -> str:
+    """The examples of one page of :data:`TUTORIALS` one after the other, a section each."""
+    title, names = TUTORIALS[page]
+    text = "\n".join(tutorial_page(name) for name in names)
+    parts = text.split("```")  # every second one is code, where `#` begins a comment
+    parts[::2] = [re.sub(r"^#", "##", part, flags=re.MULTILINE) for part in parts[::2]]
+    return f"# {title}\n\n" + "```".join(parts)
 
 
 def _cell(body: str, text: bool) -> str:

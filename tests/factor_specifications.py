@@ -1,6 +1,6 @@
 """What each factor measures, as pure functions of poses and points: no graph, no noise, no solver.
 
-The specification that factors are tested against (docs/derivations/factors.md). All
+The specification that factors are tested against (docs/derivations/measurements.md). All
 residuals are *predicted minus measured*. Poses are (4, 4), points (3,) in the world, metres; the
 tangent space of a pose is [rotation, translation] on the right, ``T * Exp(xi)``.
 

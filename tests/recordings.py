@@ -41,7 +41,7 @@ _WIDE = (180.0, 600, 480)
 
 
 def write_recording(root: Path, frames: int = 12, top: bool = True, seed: int = 0) -> Path:
-    """An image folder (docs/datasets/image_folder.md) of ``frames`` frames, truth and odometry."""
+    """An image folder (docs/datasets/images.md) of ``frames`` frames, truth and odometry."""
     rng = np.random.default_rng(seed)
     textures = [_texture(rng, width, height) for *_, width, height in _BOARDS]
     poses = camera_path(frames)

@@ -151,7 +151,7 @@ class ErrorColumns:
 # each landmark follow the terms that all cameras share, and the field that no term follows,
 # neither of which is estimated. A frame costs what it sees. Final covariances of a whole graph
 # have the same from the graph (:mod:`fgslam.backend.smoothers.final`).
-# docs/derivations/measurement_noise.md.
+# docs/derivations/measurements.md.
 
 
 _LEAST_MATCHES = 6  # of a frame; with fewer, its pose follows the one before
@@ -381,7 +381,7 @@ def shared_covariance(correction: RigCorrection) -> FloatArray:
 # with the square of the map. Here a fixed number of drawn samples stands for it, as in the
 # ensemble of Evensen (1994): a landmark costs as much whatever the map. The terms of the rig's
 # calibration go the same way, one column each. The noise is drawn as large as the drive's
-# residuals so far have it, as a smoother weighs it. docs/derivations/landmark_filter.md.
+# residuals so far have it, as a smoother weighs it. docs/derivations/filters.md.
 
 
 SAMPLES = 48

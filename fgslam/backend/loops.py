@@ -3,7 +3,7 @@
 A drive is a chain of steps, each as uncertain as it was tracked. Closing a loop asks for the least
 weighted changes to the chain under which it meets itself: the minimum of a pose graph of the poses
 at which submaps begin; within a submap the change is spread over the frames as their steps'
-uncertainty has it. Filters and smoothers share it. Derivation: docs/derivations/submaps.md.
+uncertainty has it. Filters and smoothers share it. Derivation: docs/derivations/places.md.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ GATE_SIGMAS = 10.0
 """A loop closure is refused where it raises the cost by more than the square of this (ekf: its
 innovation squared beyond what is expected). Wide: true ones measured 0.7 to 6.1 in the rendered
 rooms, and a lost closure costs more than covariances a few times too small
-(docs/derivations/submaps.md)."""
+(docs/derivations/places.md)."""
 _ITERATIONS = 100
 _TOLERANCE = 1e-12  # of the cost
 _EXACT_SIGMA = 1e-6  # radians and metres: a step's least deviation, for what a floor excludes

@@ -3,7 +3,7 @@
 A graph, and a filter, takes the errors of a landmark's measurements to be independent from frame to
 frame. Those of SIFT are not: the appearance changes slowly with the view. What that costs a path is
 the power of the errors in their slowest part, the one that leans a landmark's whole track forwards
-or backwards as a drift of the camera would. docs/derivations/measurement_noise.md.
+or backwards as a drift of the camera would. docs/derivations/measurements.md.
 """
 
 from __future__ import annotations

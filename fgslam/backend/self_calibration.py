@@ -2,7 +2,7 @@
 
 Windows of frames that share no image give evidence, which is added up, with the noise that the
 windows themselves show by how far they disagree. Nothing is known of the truth. Derived in
-docs/derivations/self_calibration.md.
+docs/derivations/cameras.md.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class _Field(NamedTuple):
     """Modes of a field (:mod:`fgslam.core.correction`) as the same windows show them.
 
     Eliminated from what is known, they would need their prior at once; so they are kept beside it,
-    and the prior may change with what is found. docs/derivations/self_calibration.md.
+    and the prior may change with what is found. docs/derivations/cameras.md.
 
     Attributes:
         lean: (p, q) how the correction known changes with the modes.
@@ -784,7 +784,7 @@ class RigAlignment:
 # motion or truth. What of it depends on the place in the image, and is none of the terms of the
 # correction, is the field; its columns are taken to be as large. Landmarks are put into groups, and
 # only what different groups agree on counts, so that noise does not, were it a landmark's own for
-# good. docs/derivations/measurement_noise.md.
+# good. docs/derivations/measurements.md.
 
 
 _GROUPS = 8  # of landmarks; a deviation from them is known to a quarter

@@ -190,7 +190,7 @@ def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
 
 def read_json_object(path: Path) -> Mapping[str, Any]:
     """A JSON file's outermost object. Raises CalibrationError when there is none."""
-    remedy = "give a calibration: this file (docs/datasets/image_folder.md has its keys), or "
+    remedy = "give a calibration: this file (docs/datasets/images.md has its keys), or "
     remedy += "another one by --camera FILE"
     values = read_json(path, read_text(path, CalibrationError, remedy))
     if not isinstance(values, dict):

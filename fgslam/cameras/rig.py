@@ -355,7 +355,7 @@ def _of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration:
     if path.suffix.lower() != ".json":
         raise CalibrationError(
             f"{path}: {', '.join(sorted(formats.OF_RECTIFIED & tree.keys()))} are keys of fgslam's "
-            "calib.json; write it so (docs/datasets/image_folder.md has its keys)"
+            "calib.json; write it so (docs/datasets/images.md has its keys)"
         )
     rig = formats.read_rectified(path, "vertical_baseline_m" in tree)
     return _calibration_of(rig, path, formats.stated_corrections(path, tree))

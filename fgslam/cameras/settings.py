@@ -1,4 +1,4 @@
-"""Settings of omnidirectional cameras, tagged by ``kind`` (docs/datasets/mirror_images.md).
+"""Settings of omnidirectional cameras, tagged by ``kind`` (docs/datasets/omnidirectional.md).
 
 Angles are degrees here; the picture's direction ``ahead_deg`` is measured clockwise from the right,
 so -90 is up.

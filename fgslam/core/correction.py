@@ -2,7 +2,7 @@
 
 A random field over each image: smooth, as large in columns as in rows, and without what the terms
 of :data:`fgslam.core.correction.TERMS` follow. Its modes are those of Karhunen and Loeve, on a
-grid. docs/derivations/measurement_noise.md.
+grid. docs/derivations/measurements.md.
 """
 
 from __future__ import annotations

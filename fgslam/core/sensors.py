@@ -1,6 +1,6 @@
 """The rectified camera rig and the linear model of its pixels.
 
-Derived in docs/derivations/stereo_measurement.md.
+Derived in docs/derivations/measurements.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Colour and depth as a stereo pair, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md).
+"""Colour and depth as a stereo pair, as in TUM RGB-D or in two folders (docs/datasets/images.md).
 
 Depth is measured as disparity: what a second camera next to the colour camera would see is made
 from the depth image, and found again by the front-end as in any stereo pair.

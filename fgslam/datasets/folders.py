@@ -1,6 +1,6 @@
 """Folders of images: our own layout, and any two folders, or one with the side in the names.
 
-docs/datasets/image_folder.md, docs/datasets/loose_images.md.
+docs/datasets/images.md, docs/datasets/images.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Measurements without images: a folder with a log, GTSAM's stereo tracks, a simulated drive.
 
-docs/datasets/measurements.md, stereo_tracks.md, simulated_measurements.md.
+docs/datasets/published.md, docs/datasets/rendered.md.
 """
 
 from __future__ import annotations

@@ -317,7 +317,7 @@ def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatA
 
 
 # --------------------------------------------------------------------------------------------
-# Gyroscope: angular velocity, integrated between frames (docs/derivations/gyroscope.md)
+# Gyroscope: angular velocity, integrated between frames (docs/derivations/motion.md)
 
 
 # Of MEMS gyroscopes in cameras, phones and drones, by their data sheets (InvenSense MPU-9250, Bosch

@@ -1,6 +1,6 @@
 """Pictures of an omnidirectional camera: folders, panoramas with surveyed poses, videos.
 
-docs/datasets/mirror_images.md, docs/datasets/panoramas.md.
+docs/datasets/omnidirectional.md, docs/datasets/omnidirectional.md.
 """
 
 from __future__ import annotations

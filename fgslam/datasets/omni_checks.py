@@ -19,7 +19,7 @@ from fgslam.datasets.settings import OmniDatasetSettings
 _PICTURES = 3  # the rim may be as dark as its holder in one of them
 _CLEARLY_OFF = 0.025
 """Of the radius: a calibrated mirror was seen off by 0.015, its rim and its axis not being one
-(docs/datasets/mirror_images.md); this is an error of 1.4 degrees at the rim, more within."""
+(docs/datasets/omnidirectional.md); this is an error of 1.4 degrees at the rim, more within."""
 _LEAST_OFF_PX = 3.0
 _UNEVEN = 1.25  # columns over rows a degree, or the reverse, that no one means
 _BLACK = 16.0  # mean of red, green and blue; a film's black is up to that

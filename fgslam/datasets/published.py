@@ -1,6 +1,6 @@
 """Published data sets in their native layouts: EuRoC, KITTI odometry, KITTI raw.
 
-docs/datasets/euroc.md, docs/datasets/md.
+docs/datasets/published.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The rendered lab as a recording with exact ground truth (docs/datasets/rendered_lab.md).
+"""The rendered lab as a recording with exact ground truth (docs/datasets/rendered.md).
 
 Images are rendered once, cached by the content of the settings that shape them, and get their
 noise when they are read. Poses, depths and object identities are exact.

@@ -94,7 +94,7 @@ class PairedSettings(CalibratedSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class ImageFolderSettings(CalibratedSettings):
-    """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/image_folder.md."""
+    """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/images.md."""
 
     kind: Literal["image_folder"] = "image_folder"
     use_top: bool = Field(default=True, description="use the third camera where the folder has one")
@@ -103,7 +103,7 @@ class ImageFolderSettings(CalibratedSettings):
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class LooseImagesSettings(PairedSettings):
-    """Folders of images with any names, with or without times (docs/datasets/loose_images.md)."""
+    """Folders of images with any names, with or without times (docs/datasets/images.md)."""
 
     path: str = Field(min_length=1, description="the folder, or a pattern of file names in it")
     kind: Literal["loose_images"] = "loose_images"
@@ -115,7 +115,7 @@ class LooseImagesSettings(PairedSettings):
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class VideoSettings(PairedSettings):
-    """Stereo films: one of both views, or one a camera (docs/datasets/video.md)."""
+    """Stereo films: one of both views, or one a camera (docs/datasets/images.md)."""
 
     path: str = Field(min_length=1, description="the film, a folder of one to three, or a pattern")
     kind: Literal["video"] = "video"
@@ -129,7 +129,7 @@ class VideoSettings(PairedSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class RgbdSettings(PairedSettings):
-    """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/rgbd.md)."""
+    """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/images.md)."""
 
     kind: Literal["rgbd"] = "rgbd"
     depth_scale: Positive | None = Field(
@@ -154,14 +154,14 @@ class BagSettings(PairedSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class KittiRawSettings(CalibratedSettings):
-    """A synchronised and rectified drive of KITTI raw (docs/datasets/kitti.md)."""
+    """A synchronised and rectified drive of KITTI raw (docs/datasets/published.md)."""
 
     kind: Literal["kitti_raw"] = "kitti_raw"
 
 
 @dataclass(frozen=True, config=STRICT)
 class KittiSettings(RecordingSettings):
-    """KITTI odometry in its native layout (docs/datasets/kitti.md)."""
+    """KITTI odometry in its native layout (docs/datasets/published.md)."""
 
     kind: Literal["kitti"] = "kitti"
     sequence: str = Field(
@@ -171,7 +171,7 @@ class KittiSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class EurocSettings(PairedSettings):
-    """EuRoC MAV in its native layout, rectified on reading (docs/datasets/euroc.md)."""
+    """EuRoC MAV in its native layout, rectified on reading (docs/datasets/published.md)."""
 
     kind: Literal["euroc"] = "euroc"
     pairing_tolerance_ms: float = Field(
@@ -199,7 +199,7 @@ FileRecordingSettings: TypeAlias = (
 
 @dataclass(frozen=True, config=STRICT)
 class StereoTracksSettings(FrameSelection):
-    """Stereo feature tracks of KITTI drives, inside GTSAM (docs/datasets/stereo_tracks.md)."""
+    """Stereo feature tracks of KITTI drives, inside GTSAM (docs/datasets/published.md)."""
 
     kind: Literal["stereo_tracks"] = "stereo_tracks"
     file: str = Field(
@@ -209,14 +209,13 @@ class StereoTracksSettings(FrameSelection):
     )
     pixel_sigma: Positive = Field(
         default=0.25,
-        description="noise of one image coordinate, pixels (measured: docs/datasets/"
-        "stereo_tracks.md)",
+        description="noise of one image coordinate, pixels (measured: docs/datasets/published.md)",
     )
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
 class MeasurementFilesSettings(FrameSelection):
-    """The measurements of a run folder, or of a converted recording: docs/datasets/measurements.md.
+    """The measurements of a run folder, or of a converted recording: docs/datasets/published.md.
 
     Frames build upon those before them: the first ones (``stop``) are used, or all.
     """
@@ -239,7 +238,7 @@ DatasetSettings: TypeAlias = Annotated[
 
 @dataclass(frozen=True, config=STRICT)
 class PanoramasSettings(RecordingSettings):
-    """A folder of panoramas, with or without ``poses.csv`` (docs/datasets/panoramas.md)."""
+    """A folder of panoramas, with or without ``poses.csv`` (docs/datasets/omnidirectional.md)."""
 
     kind: Literal["panoramas"] = "panoramas"
     camera: EquirectangularSettings = EquirectangularSettings()
@@ -253,7 +252,7 @@ class PanoramasSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class OmniPathSettings(RecordingSettings):
-    """A folder of a mirror camera's pictures along a path (docs/datasets/mirror_images.md)."""
+    """A folder of a mirror camera's pictures along a path (docs/datasets/omnidirectional.md)."""
 
     kind: Literal["omni_path"] = "omni_path"
     camera: OmniCameraSettings = HyperbolicMirrorSettings()
@@ -267,7 +266,7 @@ class OmniPathSettings(RecordingSettings):
 
 @dataclass(frozen=True, config=STRICT)
 class OmniVideoSettings(RecordingSettings):
-    """A mirror camera's video file; ``path`` is the file (docs/datasets/mirror_images.md)."""
+    """A mirror camera's video file; ``path`` is the file (docs/datasets/omnidirectional.md)."""
 
     kind: Literal["omni_video"] = "omni_video"
     camera: OmniCameraSettings = BloggieSettings()
@@ -290,7 +289,7 @@ class ConstantVelocitySettings:
 
     Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``, more
     while the camera is blind: ``sigma * T * dt``, T since the velocity was last measured. How large
-    the acceleration is, is estimated from the frames so far (docs/derivations/motion_noise.md);
+    the acceleration is, is estimated from the frames so far (docs/derivations/motion.md);
     the first frames are tracked with the values below. They are those of a flying or hand-held
     camera, wide for any other (cars of KITTI: 12, 6, 8 degrees/s^2 and 0.35, 0.43, 2.3 m/s^2).
     """
@@ -318,7 +317,7 @@ class RecordedOdometrySettings:
 
     The rates are taken as constant over one step, so each standard deviation is multiplied by the
     step's duration. Defaults: measured on KITTI raw 2011_09_26 against its truth (step 0.206 s,
-    7.5 m/s), where truth's own noise is included; docs/datasets/image_folder.md has the numbers.
+    7.5 m/s), where truth's own noise is included; docs/datasets/images.md has the numbers.
     """
 
     kind: Literal["recorded"] = "recorded"

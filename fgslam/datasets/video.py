@@ -1,4 +1,4 @@
-"""Stereo films: one of both views, or one a camera (docs/datasets/video.md).
+"""Stereo films: one of both views, or one a camera (docs/datasets/images.md).
 
 Frames are decoded by number, those of several films are paired by number or by time.
 """

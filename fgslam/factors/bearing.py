@@ -3,7 +3,7 @@
 Variables: planar poses of the start, of every image on the way and of the target (``Pose2``),
 velocities in the robot's axes, and landmarks in the plane. GTSAM's own factors serve wherever there
 is one; residuals are specified in :mod:`fgslam.factors.bearing`. Derivation:
-docs/derivations/homing_graph.md.
+docs/derivations/homing_estimators.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Landmark observations by stereo or trinocular cameras: GTSAM's factor of one, and many in arrays.
 
-Derivation: docs/derivations/factors.md.
+Derivation: docs/derivations/measurements.md.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ STIFF_RAD, STIFF_M = 1e-5, 1e-4
 """Deviations of a hard floor. GTSAM's constrained models would be exact, and make every solve
 fifteen times slower (they need QR). Its Cholesky calls a pose indeterminate that is known some ten
 thousand times worse in one direction than in another, once these are no axes of the camera:
-stiffer, and a blind drive with a pitched camera fails (docs/derivations/factors.md)."""
+stiffer, and a blind drive with a pitched camera fails (docs/derivations/measurements.md)."""
 
 _EXACT = 1e-6  # radians and metres: the deviation of what has no variance
 _RELATIVE = 1e-3  # of the largest deviation of the same covariance, for the same reason

@@ -1,7 +1,7 @@
 """Watches the cameras of a rig: one that delivers old images, swapped, darker or knocked ones.
 
 Each frame's images are compared with each other and with those of the frame before, whatever the
-front-end makes of them. docs/derivations/camera_faults.md.
+front-end makes of them. docs/derivations/cameras.md.
 """
 
 from __future__ import annotations

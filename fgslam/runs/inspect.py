@@ -1,4 +1,4 @@
-"""What is in a recording, and what is wrong with it (docs/howto/inspect.md).
+"""What is in a recording, and what is wrong with it (docs/howto/your_recording.md).
 
 A check returns findings as data: a code, and the values of its sentence (:mod:`findings`).
 """

@@ -91,7 +91,7 @@ class LabDriveSettings(DriveLimits):
 
 @dataclass(frozen=True, config=STRICT)
 class WheelOdometrySettings:
-    """Drift of the wheel odometry (docs/datasets/rendered_lab.md)."""
+    """Drift of the wheel odometry (docs/datasets/rendered.md)."""
 
     scale_error: float = Field(
         default=0.01,
@@ -319,7 +319,7 @@ class MovedLandmarksSettings:
 
 @dataclass(frozen=True, config=STRICT)
 class SimulatedMeasurementsSettings(FrameSelection):
-    """A simulated drive without images (docs/datasets/simulated_measurements.md)."""
+    """A simulated drive without images (docs/datasets/rendered.md)."""
 
     kind: Literal["simulated_measurements"] = "simulated_measurements"
     world: MeasurementWorldSettings = MeasurementWorldSettings()

@@ -2,7 +2,7 @@
 
 What the front-end would hand to the estimators, with noise of exactly the covariance that it
 states: independent noise on the pixels of all images, fused as
-docs/derivations/stereo_measurement.md derives. Everything follows from two seeds: the world's
+docs/derivations/measurements.md derives. Everything follows from two seeds: the world's
 (where landmarks are) and the run's (noise, detections, wrong matches).
 """
 

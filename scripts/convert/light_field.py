@@ -1,4 +1,4 @@
-"""A gantry's grid of views as a trinocular image folder (docs/datasets/image_folder.md).
+"""A gantry's grid of views as a trinocular image folder (docs/datasets/images.md).
 
 `python -m scripts.convert.light_field GRID FOLDER`. The reference camera walks along one row; its
 left and top neighbours are the other two. A grid, as of the Stanford (New) Light Field Archive::

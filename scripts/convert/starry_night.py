@@ -1,4 +1,4 @@
-"""UTIAS "Starry Night", a MATLAB file, as a folder of measurements (docs/datasets/measurements.md).
+"""UTIAS "Starry Night", a MATLAB file, as a folder of measurements (docs/datasets/published.md).
 
 `python -m scripts.convert.starry_night FILE.mat FOLDER`. Variables, after Barfoot's course notes
 (State Estimation for Robotics, assignment of data set 3): ``theta_vk_i``, ``r_i_vk_i`` true

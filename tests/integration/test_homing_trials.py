@@ -1,6 +1,6 @@
 """What the homing graph must reach on simulated bearings, and what the filters miss (issue 4).
 
-Few trials by default; the whole 800 in a slow test, as docs/derivations/homing_filters.md reports.
+Few trials by default; the whole 800 in a slow test (docs/derivations/homing_estimators.md).
 """
 
 from __future__ import annotations

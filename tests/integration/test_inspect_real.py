@@ -72,7 +72,7 @@ def test_turned_left_camera_is_measured(shared_data: Path, tmp_path: Path) -> No
 
 @pytest.mark.slow  # the same car's clock by default: tests/unit/datasets/test_clock.py
 def test_clock_of_the_real_odometry(shared_data: Path) -> None:
-    """-0.06 s is what the images alone gave (docs/datasets/image_folder.md)."""
+    """-0.06 s is what the images alone gave (docs/datasets/images.md)."""
     root = source(shared_data, "kitti_raw_0926_5hz")
     assert "stamps are shifted by -0.06 s" in flat(inspect_recording(root, (), 1))
     corrected = inspect_recording(root, ["odometry.time_offset_s=-0.06"], 1)

@@ -9,7 +9,7 @@ theirs, a frame is
     S = H P H^T + R,    K = P H^T S^-1,    x + K v,    P - K S K^T    (correct)
 
 and new landmarks are correlated with all there is through the pose. Derivation:
-docs/derivations/ekf.md.
+docs/derivations/filters.md.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ def correct(
 ) -> Correction:
     """One Kalman correction by all matches within the gate, and the floor, at once.
 
-    S = H P H^T + R, K = P H^T S^-1, step K v, and P loses K S K^T (docs/derivations/ekf.md). Only
-    the pose's columns and those of the observed landmarks enter; with n rows of state and m of
-    measurement the gain costs ``n m^2``, the covariance's update ``n^2 m``.
+    S = H P H^T + R, K = P H^T S^-1, step K v, and P loses K S K^T (docs/derivations/filters.md).
+    Only the pose's columns and those of the observed landmarks enter; with n rows of state and m
+    of measurement the gain costs ``n m^2``, the covariance's update ``n^2 m``.
 
     Args:
         covariance: of the state before the frame.

@@ -3,7 +3,7 @@
 Equal to :class:`~fgslam.backend.filters.kalman.LandmarkKalman` up to rounding: the pose
 is that of a graph on fixed landmarks (Se et al. 3.3), each landmark that of its own graph (6.4).
 Which edges of the full graph are missing, and what that costs, is derived in
-docs/derivations/landmark_filter_as_graph.md.
+docs/derivations/filters.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The state is (x, y, psi, v; D, theta, psi_t; d_1, delta_1, d_2, ...): robot, target, features, in
 the start frame. Unlike the printed filters (:mod:`fgslam.backend.homing.paper_ekf`) the target is
 part of the state, correlated with the features as they all come from the same two views, and its
-bearings are used once; the unit of length is the leg. docs/derivations/homing_filters.md.
+bearings are used once; the unit of length is the leg. docs/derivations/homing_estimators.md.
 """
 
 from __future__ import annotations

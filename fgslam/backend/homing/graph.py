@@ -3,7 +3,7 @@
 Start, target and every image on the way are planar poses, landmarks points. The start's and the
 target's bearings enter once, with the landmark; scale is the leg from start to target. Here is what
 each image adds, with first guesses; :mod:`fgslam.backend.homing.schur` and
-:mod:`fgslam.backend.homing.gtsam` solve it. Derivation: docs/derivations/homing_graph.md.
+:mod:`fgslam.backend.homing.gtsam` solve it. Derivation: docs/derivations/homing_estimators.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Robot and features are one filter, the target another, which gets the *same* target bearings with
 every image. One feature's distance is the unit of length, and bearings from the start have no
-variance. What this does to the covariances: docs/derivations/homing_filters.md.
+variance. What this does to the covariances: docs/derivations/homing_estimators.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Gauss-Newton with reweighting from the last solution; steps that raise the cost are damped. Every
 few images the match that everything else contradicts most is put to the test.
-Derivation: docs/derivations/homing_graph.md.
+Derivation: docs/derivations/homing_estimators.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ for each landmark. The fusion takes the poses within the block as the tracker fo
 common error moves all fused observations alike, and so goes into the middle frame's pose, which
 is a variable of its own: what the landmarks learn is their shape, as from single frames. Dropping
 the frames between would cost accuracy; fusing them onto the keyframe itself would count its
-pose's knowledge once for each frame. Derivation and measurements: docs/derivations/keyframes.md.
+pose's knowledge once for each frame. Derivation and measurements: docs/derivations/smoothers.md.
 
 Once the map is smoothed, each frame's own observations give its pose against it (all frames at
 once, in NumPy); a chain of these, of the odometry, and of the graph's poses held fixed gives all

@@ -88,7 +88,7 @@ class PatchColours:
 # ------------------------------------------------------------------------------------------
 # Rotation-reduced colour SIFT of one omnidirectional image (Goedemé et al. III-A1)
 
-SIGMA_PX = 1.2  # of a feature's position, pixels of its view (docs/derivations/omni_features.md)
+SIGMA_PX = 1.2  # of a feature's position, pixels of its view (docs/derivations/omni.md)
 SIGMA_SCALES = 0.27  # scales of a feature, added in quadrature to its position's sigma
 MAX_FEATURES = 3000  # the strongest
 MIN_ELEVATION_DEG, MAX_ELEVATION_DEG = -60.0, 60.0
@@ -318,7 +318,7 @@ def empty_features() -> UprightFeatures:
 # ------------------------------------------------------------------------------------------
 # Invariant column segments of one cylindrical view (Goedemé et al. III-A2)
 
-_SIGMA_PX = 1.8  # of an end, and of a run of one column (docs/derivations/omni_features.md)
+_SIGMA_PX = 1.8  # of an end, and of a run of one column (docs/derivations/omni.md)
 _SIGMA_RUN = 0.15  # part of a run's width added to the bearing's deviation
 _RUN_STEP_PX = 1.5  # ends of one run shift less than this between columns
 _MAX_RUN_DEG = 8.0

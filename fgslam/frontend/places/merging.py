@@ -1,6 +1,6 @@
 """Two maps of one place become one: what both hold is fused, the rest stands side by side.
 
-No evidence counts twice: maps know the frames that are in them (docs/derivations/map_alignment.md).
+No evidence counts twice: maps know the frames that are in them (docs/derivations/places.md).
 """
 
 from __future__ import annotations

@@ -255,7 +255,7 @@ def test_two_runs_give_the_same_bits() -> None:
 
 
 # --------------------------------------------------------------------------------------------
-# What the missing edges cost: the numbers of docs/derivations/landmark_filter_as_graph.md
+# What the missing edges cost: the numbers of docs/derivations/filters.md
 
 
 def standing_still(frames: int) -> tuple[float, float]:

@@ -105,7 +105,7 @@ def test_the_unified_model_is_reflection_on_the_hyperboloid(a: float, b: float) 
 
     size = 2 * int(radius[-1]) + 3
     frame = MirrorFrame(size, size, (size / 2.0, size / 2.0))
-    both = 2.0 * a * a + b * b  # docs/derivations/omni_cameras.md
+    both = 2.0 * a * a + b * b  # docs/derivations/omni.md
     xi, unified = 2.0 * a * float(np.hypot(a, b)) / both, focal * b * b / both
     camera = HyperbolicMirror(frame, 0.0, radius[-1], xi=xi, focal_px=unified)
     np.testing.assert_allclose(camera.elevation(radius), expected, atol=1e-9)

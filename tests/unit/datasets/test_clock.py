@@ -124,7 +124,7 @@ def test_turns_are_seen() -> None:
 
 @pytest.mark.data
 def test_the_clock_of_a_real_car_is_found_without_its_truth(shared_data: Path) -> None:
-    """By the truth its odometry agrees best at -0.06 s (docs/datasets/image_folder.md)."""
+    """By the truth its odometry agrees best at -0.06 s (docs/datasets/images.md)."""
     folder = ImageFolderSettings(path=str(shared_data / "kitti_raw_0926_5hz"))
     shifted = open_recording(folder, RecordedOdometrySettings(time_offset_s=0.09))
     assert judged_turns(shifted).time_offset_s == pytest.approx(-0.15, abs=0.015)
