@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from benchmarks.measured import stored
@@ -16,34 +16,23 @@ _NOTE = "<!-- Made by `python -m benchmarks pages` from benchmarks/results/{}.js
 _BY_HAND = "by hand"
 _MISSED = ", **missed**"
 
-GROUPS: dict[str, tuple[str, ...]] = {
-    "Mapping and localisation": (
-        "paper_drive",
-        "real_recordings",
-        "three_cameras",
-        "moving_person",
-        "ablations",
+SUBJECTS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "mapping": (
+        "Mapping and localisation",
+        ("paper_drive", "real_recordings", "three_cameras", "moving_person", "ablations"),
     ),
-    "Filters and smoothers": ("filter_or_smoother", "robustness"),
-    "Failures, bad input, scale": ("nothing_lost",),
-    "Maps": ("lasting_landmarks", "saved_maps", "relocalisation", "loops"),
-    "Homing": (
-        "homing_vectors",
-        "homing_drives",
-        "own_routes",
-        "topological_maps",
-        "homing_estimators",
-    ),
-    "Speed": (
-        "key_frames",
-        "speed",
-    ),
+    "filter_or_smoother": ("Filter or smoother", ("filter_or_smoother",)),
+    "robustness": ("Robustness", ("robustness", "nothing_lost")),
+    "maps": ("Maps", ("lasting_landmarks", "saved_maps", "relocalisation", "loops")),
+    "homing": ("Homing", ("homing_vectors", "homing_drives", "homing_estimators")),
+    "routes": ("Routes", ("own_routes", "topological_maps")),
+    "speed": ("Speed", ("key_frames", "speed")),
 }
-"""Pages in the order of the site."""
+"""Pages in the order of the site: the title, and the files of measurements on it."""
 
 
 def write_pages(results: Path = RESULTS, folder: Path = PAGES) -> None:
-    """Writes one page for each file of measurements, and the overview."""
+    """Writes one page a subject, and the overview."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in all_pages(results).items():
         (folder / f"{name}.md").write_text(text, encoding="utf-8")
@@ -52,15 +41,16 @@ def write_pages(results: Path = RESULTS, folder: Path = PAGES) -> None:
 def all_pages(results: Path = RESULTS) -> dict[str, str]:
     """Text of every page by its name; ``index`` is the overview."""
     records = {
-        name: load_record(results / f"{name}.json") for group in GROUPS.values() for name in group
+        subject: [load_record(results / f"{name}.json") for name in names]
+        for subject, (_, names) in SUBJECTS.items()
     }
-    pages = {name: page(record) for name, record in records.items()}
+    pages = {name: page(SUBJECTS[name][0], found) for name, found in records.items()}
     return pages | {"index": overview(records)}
 
 
-def overview(records: dict[str, Record]) -> str:
-    """How many bounds each page has and how many are met, then every one that is missed."""
-    rows = [row for record in records.values() for row in record.rows]
+def overview(records: Mapping[str, Sequence[Record]]) -> str:
+    """How many bounds each subject has and how many are met, then every one that is missed."""
+    rows = [row for found in records.values() for record in found for row in record.rows]
     missed = sum(row.met is False for row in rows)
     lines = [
         "# Results",
@@ -71,38 +61,43 @@ def overview(records: dict[str, Record]) -> str:
             f"{len(rows)} bounds, {len(rows) - missed} met, {missed} missed. Each page gives the "
             "numbers, their bounds and the commands that measure them; slow tests hold most "
             "bounds. Images measured before 2026-11-25 had SIFT on every frame "
-            "(`frontend.tracking: sift`); since then [key frames](key_frames.md) are the default."
+            "(`frontend.tracking: sift`); since then [key frames](speed.md) are the default."
         ),
     ]
-    for group, names in GROUPS.items():
-        lines += ["", f"## {group}", "", *(_counted(records[name]) for name in names)]
-    lines += ["", "## Missed", "", *(list(_missed(records.values())) or ["None."])]
+    for subject, found in records.items():
+        lines += ["", f"## [{SUBJECTS[subject][0]}]({subject}.md)", "", *map(_counted, found)]
+    missing = [line for found in records.values() for record in found for line in _missed(record)]
+    lines += ["", "## Missed", "", *(missing or ["None."])]
     return _joined(lines)
 
 
 def _counted(record: Record) -> str:
     met = sum(row.met is True for row in record.rows)
     of = len(record.rows)
-    return f"- [{record.title}]({record.name}.md)" + (f": {met} of {of} bounds met" if of else "")
+    return f"- {record.title}" + (f": {met} of {of} bounds met" if of else "")
 
 
-def _missed(records: Iterable[Record]) -> Iterator[str]:
-    """An item for each page: what it misses, the number and its bound."""
+def _missed(record: Record) -> Iterator[str]:
+    """An item: what the record misses, the number and its bound."""
+    rows = [row for row in record.rows if row.met is False]
+    listed = "; ".join(f"{row.name}: {shown_number(row)} ({shown_bound(row)})" for row in rows)
+    if rows:
+        first, *others = _wrapped(f"- {record.title}: {listed}")
+        yield from (first, *(f"  {line}" for line in others))
+
+
+def page(title: str, records: Sequence[Record]) -> str:
+    """One page: each section with its command, bounds and tables; a chapter a record."""
+    lines = [f"# {title}"]
     for record in records:
-        rows = [row for row in record.rows if row.met is False]
-        told = "; ".join(f"{row.name}: {shown_number(row)} ({shown_bound(row)})" for row in rows)
-        if rows:
-            lines = _wrapped(f"- [{record.title}]({record.name}.md): {told}")
-            yield from (lines[0], *(f"  {line}" for line in lines[1:]))
-
-
-def page(record: Record) -> str:
-    """One page: each section with its command, bounds and tables."""
-    lines = [f"# {record.title}", "", _NOTE.format(record.name)]
-    for paragraph in (*record.text, *_when(record)):
-        lines += ["", *_wrapped(paragraph)]
-    for section in record.sections:
-        lines += ["", f"## {section.title}", "", *_section(section)]
+        mark = "##" if len(records) > 1 else "#"
+        if len(records) > 1:
+            lines += ["", f"## {record.title}"]
+        lines += ["", _NOTE.format(record.name)]
+        for paragraph in (*record.text, *_when(record)):
+            lines += ["", *_wrapped(paragraph)]
+        for section in record.sections:
+            lines += ["", f"{mark}# {section.title}", "", *_section(section)]
     return _joined(lines)
 
 

@@ -229,7 +229,7 @@ def _doubles(array: Array) -> FloatArray:
 # before and after show, too. Their votes come first, then how strong they are; each sector of
 # bearing gives its best in turn, as features on one side leave the homing vector open.
 #
-# Descriptors are rounded to three bits. What that costs is measured: docs/results/own_routes.md.
+# Descriptors are rounded to three bits. What that costs is measured: docs/results/routes.md.
 
 
 MOST_SIFT, MOST_COLUMNS = 300, 100

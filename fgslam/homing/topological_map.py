@@ -301,7 +301,7 @@ pairs share nothing, and those that do not follow each other must convince by mo
 _ALL = 60  # images of a map that are tried against all others
 _CANDIDATES = 40
 """Otherwise so many, the most alike: of the 60 school corridors' views, from day to night, that is
-what keeps all connected (docs/results/topological_maps.md)."""
+what keeps all connected (docs/results/routes.md)."""
 
 _NO_WAY = 0.01  # cost between two images of one place; a leg has more than 1
 _STREAM = 10  # of the seed's random numbers

@@ -60,7 +60,7 @@ _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 _LEVEL = float(chi2.ppf(0.95, 5))  # of the prior's strain: level cameras keep within
 _FREE = (np.deg2rad(5.0), 1.0)
 """Prior of a camera that is carried: tilts at which nearly all features are still matched
-(docs/results/homing_vectors.md), and a height of a whole leg, up stairs or down to the ground."""
+(docs/results/homing.md), and a height of a whole leg, up stairs or down to the ground."""
 
 
 def estimate_homing_vector(

@@ -11,7 +11,7 @@ import pytest
 import benchmarks.__main__ as runner
 from benchmarks.__main__ import EVIDENCE
 from benchmarks.measured import keep, stored
-from benchmarks.pages import PAGES, WIDTH, all_pages, fitted, page
+from benchmarks.pages import PAGES, SUBJECTS, WIDTH, all_pages, fitted, page
 from benchmarks.rows import (
     RESULTS,
     RecordError,
@@ -108,7 +108,9 @@ def test_pages_of_results_are_those_of_the_committed_measurements() -> None:
     for name, text in all_pages().items():
         page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
         assert page == text, f"stale page {name}: run python -m benchmarks pages"
-    assert {path.stem for path in RESULTS.glob("*.json")} | {"index"} == set(all_pages())
+    assert {path.stem for path in RESULTS.glob("*.json")} == {
+        name for _, names in SUBJECTS.values() for name in names
+    }
     assert {path.stem for path in PAGES.glob("*.md")} == set(all_pages())
 
 
@@ -173,7 +175,7 @@ def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path
     rows = record.sections[0].rows
     assert [row.measured for row in rows] == [1.23456, 1.0, 0.5, 7.25]
     assert [row.met for row in rows[:2]] == [False, True]
-    text = page(record)
+    text = page("T", [record])
     assert "| ATE | 1.23 cm | < 1 cm, **missed** |" in text
     assert "| written down | 7.25 (by hand) |" in text
     assert "| 2.00 | worst |" in text
@@ -185,7 +187,7 @@ def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path
 
 def test_numbers_without_a_measurement_are_said_to_be_by_hand(tmp_path: Path) -> None:
     section = {"title": "S", "rows": [{"name": "ATE", "measured": 1.0}]}
-    text = page(load_record(written(tmp_path / "page.json", section)))
+    text = page("T", [load_record(written(tmp_path / "page.json", section))])
     assert "Measured by hand on 2026-01-01 with fgslam 1." in text
     assert "| ATE | 1 |" in text
 
