@@ -122,7 +122,7 @@ def _when(record: Record) -> Iterator[str]:
     """When the numbers were measured that a person wrote down; nothing where there are none."""
     sources = [section.sources for section in record.sections]
     if not all(found and all(found) for found in sources):
-        rest = ", where nothing else is said" if any(map(any, sources)) else ""
+        rest = " unless stated otherwise" if any(map(any, sources)) else ""
         yield f"Measured {_BY_HAND} on {record.date} with fgslam {record.version}{rest}."
 
 

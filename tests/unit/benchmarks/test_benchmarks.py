@@ -182,7 +182,7 @@ def test_pages_compute_numbers_from_stored_measurements(measured: Path, tmp_path
     assert record.sections[0].tables[0].rows == [(2.0, "worst")]
     assert "| lab | 1.23 |" in text
     assert "Computed from `benchmarks/measured`: `lab` (" in text
-    assert "Measured by hand on 2026-01-01 with fgslam 1, where nothing else is said." in text
+    assert "Measured by hand on 2026-01-01 with fgslam 1 unless stated otherwise." in text
 
 
 def test_numbers_without_a_measurement_are_said_to_be_by_hand(tmp_path: Path) -> None:
