@@ -32,7 +32,7 @@ from fgslam.homing.closed_loop import Driver, DriveRecord, follow
 from fgslam.homing.controller import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, ObstacleAvoider, Steering
-from fgslam.runs.tasks.homing_drives import start_from_matches
+from fgslam.runs.tasks.homing_replay import start_from_matches
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
 

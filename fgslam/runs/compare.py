@@ -42,7 +42,6 @@ from fgslam.runs.engine import (
     run_task,
 )
 from fgslam.runs.folder import COMPARISON_FILE, RUN_MARKER, ExistingFolder, is_run_folder
-from fgslam.runs.homing_comparison import open_homing_comparison
 from fgslam.runs.slam_comparison import (
     judged_apart,
     named,
@@ -50,6 +49,7 @@ from fgslam.runs.slam_comparison import (
     with_odometry,
 )
 from fgslam.runs.tables import ate_table, write_comparison_csv
+from fgslam.runs.tasks.homing_replay import open_homing_comparison
 from fgslam.runs.units import Progress, Stopped
 
 DEFAULT_FOLDER = "compare"

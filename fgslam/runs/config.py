@@ -617,10 +617,6 @@ class OmniVideoConfig(HomingExperiment):
 
     task: Annotated[Literal["omni_video"], _TASK]
     dataset: OmniDatasetSettings
-    least_points: Count = Field(
-        default=110, description="with fewer points left, new ones are added"
-    )
-    most_points: Count = Field(default=160, description="up to so many")
 
 
 class TeachConfig(HomingExperiment):

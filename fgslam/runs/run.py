@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from fgslam.core.errors import ConfigError
 from fgslam.core.files import require_output
 from fgslam.runs.config import (
-    CrossroadsConfig,
     DrivingConfig,
     Experiment,
     ExperimentConfig,
@@ -112,13 +111,9 @@ def opener_of(  # noqa: PLR0911 - one a task
         case TeachConfig() | FollowConfig() | JoinConfig():
             return _opener_of_routes(config)
         case HomingTrialsConfig():
-            from fgslam.runs.tasks.homing_drives import open_trials
+            from fgslam.runs.tasks.homing_replay import open_trials
 
             return open_trials
-        case CrossroadsConfig():
-            from fgslam.runs.tasks.homing_drives import open_crossroads
-
-            return open_crossroads
         case DrivingConfig():
             from fgslam.runs.tasks.homing_drives import open_drives
 

@@ -32,7 +32,7 @@ from fgslam.runs.folder import (
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.slam_comparison import named, with_odometry
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, trials_table, write_comparison_csv
-from fgslam.runs.tasks.homing_drives import open_trials
+from fgslam.runs.tasks.homing_replay import open_trials
 from fgslam.runs.trial import Trial, TrialTask, perform_trial
 from fgslam.runs.units import Progress, Stopped, each_apart
 

@@ -28,7 +28,6 @@ from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import NoAvoidance, Steering
 from fgslam.runs.config import HomingConfig, PathFollowingConfig, make_experiment
 from fgslam.runs.folder import write_config
-from fgslam.runs.homing_comparison import load_bearing_logs, replay_homing
 from fgslam.runs.tasks.homing_drives import (
     DrivenSeed,
     DriveWatcher,
@@ -40,6 +39,7 @@ from fgslam.runs.tasks.homing_drives import (
     drive_of,
     finish_drives,
 )
+from fgslam.runs.tasks.homing_replay import load_bearing_logs, replay_homing
 
 EKF = {"kind": "homing_ekf"}
 
@@ -98,7 +98,7 @@ def test_covariances_of_landmarks_are_kept_where_wanted(record: DriveRecord) -> 
 def test_files_and_numbers_of_drives(record: DriveRecord, tmp_path: Path) -> None:
     config = configuration(output={"logs": 1})
     write_config(tmp_path, config, {})
-    result = finish_drives(config, tmp_path, "finished", [driven(record)], [])
+    result = finish_drives(config, tmp_path, [driven(record)], [])
     assert "1 of 1 drives arrive" in result.lines[0]
     with (tmp_path / "legs.csv").open(encoding="utf-8") as lines:
         legs = list(csv.DictReader(lines))
@@ -120,7 +120,7 @@ def test_a_drive_by_an_average_has_a_page_without_a_map(
     """Estimators without a map, and without a covariance, are no reason to lose a drive."""
     config = configuration(estimator={"kind": "alv"})
     write_config(tmp_path, config, {})
-    finish_drives(config, tmp_path, "finished", [driven(record)], [])
+    finish_drives(config, tmp_path, [driven(record)], [])
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert 'id="plot-drive"' in page
     assert 'id="plot-local-map"' not in page

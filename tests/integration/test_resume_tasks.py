@@ -83,8 +83,8 @@ HOUSE: dict[str, Any] = {
 }
 IN_SMALL_BLOCKS = """
 from fgslam.cli.main import main
-from fgslam.runs.tasks import homing_drives, homing_views
-homing_drives.TRIALS_A_BLOCK = 1
+from fgslam.runs.tasks import homing_replay, homing_views
+homing_replay.TRIALS_A_BLOCK = 1
 homing_views.VIEWS_A_BLOCK = 2
 main()
 """
@@ -164,7 +164,7 @@ def values_of(
         "homing_pairs": panoramas | {"task": "homing_pairs", "output": {"pictures": 1}},
         "topological_map": panoramas
         | {"task": "topological_map", "held_out_every": 2, "routes": [[0, 3]], "output": SILENT},
-        "omni_video": panoramas | {"task": "omni_video", "least_points": 10, "most_points": 20},
+        "omni_video": panoramas | {"task": "omni_video"},
         "homing_trials": {
             "task": "homing_trials",
             "name": "few_trials",
@@ -236,7 +236,7 @@ def doing(
 def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Units in this process, few in a block, and every state saved."""
     monkeypatch.setattr("fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK", 2)
-    monkeypatch.setattr("fgslam.runs.tasks.homing_drives.TRIALS_A_BLOCK", 1)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_replay.TRIALS_A_BLOCK", 1)
     monkeypatch.setattr("fgslam.runs.tasks.homing_video.SAVE_EVERY_S", 0.0)
     monkeypatch.setattr("fgslam.runs.tasks.localisation.SAVE_EVERY_S", 0.0)
 

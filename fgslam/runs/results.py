@@ -1,0 +1,119 @@
+"""The shared end of every task: tables, pictures, metrics.json and the page of a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from fgslam.core.files import make_subfolder
+from fgslam.evaluation.statistics import JsonValue
+from fgslam.report.content import (
+    Cell,
+    Column,
+    Figure,
+    Page,
+    Picture,
+    TextTable,
+    write_csv,
+    write_json,
+)
+from fgslam.runs.engine import RunResult
+from fgslam.runs.folder import METRICS_FILE, REPORT_FILE, RUN_MARKER, versions
+
+R = TypeVar("R", bound=RunResult)
+
+PICTURES = "pictures"
+UNKNOWN = "-"
+
+
+def finish(
+    result: R,
+    numbers: Mapping[str, JsonValue],
+    subtitle: str,
+    figures: Sequence[Figure] = (),
+    pictures: Sequence[Picture] = (),
+    estimators: Mapping[str, JsonValue] | None = None,
+) -> R:
+    """The result, its metrics.json written, and its page if wanted.
+
+    Args:
+        result: of a task whose results are tables: homing, localisation.
+        numbers: the task's own, after those that each task has.
+        subtitle: of the page.
+        figures: of the page.
+        pictures: of the page.
+        estimators: numbers by title.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    about: dict[str, JsonValue] = {
+        "name": result.config.name,
+        "task": result.config.task_name,
+        "status": result.status,
+        "remarks": list(result.notes),
+    }
+    document = {**about, **numbers, "estimators": dict(estimators or {})}
+    write_json(result.folder / METRICS_FILE, document)
+    write_page(result, subtitle, figures, pictures)
+    return result
+
+
+def write_page(
+    result: RunResult,
+    subtitle: str,
+    figures: Sequence[Figure] = (),
+    pictures: Sequence[Picture] = (),
+) -> None:
+    """report.html, unless the configuration does without. Raises OutputError."""
+    if not result.config.wants_report:
+        return
+    from fgslam.report.page import write_html  # loads Plotly
+
+    page = Page(
+        title=result.config.name,
+        subtitle=subtitle,
+        headline=result.lines,
+        tables=result.tables,
+        figures=tuple(figures),
+        pictures=tuple(pictures),
+        notes=result.notes,
+        config_yaml=(result.folder / RUN_MARKER).read_text(encoding="utf-8"),
+        versions=versions(),
+    )
+    write_html(result.folder / REPORT_FILE, page)
+
+
+def write_table(path: Path, columns: Mapping[str, Sequence[Cell]]) -> None:
+    """Writes columns of equal length, or a DataFrame, as CSV. Raises OutputError."""
+    write_csv(path, list(columns), zip(*(columns[name] for name in columns), strict=True))
+
+
+def draw_picture(folder: Path, name: str, caption: str, draw: Callable[[Path], None]) -> Picture:
+    """A picture of the page, which ``draw`` writes into the run's folder of pictures."""
+    path = make_subfolder(folder, PICTURES) / name
+    draw(path)
+    return Picture(caption, path.read_bytes())
+
+
+def numbers_table(
+    key: str, heading: str, numbers: Mapping[str, JsonValue], names: Mapping[str, str]
+) -> TextTable:
+    """A table of metrics.json's numbers; ``names`` gives the key of each row's name."""
+    rows = tuple((name, (number_text(numbers[of]),)) for name, of in names.items())
+    return TextTable(key, heading, "quantity", (Column("value", "of the run"),), rows)
+
+
+def number_text(value: JsonValue, spec: str = ".2f") -> str:
+    """A number as text, decimal ones by ``spec``; a dash where it is not known."""
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return UNKNOWN
+    return format(value, spec) if isinstance(value, float) else str(value)
+
+
+def median(values: Sequence[float] | np.ndarray) -> float | None:
+    """The median of values; None without any."""
+    return float(np.median(values)) if len(values) else None
