@@ -396,6 +396,7 @@ def _no_columns(max_views: int, patch_pixels: int) -> GrowingColumns:
         places=np.empty((0, max_views), np.int32),
         patch=np.empty((0, patch_pixels), np.uint8),
         patch_distance=np.empty(0),
+        farthest=np.empty(0),
         **dict.fromkeys(_COUNTS, count),
     )
 
@@ -551,6 +552,7 @@ class LandmarkDatabase:
             np.add.at(self._columns[name], to_rows, self._columns[name][from_rows])
         seen = self._columns["seen"]
         np.maximum.at(seen, to_rows, seen[from_rows])
+        np.maximum.at(self._columns["farthest"], to_rows, self._columns["farthest"][from_rows])
         lacking = self._columns["patch_distance"][to_rows] == 0.0
         for name in _PATCH:
             column = self._columns[name]
@@ -601,6 +603,7 @@ class LandmarkDatabase:
                 "unlooked": zeros,
                 "seen": zeros,
                 "contradicted": zeros,
+                "farthest": np.full(len(ids), np.inf),
                 **self._as_columns(saved.patches, len(ids)),
             }
         )
@@ -639,7 +642,7 @@ class LandmarkDatabase:
             scale=views.size / found.points[:, 2],
             orientation=views.orientation + lean(self._rig, wTc, found.points),
             descriptors=views.descriptors,
-            certain=found.certain & known,
+            certain=found.certain & known & self._in_reach(rows, found.points),
         )
 
     def missing(self, expected: ExpectedLandmarks, hit: BoolArray) -> IntArray:
@@ -665,6 +668,9 @@ class LandmarkDatabase:
             directions: (k, 3) from the camera to each, unit, world; None where nobody asks.
         """
         rows = self._hit(ids)
+        farthest = self._columns["farthest"]
+        distances = np.linalg.norm(features.position[which], axis=1)
+        farthest[rows] = np.maximum(farthest[rows], distances)
         places = self._places[rows]
         self._pool.refresh(places, Views.of(features, which, directions, self._frame))
         self._places[rows] = places
@@ -754,6 +760,7 @@ class LandmarkDatabase:
                 "unlooked": zeros,
                 "seen": zeros + self._frame,
                 "contradicted": zeros,
+                "farthest": np.linalg.norm(features.position[which], axis=1),
                 **self._as_columns(None, len(ids)),
             }
         )
@@ -796,6 +803,15 @@ class LandmarkDatabase:
         self._columns["unlooked"][rows] = 0
         self.hits[rows] += 1
         return rows
+
+    def _in_reach(self, rows: IntArray, points: FloatArray) -> BoolArray:
+        """Landmarks (k,) whose absence from a frame says something, at points of its camera.
+
+        From farther than a valid landmark was ever seen a nearer wall hides it, or it is too small:
+        as when the drive first came that way. Pruning it would leave no loop to close there.
+        """
+        near = np.linalg.norm(points, axis=1) <= self._columns["farthest"][rows]
+        return np.asarray(near | ~self.valid[rows])
 
     def _larger_than(self, least: float, ids: IntArray) -> Wanted:
         """Predicate on landmarks, by rows and distances: expected scale at least that large."""

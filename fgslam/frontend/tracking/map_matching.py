@@ -45,8 +45,9 @@ class ExpectedLandmarks:
         orientation: (v,) radians.
         descriptors: (v, 128).
         certain: (v,) well inside the view, so that no match is a miss; those at its border may be
-            matched (else each frame would start them anew) but are not missed, nor are those seen
-            from a direction from which they were never matched (6.3).
+            matched (else each frame would start them again) but are not missed, nor are those
+            seen from farther than ever, or from a direction from which they were never matched
+            (6.3).
     """
 
     ids: IntArray

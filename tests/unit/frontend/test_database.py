@@ -190,6 +190,24 @@ def test_landmark_ids_may_differ_from_row_numbers() -> None:
     np.testing.assert_array_equal(expected.descriptors, stereo_features(points).descriptors[kept])
 
 
+def test_a_confirmed_landmark_is_not_missed_from_farther_than_it_was_ever_seen() -> None:
+    """What hid it when the drive came hides it again; a single sighting tells no such distance."""
+    points = np.array([[0.0, 0.0, 3.0], [0.2, 0.0, 3.0]])
+    database = database_of(points)
+    for z in (2.0, 1.5):
+        seen = stereo_features(points - [0.0, 0.0, 3.0 - z])
+        database.record_hits(np.array([0]), seen, np.array([0]))
+    for z, certain in ((0.01, [True, True]), (-0.01, [False, True])):
+        expected = database.expected(landmark_map(points), g.se3_exp(np.array([0, 0, 0, 0, 0, z])))
+        assert expected.ids.tolist() == [0, 1]
+        assert expected.certain.tolist() == certain
+    database.merge(np.array([[1, 0]]))
+    restored = LandmarkDatabase(RIG, SETTINGS, 40.0)
+    restore(restored, state_of(database))
+    behind = g.se3_exp(np.array([0, 0, 0, 0, 0, -0.01]))
+    assert restored.expected(landmark_map(points[:1]), behind).certain.tolist() == [False]
+
+
 def test_a_miss_on_a_key_frame_counts_the_frames_in_view_that_did_not_look() -> None:
     """Three frames carry the third of four landmarks; the last is not in their view."""
     database = LandmarkDatabase(RIG, DatabaseSettings(), 40.0)

@@ -306,9 +306,9 @@ def test_an_empty_map() -> None:
 
 def test_memory_a_landmark_is_as_documented() -> None:
     """docs/concepts/maps.md tells it."""
-    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0)) == 70 + 164
-    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)) == 234 + 289
-    assert kept_bytes(LandmarkDatabase(RIG, VIEWS, 40.0)) == 234 + 2 * 4
+    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0)) == 78 + 164
+    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)) == 242 + 289
+    assert kept_bytes(LandmarkDatabase(RIG, VIEWS, 40.0)) == 242 + 2 * 4
 
 
 def kept_bytes(database: LandmarkDatabase) -> float:

@@ -171,8 +171,8 @@ def test_an_orbit_around_a_pillar(several: bool) -> None:
         observed = association.observations
         born |= set(observed.ids[observed.is_new].tolist())
         lost += len(association.pruned_ids)
-    if not several:
-        assert lost > 0.5 * len(born)
+    if not several:  # from behind, the pillar hides them: farther off than they were ever seen
+        assert lost <= 0.02 * len(born)
         return
     assert lost == 0
     assert len(things.map) == len(born)
