@@ -59,6 +59,7 @@ def estimator_report(
         online_error_m=2.0 * errors,
         nees=nees,
         update_ms=5.0 + rng.random(n),
+        predicted=np.zeros(n, np.bool_),
         nees_band=(0.07, 3.12),
         ate_m=float(np.sqrt(np.mean(errors**2))),
         nees_per_dof=float(np.nanmean(nees)),

@@ -8,15 +8,16 @@ returns a :class:`fgslam.report.content.Figure`.
 from __future__ import annotations
 
 import html
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.types import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer, Comparable, require_named
 from fgslam.evaluation.statistics import to_estimate_world
@@ -68,6 +69,7 @@ TEMPLATE = go.layout.Template(
 
 _BAND = "rgba(90, 100, 110, 0.18)"
 _SECONDS = "time since the start (s)"
+_LEVEL = ("right", "ahead", "up")
 HOVER_PLACE = "<b>%{fullData.name}</b><br>%{x:.3f}, %{y:.3f}<extra></extra>"
 
 
@@ -186,19 +188,17 @@ def _scales(*, log: bool) -> dict[str, Any]:
 _ELLIPSES = 40
 _MARKED = 500  # predicted poses of an estimator
 _DENSE = 3_000  # dots; finer ones keep the paths in sight
-# Dead reckoning beside smoothers: enlarged as these need it, its ellipses would cover everything.
+# Dead reckoning next to smoothers: enlarged as these need it, its ellipses would cover everything.
 _FLOOD = 0.25
 LANDMARK_ELLIPSES = "uncertainty of a landmark"
 
 
-@dataclass(frozen=True, slots=True)
-class Detail:
+class Detail(NamedTuple):
     """How much is drawn at most, evenly spread.
 
     Attributes:
         poses: of each path.
-        dots_above: landmarks of an estimator seen from above.
-        dots_map: and in space.
+        dots_above, dots_map: landmarks of an estimator seen from above, and in space.
         landmark_ellipses: of the landmarks seen from above, where there is one estimator.
     """
 
@@ -220,15 +220,19 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     Se, Lowe and Little (2001).
     """
     level = level_axes(data.up)
-    limits = _limits(data, level)[:2]
+    limits = np.array(_limits(data, level)[:2])
     # No side shorter than half the other: a road is long and thin.
-    least = 0.5 * max(high - low for low, high in limits)
-    wider = [max(least - (high - low), 0.0) / 2.0 for low, high in limits]
-    ranges = [[low - more, high + more] for (low, high), more in zip(limits, wider, strict=True)]
+    sides = np.diff(limits)
+    more = np.maximum(0.5 * sides.max() - sides, 0.0) / 2.0
     alone = len(data.estimators) == 1
-    any_predicted = any(len(_predicted_rows(one)) for one in data.estimators)
-    ellipses, factor = _uncertainty(data, level)
+    ellipses, factor = _ellipses(data, level[:2], float(sides.max()))
+    traces = [*_landmarks_above(data, level, detail), *_paths(data, level[:2], detail), *ellipses]
+    if data.closures:  # from each frame that closed a loop to the one whose place it recognised
+        ends = data.estimators[0].final_poses[np.array(data.closures), :3, 3] @ level[:2].T
+        style = {"mode": "lines+markers", "hoverinfo": "name"}
+        traces.append(line("loops closed", ends, GREY, 1.5, **style))
     larger = f"Ellipses are drawn {factor} times larger." if factor > 1 else ""
+    thinning = _thinning_note(data, detail.poses, detail.dots_above)
     return Figure(
         "above",
         "The drive from above",
@@ -237,20 +241,13 @@ def drive_from_above(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
         "estimator claims it. Dots: landmarks"
         + (", coloured by height" if alone else "")
         + ". Cross: start; dot: end."
-        + (" x: a pose that no landmark measured." if any_predicted else "")
+        + (
+            " x: a pose that no landmark measured."
+            * any(e.predicted.any() for e in data.estimators)
+        )
         + " A click on the legend hides or shows what it names.",
-        plane(
-            (
-                *_dots_above(data, level, detail),
-                *_paths(data, level[:2], detail),
-                *ellipses,
-                *_returns(data, level),
-            ),
-            ranges,
-        ),
-        note=" ".join(
-            filter(None, [larger, _thinning_note(data, detail.poses, detail.dots_above)])
-        ),
+        plane(traces, (limits + more * [-1.0, 1.0]).tolist()),
+        note=" ".join(filter(None, [larger, thinning])),
     )
 
 
@@ -258,165 +255,150 @@ def map_to_turn(data: ReportData, detail: Detail = ON_PAGE) -> Figure:
     """The landmarks and the paths in three dimensions."""
     level = level_axes(data.up)
     limits = _limits(data, level)
-    spans = np.array([high - low for low, high in limits])
-    scene: dict[str, Any] = {
-        f"{name}axis": {"title": {"text": title}, "range": limit, "showbackground": False}
-        for name, title, limit in zip(
-            "xyz", ("right (m)", "ahead (m)", "up (m)"), limits, strict=True
+    low, high = np.array(limits).T
+    traces, outside = [], 0
+    for i, estimator in enumerate(data.estimators):
+        points = estimator.landmarks.positions @ level.T
+        inside = ((points >= low) & (points <= high)).all(axis=1)
+        outside = max(outside, int((~inside).sum()))
+        # Plotly would draw what lies outside the axes across the page.
+        rows = thinned(len(points), detail.dots_map)
+        points = points[rows[inside[rows]]]
+        traces.append(
+            dots(
+                f"landmarks of {estimator.title}",
+                points,
+                GREY,
+                2.5 if len(points) < _DENSE else 1.6,
+                marker=_by_height(points[:, 2], float(low[2]), float(high[2])),
+                hovertemplate="%{x:.2f} m right, %{y:.2f} m ahead, %{z:.2f} m up<extra></extra>",
+                shown=i == data.best,
+            )
         )
+    axes: dict[str, Any] = {
+        f"{name}axis": {"title": {"text": f"{title} (m)"}, "range": limit, "showbackground": False}
+        for name, title, limit in zip("xyz", _LEVEL, limits, strict=True)
     }
-    scene |= {
-        "aspectmode": "manual",
-        "aspectratio": dict(zip("xyz", (spans / spans.max()).tolist(), strict=True)),
-        "camera": {
-            "eye": {"x": -0.5, "y": -1.05, "z": 0.85},
-            "center": {"x": 0, "y": 0, "z": -0.1},
-        },
-        "dragmode": "turntable",
-    }
-    traces = (*_dots_in_space(data, level, limits, detail), *_paths(data, level, detail))
-    notes = (_thinning_note(data, detail.poses, detail.dots_map), _outside(data, level, limits))
+    far = f"Far landmarks outside the box, not drawn: up to {outside:,}." if outside else ""
+    thinning = _thinning_note(data, detail.poses, detail.dots_map)
     return Figure(
         "map",
         "The map in three dimensions",
         "Drag to turn, pinch or scroll to come closer, drag with the right button to shift. Dots: "
         "landmarks, coloured by height. Lines as above.",
-        go.Figure(traces, {"template": TEMPLATE}).update_scenes(**scene),
-        note=" ".join(filter(None, notes)),
+        go.Figure([*traces, *_paths(data, level, detail)], {"template": TEMPLATE}).update_scenes(
+            **axes,
+            aspectmode="manual",
+            aspectratio=dict(zip("xyz", ((high - low) / (high - low).max()).tolist(), strict=True)),
+            camera={
+                "eye": {"x": -0.5, "y": -1.05, "z": 0.85},
+                "center": {"x": 0, "y": 0, "z": -0.1},
+            },
+            dragmode="turntable",
+        ),
+        note=" ".join(filter(None, [thinning, far])),
     )
+
+
+def _limits(data: ReportData, level: FloatArray) -> list[list[float]]:
+    """Limits along right, ahead and up."""
+    paths = [np.zeros((1, 3)), *(e.final_poses[:, :3, 3] for e in data.estimators)]
+    if data.truth is not None:
+        paths.append(data.truth.poses[:, :3, 3])
+    maps = [e.landmarks.positions @ level.T for e in data.estimators]
+    return bulk_limits(np.concatenate(paths) @ level.T, *maps)
 
 
 def _thinning_note(data: ReportData, most_poses: int, most_landmarks: int) -> str:
     """What is left out to keep the page small; empty where all is drawn."""
-    poses = max((len(e) for e in data.estimators), default=0)
-    landmarks = max((len(e.landmarks) for e in data.estimators), default=0)
-    parts = [f"{most_poses:,} of up to {poses:,} poses"] if poses > most_poses else []
-    if landmarks > most_landmarks:
-        parts.append(f"{most_landmarks:,} of up to {landmarks:,} landmarks")
-    if not parts:
-        return ""
-    return f"Drawn, evenly spread, to keep this page small: {' and '.join(parts)}."
-
-
-def _outside(data: ReportData, level: FloatArray, limits: list[list[float]]) -> str:
-    """How many far landmarks the box of the map does not hold; empty where it holds all."""
-    low, high = np.array(limits).T
-    maps = [estimator.landmarks.positions @ level.T for estimator in data.estimators]
-    worst = max((int((~_inside(points, low, high)).sum()) for points in maps), default=0)
-    return f"Far landmarks outside the box, not drawn: up to {worst:,}." if worst else ""
-
-
-def _inside(points: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
+    parts = [
+        f"{most:,} of up to {count:,} {what}"
+        for what, most, count in (
+            ("poses", most_poses, max(map(len, data.estimators), default=0)),
+            (
+                "landmarks",
+                most_landmarks,
+                max((len(e.landmarks) for e in data.estimators), default=0),
+            ),
+        )
+        if count > most
+    ]
+    kept = " and ".join(parts)
+    return f"Drawn, evenly spread, to keep this page small: {kept}." if parts else ""
 
 
 def _paths(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Any]:
     """Lines in the axes that the rows of ``level`` (2 or 3, 3) span; the truth on top."""
     flat = len(level) == 2
+    up = "" if flat else ", %{z:.3f} m up"
+    dot = 10.0 if flat else 4.0
+
+    def path(name: str, stamps: FloatArray, poses: FloatArray, *style: Any, **more: Any) -> Any:
+        rows = thinned(len(poses), detail.poses)
+        hover = f"<b>%{{fullData.name}}</b><br>%{{x:.3f}} m right, %{{y:.3f}} m ahead{up}"
+        return line(
+            name,
+            poses[rows, :3, 3] @ level.T,
+            *style,
+            customdata=np.asarray(stamps[rows] - data.start, np.float32),
+            hoverinfo=None,
+            hovertemplate=f"{hover}<br>%{{customdata:.2f}} s<extra></extra>",
+            **more,
+        )
+
+    wider = len(level) - 1  # lines in space are drawn thinner than those of a plane
     for i, estimator in enumerate(data.estimators):
-        title, poses = estimator.title, estimator.final_poses
-        stamps = estimator.timestamps
-        yield _path(data, f"{title}, online", stamps, estimator.online_poses, level, detail, i)
-        yield _path(data, f"{title}, final", stamps, poses, level, detail, i)
-        if len(rows := _predicted_rows(estimator)):
+        title, stamps, poses = estimator.title, estimator.timestamps, estimator.final_poses
+        online, tint = estimator.online_poses, colour(i)
+        yield path(f"{title}, online", stamps, online, tint, 2.0 * wider, "dot", shown=False)
+        yield path(f"{title}, final", stamps, poses, tint, 2.5 * wider)
+        if len(rows := np.flatnonzero(estimator.predicted)):
             points = poses[rows[thinned(len(rows), _MARKED)], :3, 3] @ level.T
-            kind = ("x-thin-open", 8.0) if flat else ("x", 3.0)
-            name = f"{title}, predicted poses"
-            yield dots(name, points, colour(i), kind[1], kind[0], hoverinfo="name")
+            kind = (8.0, "x-thin-open") if flat else (3.0, "x")
+            yield dots(f"{title}, predicted poses", points, tint, *kind, hoverinfo="name")
         if len(estimator):
             end = poses[-1:, :3, 3] @ level.T
-            yield dots(f"{title}, end", end, colour(i), 10.0 if flat else 4.0, showlegend=False)
+            yield dots(f"{title}, end", end, tint, dot, showlegend=False)
     if data.truth is not None and len(data.truth):
-        yield _path(data, "truth", data.truth.timestamps, data.truth.poses, level, detail, None)
-    start = next((e.final_poses[:1, :3, 3] for e in data.estimators if len(e)), None)
-    if start is not None:
-        size = 10.0 if flat else 4.0
-        yield dots("start", start @ level.T, INK, size, "cross", showlegend=False)
+        yield path("truth", data.truth.timestamps, data.truth.poses, INK, 2.0 * wider, "dash")
+    for first in [e.final_poses[:1, :3, 3] for e in data.estimators if len(e)][:1]:
+        yield dots("start", first @ level.T, INK, dot, "cross", showlegend=False)
 
 
-def _path(
-    data: ReportData,
-    name: str,
-    stamps: FloatArray,
-    poses: FloatArray,
-    level: FloatArray,
-    detail: Detail,
-    number: int | None,
-) -> Any:
-    """A path of the truth (no number), as first estimated (dotted, waits for a click), or final."""
-    rows = thinned(len(poses), detail.poses)
-    online = name.endswith(", online")
-    seconds = np.asarray((stamps[rows] - data.start), np.float32)
-    up = ", %{z:.3f} m up" if len(level) == 3 else ""
-    return line(
-        name,
-        poses[rows, :3, 3] @ level.T,
-        INK if number is None else colour(number),
-        # Lines in space are drawn thinner than those of a plane.
-        (2.0 if online or number is None else 2.5) * (len(level) - 1),
-        "dash" if number is None else "dot" if online else "solid",
-        shown=not online,
-        customdata=seconds,
-        hoverinfo=None,
-        hovertemplate=f"<b>%{{fullData.name}}</b><br>%{{x:.3f}} m right, %{{y:.3f}} m ahead{up}"
-        "<br>%{customdata:.2f} s<extra></extra>",
-    )
-
-
-def _predicted_rows(estimator: EstimatorReport) -> IntArray:
-    """(k,) which poses no landmark measured."""
-    return np.flatnonzero(() if estimator.predicted is None else estimator.predicted)
-
-
-def _returns(data: ReportData, level: FloatArray) -> Iterator[Any]:
-    """A line from each frame that closed a loop to the one whose place it recognised."""
-    if data.closures:
-        ends = data.estimators[0].final_poses[np.array(data.closures), :3, 3] @ level[:2].T
-        yield line("loops closed", ends, GREY, 1.5, mode="lines+markers", hoverinfo="name")
-
-
-def _uncertainty(data: ReportData, level: FloatArray) -> tuple[list[Any], int]:
-    """Ellipses of all estimators, and the factor by which they are drawn larger.
+def _ellipses(data: ReportData, plane: FloatArray, span: float) -> tuple[list[Any], int]:
+    """Ellipses of poses evenly spread, of all estimators, and how much larger they are drawn.
 
     One factor enlarges all, so that they stay comparable. Estimators whose ellipses would hide the
     view even at true size have no say in it, and are shown when asked for.
     """
-    span = max(high - low for low, high in _limits(data, level)[:2])
-    claimed = [_claimed(estimator, level[:2]) for estimator in data.estimators]
-    widths = [_width(covariances) for _, covariances in claimed]
-    wide = [width > _FLOOD * span for width in widths]
-    narrow = [k for k, hidden in enumerate(wide) if not hidden]
-    every = np.concatenate([np.empty((0, 2, 2)), *(claimed[k][1] for k in narrow)])
-    factor = exaggeration(every, span)
-    if max((widths[k] for k in narrow), default=0.0) * factor >= _FLOOD * span:
+    centres, claimed = [], []
+    for estimator in data.estimators:
+        poses, covariances = estimator.final_poses, estimator.covariances
+        known = np.flatnonzero(np.isfinite(covariances[:, 3:, 3:]).all(axis=(1, 2)))
+        rows = known[thinned(len(known), _ELLIPSES)]
+        world = world_position_covariances(poses[rows], covariances[rows])
+        centres.append(poses[rows, :3, 3] @ plane.T)
+        claimed.append(in_plane(world, plane))
+    widths = [
+        2.0 * SIGMAS * float(np.sqrt(np.median(np.linalg.eigvalsh(one)[:, -1])))
+        if len(one)
+        else 0.0
+        for one in claimed
+    ]
+    narrow = [width <= _FLOOD * span for width in widths]
+    factor = exaggeration(
+        np.concatenate([np.empty((0, 2, 2)), *itertools.compress(claimed, narrow)]), span
+    )
+    if max(itertools.compress(widths, narrow), default=0.0) * factor >= _FLOOD * span:
         factor = 1
     traces = []
-    for i, (estimator, (centres, covariances)) in enumerate(
-        zip(data.estimators, claimed, strict=True)
-    ):
-        around = outlines(centres, covariances, 1 if wide[i] else factor)
-        name = f"{estimator.title}, 3 sigma"
-        traces.append(line(name, around, colour(i), 1.2, shown=not wide[i]))
+    for i, (estimator, shown) in enumerate(zip(data.estimators, narrow, strict=True)):
+        around = outlines(centres[i], claimed[i], factor if shown else 1)
+        traces.append(line(f"{estimator.title}, 3 sigma", around, colour(i), 1.2, shown=shown))
     return traces, factor
 
 
-def _claimed(estimator: EstimatorReport, plane: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions (k, 2) and their covariances (k, 2, 2) in the plane, of poses evenly spread."""
-    poses, covariances = estimator.final_poses, estimator.covariances
-    known = np.flatnonzero(np.isfinite(covariances[:, 3:, 3:]).all(axis=(1, 2)))
-    rows = known[thinned(len(known), _ELLIPSES)]
-    world = world_position_covariances(poses[rows], covariances[rows])
-    return poses[rows, :3, 3] @ plane.T, in_plane(world, plane)
-
-
-def _width(covariances: FloatArray) -> float:
-    """Typical width of ellipses at true size, metres; 0 where none is known."""
-    if not len(covariances):
-        return 0.0
-    return float(2.0 * SIGMAS * np.sqrt(np.median(np.linalg.eigvalsh(covariances)[:, -1])))
-
-
-def _dots_above(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Any]:
+def _landmarks_above(data: ReportData, level: FloatArray, detail: Detail) -> Iterator[Any]:
     """Landmarks of each estimator, the best one's at first; a single one's by their heights."""
     alone = len(data.estimators) == 1
     for i, estimator in enumerate(data.estimators):
@@ -427,30 +409,14 @@ def _dots_above(data: ReportData, level: FloatArray, detail: Detail) -> Iterator
             around = outlines(landmarks.positions[rows] @ level[:2].T, flat)
             yield line(LANDMARK_ELLIPSES, around, GREY, 0.6, shown=False)
         points = landmarks.positions[thinned(len(landmarks), detail.dots_above)] @ level.T
-        marker: dict[str, Any] = {}
+        style: dict[str, Any] = {"hoverinfo": "skip", "hovertemplate": None}
         if alone and len(points):
             points = points[np.argsort(points[:, 2], kind="stable")]  # as seen from above
             low, high = np.percentile(points[:, 2], [2.0, 98.0]).tolist()
-            marker = _by_height(points[:, 2], low, high)
-        name, shown = f"landmarks of {estimator.title}", i == data.best
-        yield dots(name, points[:, :2], GREY, 3.0, marker=marker, hoverinfo="skip",
-                   hovertemplate=None, shown=shown)  # fmt: skip
-
-
-def _dots_in_space(
-    data: ReportData, level: FloatArray, limits: list[list[float]], detail: Detail
-) -> Iterator[Any]:
-    low, high = np.array(limits).T
-    for i, estimator in enumerate(data.estimators):
-        landmarks = estimator.landmarks
-        points = landmarks.positions[thinned(len(landmarks), detail.dots_map)] @ level.T
-        # Plotly would draw what lies outside the axes across the page.
-        points = points[_inside(points, low, high)]
-        marker = _by_height(points[:, 2], float(low[2]), float(high[2]))
-        name, size = f"landmarks of {estimator.title}", 2.5 if len(points) < _DENSE else 1.6
-        hover = "%{x:.2f} m right, %{y:.2f} m ahead, %{z:.2f} m up<extra></extra>"
+            style["marker"] = _by_height(points[:, 2], low, high)
+        shown = i == data.best
         yield dots(
-            name, points, GREY, size, marker=marker, hovertemplate=hover, shown=i == data.best
+            f"landmarks of {estimator.title}", points[:, :2], GREY, 3.0, shown=shown, **style
         )
 
 
@@ -466,15 +432,6 @@ def _by_height(heights: FloatArray, low: float, high: float) -> dict[str, Any]:
     }
 
 
-def _limits(data: ReportData, level: FloatArray) -> list[list[float]]:
-    """Limits along right, ahead and up."""
-    paths = [np.zeros((1, 3)), *(e.final_poses[:, :3, 3] for e in data.estimators)]
-    if data.truth is not None:
-        paths.append(data.truth.poses[:, :3, 3])
-    maps = [e.landmarks.positions @ level.T for e in data.estimators]
-    return bulk_limits(np.concatenate(paths) @ level.T, *maps)
-
-
 # --------------------------------------------------------------------------------------------
 # Curves over time: errors, consistency, time a frame, noise, the rig's calibration
 
@@ -487,33 +444,31 @@ _LEAST_NEES = 1e-9
 
 def _over_time(
     data: ReportData, number: int, words: str, values: FloatArray, unit: str, **style: Any
-) -> Iterator[Any]:
+) -> list[Any]:
     """A curve of an estimator's values (n,), or nothing where none is known."""
     estimator = data.estimators[number]
     if not np.isfinite(values).any():
-        return
+        return []
     rows = peaks(values, MAX_POINTS)
     seconds = (estimator.timestamps - data.start)[rows]
-    name = f"{estimator.title}, {words}" if words else estimator.title
+    name = ", ".join(filter(None, [estimator.title, words]))
     style = {"hovertemplate": f"%{{y:.4g}}{unit} at %{{x:.2f}} s"} | style
-    yield curve(name, seconds, values[rows], colour(number), **style)
+    return [curve(name, seconds, values[rows], colour(number), **style)]
 
 
 def error_over_time(data: ReportData) -> Figure:
-    """Distance from the true position, final and online, beside what the estimator claims."""
+    """Distance from the true position, final and online, next to what the estimator claims."""
     traces: list[Any] = []
-    for i, estimator in enumerate(data.estimators):
-        for values, words, style in (
-            (SIGMAS * position_sigma(estimator), "3 sigma", {"width": 1.2, "dash": "dash"}),
-            (estimator.online_error_m, "as first estimated", {"dash": "dot", "shown": False}),
-            (estimator.final_error_m, "final", {}),
-        ):
-            traces += _over_time(data, i, words, values, " m", **style)
+    for i, one in enumerate(data.estimators):
+        claimed = SIGMAS * position_sigma(one)
+        traces += _over_time(data, i, "3 sigma", claimed, " m", width=1.2, dash="dash")
+        online, style = one.online_error_m, {"dash": "dot", "shown": False}
+        traces += _over_time(data, i, "as first estimated", online, " m", **style)
+        traces += _over_time(data, i, "final", one.final_error_m, " m")
     finals = [e.final_error_m for e in data.estimators if np.isfinite(e.final_error_m).any()]
     largest = [float(np.nanmax(errors)) for errors in finals]
     # A linear scale would press the better estimators onto its axis.
-    differ_widely = bool(largest) and max(largest) > _WIDELY * min(largest)
-    scales = _scales(log=differ_widely)
+    scales = _scales(log=bool(largest) and max(largest) > _WIDELY * min(largest))
     scales["yaxis"] |= {"rangemode": "tozero"}
     return Figure(
         "error",
@@ -540,26 +495,34 @@ def error_by_axis(data: ReportData) -> Figure:
     known = [i for i, e in enumerate(data.estimators) if np.isfinite(e.final_error_m).any()]
     largest = max((float(np.nanmax(data.estimators[i].final_error_m)) for i in known), default=0.0)
     unit, factor = ("cm", 100.0) if largest < 1.0 else ("m", 1.0)
-    level, names = level_axes(data.up), ("right", "ahead", "up")
+    level = level_axes(data.up)
     chosen = data.best if data.best in known else min(known, default=0)
     traces: list[Any] = []
     for i, estimator in enumerate(data.estimators):
-        rows, errors, sigmas = _errors_along(estimator, data.truth, level)
-        seconds = estimator.timestamps[rows] - data.start
-        for k, name in enumerate(names if len(rows) else ()):
-            error, bound = factor * errors[:, k], factor * SIGMAS * sigmas[:, k]
-            rmse = f"{float(np.sqrt(np.mean(error**2))):.2f} {unit}"
+        found = None if data.truth is None else to_estimate_world(estimator.final, data.truth)
+        if found is None:
+            continue
+        kept = thinned(len(found[0]), _MAX_POINTS_ALONG)
+        rows, true_poses = found[0][kept], found[1][kept]
+        poses, seconds = estimator.final_poses[rows], estimator.timestamps[rows] - data.start
+        errors = factor * (poses[:, :3, 3] - true_poses[:, :3, 3]) @ level.T
+        world = world_position_covariances(poses, estimator.covariances[rows])
+        # A planar covariance, rotated, may round to just below zero.
+        variances = np.maximum(np.einsum("ij,njk,ik->ni", level, world, level), 0.0)
+        bounds = factor * SIGMAS * np.sqrt(variances)
+        for k, (name, error, bound) in enumerate(zip(_LEVEL, errors.T, bounds.T, strict=True)):
             of = {"yaxis": _panel(k), "group": estimator.title, "shown": i == chosen}
             if np.isfinite(bound).any():
                 traces.append(band("3 sigma", seconds, -bound, bound, **of))
-            words = f"{estimator.title}, {name}, rmse {rmse}"
+            rmse = float(np.sqrt(np.mean(error**2)))
+            words = f"{estimator.title}, {name}, rmse {rmse:.2f} {unit}"
             traces.append(curve(words, seconds, error, colour(i), showlegend=True, **of))
     return Figure(
         "axes",
         "Position error along the axes",
         "Estimate minus truth of the final positions, the first pose aligned. Band: three standard "
         "deviations as claimed, which should hold nearly all of it.",
-        panels(traces, [f"{name} ({unit})" for name in names]),
+        panels(traces, [f"{name} ({unit})" for name in _LEVEL]),
         missing=_missing(data),
     )
 
@@ -568,40 +531,23 @@ def _missing(data: ReportData) -> str:
     return "there is no ground truth" if data.truth is None else "nothing was recorded"
 
 
-def _errors_along(
-    estimator: EstimatorReport, truth: Trajectory | None, level: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Rows (n,) with a truth, thinned, and errors and sigmas (n, 3) in the level axes, metres."""
-    found = None if truth is None else to_estimate_world(estimator.final, truth)
-    if found is None:
-        return np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
-    kept = thinned(len(found[0]), _MAX_POINTS_ALONG)
-    rows, poses = found[0][kept], found[1][kept]
-    errors = estimator.final_poses[rows, :3, 3] - poses[:, :3, 3]
-    world = world_position_covariances(estimator.final_poses[rows], estimator.covariances[rows])
-    variances = np.einsum("ij,njk,ik->ni", level, world, level)
-    # A planar covariance, rotated, may round to just below zero.
-    return rows, errors @ level.T, np.sqrt(np.maximum(variances, 0.0))
-
-
 def matches_over_time(
     frames: IntArray, matched: IntArray, inliers: IntArray, landmarks: IntArray
 ) -> Figure:
     """Landmarks matched and used in each frame, and landmarks in the map; (n,) each."""
-    at = frames.astype(np.float64)
     traces = [
-        curve(name, at, counts.astype(np.float64), colour(number), width=1.8, yaxis=axis)
+        curve(name, frames.astype(np.float64), counts.astype(np.float64), colour(number),
+              width=1.8, yaxis=axis)
         for number, name, counts, axis in (
             (1, "matched", matched, "y"),
             (0, "used for the pose", inliers, "y"),
             (2, "landmarks in the map", landmarks, "y2"),
         )
-    ]
+    ]  # fmt: skip
     out = panels(traces, ["landmarks a frame", "landmarks in the map"], "frame")
-    out.update_yaxes(rangemode="tozero")
     note = f"median {np.median(matched):.0f} matched, least {matched.min()}" if len(frames) else ""
     words = "Landmarks matched and used in each frame, and landmarks in the map."
-    return Figure("matches", "Matches and map", words, out, note=note)
+    return Figure("matches", "Matches and map", words, out.update_yaxes(rangemode="tozero"), note)
 
 
 def nees_over_time(data: ReportData) -> Figure:
@@ -610,10 +556,12 @@ def nees_over_time(data: ReportData) -> Figure:
     for estimator in data.estimators:
         if estimator.nees_band is not None:
             bands.setdefault(estimator.nees_band, []).append(estimator.title)
-    bands = dict(sorted(bands.items()))
     end = max((float(e.timestamps[-1]) - data.start for e in data.estimators if len(e)), default=1)
-    ends, both = np.array([0.0, end]), np.ones(2)
-    traces: list[Any] = [band("95 % band", ends, low * both, high * both) for low, high in bands]
+    both = np.ones(2)
+    traces: list[Any] = [
+        band("95 % band", np.array([0.0, end]), low * both, high * both)
+        for low, high in sorted(bands)
+    ]
     for i, estimator in enumerate(data.estimators):
         # The first pose is known exactly, or as good as: its NEES of 0 or 1e-20 has no place on a
         # logarithmic axis.
@@ -621,7 +569,7 @@ def nees_over_time(data: ReportData) -> Figure:
         traces += _over_time(data, i, "", values, "", width=1.6)
     each = [
         f"{low:.2f} to {high:.2f}" + (f" of {', '.join(titles)}" if len(bands) > 1 else "")
-        for (low, high), titles in bands.items()
+        for (low, high), titles in sorted(bands.items())
     ]
     return Figure(
         "nees",
@@ -637,11 +585,9 @@ def nees_over_time(data: ReportData) -> Figure:
 
 def time_per_frame(data: ReportData) -> Figure:
     """Milliseconds that each estimator took for each frame."""
-    traces = [
-        one
-        for i, estimator in enumerate(data.estimators)
-        for one in _over_time(data, i, "", estimator.update_ms, " ms", width=1.4)
-    ]
+    traces: list[Any] = []
+    for i, estimator in enumerate(data.estimators):
+        traces += _over_time(data, i, "", estimator.update_ms, " ms", width=1.4)
     return Figure(
         "time",
         "Time for each frame",
@@ -650,55 +596,48 @@ def time_per_frame(data: ReportData) -> Figure:
     )
 
 
-_ACCELERATION, _TIMES = " m/s\u00b2", " \u00d7"
+_ROTATION, _TRANSLATION = "rotation (deg/s\u00b2)", "translation (m/s\u00b2)"
 _NOISE = (
-    ("rotation (deg/s\u00b2)", "log", (("rotation_sigma_dps2", "rotation", " deg/s\u00b2"),)),
-    ("translation (m/s\u00b2)", "log", (("translation_sigma_mps2", "translation", _ACCELERATION),)),
-    ("gyroscope (\u00d7 stated)", "linear", (("gyroscope_factor", "gyroscope", _TIMES),)),
-    ("matches (\u00d7 stated)", "linear", (("match_factor", "matches", _TIMES),)),
-    (
-        "graph (\u00d7 stated)",
-        "linear",
-        (
-            ("correlated_factor", "weighed by", _TIMES),
-            ("single_factor", "single measurement", _TIMES),
-        ),
-    ),
+    (_ROTATION, "rotation_sigma_dps2", "rotation", " deg/s\u00b2"),
+    (_TRANSLATION, "translation_sigma_mps2", "translation", " m/s\u00b2"),
+    ("gyroscope (\u00d7 stated)", "gyroscope_factor", "gyroscope", " \u00d7"),
+    ("matches (\u00d7 stated)", "match_factor", "matches", " \u00d7"),
+    ("graph (\u00d7 stated)", "correlated_factor", "weighed by", " \u00d7"),
+    ("graph (\u00d7 stated)", "single_factor", "single measurement", " \u00d7"),
 )
-"""Panels: title, scale, and of each curve the column of noise.csv, words and unit."""
+"""Curves: panel, column of noise.csv, words and unit."""
 
 
 def noise_over_time(data: ReportData) -> Figure:
     """Noise of motion model, matches and graph of each estimator, as in use in each frame."""
     titles: list[str] = []
-    scales: list[str] = []
     traces: list[Any] = []
-    for title, scale, curves in _NOISE:
-        own = [
-            curve(
-                f"{estimator.title}, {words}",
-                (estimator.timestamps - data.start)[rows],
-                values[rows],
-                colour(i),
-                width=1.6,
-                dash="dash" if order else "solid",
-                hovertemplate=f"%{{y:.3g}}{unit}",
-                yaxis=_panel(len(titles)),
+    for title, column, words, unit in _NOISE:
+        for i, estimator in enumerate(data.estimators):
+            values = estimator.noise.get(column, np.empty(0))
+            if not np.isfinite(values).any():
+                continue
+            if title not in titles:
+                titles.append(title)
+            rows = thinned(len(values), _MAX_POINTS_NOISE)
+            traces.append(
+                curve(
+                    f"{estimator.title}, {words}",
+                    (estimator.timestamps - data.start)[rows],
+                    values[rows],
+                    colour(i),
+                    width=1.6,
+                    dash="dash" if column == "single_factor" else "solid",
+                    hovertemplate=f"%{{y:.3g}}{unit}",
+                    yaxis=_panel(titles.index(title)),
+                )
             )
-            for order, (column, words, unit) in enumerate(curves)
-            for i, estimator in enumerate(data.estimators)
-            if np.isfinite(values := estimator.noise.get(column, np.empty(0))).any()
-            for rows in [thinned(len(values), _MAX_POINTS_NOISE)]
-        ]
-        if own:
-            titles.append(title)
-            scales.append(scale)
-            traces += own
     out = panels(traces, titles) if titles else drawing((), _SECONDS, "")
-    for k, scale in enumerate(scales):
-        axis = {"type": "log"} if scale == "log" else {"rangemode": "tozero"}
+    for k, title in enumerate(titles):
+        spans_decades = title in (_ROTATION, _TRANSLATION)
+        axis = {"type": "log"} if spans_decades else {"rangemode": "tozero"}
         out.update_layout({_panel(k, "yaxis"): axis})
-    without_motion = data.estimators and "log" not in scales
+    has_motion = not data.estimators or {_ROTATION, _TRANSLATION} & set(titles)
     return Figure(
         "noise",
         "Noise estimated from the drive",
@@ -708,10 +647,10 @@ def noise_over_time(data: ReportData) -> Figure:
         "a graph, as measurements are weighed (solid: errors that persist from frame to frame "
         "count for more) and as a single one is judged (dashed).",
         out,
-        note="No noise of a motion model is shown: it estimates none, or odometry measured the "
-        "motion."
-        if without_motion
-        else "",
+        note=""
+        if has_motion
+        else "No noise of a motion model is shown: it estimates none, or odometry measured the "
+        "motion.",
     )
 
 
@@ -735,15 +674,12 @@ def calibration_over_time(found: Mapping[str, FloatArray], start: float) -> Figu
     traces: list[Any] = []
     for k, change in enumerate(_CHANGES):
         for i, camera in enumerate(cameras):
-            values, bound = (found[f"{camera}_{change}{end}"] for end in ("", "_sigma"))
-            of = {"yaxis": _panel(k), "group": camera}
-            bound = SIGMAS * bound
-            traces.append(band(f"{camera} camera, 3 sigma", seconds, values - bound,
-                               values + bound, **of))  # fmt: skip
-            traces.append(curve(f"{camera} camera", seconds, values, colour(i),
-                                width=1.8, showlegend=k == 0, **of))  # fmt: skip
-    out = panels(traces, list(_CHANGES.values()))
-    out.update_yaxes(rangemode="tozero")
+            values = found[f"{camera}_{change}"]
+            bound = SIGMAS * found[f"{camera}_{change}_sigma"]
+            name, of = f"{camera} camera", {"yaxis": _panel(k), "group": camera}
+            traces.append(band(f"{name}, 3 sigma", seconds, values - bound, values + bound, **of))
+            style = {"width": 1.8, "showlegend": k == 0} | of
+            traces.append(curve(name, seconds, values, colour(i), **style))
     knocks = int(found["knocks"][-1]) if len(seconds) else 0
     return Figure(
         "calibration",
@@ -751,7 +687,7 @@ def calibration_over_time(found: Mapping[str, FloatArray], start: float) -> Figu
         "How far the other cameras are turned and zoomed against the rig's calibration, as the "
         "drive showed it. Band: three standard deviations; where it holds zero, the calibration "
         "may be exact.",
-        out,
+        panels(traces, list(_CHANGES.values())).update_yaxes(rangemode="tozero"),
         note=f"The rig was found to have moved {knocks} times." if knocks else "",
     )
 

@@ -7,7 +7,7 @@ first frame. What cannot be known is None or NaN, never a guess; the page then s
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class EstimatorReport:
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to correct or leave out, in words.
         failure: why it ended early, with what it had until then, or gave nothing; else empty.
-        predicted: (n,) poses that no landmark measured; None: not known.
+        predicted: (n,) poses that no landmark measured.
         noise: (n,) each, the columns of noise.csv; empty where nothing is known of it.
     """
 
@@ -61,34 +61,21 @@ class EstimatorReport:
     online_error_m: FloatArray
     nees: FloatArray
     update_ms: FloatArray
+    predicted: BoolArray
     nees_band: tuple[float, float] | None = None
     ate_m: float | None = None
     nees_per_dof: float | None = None
     verdict: str | None = None
     remarks: tuple[str, ...] = ()
     failure: str = ""
-    predicted: BoolArray | None = None
     noise: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        n = len(self.timestamps)
-        shapes = {
-            "final_poses": (n, 4, 4),
-            "online_poses": (n, 4, 4),
-            "covariances": (n, 6, 6),
-            "final_error_m": (n,),
-            "online_error_m": (n,),
-            "nees": (n,),
-            "update_ms": (n,),
-            **({} if self.predicted is None else {"predicted": (n,)}),
-        }
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(
-                    f"{self.title}: {name} has shape {getattr(self, name).shape}, not {shape}"
-                )
-        if any(values.shape != (n,) for values in self.noise.values()):
-            raise ValueError(f"{self.title}: its noise is not one of {n} frames")
+        rows = {f.name: getattr(self, f.name) for f in fields(self)} | dict(self.noise)
+        del rows["landmarks"]
+        for name, values in rows.items():
+            if isinstance(values, np.ndarray) and len(values) != len(self):
+                raise ValueError(f"{self.title}: {name} has {len(values)} rows, not {len(self)}")
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -114,6 +101,7 @@ class EstimatorReport:
             online_error_m=unknown,
             nees=unknown,
             update_ms=unknown,
+            predicted=np.zeros(len(final), np.bool_),
             remarks=estimate.remarks,
         )
 
