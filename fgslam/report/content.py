@@ -23,6 +23,7 @@ from fgslam.core.geometry import congruence
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 
 if TYPE_CHECKING:
+    import pandas as pd
     from plotly import graph_objects as go
 
 
@@ -306,6 +307,67 @@ def write_parquet(
     table = pyarrow.table({name: pyarrow.array(cells) for name, cells in columns.items()})
     with replacing(path) as partial:
         parquet.write_table(table.replace_schema_metadata(about), partial, compression="zstd")
+
+
+def read_table(
+    path: Path,
+    numbers: Iterable[str] | None = None,
+    texts: Iterable[str] = (),
+    *,
+    known: Iterable[str] = (),
+    whole: Iterable[str] = (),
+    again: str = "run the experiment again",
+) -> pd.DataFrame:
+    """A table that a run wrote: numbers as floats, NaN where they are not known, and texts.
+
+    Args:
+        path: the .csv file.
+        numbers: columns of numbers that must be there; None: all of the file.
+        texts: columns of texts that must be there.
+        known: columns whose numbers must all be known.
+        whole: columns of whole numbers.
+        again: what to do where it is damaged.
+
+    Raises:
+        DatasetError: the file cannot be read, lacks a column, or has a cell that is no number.
+    """
+    import pandas as pd
+
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file)
+            table = pd.DataFrame(list(reader), columns=list(reader.fieldnames or []))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: cannot be read ({error}); {again}") from error
+    numbers = list(table.columns if numbers is None else numbers)
+    for column in (*numbers, *texts):
+        if column not in table:
+            raise DatasetError(f"{path}: lacks column {column}; {again}")
+        cells = table[column]
+        if cells.isna().any():
+            line = int(cells.isna().argmax()) + 2
+            raise DatasetError(f"{path}, line {line}: ends before column {column}; {again}")
+        if column not in numbers:
+            continue
+        # Not by pandas, whose numbers may differ in their last bit.
+        values = np.array([_parsed(cell) for cell in cells], np.float64)
+        wrong = np.isinf(values) | (np.isnan(values) & ((cells != "") | (column in known)))
+        if column in whole:
+            wrong |= values % 1.0 > 0.0
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise DatasetError(
+                f"{path}, line {row + 2}: {column} is {cells[row][:40]!r}, not a number; {again}"
+            )
+        table[column] = values
+    return table
+
+
+def _parsed(cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def write_json(path: Path, document: Mapping[str, JsonValue]) -> None:

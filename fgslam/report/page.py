@@ -178,8 +178,6 @@ def write_report(path: Path, data: ReportData) -> None:
 
 def slam_page(data: ReportData) -> Page:
     """Sentences, tables and figures of a run."""
-    remarks = [f"{e.title}: {remark}" for e in data.estimators for remark in e.remarks]
-    remarks += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
     rig = data.calibration
     return Page(
         title=data.title,
@@ -199,7 +197,7 @@ def slam_page(data: ReportData) -> Page:
         pictures=data.pictures,
         failed=frozenset(e.title for e in data.estimators if e.failure),
         notes=data.notes,
-        remarks=tuple(remarks),
+        remarks=data.remarks,
         config_yaml=data.config_yaml,
         versions=data.versions,
     )

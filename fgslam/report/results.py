@@ -24,6 +24,8 @@ from fgslam.evaluation.statistics import (
 )
 from fgslam.report.content import Picture, TextTable
 
+NO_LANDMARKS = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimatorReport:
@@ -109,8 +111,7 @@ class EstimatorReport:
     def failed(title: str, kind: str, why: str) -> EstimatorReport:
         """An estimator that gave no result."""
         path = Trajectory(np.empty(0), np.empty((0, 4, 4)))
-        landmarks = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-        nothing = Estimate(path, np.empty((0, 6, 6)), landmarks)
+        nothing = Estimate(path, np.empty((0, 6, 6)), NO_LANDMARKS)
         return replace(EstimatorReport.unjudged(title, kind, nothing), failure=why)
 
 
@@ -152,6 +153,13 @@ class ReportData:
         titles = [estimator.title for estimator in self.estimators]
         if len(set(titles)) != len(titles):
             raise ValueError(f"titles of estimators are not unique: {titles}")
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the estimators had to correct or leave out, and why some failed, in words."""
+        lines = [f"{e.title}: {remark}" for e in self.estimators for remark in e.remarks]
+        lines += [f"{e.title} failed: {e.failure}" for e in self.estimators if e.failure]
+        return tuple(lines)
 
     @property
     def start(self) -> float:

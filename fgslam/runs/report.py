@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, FgslamError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import vertical_of
@@ -36,9 +33,18 @@ from fgslam.evaluation.judging import (
     predicted_poses,
 )
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, UpdateTime
-from fgslam.report.content import Cell, Column, Picture, TextTable, read_metrics, write_csv
-from fgslam.report.formats import MapPoints, read_ply
+from fgslam.report.content import (
+    Cell,
+    Column,
+    Picture,
+    TextTable,
+    read_metrics,
+    read_table,
+    write_csv,
+)
+from fgslam.report.formats import read_ply
 from fgslam.report.results import (
+    NO_LANDMARKS,
     EstimatorReport,
     ReportData,
     judged_report,
@@ -214,42 +220,35 @@ def write_closures(folder: Path, recorder: RunRecorder, closures: list[JudgedClo
     write_csv(folder / LOOPS_FILE, _NAMES, rows)
 
 
-def read_closures(path: Path) -> tuple[TextTable, list[tuple[int, int]]]:
+def read_closures(path: Path) -> tuple[TextTable, tuple[tuple[int, int], ...]]:
     """The report's table of a loops.csv, and (closing, returned to) of the loops closed."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        rows = list(csv.DictReader(io.StringIO(text)))
-        lines = tuple((_title(row), _values(row)) for row in rows)
-        closed = [(int(row["at"]), int(row["to"])) for row in rows if row["taken"] == "true"]
-        return TextTable("places", "Places recognised", "closed at", _COLUMNS, lines), closed
-    except (OSError, UnicodeDecodeError, KeyError, ValueError, TypeError) as error:
-        raise DatasetError(
-            f"{path}: not a table of closed loops ({error}); run the experiment again"
-        ) from None
-
-
-def _title(row: dict[str, str]) -> str:
-    return f"frame {row['frame']}" + (" (false)" if row["false"] == "true" else "")
-
-
-def _values(row: dict[str, str]) -> tuple[str, ...]:
+    whole = ("frame", "returned_to", "at", "to", "matches", "merged")
     lengths = ("correction_m", "before_m", "after_m", "error_m")
-    return (
-        "yes" if row["taken"] == "true" else "no",
-        row["returned_to"],
-        row["matches"],
-        row["merged"],
-        *(_text(row[name], 100.0, ".1f") for name in lengths),
-        _text(row["error_deg"], 1.0, ".2f"),
+    table = read_table(
+        path, (*whole, *lengths, "error_deg"), ("taken", "false"), known=whole, whole=whole
     )
+    rows, closed = [], []
+    for row in table.to_dict("records"):
+        if taken := row["taken"] == "true":
+            closed.append((int(row["at"]), int(row["to"])))
+        values = (
+            "yes" if taken else "no",
+            *(f"{row[name]:.0f}" for name in ("returned_to", "matches", "merged")),
+            *(f"{100.0 * row[name]:.1f}" for name in lengths),
+            f"{row['error_deg']:.2f}",
+        )
+        title = f"frame {row['frame']:.0f}" + (" (false)" if row["false"] == "true" else "")
+        rows.append((title, tuple("-" if value == "nan" else value for value in values)))
+    heading = ("places", "Places recognised", "closed at")
+    return TextTable(*heading, _COLUMNS, tuple(rows)), tuple(closed)
 
 
-def _text(value: str, scale: float, spec: str) -> str:
-    return format(scale * float(value), spec) if value else "-"
-
+# ------------------------------------------------------------------------------------------
+# A folder read back for its page
 
 _UP = np.array([0.0, -1.0, 0.0])
 _TIMED_STAGES = ("predict", "update")
+_MOST_NOTES = 20
 
 
 def report_from_folder(folder: Path, run: Path | None = None) -> Path:
@@ -275,115 +274,97 @@ def report_from_folder(folder: Path, run: Path | None = None) -> Path:
 
 def load_report(folder: Path, run: Path | None = None) -> ReportData:
     """All that the page of a folder shows; arguments and errors as :func:`report_from_folder`."""
-    folders = _places(folder, run)
+    if run is None and not (folder / LOG_FILE).is_file():
+        above = folder.resolve().parent
+        run = above if (above / RUN_MARKER).is_file() else None
+    folders = [folder] if run is None or run == folder else [folder, run]
+
+    def find(name: str) -> Path | None:
+        return next((place / name for place in folders if (place / name).is_file()), None)
+
     metrics = read_metrics(folder / "metrics.json")
-    config_text = _report_text(_find(folders, RUN_MARKER))
-    config = _mapping(config_text)
+    config_text, config = _read_config(find(RUN_MARKER))
     if "task" in config:
         raise DatasetError(
             f"{folder}: is a homing run ({config['task']}), and this needs one of SLAM; open its "
             "report.html, or give it to `fgslam compare`"
         )
-    truth_file = _find(folders, "ground_truth.tum")
-    truth = None if truth_file is None else Trajectory.load(truth_file)
-    live = _live_title(config)
-    timing = _live_times(_find(folders, "timing.csv")) if folder == folders[-1] else {}
+    truth = None if (file := find("ground_truth.tum")) is None else Trajectory.load(file)
+    steering = _section(config, "estimator")
+    live = str(steering.get("label") or steering.get("kind") or "")
+    # Of a comparison's folder the clock is not the run's.
+    timing = find("timing.csv") if folder == folders[-1] else None
+    titles = marked(
+        metrics["estimators"], SYNTHETIC if metrics.get("remark") else "", say_failed=False
+    )
     estimators = tuple(
-        _estimator(folder / title, values or {}, truth, timing if title == live else {})
-        for title, values in metrics["estimators"].items()
+        replace(
+            _estimator(folder / name, values or {}, truth, timing if name == live else None),
+            title=title,
+        )
+        for title, (name, values) in zip(titles, metrics["estimators"].items(), strict=True)
     )
     pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
-    loops = _find(folders, LOOPS_FILE)
-    places, closures = (None, []) if loops is None else read_closures(loops)
-    synthetic = SYNTHETIC if metrics.get("remark") else ""
-    of_estimators = marked(metrics["estimators"], synthetic, say_failed=False)
-    estimators = tuple(
-        replace(one, title=title) for one, title in zip(estimators, of_estimators, strict=True)
+    tables, closures = list(page_tables(titles)), tuple[tuple[int, int], ...]()
+    if (file := find(LOOPS_FILE)) is not None:
+        places, closures = read_closures(file)
+        tables += [places] if places.rows else []
+    provenance = _section(config, "provenance")
+    dataset = str(_section(provenance, "dataset").get("name") or "")
+    frames, odometry = metrics.get("frames"), metrics.get("odometry")
+    subtitle = (
+        dataset,
+        f"{frames:,} frames" if isinstance(frames, int) else "",
+        f"odometry: {odometry}" if odometry else "",
+        "interrupted" if metrics.get("status") == "interrupted" else "",
     )
+    notes = [metrics.get("remark"), *(metrics.get("notes") or ())]
+    notes = [str(note) for note in (*notes, *(metrics.get("frame_problems") or ())) if note]
+    if (more := len(notes) - _MOST_NOTES) > 0:
+        notes[_MOST_NOTES:] = [f"and {more} more, see metrics.json"]
     return ReportData(
         title=str(metrics.get("name") or config.get("name") or folder.name),
-        subtitle=_subtitle(metrics, config),
+        subtitle=", ".join(filter(None, subtitle)),
         estimators=estimators,
         truth=truth_in_their_world(estimators, truth),
-        notes=_notes(metrics),
-        tables=(*page_tables(of_estimators), *([places] if places and places.rows else [])),
-        closures=tuple(closures),
+        notes=tuple(notes),
+        tables=tuple(tables),
+        closures=closures,
         pictures=tuple(_pictures(pictures)),
         config_yaml=config_text,
-        versions=_versions(config),
-        up=_up(_find(folders, LOG_FILE)),
+        versions={
+            name: None if version is None else str(version)
+            for name, version in _section(provenance, "versions").items()
+        },
+        up=_up(find(LOG_FILE)),
         alignment="after SE3 alignment",
-        calibration=_columns(_find(folders, CALIBRATION_FILE)),
+        calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
     )
 
 
-# --------------------------------------------------------------------------------------------
-# Files
-
-
-def _places(folder: Path, run: Path | None) -> list[Path]:
-    """Where files are sought, in order; the run's own folder last."""
-    if run is None and not (folder / LOG_FILE).is_file():
-        above = folder.resolve().parent
-        run = above if (above / RUN_MARKER).is_file() else None
-    return [folder] if run is None or run == folder else [folder, run]
-
-
-def _find(places: list[Path], name: str) -> Path | None:
-    return next((place / name for place in places if (place / name).is_file()), None)
-
-
-def _report_text(path: Path | None) -> str:
+def _read_config(path: Path | None) -> tuple[str, dict[str, Any]]:
+    """A configuration as text and as plain values; what cannot be parsed is shown as text only."""
     if path is None:
-        return ""
+        return "", {}
     try:
-        return path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
+        values = plain_values(text)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: cannot be read ({error}); run the experiment again") from error
-
-
-def _mapping(text: str) -> dict[str, Any]:
-    """The configuration as plain values; what cannot be read is shown as text only."""
-    try:
-        values = plain_values(text)
     except yaml.YAMLError:
-        return {}
-    return values if isinstance(values, dict) else {}
+        return text, {}
+    return text, values if isinstance(values, dict) else {}
 
 
-def _live_title(config: dict[str, Any]) -> str:
-    estimator = config.get("estimator")
-    values = estimator if isinstance(estimator, dict) else {}
-    return str(values.get("label") or values.get("kind") or "")
+def _section(values: dict[str, Any], name: str) -> dict[str, Any]:
+    found = values.get(name)
+    return found if isinstance(found, dict) else {}
 
 
-def _versions(config: dict[str, Any]) -> dict[str, str | None]:
-    provenance = config.get("provenance")
-    found = provenance.get("versions") if isinstance(provenance, dict) else None
-    if not isinstance(found, dict):
-        return {}
-    return {str(name): None if value is None else str(value) for name, value in found.items()}
-
-
-def _subtitle(metrics: dict[str, Any], config: dict[str, Any]) -> str:
-    provenance = config.get("provenance")
-    dataset = provenance.get("dataset") if isinstance(provenance, dict) else None
-    parts = [
-        str(dataset["name"]) if isinstance(dataset, dict) and "name" in dataset else "",
-        f"{metrics['frames']:,} frames" if isinstance(metrics.get("frames"), int) else "",
-        f"odometry: {metrics['odometry']}" if metrics.get("odometry") else "",
-        "interrupted" if metrics.get("status") == "interrupted" else "",
-    ]
-    return ", ".join(filter(None, parts))
-
-
-def _notes(metrics: dict[str, Any]) -> tuple[str, ...]:
-    remark = [metrics["remark"]] if metrics.get("remark") else []
-    lines = [*remark, *(metrics.get("notes") or []), *(metrics.get("frame_problems") or [])]
-    shown = [str(line) for line in lines[:20]]
-    if len(lines) > len(shown):
-        shown.append(f"and {len(lines) - len(shown)} more, see metrics.json")
-    return tuple(shown)
+def _columns(path: Path) -> dict[str, FloatArray] | None:
+    """The columns of a table of numbers; None where it has no row."""
+    table = read_table(path)
+    return None if table.empty else {str(name): table[name].to_numpy() for name in table}
 
 
 def _up(log: Path | None) -> FloatArray:
@@ -396,162 +377,95 @@ def _up(log: Path | None) -> FloatArray:
         return _UP
 
 
-# --------------------------------------------------------------------------------------------
-# One estimator
-
-
 def _estimator(
-    folder: Path, values: dict[str, Any], truth: Trajectory | None, live_ms: dict[float, float]
+    folder: Path, values: dict[str, Any], truth: Trajectory | None, timing: Path | None
 ) -> EstimatorReport:
+    """One estimator's files; what is not there is not known.
+
+    Args:
+        folder: of the estimator.
+        values: its numbers in metrics.json.
+        truth: true poses.
+        timing: the live run's timing.csv, where this is the estimator that steered.
+    """
     title, kind = folder.name, str(values.get("kind") or folder.name)
     failure = str(values.get("failure") or "")
     if not (folder / "final.tum").is_file():
         return EstimatorReport.failed(title, kind, failure or "it left no trajectory")
     final = Trajectory.load(folder / "final.tum")
-    estimate = Estimate(
-        trajectory=final,
-        covariances=_covariances(folder / "covariance.csv", final),
-        landmarks=_landmarks(folder / "map.ply"),
-        remarks=tuple(str(line) for line in values.get("remarks") or ()),
-    )
-    return replace(
-        judged_report(title, kind, estimate, _online(folder / "online.tum"), truth),
-        update_ms=_update_ms(folder / "frames.csv", final, live_ms),
-        failure=failure,
-        predicted=_predicted(values.get("predicted_rows"), len(final)),
-        noise=_noise(folder / NOISE_TABLE, final),
-    )
-
-
-def _predicted(rows: object, count: int) -> BoolArray | None:
-    """(n,) which poses no landmark measured, of the rows that metrics.json lists; None: unknown."""
-    if not isinstance(rows, list):
-        return None
-    out = np.zeros(count, np.bool_)
-    for row in rows:
-        if isinstance(row, int) and 0 <= row < count:
-            out[row] = True
-    return out
-
-
-def _noise(path: Path, final: Trajectory) -> dict[str, FloatArray]:
-    """(n,) each, the columns of noise.csv at the path's time stamps; none where it is absent."""
-    found = _columns(path if path.is_file() else None)
-    if found is None or "timestamp" not in found:
-        return {}
-    # Files keep 9 decimals of a second, which makes time stamps of one frame equal.
-    rows, of = same_times(final.timestamps.round(9), found.pop("timestamp").round(9))
-    out = {name: np.full(len(final), np.nan) for name in found}
-    for name, values in found.items():
-        out[name][rows] = values[of]
-    return out
-
-
-def _covariances(path: Path, final: Trajectory) -> FloatArray:
-    """(n, 6, 6) by time stamp; NaN where the file has none."""
-    out = np.full((len(final), 6, 6), np.nan)
-    if path.is_file():
-        stamps, found = read_covariances(path)
+    covariances = np.full((len(final), 6, 6), np.nan)
+    if (path := folder / "covariance.csv").is_file():
+        stamps, known = read_covariances(path)
         rows, of = same_times(final.timestamps, stamps)
-        out[rows] = found[of]
-    return out
+        covariances[rows] = known[of]
+    landmarks = NO_LANDMARKS
+    if (path := folder / "map.ply").is_file():
+        points = read_ply(path)
+        # Valid landmarks only (Se et al. 6.1), as in the pictures; all while none is.
+        points = points.select(points.valid) if points.valid.any() else points
+        landmarks = LandmarkMap(points.ids, points.positions, points.covariances)
+    remarks = tuple(map(str, values.get("remarks") or ()))
+    estimate = Estimate(final, covariances, landmarks, remarks)
+    path = folder / "online.tum"
+    online = Trajectory.load(path) if path.is_file() else None
+    report = judged_report(title, kind, estimate, online, truth)
+    predicted = np.isin(np.arange(len(final)), values.get("predicted_rows") or [])
+    noise = {}
+    if (path := folder / NOISE_TABLE).is_file() and (columns := _columns(path)) is not None:
+        stamps = columns.pop("timestamp", np.empty(0))
+        noise = {name: _at(final, stamps, column) for name, column in columns.items()}
+    update_ms = report.update_ms
+    if (path := folder / "frames.csv").is_file():
+        table = read_table(path, ("timestamp", "update_ms"))
+        update_ms = _at(final, table["timestamp"].to_numpy(), table["update_ms"].to_numpy())
+    elif timing is not None:
+        table = read_table(timing, ("timestamp", "milliseconds"), ("stage",))
+        table = table[table["stage"].isin(_TIMED_STAGES)]
+        sums = table.groupby("timestamp")["milliseconds"].sum()
+        update_ms = _at(final, sums.index.to_numpy(np.float64), sums.to_numpy())
+    return replace(report, update_ms=update_ms, failure=failure, predicted=predicted, noise=noise)
 
 
-def _online(path: Path) -> Trajectory | None:
-    return Trajectory.load(path) if path.is_file() else None
-
-
-def _landmarks(path: Path) -> LandmarkMap:
-    """Valid landmarks only (Se et al. 6.1), as in the pictures; all while none is."""
-    if not path.is_file():
-        return LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-    points: MapPoints = read_ply(path)
-    shown = points.select(points.valid) if points.valid.any() else points
-    return LandmarkMap(shown.ids, shown.positions, shown.covariances)
-
-
-def _update_ms(path: Path, final: Trajectory, live_ms: dict[float, float]) -> FloatArray:
-    """Milliseconds a frame (n,) of a frames.csv, else of the live run's own clock; NaN unknown."""
-    times = live_ms
-    if path.is_file():
-        rows = csv.DictReader(io.StringIO(_report_text(path)))
-        times = dict(_number_pairs(path, rows, "update_ms"))
+def _at(final: Trajectory, stamps: FloatArray, values: FloatArray) -> FloatArray:
+    """Values (k,) of a table at the path's time stamps (n,); NaN where the table has none."""
     # Files keep 9 decimals of a second, which makes time stamps of one frame equal.
-    return np.array([times.get(round(t, 9), np.nan) for t in final.timestamps.tolist()])
-
-
-def _live_times(path: Path | None) -> dict[float, float]:
-    """What the live estimator took for each frame, by time stamp, from timing.csv."""
-    if path is None:
-        return {}
-    out: dict[float, float] = {}
-    rows = [
-        r
-        for r in csv.DictReader(io.StringIO(_report_text(path)))
-        if r.get("stage") in _TIMED_STAGES
-    ]
-    for stamp, milliseconds in _number_pairs(path, rows, "milliseconds"):
-        out[stamp] = out.get(stamp, 0.0) + milliseconds
+    rows, of = same_times(final.timestamps.round(9), stamps.round(9))
+    out = np.full(len(final), np.nan)
+    out[rows] = values[of]
     return out
-
-
-def _columns(path: Path | None) -> dict[str, FloatArray] | None:
-    """The columns of a table of numbers, NaN where empty; None where there is none, or no row."""
-    if path is None:
-        return None
-    rows = list(csv.reader(io.StringIO(_report_text(path))))
-    try:
-        values = np.array([[float(cell or "nan") for cell in row] for row in rows[1:]])
-        return dict(zip(rows[0], values.T, strict=True)) if len(values) else None
-    except (IndexError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: not a table of numbers ({error}); run the experiment again"
-        ) from error
-
-
-def _number_pairs(path: Path, rows: Any, name: str) -> list[tuple[float, float]]:
-    try:
-        return [(round(float(row["timestamp"]), 9), float(row[name] or "nan")) for row in rows]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: not a table of timestamp and {name} ({error}); run the experiment again"
-        ) from error
 
 
 # --------------------------------------------------------------------------------------------
 # Pictures
 
-_FIGURES_OF_A_FRAME = {
+_CAPTIONS = {
     "flow": "Matches of two frames: dot where a landmark was, cross where it is, line its motion",
+    "matches": "Landmarks matched and used in each frame, and landmarks in the map",
     "disparities": "Stereo matches: a line as long as the disparity from each feature",
     "features": "SIFT features: a square for each, its side the scale, the stroke its orientation",
 }
-_FIGURES_OF_A_RUN = {
-    "matches": "Landmarks matched and used in each frame, and landmarks in the map",
-}
+"""By kind, in the order of the page; pictures of frames have a number at the end."""
 _FIGURES_OF_THE_PAGE = frozenset({"map_from_above", "map_views", "position_error"})
 """The page shows these as figures, drawn from the same values."""
 
 
-def _pictures(folder: Path) -> Iterator[Picture]:
+def _pictures(folder: Path) -> list[Picture]:
     """The pictures of a run's folder with captions, matches first; nothing where it is absent."""
-    drawn = (path for path in folder.glob("*.png") if path.stem not in _FIGURES_OF_THE_PAGE)
-    for path in sorted(drawn, key=_order):
-        try:
-            yield Picture(_caption(path.stem), path.read_bytes())
-        except OSError as error:
-            raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
-
-
-def _order(path: Path) -> tuple[int, str]:
-    """Matches of frames, then of the run, then the rest; each by name."""
-    kinds = ["flow", *_FIGURES_OF_A_RUN, "disparities", "features"]
-    kind = re.sub(r"_\d+$", "", path.stem)
-    return (kinds.index(kind) if kind in kinds else len(kinds), path.stem)
-
-
-def _caption(stem: str) -> str:
-    found = re.fullmatch(r"([a-z_]+)_(\d+)", stem)
-    if found and found[1] in _FIGURES_OF_A_FRAME:
-        return f"{_FIGURES_OF_A_FRAME[found[1]]} (frame number {int(found[2])} of the run)"
-    return _FIGURES_OF_A_RUN.get(stem, stem.replace("_", " "))
+    found = []
+    for path in folder.glob("*.png"):
+        if path.stem in _FIGURES_OF_THE_PAGE:
+            continue
+        kind, _, frame = (
+            path.stem.rpartition("_") if path.stem[-1].isdigit() else (path.stem, "", "")
+        )
+        caption = _CAPTIONS.get(kind, path.stem.replace("_", " "))
+        if kind in _CAPTIONS and frame:
+            caption += f" (frame number {int(frame)} of the run)"
+        order = list(_CAPTIONS).index(kind) if kind in _CAPTIONS else len(_CAPTIONS)
+        found.append((order, path.stem, caption, path))
+    try:
+        return [Picture(caption, path.read_bytes()) for *_, caption, path in sorted(found)]
+    except OSError as error:
+        raise DatasetError(
+            f"{folder}: cannot read its pictures ({error}); check the path"
+        ) from error

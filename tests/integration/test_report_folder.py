@@ -19,7 +19,7 @@ from fgslam.core.types import Trajectory, read_covariances
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.report.results import EstimatorReport
 from fgslam.runs.report import load_report, report_from_folder
-from fgslam.runs.view import ellipsoids, view_run
+from fgslam.runs.view import claimed_positions, half_axes, view_run
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch
@@ -211,7 +211,8 @@ def test_without_a_screen_it_is_saved_beside_the_results(run: Path, monkeypatch:
 
 def test_ellipsoids_are_the_covariances_in_the_world(finished: Finished) -> None:
     estimator = only(finished.folder)
-    centres, half, quaternions = ellipsoids(estimator)
+    centres, covariances = claimed_positions(estimator)
+    half, quaternions = half_axes(covariances)
     assert len(centres) == len(estimator) == 12
     row = 7
     axes = rotation_from_quaternion(quaternions[row])

@@ -321,7 +321,7 @@ def test_closures_of_a_run_come_back_from_their_file(tmp_path: Path) -> None:
     }
     write_closures(tmp_path, recorder, closures)
     table, pairs = read_closures(tmp_path / LOOPS_FILE)
-    assert pairs == [(11, 1)], "the drive from above shows what was closed"
+    assert pairs == ((11, 1),), "the drive from above shows what was closed"
     assert [title for title, _ in table.rows] == ["frame 19 (false)", "frame 21 (false)"]
     assert table.rows[0][1][:5] == ("no", "10", "0", "0", "-")
     assert table.rows[1][1][:5] == ("yes", "11", "0", "1", "0.0")
@@ -342,5 +342,5 @@ def test_no_closure_leaves_no_file(tmp_path: Path) -> None:
 
 def test_a_foreign_table_is_refused(tmp_path: Path) -> None:
     (tmp_path / LOOPS_FILE).write_text("a,b\n1,2\n")
-    with pytest.raises(DatasetError, match="not a table of closed loops"):
+    with pytest.raises(DatasetError, match="lacks column frame"):
         read_closures(tmp_path / LOOPS_FILE)

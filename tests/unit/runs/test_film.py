@@ -30,6 +30,20 @@ ROW = {
 }
 
 
+READ = ROW | {
+    "image": 3.0,
+    "time_s": 1700000000.25,
+    "path_image": 2.0,
+    "probability": 0.9,
+    "target": 3.0,
+    "direction_deg": 12.5,
+    "sigma_direction_deg": 2.0,
+    "v_mps": 0.3,
+    "omega_deg_s": -4.0,
+    "to_target_m": 8.0,
+}
+
+
 def table(path: Path, row: Row) -> Path:
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(row))
@@ -39,7 +53,9 @@ def table(path: Path, row: Row) -> Path:
 
 
 def test_a_whole_table_is_read(tmp_path: Path) -> None:
-    assert follow_rows(table(tmp_path / "follow.csv", ROW)) == (ROW, ROW)
+    assert follow_rows(table(tmp_path / "follow.csv", ROW | {"to_target_m": "8"})) == [READ, READ]
+    (row, _) = follow_rows(table(tmp_path / "follow.csv", ROW))
+    assert np.isnan(row["to_target_m"])
 
 
 @pytest.mark.parametrize("column", ["state", "target", "path_image_name", "inliers", "v_mps"])
@@ -71,11 +87,11 @@ def test_a_line_that_breaks_off_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("turn", "said"),
-    [("4", "4 degrees/s, left"), ("-4", "4 degrees/s, right"), ("0", "0 degrees/s"),
-     ("-0.2", "0 degrees/s")],
+    [(4.0, "4 degrees/s, left"), (-4.0, "4 degrees/s, right"), (0.0, "0 degrees/s"),
+     (-0.2, "0 degrees/s")],
 )  # fmt: skip
-def test_a_turn_has_a_side_unless_it_is_zero(turn: str, said: str) -> None:
-    assert f"omega {said}" in command_text(ROW | {"omega_deg_s": turn}).splitlines()
+def test_a_turn_has_a_side_unless_it_is_zero(turn: float, said: str) -> None:
+    assert f"omega {said}" in command_text(READ | {"omega_deg_s": turn}).splitlines()
 
 
 def test_a_film_runs_as_fast_as_the_recording_and_at_most_30_frames_a_second() -> None:
