@@ -17,13 +17,11 @@ from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
-from fgslam.evaluation.statistics import JsonValue
-from fgslam.report.content import Page, TextTable, read_metrics, write_json
+from fgslam.report.content import TextTable, read_metrics
 from fgslam.runs.config import Experiment, load_experiment
 from fgslam.runs.folder import (
     METRICS_FILE,
     OWNER_NAME,
-    REPORT_FILE,
     RUN_MARKER,
     STATE_FILE,
     ExistingFolder,
@@ -320,42 +318,3 @@ def resume_command(folder: Path) -> str:
     """What to type to continue the run in ``folder``, whatever overrides it was started with."""
     run = shlex.quote(str(folder))
     return f"fgslam run {shlex.quote(str(folder / RUN_MARKER))} --out {run} --resume"
-
-
-# --------------------------------------------------------------------------------------------
-# metrics.json and the page of tasks whose results are tables: homing and localisation
-
-
-def write_document(
-    result: RunResult,
-    numbers: Mapping[str, JsonValue],
-    estimators: Mapping[str, JsonValue] | None = None,
-) -> None:
-    """metrics.json: what every homing task has, then its own numbers. Raises OutputError."""
-    about: dict[str, JsonValue] = {
-        "name": result.config.name,
-        "task": result.config.task_name,
-        "status": result.status,
-        "remarks": list(result.notes),
-    }
-    document = {**about, **numbers, "estimators": dict(estimators or {})}
-    write_json(result.folder / METRICS_FILE, document)
-
-
-def write_page(result: RunResult, subtitle: str, **parts: Any) -> None:
-    """report.html, unless the configuration does without; ``parts`` as of Page."""
-    if not result.config.wants_report:
-        return
-    from fgslam.report.page import write_html  # loads Plotly
-
-    page = Page(
-        title=result.config.name,
-        subtitle=subtitle,
-        headline=result.lines,
-        tables=result.tables,
-        notes=result.notes,
-        config_yaml=(result.folder / RUN_MARKER).read_text(encoding="utf-8"),
-        versions=versions(),
-        **parts,
-    )
-    write_html(result.folder / REPORT_FILE, page)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import pandas as pd
 
 from fgslam.core.files import make_subfolder
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import (
-    Cell,
     Column,
     Figure,
     Page,
@@ -50,6 +50,17 @@ def finish(
     Raises:
         OutputError: a file cannot be written.
     """
+    write_document(result, numbers, estimators)
+    write_page(result, subtitle, figures, pictures)
+    return result
+
+
+def write_document(
+    result: RunResult,
+    numbers: Mapping[str, JsonValue],
+    estimators: Mapping[str, JsonValue] | None = None,
+) -> None:
+    """metrics.json: what every task has, then its own numbers. Raises OutputError."""
     about: dict[str, JsonValue] = {
         "name": result.config.name,
         "task": result.config.task_name,
@@ -58,8 +69,6 @@ def finish(
     }
     document = {**about, **numbers, "estimators": dict(estimators or {})}
     write_json(result.folder / METRICS_FILE, document)
-    write_page(result, subtitle, figures, pictures)
-    return result
 
 
 def write_page(
@@ -87,9 +96,9 @@ def write_page(
     write_html(result.folder / REPORT_FILE, page)
 
 
-def write_table(path: Path, columns: Mapping[str, Sequence[Cell]]) -> None:
-    """Writes columns of equal length, or a DataFrame, as CSV. Raises OutputError."""
-    write_csv(path, list(columns), zip(*(columns[name] for name in columns), strict=True))
+def write_table(path: Path, table: pd.DataFrame) -> None:
+    """Writes a table as CSV. Raises OutputError."""
+    write_csv(path, table.columns.tolist(), table.itertuples(index=False, name=None))
 
 
 def draw_picture(folder: Path, name: str, caption: str, draw: Callable[[Path], None]) -> Picture:

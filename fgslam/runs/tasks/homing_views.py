@@ -11,14 +11,15 @@ import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import pandas as pd
 
 from fgslam.cameras.omni import OmniCamera
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows, chi_square_quantile
+from fgslam.core.arrays import FloatArray, IntArray, chi_square_quantile
 from fgslam.core.bearings import (
     BearingMatches,
     FeatureKind,
@@ -28,7 +29,6 @@ from fgslam.core.bearings import (
     TwoViewVector,
 )
 from fgslam.core.errors import ConfigError, OutputError, StoredMapError
-from fgslam.core.files import make_subfolder
 from fgslam.core.geometry import wrap
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.omni_checks import open_checked
@@ -43,7 +43,7 @@ from fgslam.frontend.homing.vector import pair_generator, vector_between
 from fgslam.homing.links import UNORDERED, Answer, Link, Pair, VisualWords, Walks, sift_inliers
 from fgslam.homing.places import Localiser
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
-from fgslam.report.content import Cell, Column, Figure, Picture, TextTable, write_csv
+from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import (
     Links,
     claimed_against_true,
@@ -52,23 +52,10 @@ from fgslam.report.homing_figures import (
     unfolded,
 )
 from fgslam.runs.config import HomingPairsConfig, TopologicalMapConfig
-from fgslam.runs.engine import (
-    Context,
-    Opening,
-    RunResult,
-    Task,
-    provenance_of,
-    write_document,
-    write_page,
-)
+from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
+from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table, write_table
 from fgslam.runs.units import Stage, in_blocks, interleaved
 
-PAIRS_FILE = "pairs.csv"
-REFERENCE_FILE = "reference_pairs.csv"
-MAP_FILE = "map.npz"
-LINKS_FILE = "links.csv"
-ROUTES_FILE = "routes.csv"
-LOCALISATION_FILE = "localisation.csv"
 VIEWS_A_BLOCK = 4
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
 PLAIN_INLIERS = 25
@@ -76,7 +63,6 @@ PLAIN_INLIERS = 25
 _GOOD_DEG = 2.0
 WRONG_DEG = 10.0
 """An answer whose direction or rotation is off by more is a wrong one."""
-Found = TypeVar("Found")
 
 
 # --------------------------------------------------------------------------------------------
@@ -102,42 +88,53 @@ def _run_pairs(config: HomingPairsConfig, views: OmniRecording, context: Context
     )
     answers, failures = answer_pairs(search, context)
     whole = len(features) == len(views) and len(answers) == len(search.pairs)
-    write_pairs(folder / PAIRS_FILE, answers, view_names(views))
-    errors, numbers = _judged(answers, views)
+    write_pairs(folder / "pairs.csv", answers, view_names(views))
+    numbers = _numbers(answers, views)
     numbers["images"] = len(features)
-    numbers["reference"] = (
-        _reference(config, views, context) if whole and config.reference else None
-    )
-    left = len(views) * (len(views) - 1) // 2 - len(answers)
-    sentences = _accuracy(numbers, errors)
-    sentences[0] += f" {left} more are not answered yet." if left else ""
+    reference = _reference(config, views, context) if whole and config.reference else None
+    numbers["reference"] = reference
+    every = len(views) * (len(views) - 1) // 2
+    left = every - len(answers)
+    lines = [
+        f"{numbers['answered']} of {len(answers)} pairs are answered."
+        + f" {left} more are not answered yet." * bool(left)
+    ]
+    if reference is not None:
+        lines.append(
+            f"Plain SIFT with at least {PLAIN_INLIERS} inliers answers {reference['answered']}."
+        )
+    answered = [answer for answer in answers if answer.answered]
+    doubts = -np.array([answer.inliers for answer in answered])
+    figures: list[Figure] = []
+    if views.poses is None:
+        lines.append("How accurate they are is not known: there are no true poses.")
+    else:
+        errors = pair_errors(answers, views.poses, views.rooms)
+        doubts = worst(errors)
+        figures = list(_pair_figures(errors, answers, views.poses, view_names(views)))
+        if len(errors):
+            lines.append(
+                f"The median error is {errors.direction.abs().median():.2f} degrees of the "
+                f"direction and {errors.rotation.abs().median():.2f} of the rotation; the worst "
+                f"answer is off by {doubts.max():.1f} degrees."
+            )
     result = RunResult(
         config,
         folder,
         "finished" if whole and not context.stopped() else "interrupted",
-        tuple(sentences),
-        error_tables(errors),
+        tuple(lines),
+        error_tables(numbers["errors"]),
         (*views.notes, *failures),
-        reached=f"after {len(answers)} of {len(answers) + left} pairs",
+        reached=f"after {len(answers)} of {every} pairs",
     )
-    write_document(result, numbers)
-    doubts = (
-        -np.array([k.inliers for k in answers if k.answered]) if errors is None else errors.worst
-    )
-    pictures = draw_doubtful(folder, views, search, answers, doubts, config.output.pictures)
-    figures = tuple(_figures(errors, answers, views))
-    write_page(
-        result,
-        f"{len(answers)} pairs of {len(features)} views of {views.name}",
-        figures=figures,
-        pictures=pictures,
-    )
-    return result
+    subtitle = f"{len(answers)} pairs of {len(features)} views of {views.name}"
+    pictures = draw_doubtful(folder, views, search, answered, doubts, config.output.pictures)
+    return finish(result, numbers, subtitle, figures, pictures)
 
 
 def _reference(
     config: HomingPairsConfig, views: OmniRecording, context: Context
-) -> dict[str, JsonValue] | None:
+) -> dict[str, Any] | None:
     """The same pairs by plain SIFT and two-point RANSAC; None where not all are done."""
     features = extract_features(views, config.dataset, None, context)
     every = tuple(itertools.combinations(range(len(features)), 2))
@@ -155,15 +152,13 @@ def _reference(
     found, _ = answer_pairs(search, context, "plain pairs")
     if len(features) < len(views) or len(found) < len(every):
         return None
-    answers = []
-    for answer in found:
-        if answer.answered and answer.inliers < PLAIN_INLIERS:
-            why = f"{answer.inliers} inliers of {PLAIN_INLIERS} needed"
-            few = Refusal(RefusalReason.TOO_FEW_INLIERS, why)
-            answer = PairAnswer(answer.a, answer.b, few, answer.matches)
-        answers.append(answer)
-    write_pairs(context.folder / REFERENCE_FILE, answers, view_names(views))
-    return _judged(answers, views)[1]
+    few = Refusal(RefusalReason.TOO_FEW_INLIERS, f"{PLAIN_INLIERS} inliers are needed")
+    answers = [
+        replace(one, found=few, rows=None) if one.answered and one.inliers < PLAIN_INLIERS else one
+        for one in found
+    ]
+    write_pairs(context.folder / "reference_pairs.csv", answers, view_names(views))
+    return _numbers(answers, views)
 
 
 # --------------------------------------------------------------------------------------------
@@ -184,66 +179,65 @@ def open_topological_map(config: TopologicalMapConfig, opening: Opening) -> Task
 
 
 def _run_map(config: TopologicalMapConfig, views: OmniRecording, context: Context) -> RunResult:
-    """Features once a view, homings of all candidates both ways, the map of those believed."""
+    """Features once a view, homings of all candidates both ways, the map of those that agree."""
     folder = context.folder
     features = extract_features(views, config.dataset, config.features, context)
-    walks = _walks(config, len(features))
     rng = np.random.default_rng(config.seed)
-    candidates = map_candidates(features, config.map, rng, walks)
+    candidates = map_candidates(features, config.map, rng, _walks(config, len(features)))
     pairs = tuple(pair for a, b in candidates for pair in ((a, b), (b, a)))
     matching, vector = config.features.matching, config.homing_vector
     search = PairSearch(tuple(features), pairs, matching, vector, config.seed)
     found, failures = answer_pairs(search, context)
     names = view_names(views)[: len(features)]
     topology = _map_of(config, features, found, list(range(len(features))), names)
-    kilobytes = topology.save(folder / MAP_FILE)
+    kilobytes = topology.save(folder / "map.npz")
     routes = [_route(topology, asked) for asked in config.routes]
     located = _localise(config, features, found, names, context)
-    whole = len(features) == len(views) and len(found) == len(pairs) and not context.stopped()
     numbers = _map_numbers(topology, views, len(found), kilobytes, routes, located)
+    write_links(folder, topology, views.poses)
+    rows = [["-".join(r.asked), "-".join(r.found), r.reason] for r in routes]
+    write_csv(folder / "routes.csv", Route._fields, rows)
+    if located is not None:
+        write_csv(folder / "localisation.csv", Localised._fields, located)
+    lines = [
+        f"{numbers['largest_component']} of {len(topology)} views are connected by "
+        f"{numbers['links']} links; there are {numbers['components']} parts."
+    ]
+    lines += [
+        f"From {r.asked[0]} to {r.asked[-1]}: {'-'.join(r.found) or 'no way'}." for r in routes
+    ]
+    if located:
+        right = sum(one.neighbour for one in located)
+        lines.append(f"Localisation finds {right} of {len(located)} held-out views at a neighbour.")
     missing = [f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason]
+    whole = len(features) == len(views) and len(found) == len(pairs) and not context.stopped()
     result = RunResult(
         config,
         folder,
         "finished" if whole else "interrupted",
-        _map_sentences(topology, routes, located),
-        (_map_table(numbers),),
+        tuple(lines),
+        (numbers_table("map", "The map", numbers, _MAP_ROWS),),
         (*views.notes, *failures, *missing),
     )
-    write_links(folder, topology, views.poses)
-    rows = [["-".join(r.asked), "-".join(r.found), r.reason] for r in routes]
-    write_csv(folder / ROUTES_FILE, ("asked", "found", "reason"), rows)
-    if located is not None:
-        write_csv(folder / LOCALISATION_FILE, Localised._fields, located)
-    write_document(result, numbers)
-    lengths = link_lengths(topology, views.poses)
-    if lengths is None:
-        lengths = np.array([float(link.b - link.a) for link in topology.links])
-    count = config.output.pictures
-    # The doubtful links: half of them the longest ones, half those with the fewest inliers.
-    longest = np.argsort(-lengths, kind="stable")[: (count + 1) // 2].tolist()
-    support = np.array([link.support for link in topology.links])
-    weakest = np.argsort(support, kind="stable")[: count // 2].tolist()
-    by_pair = {(k.a, k.b): k for k in found}
-    doubtful = [topology.links[k] for k in dict.fromkeys([*longest, *weakest])]
-    write_page(
+    by_pair = {(one.a, one.b): one for one in found}
+    linked = [by_pair[link.a, link.b] for link in topology.links]
+    doubts = -np.array([link.support for link in topology.links])
+    return finish(
         result,
+        numbers,
         f"{len(topology)} views of {views.name}",
-        figures=(map_figure(topology, views.poses),),
-        pictures=tuple(draw_pair(folder, views, search, by_pair[k.a, k.b]) for k in doubtful),
+        (map_figure(topology, views.poses),),
+        draw_doubtful(folder, views, search, linked, doubts, config.output.pictures),
     )
-    return result
 
 
-@dataclass(frozen=True, slots=True)
-class Route:
-    """A way on the map that was asked for.
+class Route(NamedTuple):
+    """A path on the map that was asked for: a row of routes.csv.
 
     Attributes:
         asked: names of the nodes, start first; further ones must lie one link apart.
-        found: names of the cheapest way's nodes; empty where there is none.
-        reason: why there is none, or which link of those asked for is absent; empty if all is
-            well.
+        found: names of the cheapest path's nodes; empty where there is none.
+        reason: why there is none, or which link of those asked for is absent; else empty.
     """
 
     asked: tuple[str, ...]
@@ -252,10 +246,9 @@ class Route:
 
 
 def _route(topology: TopologicalMap, asked: tuple[str, ...]) -> Route:
-    """The cheapest way between the ends, and whether every step that was asked for is a link."""
     try:
         nodes = [topology.names.index(name) for name in asked]
-        way = topology.route(nodes[0], nodes[-1])
+        path = topology.route(nodes[0], nodes[-1])
     except (StoredMapError, ValueError) as error:
         return Route(asked, (), str(error))
     links = {(link.a, link.b) for link in topology.links}
@@ -265,7 +258,7 @@ def _route(topology: TopologicalMap, asked: tuple[str, ...]) -> Route:
         if len(nodes) > 2 and (min(a, b), max(a, b)) not in links
     ]
     reason = f"no link {', '.join(absent)}" if absent else ""
-    return Route(asked, tuple(topology.names[k] for k in way), reason)
+    return Route(asked, tuple(topology.names[k] for k in path), reason)
 
 
 class Localised(NamedTuple):
@@ -273,7 +266,7 @@ class Localised(NamedTuple):
 
     Attributes:
         view: its name.
-        node: name of the node that the belief then liked best.
+        node: name of the node that is the most probable one then.
         probability: of this node.
         neighbour: whether the node is the next one before or after the view in the recording.
     """
@@ -331,7 +324,7 @@ def _map_of(
     views: Sequence[int],
     names: Sequence[str],
 ) -> TopologicalMap:
-    """The map of some views by what was found about their pairs, which are numbered anew."""
+    """The map of some views by the answers about their pairs, which are renumbered."""
     number = {view: k for k, view in enumerate(views)}
     among = {(number[k.a], number[k.b]): k for k in found if k.a in number and k.b in number}
     answers: dict[Pair, Answer] = {pair: k.found for pair, k in among.items()}
@@ -345,6 +338,87 @@ def _walks(config: TopologicalMapConfig, count: int) -> Walks:
     return Walks((count,)) if config.ordered else UNORDERED
 
 
+_MAP_ROWS = {
+    "nodes": "nodes",
+    "links": "links",
+    "parts": "components",
+    "views in the largest part": "largest_component",
+    "longest link, places apart in the recording": "longest_link_places",
+    "longest link, metres": "longest_link_m",
+    "fewest inliers of a link": "least_support",
+    "pairs tried and not linked": "pairs_not_linked",
+}
+
+
+def _map_numbers(
+    topology: TopologicalMap,
+    views: OmniRecording,
+    tried: int,
+    kilobytes: float,
+    routes: Sequence[Route],
+    located: list[Localised] | None,
+) -> dict[str, JsonValue]:
+    parts, links = topology.components(), link_table(topology, views.poses)
+    lengths = links["distance_m"].dropna()
+    return {
+        "nodes": len(topology),
+        "homings_tried": tried,
+        "links": len(links),
+        "components": len(parts),
+        "largest_component": len(parts[0]) if parts else 0,
+        "outside_largest": [topology.names[k] for part in parts[1:] for k in part.tolist()],
+        "longest_link_places": max(links["places_apart"], default=None),
+        "longest_link_m": max(lengths, default=None),
+        "least_support": min(links["inliers"], default=None),
+        "pairs_not_linked": len(topology.rejected),
+        "kilobytes_per_view": kilobytes,
+        "routes": [
+            {"asked": list(r.asked), "found": list(r.found), "reason": r.reason or None}
+            for r in routes
+        ],
+        "routes_found": sum(not r.reason for r in routes),
+        "localisation": None
+        if located is None
+        else {
+            "held_out": len(located),
+            "at_a_neighbour": sum(one.neighbour for one in located),
+            "last_probability": located[-1].probability if located else None,
+        },
+    }
+
+
+def link_table(topology: TopologicalMap, poses: FloatArray | None = None) -> pd.DataFrame:
+    """The columns of links.csv; lengths where places (n, 3) are known."""
+    links, names = topology.links, topology.names
+    a, b = (np.array([getattr(k, end) for k in links], np.int64) for end in "ab")
+    angles = np.rad2deg(np.array([(k.direction, k.rotation, k.back) for k in links]).reshape(-1, 3))
+    variances = [np.diagonal(link.covariance) for link in links]
+    sigmas = np.rad2deg(np.sqrt(np.array(variances).reshape(-1, 2)))
+    lengths = np.full(len(links), np.nan)
+    if poses is not None:
+        lengths = np.hypot(*(poses[b, :2] - poses[a, :2]).T)
+    return pd.DataFrame(
+        {
+            "from": [names[k] for k in a],
+            "to": [names[k] for k in b],
+            "direction_deg": angles[:, 0],
+            "sigma_direction_deg": sigmas[:, 0],
+            "rotation_deg": angles[:, 1],
+            "sigma_rotation_deg": sigmas[:, 1],
+            "back_deg": angles[:, 2],
+            "inliers": [link.support for link in links],
+            "cost": topology.costs,
+            "places_apart": b - a,
+            "distance_m": lengths,
+        }
+    )
+
+
+def write_links(folder: Path, topology: TopologicalMap, poses: FloatArray | None = None) -> None:
+    """links.csv; lengths where places (n, 3) are known. Raises OutputError."""
+    write_table(folder / "links.csv", link_table(topology, poses))
+
+
 # --------------------------------------------------------------------------------------------
 # Features and pairs of views
 
@@ -354,11 +428,7 @@ def view_names(views: OmniRecording) -> tuple[str, ...]:
     return tuple(str(number) for number in views.ids.tolist())
 
 
-@dataclass(frozen=True, slots=True)
-class _Block:
-    dataset: OmniDatasetSettings
-    features: OmniFeatureSettings | None
-    views: tuple[int, ...]
+_Block: TypeAlias = tuple[OmniDatasetSettings, OmniFeatureSettings | None, tuple[int, ...]]
 
 
 def extract_features(
@@ -385,7 +455,7 @@ def extract_features(
         label=what,
         count=len(views),
         work=_extract,
-        argument=lambda units: _Block(dataset, settings, units),
+        argument=lambda units: (dataset, settings, units),
         kind=OmniFeatures,
         blocks=in_blocks(VIEWS_A_BLOCK),
     )
@@ -397,14 +467,13 @@ def extract_features(
 
 
 def _extract(block: _Block) -> list[OmniFeatures]:
-    recording = open_omni(block.dataset)
-    if block.features is None:
-        return [
-            OmniFeatures(plain_sift(recording.camera, recording.image(i)), empty_segments())
-            for i in block.views
-        ]
-    extractor = _extractor(block.dataset, block.features)
-    return [extractor.extract(recording.image(i)) for i in block.views]
+    dataset, settings, views = block
+    recording = open_omni(dataset)
+    if settings is not None:
+        extractor = _extractor(dataset, settings)
+        return [extractor.extract(recording.image(i)) for i in views]
+    plain = (plain_sift(recording.camera, recording.image(i)) for i in views)
+    return [OmniFeatures(features, empty_segments()) for features in plain]
 
 
 @lru_cache(maxsize=1)
@@ -415,7 +484,7 @@ def _extractor(dataset: OmniDatasetSettings, settings: OmniFeatureSettings) -> O
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairAnswer:
-    """What was found about one pair.
+    """The answer about one pair.
 
     Attributes:
         a, b: numbers of the views; b is the target.
@@ -458,6 +527,11 @@ class PairSearch:
     vector: HomingVectorSettings
     seed: int
 
+    def answer(self, a: int, b: int) -> tuple[TwoViewVector | Refusal, BearingMatches]:
+        """One pair's homing vector and its tentative matches."""
+        views, rng = (self.features[a], self.features[b]), pair_generator(self.seed, a, b)
+        return vector_between(*views, self.matching, self.vector, rng)
+
 
 def answer_pairs(
     search: PairSearch, context: Context, what: str = "pairs"
@@ -481,43 +555,13 @@ def answer_pairs(
 def _answer(search: PairSearch) -> list[PairAnswer]:
     answers = []
     for a, b in search.pairs:
-        found, matches = _vector(search, a, b)
+        found, matches = search.answer(a, b)
         answers.append(PairAnswer(a, b, found, len(matches), sift_inliers(found, matches)))
     return answers
 
 
-def _vector(search: PairSearch, a: int, b: int) -> tuple[TwoViewVector | Refusal, BearingMatches]:
-    """One pair's homing vector and its tentative matches."""
-    views, rng = (search.features[a], search.features[b]), pair_generator(search.seed, a, b)
-    return vector_between(*views, search.matching, search.vector, rng)
-
-
 # --------------------------------------------------------------------------------------------
 # Errors of pairs
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PairErrors(Rows):
-    """Errors of the answered pairs, degrees.
-
-    Attributes:
-        direction, rotation: (n,) estimate minus truth, wrapped.
-        sigma_direction, sigma_rotation: (n,) as stated.
-        mahalanobis2: (n,) squared error in units of the stated joint covariance.
-        same_room: (n,) whether both views are of one room; None where rooms are not known.
-    """
-
-    direction: FloatArray
-    rotation: FloatArray
-    sigma_direction: FloatArray
-    sigma_rotation: FloatArray
-    mahalanobis2: FloatArray
-    same_room: BoolArray | None
-
-    @property
-    def worst(self) -> FloatArray:
-        """(n,) larger of both errors' sizes."""
-        return np.asarray(np.maximum(np.abs(self.direction), np.abs(self.rotation)))
 
 
 def true_pair(wTa: FloatArray, wTb: FloatArray) -> tuple[float, float]:
@@ -529,13 +573,18 @@ def true_pair(wTa: FloatArray, wTb: FloatArray) -> tuple[float, float]:
 
 def pair_errors(
     answers: Sequence[PairAnswer], poses: FloatArray, rooms: Sequence[str] | None = None
-) -> PairErrors:
-    """Errors of the answered pairs.
+) -> pd.DataFrame:
+    """Errors of the answered pairs, degrees, a row each.
 
     Args:
         answers: of any pairs; those without an answer are passed over.
         poses: (m, 3) true planar poses of all views, metres and radians.
         rooms: of all views; None where they are not known.
+
+    Returns:
+        ``direction`` and ``rotation`` minus truth, their stated standard deviations ``sigma_*``,
+        the squared error ``mahalanobis2`` in units of the stated joint covariance, and where rooms
+        are known whether both views are of the ``same_room``.
     """
     found = [(p, p.found) for p in answers if isinstance(p.found, TwoViewVector)]
     errors = np.zeros((len(found), 2))
@@ -546,42 +595,26 @@ def pair_errors(
         covariances[k] = vector.covariance
     solved = np.linalg.solve(covariances, errors[..., None])[..., 0]
     sigmas = np.rad2deg(np.sqrt(np.diagonal(covariances, axis1=1, axis2=2)))
-    same = None if rooms is None else np.array([rooms[p.a] == rooms[p.b] for p, _ in found], bool)
-    degrees = np.rad2deg(errors)
-    distance = np.sum(errors * solved, axis=1)
-    return PairErrors(degrees[:, 0], degrees[:, 1], sigmas[:, 0], sigmas[:, 1], distance, same)
+    table = pd.DataFrame(np.rad2deg(errors), columns=["direction", "rotation"])
+    table[["sigma_direction", "sigma_rotation"]] = sigmas
+    table["mahalanobis2"] = np.sum(errors * solved, axis=1)
+    if rooms is not None:
+        table["same_room"] = np.array([rooms[p.a] == rooms[p.b] for p, _ in found], np.bool_)
+    return table
 
 
-def error_numbers(errors: PairErrors) -> dict[str, JsonValue]:
-    """The metrics of answered pairs: errors, the worst, and whether the stated sigmas hold."""
-    numbers = _numbers(errors)
-    if errors.same_room is not None:
-        numbers["same_room"] = _numbers(errors.select(errors.same_room))
-        numbers["different_rooms"] = _numbers(errors.select(~errors.same_room))
-    return numbers
+def worst(errors: pd.DataFrame) -> FloatArray:
+    """(n,) larger of both errors' sizes, degrees."""
+    return errors[["direction", "rotation"]].abs().max(axis=1).to_numpy()
 
 
-def _numbers(errors: PairErrors) -> dict[str, JsonValue]:
-    if not len(errors):
-        return {"answered": 0}
-    direction, rotation = np.abs(errors.direction), np.abs(errors.rotation)
-    return {
-        "answered": len(errors),
-        "direction_median_deg": float(np.median(direction)),
-        "direction_p95_deg": float(np.percentile(direction, 95)),
-        "direction_worst_deg": float(direction.max()),
-        "rotation_median_deg": float(np.median(rotation)),
-        "rotation_p95_deg": float(np.percentile(rotation, 95)),
-        "rotation_worst_deg": float(rotation.max()),
-        "worse_than_10_deg": int(np.count_nonzero(errors.worst > WRONG_DEG)),
-        "covered_joint_95": float(np.mean(errors.mahalanobis2 <= chi_square_quantile(0.95, 2))),
-        "covered_direction_2_sigma": float(np.mean(direction <= 2.0 * errors.sigma_direction)),
-        "covered_rotation_2_sigma": float(np.mean(rotation <= 2.0 * errors.sigma_rotation)),
-        "nees_per_dof": float(np.mean(errors.mahalanobis2) / 2.0),
-    }
+def _numbers(answers: Sequence[PairAnswer], views: OmniRecording) -> dict[str, Any]:
+    poses, rooms = views.poses, views.rooms
+    errors = None if poses is None else error_numbers(pair_errors(answers, poses, rooms))
+    return answer_numbers(answers) | {"errors": errors}
 
 
-def answer_numbers(answers: Sequence[PairAnswer]) -> dict[str, JsonValue]:
+def answer_numbers(answers: Sequence[PairAnswer]) -> dict[str, Any]:
     """How many pairs were answered, and why the others were not."""
     reasons = Counter(p.found.reason.value for p in answers if isinstance(p.found, Refusal))
     inliers = [pair.inliers for pair in answers if pair.answered]
@@ -589,36 +622,31 @@ def answer_numbers(answers: Sequence[PairAnswer]) -> dict[str, JsonValue]:
         "pairs": len(answers),
         "answered": len(inliers),
         "refused": dict(sorted(reasons.items())),
-        "inliers_median": float(np.median(inliers)) if inliers else None,
+        "inliers_median": median(inliers),
     }
 
 
-def _judged(
-    answers: Sequence[PairAnswer], views: OmniRecording
-) -> tuple[PairErrors | None, dict[str, JsonValue]]:
-    """Errors against the true poses, and the numbers; the errors are null where there are none."""
-    errors = None if views.poses is None else pair_errors(answers, views.poses, views.rooms)
-    of_errors = {"errors": None if errors is None else error_numbers(errors)}
-    return errors, answer_numbers(answers) | of_errors
-
-
-def _accuracy(numbers: dict[str, JsonValue], errors: PairErrors | None) -> list[str]:
-    lines = [f"{numbers['answered']} of {numbers['pairs']} pairs are answered."]
-    reference = numbers["reference"]
-    if isinstance(reference, dict):
-        lines.append(
-            f"Plain SIFT with at least {PLAIN_INLIERS} inliers answers {reference['answered']}."
-        )
-    if errors is None:
-        lines.append("How accurate they are is not known: there are no true poses.")
-    elif len(errors):
-        direction = np.median(np.abs(errors.direction))
-        rotation = np.median(np.abs(errors.rotation))
-        lines.append(
-            f"The median error is {direction:.2f} degrees of the direction and {rotation:.2f} of "
-            f"the rotation; the worst answer is off by {errors.worst.max():.1f} degrees."
-        )
-    return lines
+def error_numbers(errors: pd.DataFrame) -> dict[str, Any]:
+    """The metrics of :func:`pair_errors`: sizes, the worst, and whether the sigmas hold."""
+    numbers: dict[str, Any] = {"answered": len(errors)}
+    if len(errors):
+        for name in ("direction", "rotation"):
+            size = errors[name].abs().to_numpy()
+            numbers[f"{name}_median_deg"] = float(np.median(size))
+            numbers[f"{name}_p95_deg"] = float(np.percentile(size, 95))
+            numbers[f"{name}_worst_deg"] = float(size.max())
+        numbers["worse_than_10_deg"] = int(np.count_nonzero(worst(errors) > WRONG_DEG))
+        squared = errors["mahalanobis2"].to_numpy()
+        numbers["covered_joint_95"] = float(np.mean(squared <= chi_square_quantile(0.95, 2)))
+        for name in ("direction", "rotation"):
+            held = errors[name].abs() <= 2.0 * errors[f"sigma_{name}"]
+            numbers[f"covered_{name}_2_sigma"] = float(np.mean(held))
+        numbers["nees_per_dof"] = float(np.mean(squared) / 2.0)
+    if "same_room" in errors:
+        same, plain = errors["same_room"], errors.drop(columns="same_room")
+        numbers["same_room"] = error_numbers(plain[same])
+        numbers["different_rooms"] = error_numbers(plain[~same])
+    return numbers
 
 
 _ERROR_COLUMNS = (
@@ -633,26 +661,23 @@ _ERROR_COLUMNS = (
 )
 
 
-def error_tables(errors: PairErrors | None) -> tuple[TextTable, ...]:
-    """The numbers of all pairs, and of those within one room and not; none without true poses."""
-    if errors is None:
+def error_tables(numbers: Mapping[str, Any] | None) -> tuple[TextTable, ...]:
+    """:func:`error_numbers` of all pairs, and of those within one room and not; none without."""
+    if numbers is None:
         return ()
-    numbers = error_numbers(errors)
-    groups = {
-        "all pairs": numbers,
-        "same room": numbers.get("same_room"),
-        "different rooms": numbers.get("different_rooms"),
-    }
+    groups = {"all pairs": numbers}
+    for name in ("same_room", "different_rooms"):
+        if name in numbers:
+            groups[name.replace("_", " ")] = numbers[name]
     rows = tuple(
         (
             name,
             tuple(
-                format(group[key], spec).replace("%", " %") if key in group else "-"
+                format(group[key], spec).replace("%", " %") if key in group else UNKNOWN
                 for _, key, _, spec in _ERROR_COLUMNS
             ),
         )
         for name, group in groups.items()
-        if isinstance(group, dict)
     )
     columns = tuple(Column(name, meaning) for name, _, meaning, _ in _ERROR_COLUMNS)
     return (TextTable("errors", "Errors of the answered pairs", "pairs", columns, rows),)
@@ -660,180 +685,42 @@ def error_tables(errors: PairErrors | None) -> tuple[TextTable, ...]:
 
 def write_pairs(path: Path, answers: Sequence[PairAnswer], names: Sequence[str]) -> None:
     """pairs.csv: a row for each pair, degrees, counter-clockwise positive. Raises OutputError."""
-    columns = (
-        "from",
-        "to",
-        "answered",
-        "direction_deg",
-        "sigma_direction_deg",
-        "rotation_deg",
-        "sigma_rotation_deg",
-        "inliers",
-        "reason",
-    )
-    write_csv(path, columns, (_pair_row(pair, names) for pair in answers))
+    write_csv(path, _PAIR_COLUMNS, (_pair_row(pair, names) for pair in answers))
 
 
-def _pair_row(pair: PairAnswer, names: Sequence[str]) -> list[Cell]:
-    start: list[Cell] = [names[pair.a], names[pair.b], pair.answered]
-    found = pair.found
+_PAIR_COLUMNS = (
+    "from", "to", "answered", "direction_deg", "sigma_direction_deg", "rotation_deg",
+    "sigma_rotation_deg", "inliers", "reason",
+)  # fmt: skip
+
+
+def _pair_row(pair: PairAnswer, names: Sequence[str]) -> list[Any]:
+    start, found = [names[pair.a], names[pair.b], pair.answered], pair.found
     if isinstance(found, TwoViewVector):
         sigma = np.rad2deg(np.sqrt(np.diagonal(found.covariance)))
         direction, rotation = np.rad2deg([found.direction, found.rotation])
         return [*start, direction, sigma[0], rotation, sigma[1], found.support, ""]
-    turn = None if found.rotation is None else float(np.rad2deg(found.rotation))
+    turn = None if found.rotation is None else np.rad2deg(found.rotation)
     return [*start, None, None, turn, None, 0, found.reason.value]
-
-
-# --------------------------------------------------------------------------------------------
-# Numbers and words of the map
-
-
-def _map_numbers(
-    topology: TopologicalMap,
-    views: OmniRecording,
-    tried: int,
-    kilobytes: float,
-    routes: Sequence[Route],
-    located: list[Localised] | None,
-) -> dict[str, JsonValue]:
-    parts = topology.components()
-    gaps = [link.b - link.a for link in topology.links]
-    lengths = link_lengths(topology, views.poses)
-    return {
-        "nodes": len(topology),
-        "homings_tried": tried,
-        "links": len(topology.links),
-        "components": len(parts),
-        "largest_component": len(parts[0]) if parts else 0,
-        "outside_largest": [topology.names[k] for part in parts[1:] for k in part.tolist()],
-        "longest_link_places": max(gaps, default=None),
-        "longest_link_m": None if lengths is None or not len(lengths) else float(lengths.max()),
-        "least_support": min((link.support for link in topology.links), default=None),
-        "pairs_not_linked": len(topology.rejected),
-        "kilobytes_per_view": kilobytes,
-        "routes": [
-            {"asked": list(r.asked), "found": list(r.found), "reason": r.reason or None}
-            for r in routes
-        ],
-        "routes_found": sum(not r.reason for r in routes),
-        "localisation": None
-        if located is None
-        else {
-            "held_out": len(located),
-            "at_a_neighbour": sum(one.neighbour for one in located),
-            "last_probability": located[-1].probability if located else None,
-        },
-    }
-
-
-def _map_sentences(
-    topology: TopologicalMap, routes: Sequence[Route], located: list[Localised] | None
-) -> tuple[str, ...]:
-    parts = topology.components()
-    largest = len(parts[0]) if parts else 0
-    lines = [
-        f"{largest} of {len(topology)} views are connected by {len(topology.links)} links; "
-        f"there are {len(parts)} parts."
-    ]
-    lines += [
-        f"From {r.asked[0]} to {r.asked[-1]}: {'-'.join(r.found) or 'no way'}." for r in routes
-    ]
-    if located:
-        right = sum(one.neighbour for one in located)
-        lines.append(f"Localisation finds {right} of {len(located)} held-out views at a neighbour.")
-    return tuple(lines)
-
-
-def _map_table(numbers: Mapping[str, JsonValue]) -> TextTable:
-    rows = {
-        "nodes": "nodes",
-        "links": "links",
-        "parts": "components",
-        "views in the largest part": "largest_component",
-        "longest link, places apart in the recording": "longest_link_places",
-        "longest link, metres": "longest_link_m",
-        "fewest inliers of a link": "least_support",
-        "pairs tried and not linked": "pairs_not_linked",
-    }
-    cells = tuple((name, (quantity(numbers[key], 2),)) for name, key in rows.items())
-    column = Column("value", "of the whole map; links.csv has each link")
-    return TextTable("map", "The map", "quantity", (column,), cells)
-
-
-def quantity(value: JsonValue, decimals: int) -> str:
-    """A number of metrics.json as text; a dash where it is not known."""
-    if value is None:
-        return "-"
-    return f"{value:.{decimals}f}" if isinstance(value, float) else str(value)
-
-
-def link_lengths(topology: TopologicalMap, poses: FloatArray | None) -> FloatArray | None:
-    """(m,) lengths of the links between places (n, 3), metres; None without these."""
-    if poses is None:
-        return None
-    ends = [(poses[k.a, :2], poses[k.b, :2]) for k in topology.links]
-    return np.array([float(np.hypot(*(b - a))) for a, b in ends])
-
-
-def write_links(folder: Path, topology: TopologicalMap, poses: FloatArray | None = None) -> None:
-    """links.csv; lengths where places (n, 3) are known. Raises OutputError."""
-    columns = (
-        "from",
-        "to",
-        "direction_deg",
-        "sigma_direction_deg",
-        "rotation_deg",
-        "sigma_rotation_deg",
-        "back_deg",
-        "inliers",
-        "cost",
-        "places_apart",
-        "distance_m",
-    )
-    lengths = link_lengths(topology, poses)
-    rows: list[list[Cell]] = []
-    for k, link in enumerate(topology.links):
-        sigma = np.rad2deg(np.sqrt(np.diagonal(link.covariance)))
-        direction, rotation, back = np.rad2deg([link.direction, link.rotation, link.back])
-        ends = [topology.names[link.a], topology.names[link.b]]
-        length = None if lengths is None else float(lengths[k])
-        of_map = [link.support, float(topology.costs[k]), link.b - link.a, length]
-        rows.append([*ends, direction, sigma[0], rotation, sigma[1], back, *of_map])
-    write_csv(folder / LINKS_FILE, columns, rows)
 
 
 # --------------------------------------------------------------------------------------------
 # Figures and pictures
 
 
-def _figures(
-    errors: PairErrors | None, answers: Sequence[PairAnswer], views: OmniRecording
+def _pair_figures(
+    errors: pd.DataFrame, answers: Sequence[PairAnswer], poses: FloatArray, names: Sequence[str]
 ) -> Iterator[Figure]:
-    """Where the answered pairs lie, and how good they are; nothing without true poses."""
-    if errors is None or views.poses is None:
-        return
-    yield _pairs_figure(errors, answers, views.poses, view_names(views))
-    true = {"direction": errors.direction, "rotation": errors.rotation}
-    claimed = {"direction": errors.sigma_direction, "rotation": errors.sigma_rotation}
-    yield sorted_errors(true, "degrees", ("errors", "Errors of the answered pairs"))
-    yield claimed_against_true(claimed, true)
-
-
-def _pairs_figure(
-    errors: PairErrors, answers: Sequence[PairAnswer], poses: FloatArray, names: Sequence[str]
-) -> Figure:
-    """The pairs from above, by the size of their errors."""
-    limits = (0.0, _GOOD_DEG, WRONG_DEG, np.inf)
-    kinds = (
-        f"off by less than {_GOOD_DEG:g} degrees",
-        f"off by {_GOOD_DEG:g} to {WRONG_DEG:g} degrees",
-        f"off by more than {WRONG_DEG:g} degrees",
-    )
-    answered = [answer for answer in answers if answer.answered]
+    """The pairs from above by the size of their errors, and how good they are."""
+    kinds = {
+        f"off by less than {_GOOD_DEG:g} degrees": (0.0, _GOOD_DEG),
+        f"off by {_GOOD_DEG:g} to {WRONG_DEG:g} degrees": (_GOOD_DEG, WRONG_DEG),
+        f"off by more than {WRONG_DEG:g} degrees": (WRONG_DEG, np.inf),
+    }
+    answered, size = [answer for answer in answers if answer.answered], worst(errors)
     links = []
-    for k, kind in enumerate(kinds):
-        rows = np.flatnonzero((errors.worst >= limits[k]) & (errors.worst < limits[k + 1]))
+    for k, (kind, (low, high)) in enumerate(kinds.items()):
+        rows = np.flatnonzero((size >= low) & (size < high)).tolist()
         pairs = tuple((answered[i].a, answered[i].b) for i in rows)
         labels = tuple(
             f"{names[answered[i].a]} to {names[answered[i].b]}: direction off by "
@@ -844,13 +731,15 @@ def _pairs_figure(
     refused = tuple((answer.a, answer.b) for answer in answers if not answer.answered)
     labels = tuple(f"{names[a]} to {names[b]}: refused" for a, b in refused)
     links.append(Links("refused", 3, refused, labels, shown=False))
-    words = (
-        "pairs",
-        "The pairs, from above",
+    about = (
         "Views at their true places, and the pairs that are answered; the switches choose by the "
-        "larger of the errors of direction and rotation.",
+        "larger of the errors of direction and rotation."
     )
-    return network_figure(words, poses[:, :2], names, links)
+    yield network_figure(("pairs", "The pairs, from above", about), poses[:, :2], names, links)
+    true = {name: errors[name].to_numpy() for name in ("direction", "rotation")}
+    claimed = {name: errors[f"sigma_{name}"].to_numpy() for name in true}
+    yield sorted_errors(true, "degrees", ("errors", "Errors of the answered pairs"))
+    yield claimed_against_true(claimed, true)
 
 
 def map_figure(topology: TopologicalMap, poses: FloatArray | None = None) -> Figure:
@@ -870,7 +759,7 @@ def map_figure(topology: TopologicalMap, poses: FloatArray | None = None) -> Fig
         Links("links", 0, pairs, tuple(_link_label(names, link) for link in topology.links)),
         Links("tried, no link", 1, rejected, why, shown=False),
     )
-    words = ("map", "The topological map", f"{where} A line is a homing that is believed.")
+    words = ("map", "The topological map", f"{where} A line is a homing that is accepted.")
     return network_figure(words, places, names, kinds, axes)
 
 
@@ -885,29 +774,28 @@ def draw_doubtful(
     folder: Path,
     views: OmniRecording,
     search: PairSearch,
-    answers: Sequence[PairAnswer],
-    doubts: FloatArray,
+    answered: Sequence[PairAnswer],
+    doubts: FloatArray | IntArray,
     count: int,
 ) -> tuple[Picture, ...]:
-    """Draws at most ``count`` answered pairs: half the most doubtful, half spread over the rest.
+    """Draws at most ``count`` answers: half the most doubtful, half spread over the rest.
 
-    ``doubts`` (n,) of the answered ones: errors, or inliers, negated.
+    ``doubts`` (n,): errors, or inliers, negated.
     """
-    answered = [answer for answer in answers if answer.answered]
     order = np.argsort(-doubts, kind="stable")
-    worst, rest = order[: (count + 1) // 2], order[(count + 1) // 2 :]
+    first, rest = order[: (count + 1) // 2], order[(count + 1) // 2 :]
     spread = rest[np.linspace(0, len(rest) - 1, min(count // 2, len(rest))).round().astype(int)]
-    chosen = [answered[i] for i in (*worst, *spread)]
-    return tuple(draw_pair(folder, views, search, answer) for answer in chosen)
+    return tuple(_draw_pair(folder, views, search, answered[i]) for i in (*first, *spread))
 
 
-def draw_pair(
+def _draw_pair(
     folder: Path, views: OmniRecording, search: PairSearch, answer: PairAnswer
 ) -> Picture:
     """One pair: its accepted matches on both views."""
     from fgslam.report.pictures import MatchedPixels, draw_view_matches
 
-    vector, matches = _vector(search, answer.a, answer.b)
+    vector, matches = search.answer(answer.a, answer.b)
+    kept, caption = matches.select(np.zeros(len(matches), np.bool_)), "refused"
     if isinstance(vector, TwoViewVector):
         kept = matches.select(vector.inliers)
         direction, rotation = np.rad2deg([vector.direction, vector.rotation])
@@ -915,18 +803,17 @@ def draw_pair(
             f"{vector.support} of {len(matches)} matches, direction {direction:.1f}, "
             f"rotation {rotation:.1f} degrees"
         )
-    else:
-        kept, caption = matches.select(np.zeros(len(matches), np.bool_)), "refused"
     pixels = MatchedPixels(
         _pixels(views.camera, kept.bearing_a, kept.elevation_a),
         _pixels(views.camera, kept.bearing_b, kept.elevation_b),
         kept.kind == FeatureKind.COLUMN,
     )
     a, b = view_names(views)[answer.a], view_names(views)[answer.b]
-    path = make_subfolder(folder, "pictures") / f"matches_{a}_{b}.png"
     images = views.image(answer.a), views.image(answer.b)
-    draw_view_matches(path, images, pixels, (f"view {a}: {caption}", f"view {b}"))
-    return Picture(f"Matches of views {a} and {b}: {caption}", path.read_bytes())
+    titles = (f"view {a}: {caption}", f"view {b}")
+    draw = partial(draw_view_matches, images=images, matches=pixels, titles=titles)
+    about = f"Matches of views {a} and {b}: {caption}"
+    return draw_picture(folder, f"matches_{a}_{b}.png", about, draw)
 
 
 def _pixels(camera: OmniCamera, bearing: FloatArray, elevation: FloatArray) -> FloatArray:

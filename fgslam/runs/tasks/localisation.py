@@ -73,7 +73,6 @@ from fgslam.runs.engine import (
     RunResult,
     Task,
     provenance_of,
-    write_page,
 )
 from fgslam.runs.folder import (
     METRICS_FILE,
@@ -84,6 +83,7 @@ from fgslam.runs.folder import (
     write_config,
 )
 from fgslam.runs.opening import open_sequence
+from fgslam.runs.results import write_page
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.tasks.slam_results import Sighted, TrueSights, TruthInMap, truth_in_map
@@ -665,7 +665,7 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
         pictures = make_subfolder(folder, "pictures")
         for frames, figure in figures.items():
             draw_figure(pictures / f"localisation_{frames}.png", figure, figure.heading)
-    write_page(result, subtitle, figures=tuple(figures.values()))
+    write_page(result, subtitle, tuple(figures.values()))
 
 
 def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
