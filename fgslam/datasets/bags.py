@@ -53,11 +53,11 @@ from fgslam.datasets.depth import (
 from fgslam.datasets.images import bits_held, mosaic_note, require_size
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
 from fgslam.datasets.odometry import (
-    AnyLog,
+    POSE_COLUMNS,
+    RATE_COLUMNS,
+    SPEED_COLUMNS,
     OdometrySource,
-    checked_poses,
-    checked_rates,
-    checked_speeds,
+    motions_of,
     recorded_motions,
 )
 from fgslam.datasets.recording import (
@@ -71,7 +71,7 @@ from fgslam.datasets.recording import (
     recording_identity,
 )
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
-from fgslam.datasets.times import NANOSECONDS, Table, pair_all
+from fgslam.datasets.times import NANOSECONDS, Table, pair_stamps
 
 T = TypeVar("T")
 
@@ -105,7 +105,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         for side, view in zip(("left", "top"), views[1:], strict=False)
     ]
     tolerance = 1e-3 * settings.pairing_tolerance_ms
-    rows, unpaired = pair_all(index.stamps[chosen.right], others, tolerance, chosen.right)
+    rows, unpaired = pair_stamps(index.stamps[chosen.right], others, tolerance, chosen.right)
     places = np.column_stack([index.places[v][rows[:, k]] for k, v in enumerate(views)])
     held = images.use_bits(places[:, 0])
     load, size, sigma = images.rectified(places, rig), rig.image_size, None
@@ -487,7 +487,7 @@ def _odometry_source(
     if topic is None or len(stamps) == 0:
         return None
 
-    def read() -> AnyLog:
+    def read() -> OdometrySource:
         order = np.argsort(stamps, kind="stable")  # of equal stamps the first counts
         kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0.0])]
         rows = np.column_stack([stamps, values])[kept]
@@ -497,14 +497,11 @@ def _odometry_source(
                 f"{topic.name}, message {kept[bad[0]] + 1}: not finite; record it again, or choose "
                 "another odometry.kind"
             )
-        table = Table(Path(topic.name), rows, kept + 1)
-        if topic.kind == messages.ODOMETRY:
-            return checked_poses(table, settings)
-        if topic.kind == messages.IMU:
-            return checked_rates(table, settings)
-        return checked_speeds(table, settings)
+        names = {messages.ODOMETRY: POSE_COLUMNS, messages.IMU: RATE_COLUMNS}
+        table = Table(Path(topic.name), rows, kept + 1, names.get(topic.kind, SPEED_COLUMNS))
+        return motions_of(table, settings)
 
-    return recorded_motions(topic.name, read, settings)
+    return recorded_motions(topic.name, read)
 
 
 # --------------------------------------------------------------------------------------------

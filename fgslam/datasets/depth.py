@@ -227,11 +227,10 @@ def _pairs(
     if all(path.is_file() for path in lists):
         (colour_at, colours), (depth_at, depths) = (_listed(path) for path in lists)
         tolerance = 1e-3 * settings.pairing_tolerance_ms
-        names = (str(lists[0]), str(lists[1]))
-        (rows, partners), notes = pair_stamps(colour_at, depth_at, tolerance, names)
-        numbers = zip(rows.tolist(), partners.tolist(), strict=True)
-        pairs = tuple((colours[i], depths[j]) for i, j in numbers)
-        stamps = NANOSECONDS * colour_at[rows].astype(np.float64)
+        others = [("left", str(lists[1]), depth_at)]
+        rows, notes = pair_stamps(colour_at, others, tolerance, str(lists[0]))
+        pairs = tuple((colours[i], depths[j]) for i, j in rows.tolist())
+        stamps = NANOSECONDS * colour_at[rows[:, 0]].astype(np.float64)
         return pairs, stamps, colour_and_depth_notes(notes), lists
     folders, mixed = colour_and_depth(root), None
     if folders is None:

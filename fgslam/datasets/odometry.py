@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TypeAlias
@@ -26,28 +26,73 @@ from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
 from fgslam.core.types import Trajectory
 from fgslam.datasets.settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.times import (
-    SLOWEST_MOTION_S,
     TUM_COLUMNS,
     Table,
-    finite_number,
     interpolate_poses,
+    poses_of,
     read_table,
     require_increasing,
     rows_at,
     time_unit,
-    trajectory_of,
 )
 
-OdometrySource: TypeAlias = Callable[[FloatArray], tuple[Odometry | None, ...]]
+Steps: TypeAlias = tuple[Odometry | None, ...]
+OdometrySource: TypeAlias = Callable[[FloatArray], Steps]
 """Body motions between consecutive stamps (n,): n - 1 of them, None where nothing was recorded."""
 
 # --------------------------------------------------------------------------------------------
-# Files
+# Files and their columns
 
 
-_POSES = ("odometry.txt", "odom.txt")  # the second of OpenLORIS
-_SPEED_COLUMNS = ("time", "forward speed", "yaw rate")
-_RATE_COLUMNS = ("time", "angular velocity x", "y", "z")
+SPEED_COLUMNS = ("time", "speed", "yaw_rate")
+RATE_COLUMNS = ("time", "rate_x", "rate_y", "yaw_rate")
+POSE_COLUMNS = ("time", *TUM_COLUMNS[1:])
+"""Roles of the columns of speeds, of a gyroscope and of poses, in seconds, metres and radians."""
+
+_UNNAMED = {
+    "speeds": (("time", "forward speed", "yaw rate"), ","),
+    "rates": (("time", *(f"angular velocity {axis}" for axis in "xyz")), ","),
+    "poses": (TUM_COLUMNS, None),
+}
+"""Columns of files without names of columns, and what separates them."""
+
+_NAMES = {
+    "time": "t time stamp timestamp sec secs seconds header_stamp",
+    "speed": "v vx speed velocity forward_speed linear_x linear_velocity twist_linear_x v_forward",
+    "yaw_rate": "w wz omega yaw_rate yawrate turn_rate angular_z angular_velocity "
+    "twist_angular_z gyro_z w_z omega_z angular_velocity_z gz gyr_z rotation_rate_z w_rs_s_z",
+    "rate_x": "wx w_x omega_x angular_x angular_velocity_x gyro_x gx gyr_x rotation_rate_x "
+    "w_rs_s_x",
+    "rate_y": "wy w_y omega_y angular_y angular_velocity_y gyro_y gy gyr_y rotation_rate_y "
+    "w_rs_s_y",
+    "left_speed": "v_left left_speed speed_left left_velocity velocity_left vl v_l",
+    "right_speed": "v_right right_speed speed_right right_velocity velocity_right vr v_r",
+    "left_ticks": "left_ticks ticks_left left_encoder encoder_left left_count count_left left",
+    "right_ticks": "right_ticks ticks_right right_encoder encoder_right right_count count_right "
+    "right",
+    **{axis: f"{axis} p{axis} pos_{axis} position_{axis} pose_{axis} t{axis}" for axis in "xyz"},
+    "yaw": "yaw theta heading phi",
+    **{f"q{axis}": f"q{axis} q_{axis} orientation_{axis}" for axis in "xyzw"},
+}
+"""Names of the columns of each role, in small letters, anything else as `_`."""
+
+_ROLES = {name: role for role, names in _NAMES.items() for name in names.split()}
+_UNITS = {
+    unit: factor
+    for factor, units in (
+        (1e-9, "ns nsec"),
+        (1e-6, "us"),
+        (1e-3, "ms mm mm_s"),
+        (1e-2, "cm cm_s"),
+        (1.0, "s m m_s mps rad rad_s radps rps rad_s_1"),
+        (1 / 3.6, "kmh km_h kph"),
+        (np.pi / 180.0, "deg degrees dps deg_s degps deg_s_1"),
+    )
+    for unit in units.split()
+}
+"""Units at the end of a name, in seconds, metres, radians."""
+
+_SLOWEST_S, _SLOWEST_GYROSCOPE_S = 1.0, 0.1  # between two samples: what makes a unit plausible
 
 
 def find_odometry(root: Path, name: str | None) -> Path | None:
@@ -65,16 +110,16 @@ def find_odometry(root: Path, name: str | None) -> Path | None:
                 "it out"
             )
         return root / name
-    found = [*(root / name for name in _POSES), *sorted(root.glob("odom*.csv"))]
-    candidates = [path for path in found if path.is_file()]
-    if not candidates:  # wheels say more than a gyroscope
-        candidates = [path for path in sorted(root.glob("*.csv")) if is_of_gyroscope(path)]
-    if len(candidates) > 1:
+    named = (root / "odometry.txt", root / "odom.txt")  # the second of OpenLORIS
+    found = [path for path in (*named, *sorted(root.glob("odom*.csv"))) if path.is_file()]
+    # Wheels measure more than a gyroscope.
+    found = found or [path for path in sorted(root.glob("*.csv")) if is_of_gyroscope(path)]
+    if len(found) > 1:
         raise DatasetError(
-            f"{root} has several odometry files ({', '.join(p.name for p in candidates)}); name "
+            f"{root} has several odometry files ({', '.join(p.name for p in found)}); name "
             "one in dataset.odometry_file"
         )
-    return candidates[0] if candidates else None
+    return found[0] if found else None
 
 
 def is_of_gyroscope(path: Path) -> bool:
@@ -86,42 +131,44 @@ def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> Odom
     """Body motions by a file, which is read when they are first needed; None without a file."""
     if path is None:
         return None
-
-    def read() -> AnyLog:
-        if _has_named_columns(path):
-            return _read_named_columns(path, settings)
-        if is_of_gyroscope(path):
-            return checked_rates(read_rates(path), settings)
-        if path.suffix == ".csv":
-            return checked_speeds(read_table(path, _SPEED_COLUMNS, ",", OdometryError), settings)
-        return checked_poses(read_table(path, TUM_COLUMNS, error=OdometryError), settings)
-
-    return recorded_motions(str(path), read, settings)
+    kind = "rates" if is_of_gyroscope(path) else "speeds" if path.suffix == ".csv" else "poses"
+    return recorded_motions(str(path), lambda: motions_of(read_columns(path, kind), settings))
 
 
-def recorded_motions(
-    name: str, read: Callable[[], AnyLog], settings: RecordedOdometrySettings
+def gyroscope_odometry(
+    path: Path, mounting: Path | None, noise: Path | None, settings: RecordedOdometrySettings
 ) -> OdometrySource:
-    """Body motions by a log that is read when motions are first asked for.
+    """Turns of the body by a file of rates, and what other files state of the sensor.
 
     Args:
-        name: of the file or topic, for messages.
-        read: the log; raises OdometryError where it is malformed.
-        settings: noise and limits.
+        path: seconds, or another unit of time, and rad/s about the sensor's axes.
+        mounting: sensor.yaml with the sensor's pose in the body; None: its axes are the body's.
+        noise: as :func:`read_gyroscope_noise` reads it; None for the default.
+        settings: limits and time offset.
 
     Raises:
-        OdometryError: (when motions are asked for) it covers none of the frames.
+        OdometryError: (when motions are asked for) the file of rates is malformed.
+        CalibrationError: (then) another one is.
+    """
+
+    def read() -> OdometrySource:
+        bRs = None if mounting is None else read_asl_mounting(mounting)[:3, :3]
+        stated = GyroscopeNoise() if noise is None else read_gyroscope_noise(noise)
+        return motions_of(read_columns(path, "rates"), settings, bRs, stated)
+
+    return recorded_motions(str(path), read)
+
+
+def recorded_motions(name: str, read: Callable[[], OdometrySource]) -> OdometrySource:
+    """Body motions of a file or topic that is read when motions are first asked for.
+
+    Raises:
+        OdometryError: (when motions are asked for) it is malformed, or covers none of the frames.
     """
     read = cache(read)  # motions are asked for again with the clock shifted
 
-    def source(frames: FloatArray) -> tuple[Odometry | None, ...]:
-        log = read()
-        if isinstance(log, SpeedLog):
-            steps = motions_from_speed(log, frames, settings)
-        elif isinstance(log, GyroscopeLog):
-            steps = motions_from_gyroscope(log, frames)
-        else:
-            steps = motions_from_poses(log, frames, settings)
+    def source(frames: FloatArray) -> Steps:
+        steps = read()(frames)
         if len(frames) > 1 and all(step is None for step in steps):
             raise OdometryError(
                 f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
@@ -132,200 +179,53 @@ def recorded_motions(
     return source
 
 
-def _check_samples(table: Table) -> None:
-    if len(table) < 2:
-        raise OdometryError(
-            f"{table.path} holds {len(table)} samples, at least 2 are needed; restore the file, or "
-            "choose another odometry.kind (constant_velocity, synthetic)"
-        )
-    require_increasing(table, table.column(0), OdometryError)
+def read_columns(path: Path, kind: str) -> Table:
+    """The columns of known roles, in seconds, metres and radians; the first of a role counts.
+
+    Args:
+        path: the file, perhaps with names of columns in its first line.
+        kind: what the columns are where they have no names: speeds, rates or poses.
+
+    Raises:
+        OdometryError: a line is malformed, a number not finite, or no column is of time.
+    """
+    lines = read_lines(path, OdometryError)
+    names, delimiter = _UNNAMED[kind]
+    if lines and re.search(r"[A-Za-z]", re.sub(r"[eE][-+]?\d", "", lines[0][1])):
+        _, header = lines.pop(0)
+        delimiter = next((mark for mark in ",;\t" if mark in header), None)
+        names = tuple(header.split(delimiter))
+    known = [_role(name) for name in names]
+    roles, factors = zip(*filter(None, known), strict=True) if any(known) else ((), ())
+    if "time" not in roles:
+        raise OdometryError(f"{path}: no column is named time; name the columns")
+    used = [name.strip() if role else None for name, role in zip(names, known, strict=True)]
+    table = read_table(path, used, delimiter, OdometryError, lines)
+    values = table.values * np.where(np.isnan(factors), 1.0, factors)
+    if np.isnan(factors[k := roles.index("time")]):
+        slowest = _SLOWEST_GYROSCOPE_S if "rate_x" in roles else _SLOWEST_S
+        timed = kind == "rates" or names != _UNNAMED[kind][0]  # of others without names: seconds
+        values[:, k] *= time_unit(values[:, k], slowest)[1] if timed else 1.0
+    return Table(path, values, table.lines, roles)
 
 
-def _require_sane(
-    table: Table, values: FloatArray, limit: float, what: str, unit: str, hint: str = ""
-) -> None:
-    """Raises OdometryError, naming the line, if one of the values (n,) exceeds the limit."""
-    bad = np.flatnonzero(np.abs(values) > limit)
-    if len(bad):
-        k = int(bad[0])
-        raise OdometryError(
-            f"{table.path}, line {table.lines[k]}: {what} of {values[k]:.4g} {unit} is absurd "
-            f"(limit {limit:g}){hint}; correct the line"
-        )
+def _role(name: str) -> tuple[str, float] | None:
+    """What a column is, and what its numbers are multiplied by: NaN for times of unknown unit."""
+    clean = re.sub(r"[^a-z0-9]+", "_", name.strip().lower()).strip("_")
+    if role := _ROLES.get(clean):
+        return role, np.nan if role == "time" else 1.0
+    for unit in sorted(_UNITS, key=len, reverse=True):
+        if clean.endswith(f"_{unit}") and (role := _ROLES.get(clean.removesuffix(f"_{unit}"))):
+            return role, _UNITS[unit]
+    return None
+
+
+# --------------------------------------------------------------------------------------------
+# What the columns measure
 
 
 # Faster samples are absurd: of cars, drones and hands none of the data sets comes near.
 _MAX_SPEED_MPS, _MAX_TURN_DPS = 60.0, 720.0
-_ARE_DEGREES = ", radians are expected: are these degrees?"
-
-
-def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float, hold: float) -> BoolArray:
-    """Which of the n - 1 steps between frames (n,) the increasing stamps (m,) cover.
-
-    A step is covered unless it overlaps a gap between stamps longer than ``max_gap`` seconds, or
-    reaches more than ``hold`` seconds beyond the first or last stamp.
-    """
-    before, after = frames[:-1], frames[1:]
-    long = np.diff(stamps) > max_gap
-    starts, ends = stamps[:-1][long], stamps[1:][long]
-    overlapped = np.searchsorted(starts, after, "left") - np.searchsorted(ends, before, "right")
-    within = (before >= stamps[0] - hold) & (after <= stamps[-1] + hold)
-    return np.asarray(within & (overlapped == 0))
-
-
-def _motions(
-    poses: FloatArray, covariances: Sequence[FloatArray], known: BoolArray
-) -> tuple[Odometry | None, ...]:
-    motions = inverse(poses[:-1]) @ poses[1:]
-    steps = zip(motions, covariances, known, strict=True)
-    return tuple(Odometry(m, c) if ok else None for m, c, ok in steps)
-
-
-# --------------------------------------------------------------------------------------------
-# Speed and yaw rate
-
-
-# What speed and yaw rate leave unmeasured; by KITTI raw 2011_09_26, as the settings' defaults.
-_LATERAL_SIGMA_MPS, _VERTICAL_SIGMA_MPS = 0.08, 0.12
-_ROLL_RATE_SIGMA_DPS, _PITCH_RATE_SIGMA_DPS = 1.3, 1.9
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SpeedLog:
-    """Forward speed (n,) in m/s and yaw rate (n,) in rad/s, counter-clockwise, at stamps (n,)."""
-
-    stamps: FloatArray
-    speed: FloatArray
-    yaw_rate: FloatArray
-
-
-def checked_speeds(table: Table, settings: RecordedOdometrySettings) -> SpeedLog:
-    """Rows (time, forward speed in m/s, yaw rate in rad/s) as a log.
-
-    Raises:
-        OdometryError: rows are too few, out of time order, or absurd.
-    """
-    _check_samples(table)
-    time, speed, yaw_rate = (table.column(k) for k in range(3))
-    _require_sane(table, speed, _MAX_SPEED_MPS, "forward speed", "m/s")
-    turn, limit = np.degrees(yaw_rate), _MAX_TURN_DPS
-    _require_sane(table, turn, limit, "yaw rate", "degrees/s", _ARE_DEGREES)
-    return SpeedLog(time + settings.time_offset_s, speed, yaw_rate)
-
-
-def planar_poses(log: SpeedLog, at: FloatArray) -> FloatArray:
-    """(x, y, yaw) (m, 3) at increasing times (m,): the path of interpolated speed and yaw rate.
-
-    Between neighbouring stamps both are linear in time: the turn follows exactly, the path by
-    Gauss-Legendre quadrature, exact to rounding for turns below a radian between two stamps.
-    Outside the log the nearest sample is held.
-    """
-    times = np.union1d(log.stamps, at)
-    duration = np.diff(times)
-    speed, rate = (np.interp(times, log.stamps, y) for y in (log.speed, log.yaw_rate))
-    yaw = np.concatenate([[0.0], np.cumsum(duration * 0.5 * (rate[1:] + rate[:-1]))])
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights  # on [0, 1]
-    speed_inside = speed[:-1, None] + np.diff(speed)[:, None] * nodes
-    turned = rate[:-1, None] * nodes + 0.5 * np.diff(rate)[:, None] * nodes**2
-    heading = yaw[:-1, None] + duration[:, None] * turned
-    x, y = (
-        np.concatenate([[0.0], np.cumsum(duration * ((speed_inside * part(heading)) @ weights))])
-        for part in (np.cos, np.sin)
-    )
-    return np.column_stack([x, y, yaw])[np.searchsorted(times, at)]
-
-
-def motions_from_speed(
-    log: SpeedLog, frames: FloatArray, settings: RecordedOdometrySettings
-) -> tuple[Odometry | None, ...]:
-    """Body motions (n - 1) between consecutive frame stamps (n,): planar arcs; None if not covered.
-
-    The covariance is diagonal: noise of the measured speed and yaw rate, and of the unmeasured
-    rates, each times the step's duration.
-    """
-    from scipy.spatial.transform import Rotation  # slow to load, and not all have odometry
-
-    planar = planar_poses(log, frames)
-    poses = np.tile(np.eye(4), (len(frames), 1, 1))
-    poses[:, :3, :3] = Rotation.from_euler("z", planar[:, 2:]).as_matrix()
-    poses[:, :2, 3] = planar[:, :2]
-    rotation = (
-        _ROLL_RATE_SIGMA_DPS,
-        _PITCH_RATE_SIGMA_DPS,
-        settings.yaw_rate_sigma_dps,
-    )
-    translation = (
-        settings.speed_sigma_mps,
-        _LATERAL_SIGMA_MPS,
-        _VERTICAL_SIGMA_MPS,
-    )
-    rates = np.concatenate([np.radians(rotation), translation])
-    covariances = [np.diag((rates * dt) ** 2) for dt in np.diff(frames)]
-    known = steps_covered(log.stamps, frames, settings.max_gap_s, settings.max_gap_s)
-    return _motions(poses, covariances, known)
-
-
-# --------------------------------------------------------------------------------------------
-# Poses
-
-
-_POSE_HOLD_S = 1e-3
-# Least noise of a step between two poses: what the encoders of a standing robot leave open.
-_TRANSLATION_FLOOR_M, _ROTATION_FLOOR_DEG = 0.002, 0.1
-
-
-def checked_poses(table: Table, settings: RecordedOdometrySettings) -> Trajectory:
-    """Rows (time, position, quaternion) as a trajectory of the body, in any world.
-
-    Raises:
-        OdometryError: rows are too few, malformed, out of time order, or move absurdly fast.
-    """
-    from scipy.spatial.transform import Rotation
-
-    _check_samples(table)
-    log = trajectory_of(table, OdometryError)
-    motions = inverse(log.poses[:-1]) @ log.poses[1:]
-    duration = np.diff(log.timestamps)
-    speed = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
-    turn = np.degrees(Rotation.from_matrix(motions[:, :3, :3]).magnitude()) / duration
-    arrival = Table(table.path, table.values[1:], table.lines[1:])
-    _require_sane(arrival, speed, _MAX_SPEED_MPS, "speed", "m/s")
-    _require_sane(arrival, turn, _MAX_TURN_DPS, "turn", "degrees/s")
-    return Trajectory(log.timestamps + settings.time_offset_s, log.poses)
-
-
-def motions_from_poses(
-    log: Trajectory, frames: FloatArray, settings: RecordedOdometrySettings
-) -> tuple[Odometry | None, ...]:
-    """Body motions between consecutive frame stamps (n,): n - 1 of them; None where not covered."""
-    poses = interpolate_poses(log, frames)
-    motions = inverse(poses[:-1]) @ poses[1:]
-    covariances = [pose_noise(motion, settings) for motion in motions]
-    # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
-    known = steps_covered(log.timestamps, frames, settings.max_gap_s, _POSE_HOLD_S)
-    return _motions(poses, covariances, known)
-
-
-def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:
-    """Covariance (6, 6) of a body motion (4, 4): a fraction of its length and angle, no less."""
-    length = float(np.linalg.norm(motion[:3, 3]))
-    angle = rotation_angle(motion[:3, :3])
-    rotation = max(settings.rotation_sigma_fraction * angle, float(np.radians(_ROTATION_FLOOR_DEG)))
-    translation = max(settings.translation_sigma_fraction * length, _TRANSLATION_FLOOR_M)
-    return np.diag(np.repeat([rotation**2, translation**2], 3))
-
-
-# --------------------------------------------------------------------------------------------
-# Gyroscope: angular velocity, integrated between frames (docs/derivations/motion.md)
-
-
-# Of MEMS gyroscopes in cameras, phones and drones, by their data sheets (InvenSense MPU-9250, Bosch
-# BMI055 and BMI160, Analog Devices ADIS16448). EuRoC's is 4.5 degrees/s off.
-_START_BIAS_DPS = 3.0
-_TURN_SIGMA_FRACTION = 0.013  # sensitivity 1 %, alignment of its axes half a degree
-_MAX_GAP_S = 0.1  # over which the angular velocity is taken as linear
-_HOLD_S = 0.02  # beyond the first and last sample
 
 
 @dataclass(frozen=True, slots=True)
@@ -337,78 +237,6 @@ class GyroscopeNoise:
 
     density: float = 1.75e-4
     walk: float = 1.94e-5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class GyroscopeLog:
-    """Angular velocity (n, 3) in rad/s about the body's axes, at stamps (n,)."""
-
-    stamps: FloatArray
-    rates: FloatArray
-    noise: GyroscopeNoise = field(default_factory=GyroscopeNoise)
-
-
-AnyLog: TypeAlias = SpeedLog | GyroscopeLog | Trajectory
-"""What odometry is recorded as: speeds, angular velocities, or poses."""
-
-
-def read_rates(path: Path) -> Table:
-    """Rows (seconds, rad/s about x, y, z) of a comma-separated file, whatever its unit of time.
-
-    Raises:
-        OdometryError: a line is malformed or not finite.
-    """
-    table = read_table(path, _RATE_COLUMNS, ",", OdometryError)
-    unit = time_unit(table.column(0), _MAX_GAP_S)[1]
-    return Table(path, table.values * [unit, 1.0, 1.0, 1.0], table.lines)
-
-
-def recorded_gyroscope(
-    path: Path,
-    mounting: Path | None,
-    noise: Path | None,
-    settings: RecordedOdometrySettings,
-) -> GyroscopeLog:
-    """The log of a file of rates, with what other files say of the sensor.
-
-    Args:
-        path: as :func:`read_rates` reads it.
-        mounting: sensor.yaml with the sensor's pose in the body; None: its axes are the body's.
-        noise: as :func:`read_gyroscope_noise` reads it; None for the default.
-        settings: limits and time offset.
-
-    Raises:
-        OdometryError: the file of rates is malformed.
-        CalibrationError: another one is.
-    """
-    bRs = None if mounting is None else read_asl_mounting(mounting)[:3, :3]
-    stated = None if noise is None else read_gyroscope_noise(noise)
-    return checked_rates(read_rates(path), settings, bRs, stated)
-
-
-def checked_rates(
-    table: Table,
-    settings: RecordedOdometrySettings,
-    bRs: FloatArray | None = None,
-    noise: GyroscopeNoise | None = None,
-) -> GyroscopeLog:
-    """Rows (time, angular velocity) of a sensor as a log of the body.
-
-    Args:
-        table: seconds and rad/s about the sensor's axes.
-        settings: limits and time offset.
-        bRs: (3, 3) axes of the sensor in the body; None: the same.
-        noise: None for the default.
-
-    Raises:
-        OdometryError: the times do not increase, or a rate is absurd.
-    """
-    _check_samples(table)
-    rates = table.values[:, 1:4]
-    size, limit = np.degrees(np.linalg.norm(rates, axis=1)), _MAX_TURN_DPS
-    _require_sane(table, size, limit, "angular velocity", "degrees/s", _ARE_DEGREES)
-    body = rates if bRs is None else rates @ bRs.T
-    return GyroscopeLog(table.column(0) + settings.time_offset_s, body, noise or GyroscopeNoise())
 
 
 def read_gyroscope_noise(path: Path) -> GyroscopeNoise:
@@ -426,24 +254,245 @@ def read_gyroscope_noise(path: Path) -> GyroscopeNoise:
     )
 
 
-def motions_from_gyroscope(log: GyroscopeLog, frames: FloatArray) -> tuple[Odometry | None, ...]:
-    """Turns of the body between consecutive frame stamps (n,): n - 1; None where not covered."""
-    known = steps_covered(log.stamps, frames, _MAX_GAP_S, _HOLD_S)
-    rotations, jacobians = integrated(log, frames)
+def motions_of(
+    table: Table,
+    settings: RecordedOdometrySettings,
+    bRs: FloatArray | None = None,
+    noise: GyroscopeNoise | None = None,
+) -> OdometrySource:
+    """Body motions by the best columns that a table has: poses, ticks, speeds, or a gyroscope's.
+
+    Args:
+        table: columns by their roles, as :func:`read_columns` gives them.
+        settings: noise and limits.
+        bRs: (3, 3) axes of a gyroscope in the body; None: the same.
+        noise: of a gyroscope; None for the default.
+
+    Raises:
+        OdometryError: columns are lacking, rows are too few, out of time order, or absurd.
+    """
+    columns = dict(zip(reversed(table.names), table.values.T[::-1], strict=True))
+    path, time = table.path, columns["time"]
+
+    def has(*roles: str) -> bool:
+        return columns.keys() >= set(roles)
+
+    def require_sane(values: FloatArray, limit: float, what: str, hint: str = "") -> None:
+        bad = np.flatnonzero(np.abs(values) > limit)
+        if len(bad):
+            quantity, _, unit = what.partition(", ")
+            raise OdometryError(
+                f"{path}, line {table.lines[-len(values) :][bad[0]]}: {quantity} of "
+                f"{values[bad[0]]:.4g} {unit} is absurd (limit {limit:g}){hint}; correct the line"
+            )
+
+    def track() -> float:
+        if settings.track_m is None:
+            raise OdometryError(
+                f"{path} gives both wheels; say their distance: --set odometry.track_m=..."
+            )
+        return settings.track_m
+
+    if len(table) < 2:
+        raise OdometryError(
+            f"{path} holds {len(table)} samples, at least 2 are needed; restore the file, or "
+            "choose another odometry.kind (constant_velocity, synthetic)"
+        )
+    require_increasing(table, time, OdometryError)
+    stamps, none = time + settings.time_offset_s, np.zeros(len(time))
+    are_degrees = ", radians are expected: are these degrees?"
+    if has("x", "y", "qx", "qy", "qz", "qw"):
+        position = [columns["x"], columns["y"], columns.get("z", none)]
+        quaternion = [columns[name] for name in ("qx", "qy", "qz", "qw")]
+    elif has("x", "y", "yaw") or has("left_ticks", "right_ticks"):
+        if has("x", "y", "yaw"):
+            position, yaw = [columns["x"], columns["y"], columns.get("z", none)], columns["yaw"]
+        else:
+            *position, yaw = _arcs_of_ticks(path, columns, track, settings.metres_per_tick)
+        quaternion = [none, none, np.sin(0.5 * yaw), np.cos(0.5 * yaw)]
+    elif has("speed", "yaw_rate") or has("left_speed", "right_speed"):
+        if has("speed", "yaw_rate"):
+            speed, yaw_rate = columns["speed"], columns["yaw_rate"]
+        else:
+            left, right = columns["left_speed"], columns["right_speed"]
+            speed, yaw_rate = 0.5 * (left + right), (right - left) / track()
+        require_sane(speed, _MAX_SPEED_MPS, "forward speed, m/s")
+        require_sane(np.degrees(yaw_rate), _MAX_TURN_DPS, "yaw rate, degrees/s", are_degrees)
+        return lambda frames: speed_motions(stamps, speed, yaw_rate, frames, settings)
+    elif has("rate_x", "rate_y", "yaw_rate"):
+        rates = np.column_stack([columns[role] for role in RATE_COLUMNS[1:]])
+        size = np.degrees(np.linalg.norm(rates, axis=1))
+        require_sane(size, _MAX_TURN_DPS, "angular velocity, degrees/s", are_degrees)
+        body = rates if bRs is None else rates @ bRs.T
+        return lambda frames: gyroscope_motions(stamps, body, frames, noise or GyroscopeNoise())
+    else:
+        raise OdometryError(
+            f"{path}: columns {', '.join(sorted(columns))} were understood; needed are time with "
+            "speed and yaw_rate, left_speed and right_speed, left_ticks and right_ticks, x, y and "
+            "yaw (or qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z; name the columns so"
+        )
+    from scipy.spatial.transform import Rotation  # slow to load, and not all have odometry
+
+    xyz, xyzw = np.column_stack(position), np.column_stack(quaternion)
+    poses = poses_of(table, xyz, xyzw, OdometryError)
+    motions, duration = inverse(poses[:-1]) @ poses[1:], np.diff(time)
+    pace = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
+    require_sane(pace, _MAX_SPEED_MPS, "speed, m/s")
+    turns = np.degrees(Rotation.from_matrix(motions[:, :3, :3]).magnitude()) / duration
+    require_sane(turns, _MAX_TURN_DPS, "turn, degrees/s")
+    return lambda frames: pose_motions(Trajectory(stamps, poses), frames, settings)
+
+
+def _arcs_of_ticks(
+    path: Path,
+    columns: dict[str, FloatArray],
+    track: Callable[[], float],
+    metres_per_tick: float | None,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """x, y, z and yaw (n,) by exact arcs between the samples of two wheels' counters."""
+    if metres_per_tick is None:
+        raise OdometryError(
+            f"{path} counts ticks; say how far one goes: --set odometry.metres_per_tick=..."
+        )
+    left, right = (
+        metres_per_tick * np.diff(columns[name], prepend=columns[name][:1])
+        for name in ("left_ticks", "right_ticks")
+    )
+    length, turn = 0.5 * (left + right), (right - left) / track()
+    yaw = np.cumsum(turn)
+    # The chord of an arc, at the mean of both headings.
+    chord = length * np.sinc(turn / (2.0 * np.pi))
+    middle = yaw - 0.5 * turn
+    x, y = np.cumsum(chord * np.cos(middle)), np.cumsum(chord * np.sin(middle))
+    return x, y, np.zeros_like(x), yaw
+
+
+# --------------------------------------------------------------------------------------------
+# Motions between frames
+
+
+def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float, hold: float) -> BoolArray:
+    """Which of the n - 1 steps between frames (n,) the increasing stamps (m,) cover.
+
+    A step is covered unless it overlaps a gap between stamps longer than ``max_gap`` seconds, or
+    reaches more than ``hold`` seconds beyond the first or last stamp.
+    """
+    before, after = frames[:-1], frames[1:]
+    long = np.diff(stamps) > max_gap
+    starts, ends = stamps[:-1][long], stamps[1:][long]
+    overlapped = np.searchsorted(starts, after, "left") - np.searchsorted(ends, before, "right")
+    within = (before >= stamps[0] - hold) & (after <= stamps[-1] + hold)
+    return np.asarray(within & (overlapped == 0))
+
+
+def _steps(poses: FloatArray, covariances: Sequence[FloatArray], known: BoolArray) -> Steps:
+    steps = zip(inverse(poses[:-1]) @ poses[1:], covariances, known, strict=True)
+    return tuple(Odometry(m, c) if ok else None for m, c, ok in steps)
+
+
+# What speed and yaw rate leave unmeasured; by KITTI raw 2011_09_26, as the settings' defaults.
+_LATERAL_SIGMA_MPS, _VERTICAL_SIGMA_MPS = 0.08, 0.12
+_ROLL_RATE_SIGMA_DPS, _PITCH_RATE_SIGMA_DPS = 1.3, 1.9
+
+
+def speed_motions(
+    stamps: FloatArray,
+    speed: FloatArray,
+    yaw_rate: FloatArray,
+    frames: FloatArray,
+    settings: RecordedOdometrySettings,
+) -> Steps:
+    """Planar arcs between frames (m,) by forward speed and yaw rate (n,) in m/s, rad/s at stamps.
+
+    Between neighbouring stamps both are linear in time: the turn follows exactly, the path by
+    Gauss-Legendre quadrature, exact to rounding for turns below a radian between two stamps.
+    Outside the log the nearest sample is held. The covariance is diagonal: noise of the measured
+    speed and yaw rate, and of the unmeasured rates, each times the step's duration.
+    """
+    from scipy.spatial.transform import Rotation
+
+    times = np.union1d(stamps, frames)
+    duration = np.diff(times)
+    v, rate = (np.interp(times, stamps, y) for y in (speed, yaw_rate))
+    yaw = np.concatenate([[0.0], np.cumsum(duration * 0.5 * (rate[1:] + rate[:-1]))])
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    nodes, weights = 0.5 * (nodes + 1.0), 0.5 * weights  # on [0, 1]
+    v_inside = v[:-1, None] + np.diff(v)[:, None] * nodes
+    turned = rate[:-1, None] * nodes + 0.5 * np.diff(rate)[:, None] * nodes**2
+    heading = yaw[:-1, None] + duration[:, None] * turned
+    x, y = (
+        np.concatenate([[0.0], np.cumsum(duration * ((v_inside * part(heading)) @ weights))])
+        for part in (np.cos, np.sin)
+    )
+    at = np.searchsorted(times, frames)
+    poses = np.tile(np.eye(4), (len(frames), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("z", yaw[at][:, None]).as_matrix()
+    poses[:, :2, 3] = np.column_stack([x, y])[at]
+    rotation = (_ROLL_RATE_SIGMA_DPS, _PITCH_RATE_SIGMA_DPS, settings.yaw_rate_sigma_dps)
+    translation = (settings.speed_sigma_mps, _LATERAL_SIGMA_MPS, _VERTICAL_SIGMA_MPS)
+    rates = np.concatenate([np.radians(rotation), translation])
+    covariances = [np.diag((rates * dt) ** 2) for dt in np.diff(frames)]
+    known = steps_covered(stamps, frames, settings.max_gap_s, settings.max_gap_s)
+    return _steps(poses, covariances, known)
+
+
+_POSE_HOLD_S = 1e-3
+# Least noise of a step between two poses: what the encoders of a standing robot leave open.
+_TRANSLATION_FLOOR_M, _ROTATION_FLOOR_DEG = 0.002, 0.1
+
+
+def pose_motions(log: Trajectory, frames: FloatArray, settings: RecordedOdometrySettings) -> Steps:
+    """Body motions between frames (m,) by recorded poses."""
+    poses = interpolate_poses(log, frames)
+    motions = inverse(poses[:-1]) @ poses[1:]
+    covariances = [pose_noise(motion, settings) for motion in motions]
+    # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
+    known = steps_covered(log.timestamps, frames, settings.max_gap_s, _POSE_HOLD_S)
+    return _steps(poses, covariances, known)
+
+
+def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatArray:
+    """Covariance (6, 6) of a body motion (4, 4): a fraction of its length and angle, no less."""
+    length = float(np.linalg.norm(motion[:3, 3]))
+    angle = rotation_angle(motion[:3, :3])
+    rotation = max(settings.rotation_sigma_fraction * angle, float(np.radians(_ROTATION_FLOOR_DEG)))
+    translation = max(settings.translation_sigma_fraction * length, _TRANSLATION_FLOOR_M)
+    return np.diag(np.repeat([rotation**2, translation**2], 3))
+
+
+# Of MEMS gyroscopes in cameras, phones and drones, by their data sheets (InvenSense MPU-9250, Bosch
+# BMI055 and BMI160, Analog Devices ADIS16448). EuRoC's is 4.5 degrees/s off.
+_START_BIAS_DPS = 3.0
+_TURN_SIGMA_FRACTION = 0.013  # sensitivity 1 %, alignment of its axes half a degree
+_MAX_GAP_S = 0.1  # over which the angular velocity is taken as linear
+_HOLD_S = 0.02  # beyond the first and last sample
+
+
+def gyroscope_motions(
+    stamps: FloatArray, rates: FloatArray, frames: FloatArray, noise: GyroscopeNoise
+) -> Steps:
+    """Turns between frames (m,) by angular velocities (n, 3) in rad/s about the body's axes.
+
+    docs/derivations/motion.md.
+    """
+    known = steps_covered(stamps, frames, _MAX_GAP_S, _HOLD_S)
+    rotations, jacobians = integrate_rates(stamps, rates, frames)
     start = float(np.radians(_START_BIAS_DPS)) ** 2
     steps: list[Odometry | None] = []
     for ok, dt, rotation, jacobian in zip(
         known, np.diff(frames).tolist(), rotations, jacobians, strict=True
     ):
         angle = rotation_angle(rotation)
-        variance = log.noise.density**2 * dt + (_TURN_SIGMA_FRACTION * angle) ** 2
-        bias = BiasEffect(jacobian, start_variance=start, walk=log.noise.walk**2 * dt)
+        variance = noise.density**2 * dt + (_TURN_SIGMA_FRACTION * angle) ** 2
+        bias = BiasEffect(jacobian, start_variance=start, walk=noise.walk**2 * dt)
         steps.append(Odometry.turn(rotation, variance * np.eye(3), bias) if ok else None)
     return tuple(steps)
 
 
-def integrated(log: GyroscopeLog, at: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations (n - 1, 3, 3) between times (n,), and their Jacobians by the bias.
+def integrate_rates(
+    stamps: FloatArray, rates: FloatArray, at: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Rotations (m - 1, 3, 3) between times (m,), and their Jacobians by the bias.
 
     Between samples the angular velocity is linear in time; the rotation of that is exact to the
     fourth order (Magnus expansion: Iserles et al. 2000). The Jacobian is that of the rotation
@@ -452,222 +501,26 @@ def integrated(log: GyroscopeLog, at: FloatArray) -> tuple[FloatArray, FloatArra
     """
     from scipy.spatial.transform import Rotation
 
-    times = np.union1d(log.stamps, at)
-    rates = np.column_stack([np.interp(times, log.stamps, axis) for axis in log.rates.T])
+    times = np.union1d(stamps, at)
+    sampled = np.column_stack([np.interp(times, stamps, axis) for axis in rates.T])
     dt = np.diff(times)[:, None]
-    first, second = rates[:-1], rates[1:]
+    first, second = sampled[:-1], sampled[1:]
     vectors = 0.5 * dt * (first + second) + dt**2 / 12.0 * np.cross(first, second)
     steps = Rotation.from_rotvec(vectors).as_matrix()
     turned = np.empty((len(steps) + 1, 3, 3))  # the product of the first k steps, for every k
     turned[0] = np.eye(3)
     for k, step in enumerate(steps):
         turned[k + 1] = turned[k] @ step
-    effect = turned[1:] @ (_right_jacobians(vectors) * dt[:, :, None])
+    x, y, z = vectors.T
+    none = np.zeros_like(x)
+    skew = np.array([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
+    right = np.eye(3) - 0.5 * skew + skew @ skew / 6.0  # Jacobians, to the second order
+    effect = turned[1:] @ (right * dt[:, :, None])
     summed = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(effect, axis=0)])
     rows = np.searchsorted(times, at)
     start, end = rows[:-1], rows[1:]
     back = np.swapaxes(turned[end], -1, -2)
     return np.swapaxes(turned[start], -1, -2) @ turned[end], -back @ (summed[end] - summed[start])
-
-
-def _right_jacobians(vectors: FloatArray) -> FloatArray:
-    """(n, 3, 3) of rotation vectors (n, 3) between samples, to the second order of their angle."""
-    x, y, z = vectors.T
-    none = np.zeros_like(x)
-    skew = np.array([[none, -z, y], [z, none, -x], [-y, x, none]]).transpose(2, 0, 1)
-    return np.asarray(np.eye(3) - 0.5 * skew + skew @ skew / 6.0)
-
-
-# --------------------------------------------------------------------------------------------
-# Tables with named columns: speeds, wheels, ticks, poses, or a gyroscope
-
-
-_NAMES = {
-    "time": "t time stamp timestamp sec secs seconds header_stamp",
-    "speed": "v vx speed velocity forward_speed linear_x linear_velocity twist_linear_x v_forward",
-    "yaw_rate": "w wz omega yaw_rate yawrate turn_rate angular_z angular_velocity "
-    "twist_angular_z gyro_z w_z omega_z angular_velocity_z gz gyr_z rotation_rate_z w_rs_s_z",
-    "rate_x": "wx w_x omega_x angular_x angular_velocity_x gyro_x gx gyr_x rotation_rate_x "
-    "w_rs_s_x",
-    "rate_y": "wy w_y omega_y angular_y angular_velocity_y gyro_y gy gyr_y rotation_rate_y "
-    "w_rs_s_y",
-    "left_speed": "v_left left_speed speed_left left_velocity velocity_left vl v_l",
-    "right_speed": "v_right right_speed speed_right right_velocity velocity_right vr v_r",
-    "left_ticks": "left_ticks ticks_left left_encoder encoder_left left_count count_left left",
-    "right_ticks": "right_ticks ticks_right right_encoder encoder_right right_count count_right "
-    "right",
-    "x": "x px pos_x position_x pose_x tx",
-    "y": "y py pos_y position_y pose_y ty",
-    "z": "z pz pos_z position_z pose_z tz",
-    "yaw": "yaw theta heading phi",
-    "qx": "qx q_x orientation_x",
-    "qy": "qy q_y orientation_y",
-    "qz": "qz q_z orientation_z",
-    "qw": "qw q_w orientation_w",
-}
-"""Names of each column, in small letters, anything else as `_`."""
-
-_ROLES = {name: role for role, names in _NAMES.items() for name in names.split()}
-_UNITS = {
-    "ns": 1e-9,
-    "nsec": 1e-9,
-    "us": 1e-6,
-    "ms": 1e-3,
-    "s": 1.0,
-    "mps": 1.0,
-    "m_s": 1.0,
-    "mm_s": 1e-3,
-    "cm_s": 1e-2,
-    "m": 1.0,
-    "mm": 1e-3,
-    "cm": 1e-2,
-    **dict.fromkeys(("kmh", "km_h", "kph"), 1 / 3.6),
-    **dict.fromkeys(("rad", "rad_s", "radps", "rps", "rad_s_1"), 1.0),
-    **dict.fromkeys(("deg", "degrees", "dps", "deg_s", "degps", "deg_s_1"), np.pi / 180.0),
-}
-"""Units at the end of a name, in seconds, metres, radians."""
-
-_Columns: TypeAlias = dict[str, FloatArray]
-"""Columns (n,) by role, in seconds, metres and radians."""
-
-
-def _has_named_columns(path: Path) -> bool:
-    """Whether the first line that is no comment has names. Raises OdometryError if unreadable."""
-    lines = read_lines(path, OdometryError)
-    without_exponents = re.sub(r"[eE][-+]?\d", "", lines[0][1]) if lines else ""
-    return re.search(r"[A-Za-z]", without_exponents) is not None
-
-
-def _read_named_columns(path: Path, settings: RecordedOdometrySettings) -> AnyLog:
-    """Speed and yaw rate, angular velocity, or poses of the body, by what columns there are.
-
-    Raises:
-        OdometryError: no known set of columns, a line is malformed, or a value is absurd.
-    """
-    (_, header), *rows = read_lines(path, OdometryError)
-    delimiter = next((mark for mark in ",;\t" if mark in header), None)
-    names = header.split(delimiter)
-    roles = [_role(name) for name in names]
-    columns: dict[str, list[float]] = {role: [] for role, _ in filter(None, roles)}
-    for line, text in rows:
-        words = [word.strip() for word in text.split(delimiter)]
-        if len(words) < len(names):
-            raise OdometryError(
-                f"{path}, line {line}: {len(words)} columns, the first line names {len(names)}; "
-                "complete or remove the line"
-            )
-        found = {
-            role[0]: role[1]
-            * finite_number(word, f"{path}, line {line}: {name.strip()}", OdometryError)
-            for role, word, name in reversed(list(zip(roles, words, names, strict=False)))
-            if role is not None
-        }
-        for key, value in found.items():
-            columns[key].append(value)
-    table = {role: np.array(values) for role, values in sorted(columns.items())}
-    if "time" not in table:
-        raise OdometryError(f"{path}: no column is named time; name the columns")
-    if any(role == "time" for role in map(_ROLES.get, map(_clean, names))):  # without a unit
-        table["time"] = table["time"] * time_unit(table["time"], SLOWEST_MOTION_S)[1]
-    for needed, make, checked in _SETS:
-        if set(needed) <= set(table):
-            values = np.column_stack([table["time"], *make(path, table, settings)])
-            return checked(Table(path, values, np.array([line for line, _ in rows])), settings)
-    raise OdometryError(
-        f"{path}: columns {', '.join(table)} were understood; needed are time with speed "
-        "and yaw_rate, left_speed and right_speed, left_ticks and right_ticks, x, y and yaw (or "
-        "qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z; name the columns so"
-    )
-
-
-def _clean(name: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "_", name.strip().lower()).strip("_")
-
-
-def _role(name: str) -> tuple[str, float] | None:
-    """What a column is, and what its numbers are multiplied by; None where it is unknown."""
-    clean = _clean(name)
-    if clean in _ROLES:
-        return _ROLES[clean], 1.0
-    for unit, factor in sorted(_UNITS.items(), key=lambda each: -len(each[0])):
-        if clean.endswith(f"_{unit}") and clean.removesuffix(f"_{unit}") in _ROLES:
-            return _ROLES[clean.removesuffix(f"_{unit}")], factor
-    return None
-
-
-def _of_wheels(
-    path: Path, table: _Columns, settings: RecordedOdometrySettings
-) -> tuple[FloatArray, ...]:
-    left, right = table["left_speed"], table["right_speed"]
-    return 0.5 * (left + right), (right - left) / _track(path, settings)
-
-
-def _of_ticks(
-    path: Path, table: _Columns, settings: RecordedOdometrySettings
-) -> tuple[FloatArray, ...]:
-    """Exact arcs between the samples of counters that go on."""
-    if settings.metres_per_tick is None:
-        raise OdometryError(
-            f"{path} counts ticks; say how far one goes: --set odometry.metres_per_tick=..."
-        )
-    left, right = (
-        settings.metres_per_tick * np.diff(table[name], prepend=table[name][:1])
-        for name in ("left_ticks", "right_ticks")
-    )
-    length, turn = 0.5 * (left + right), (right - left) / _track(path, settings)
-    yaw = np.cumsum(turn)
-    # The chord of an arc, at the mean of both headings.
-    chord = length * np.sinc(turn / (2.0 * np.pi))
-    middle = yaw - 0.5 * turn
-    x, y = np.cumsum(chord * np.cos(middle)), np.cumsum(chord * np.sin(middle))
-    return _level(x, y, np.zeros_like(x), yaw)
-
-
-def _track(path: Path, settings: RecordedOdometrySettings) -> float:
-    if settings.track_m is None:
-        raise OdometryError(
-            f"{path} gives both wheels; say their distance: --set odometry.track_m=..."
-        )
-    return settings.track_m
-
-
-def _level(x: FloatArray, y: FloatArray, z: FloatArray, yaw: FloatArray) -> tuple[FloatArray, ...]:
-    none = np.zeros_like(yaw)
-    return x, y, z, none, none, np.sin(0.5 * yaw), np.cos(0.5 * yaw)
-
-
-def _of_yaw(_: Path, table: _Columns, __: RecordedOdometrySettings) -> tuple[FloatArray, ...]:
-    z = table.get("z", np.zeros_like(table["x"]))
-    return _level(table["x"], table["y"], z, table["yaw"])
-
-
-def _of_quaternion(
-    _: Path, table: _Columns, __: RecordedOdometrySettings
-) -> tuple[FloatArray, ...]:
-    z = table.get("z", np.zeros_like(table["x"]))
-    return (table["x"], table["y"], z, *(table[name] for name in ("qx", "qy", "qz", "qw")))
-
-
-def _of_speed(_: Path, table: _Columns, __: RecordedOdometrySettings) -> tuple[FloatArray, ...]:
-    return table["speed"], table["yaw_rate"]
-
-
-def _of_rates(_: Path, table: _Columns, __: RecordedOdometrySettings) -> tuple[FloatArray, ...]:
-    return table["rate_x"], table["rate_y"], table["yaw_rate"]
-
-
-_Made: TypeAlias = Callable[[Path, _Columns, RecordedOdometrySettings], tuple[FloatArray, ...]]
-_Checked: TypeAlias = Callable[[Table, RecordedOdometrySettings], AnyLog]
-
-_SETS: tuple[tuple[tuple[str, ...], _Made, _Checked], ...] = (
-    (("x", "y", "qx", "qy", "qz", "qw"), _of_quaternion, checked_poses),
-    (("x", "y", "yaw"), _of_yaw, checked_poses),
-    (("left_ticks", "right_ticks"), _of_ticks, checked_poses),
-    (("speed", "yaw_rate"), _of_speed, checked_speeds),
-    (("left_speed", "right_speed"), _of_wheels, checked_speeds),
-    (("rate_x", "rate_y", "yaw_rate"), _of_rates, checked_rates),
-)
-"""Columns that are enough, the best first; the columns that are made of them; what these become."""
 
 
 # --------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ docs/datasets/published.md.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +29,10 @@ from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
 from fgslam.datasets.odometry import (
+    SPEED_COLUMNS,
     OdometrySource,
-    checked_speeds,
-    recorded_gyroscope,
+    gyroscope_odometry,
+    motions_of,
     recorded_motions,
 )
 from fgslam.datasets.recording import (
@@ -86,10 +86,10 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
     cameras = [read_camera_frames(folder) for folder in folders]
     rig = _euroc_rig(settings, root, first_size(cameras[0].paths))
     right, left = (cameras[k] for k in rig.sources[:2])
-    names = (str(right.paths[0].parent), str(left.paths[0].parent))
+    others = [("left", str(left.paths[0].parent), left.stamps)]
     tolerance = 1e-3 * settings.pairing_tolerance_ms
-    (rows, partners), paired = pair_stamps(right.stamps, left.stamps, tolerance, names)
-    paths = [(right.paths[i], left.paths[j]) for i, j in zip(rows, partners, strict=True)]
+    rows, paired = pair_stamps(right.stamps, others, tolerance, str(right.paths[0].parent))
+    paths = [(right.paths[i], left.paths[j]) for i, j in rows.tolist()]
     images, noticed = open_frames(paths, rig, root)
     sensors = [*folders, root / "imu0"]
     defining = [folder / name for folder in sensors for name in ("sensor.yaml", "data.csv")]
@@ -101,7 +101,7 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         settings,
         root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig,
-        right.stamps[rows].astype(np.float64) * NANOSECONDS,
+        right.stamps[rows[:, 0]].astype(np.float64) * NANOSECONDS,
         images.load,
         identity,
         (*noticed, *paired),
@@ -135,9 +135,7 @@ def _euroc_gyroscope(root: Path, settings: RecordedOdometrySettings) -> Odometry
     if not path.is_file():
         return None
     noise = next((p for p in (own, root.parent / "dso" / "imu_config.yaml") if p.is_file()), None)
-    mounting = own if own.is_file() else None
-    read = partial(recorded_gyroscope, path, mounting, noise, settings)
-    return recorded_motions(str(path), read, settings)
+    return gyroscope_odometry(path, own if own.is_file() else None, noise, settings)
 
 
 def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
@@ -395,10 +393,8 @@ class Oxts:
     def odometry(self, settings: RecordedOdometrySettings) -> OdometrySource:
         """Motions of the unit by its forward speed and yaw rate."""
         values = np.column_stack([self.stamps, self.rows[:, [_FORWARD_SPEED, _YAW_RATE]]])
-        table = Table(self.folder, values, np.arange(1, len(values) + 1))
-        return recorded_motions(
-            str(self.folder), partial(checked_speeds, table, settings), settings
-        )
+        table = Table(self.folder, values, np.arange(1, len(values) + 1), SPEED_COLUMNS)
+        return recorded_motions(str(self.folder), lambda: motions_of(table, settings))
 
     def poses(self) -> Trajectory:
         """Poses of the unit (x ahead, y left, z up) in a world with x east, z up."""

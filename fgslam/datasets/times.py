@@ -36,11 +36,19 @@ NANOSECONDS = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """Numbers of a text file: values (n, columns) and the line (n,) each row came from, from 1."""
+    """Numbers of a text file.
+
+    Attributes:
+        path: the file, or what messages call the source.
+        values: (n, columns).
+        lines: (n,) the line that each row came from, from 1.
+        names: of the columns.
+    """
 
     path: Path
     values: FloatArray
     lines: IntArray
+    names: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.lines)
@@ -52,34 +60,38 @@ class Table:
 
 def read_table(
     path: Path,
-    columns: tuple[str, ...],
+    columns: Sequence[str | None],
     delimiter: str | None = None,
     error: type[DatasetError] = DatasetError,
+    lines: Sequence[tuple[int, str]] | None = None,
 ) -> Table:
-    """The first ``len(columns)`` numbers of every line; further columns are ignored.
+    """The numbers of every line, as many as ``columns``; further columns are ignored.
 
     Args:
         path: the file.
-        columns: names of the columns, for the messages.
+        columns: names of the columns, for the messages; None for one that is ignored.
         delimiter: what separates them; None for white space.
         error: class of the errors to raise.
+        lines: numbers and texts of the lines; None for all of the file.
 
     Raises:
         DatasetError: (or ``error``) the file is unreadable, or a line has too few columns, a word
             that is no number, or a number that is not finite.
     """
-    rows = read_lines(path, error)
-    values = np.empty((len(rows), len(columns)))
-    for k, (line, text) in enumerate(rows):
+    used = [(k, name) for k, name in enumerate(columns) if name is not None]
+    rows, numbers = [], []
+    for line, text in read_lines(path, error) if lines is None else lines:
         words = text.split(delimiter)
         if len(words) < len(columns):
             raise error(
                 f"{path}, line {line}: {len(words)} columns, expected {len(columns)} "
-                f"({', '.join(columns)}); complete or remove the line"
+                f"({', '.join(name for _, name in used)}); complete or remove the line"
             )
-        for j, name in enumerate(columns):
-            values[k, j] = finite_number(words[j], f"{path}, line {line}: {name}", error)
-    return Table(path, values, np.array([line for line, _ in rows], np.int64))
+        where = f"{path}, line {line}: "
+        rows.append([finite_number(words[k], where + name, error) for k, name in used])
+        numbers.append(line)
+    values = np.array(rows, np.float64).reshape(-1, len(used))
+    return Table(path, values, np.array(numbers, np.int64), tuple(name for _, name in used))
 
 
 def finite_number(word: str, where: str, error: type[DatasetError] = DatasetError) -> float:
@@ -116,18 +128,14 @@ _QUATERNION_TOLERANCE = 0.01
 
 
 def read_tum(path: Path) -> Trajectory:
-    """Poses of a TUM file (``t x y z qx qy qz qw``); raises as :func:`trajectory_of`."""
-    return trajectory_of(read_table(path, TUM_COLUMNS))
-
-
-def trajectory_of(table: Table, error: type[DatasetError] = DatasetError) -> Trajectory:
-    """The poses of a table with the columns of a TUM file.
+    """Poses of a TUM file, ``t x y z qx qy qz qw``.
 
     Raises:
-        DatasetError: (or ``error``) times do not increase, a quaternion is not of unit length.
+        DatasetError: a line is malformed, times do not increase, or a quaternion is no rotation.
     """
-    require_increasing(table, table.column(0), error)
-    poses = poses_of(table, table.values[:, 1:4], table.values[:, 4:8], error)
+    table = read_table(path, TUM_COLUMNS)
+    require_increasing(table, table.column(0))
+    poses = poses_of(table, table.values[:, 1:4], table.values[:, 4:8])
     return Trajectory(table.column(0), poses)
 
 
@@ -225,76 +233,55 @@ def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:
 
 
 def pair_stamps(
-    right: IntArray, left: IntArray, tolerance: float, names: tuple[str, str], side: str = "left"
-) -> tuple[tuple[IntArray, IntArray], tuple[str, ...]]:
-    """Rows of the right and the left images that are each other's nearest in time.
-
-    Args:
-        right: (n,) stamps of the right camera in nanoseconds, increasing.
-        left: (m,) stamps of the left one.
-        tolerance: largest difference in seconds.
-        names: of the right and the left camera, in messages.
-        side: of the camera in place of the left one, in notes.
-
-    Returns:
-        The paired rows, and notes on images left without a partner and on how far pairs differ.
-
-    Raises:
-        DatasetError: no pair is left.
-    """
-    partner = nearest_rows(left, right)
-    rows = np.arange(len(right))
-    mutual = nearest_rows(right, left)[partner] == rows
-    skew = NANOSECONDS * np.abs(left[partner] - right).astype(np.float64)
-    close = skew <= tolerance + 0.5 * NANOSECONDS
-    kept = rows[mutual & close]
-    if len(kept) == 0:
-        spans = [f"{NANOSECONDS * s[0]:.3f} to {NANOSECONDS * s[-1]:.3f} s" for s in (right, left)]
-        raise DatasetError(
-            f"no image of {names[0]} ({spans[0]}) has a partner in {names[1]} ({spans[1]}) "
-            f"within {1e3 * tolerance:g} ms, the nearest differ by {1e3 * skew.min():.4g} ms; "
-            "raise dataset.pairing_tolerance_ms or restore the stamps"
-        )
-    notes = [
-        f"{n} {camera} images have no partner within {1e3 * tolerance:g} ms and are left out"
-        for camera, n in (("right", len(rows) - len(kept)), (side, len(left) - len(kept)))
-        if n
-    ]
-    if (worst := float(skew[kept].max())) > _NAMED_SKEW_S:
-        median = float(np.median(skew[kept]))
-        notes.append(
-            f"the images of a pair differ in time by {1e3 * median:.3g} ms in the median and "
-            f"{1e3 * worst:.3g} ms at most: cameras that are not synchronised measure wrong depths "
-            "while they turn"
-        )
-    return (kept, partner[kept]), tuple(notes)
-
-
-def pair_all(
     reference: IntArray,
     others: Sequence[tuple[str, str, IntArray]],
     tolerance: float,
     name: str,
 ) -> tuple[IntArray, tuple[str, ...]]:
-    """Rows (n, 1 + others) of images of one time, those of the reference first, and notes.
+    """Rows (n, 1 + others) of images that are each other's nearest in time, and notes.
 
     Args:
-        reference: (n,) stamps of the right camera in nanoseconds, increasing.
+        reference: stamps of the right camera in nanoseconds, increasing.
         others: side, name and stamps of each other camera.
         tolerance: largest difference in seconds from the reference.
         name: of the right camera, in messages.
+
+    Returns:
+        The rows, those of the reference first; and notes on images left without a partner and on
+        how far pairs differ.
 
     Raises:
         DatasetError: no image is left that has a partner of each camera.
     """
     rows = np.arange(len(reference))[:, None]
-    notes: tuple[str, ...] = ()
+    notes: list[str] = []
     for side, other, stamps in others:
-        (kept, partners), reported = pair_stamps(
-            reference[rows[:, 0]], stamps, tolerance, (name, other), side
-        )
-        rows, notes = np.column_stack([rows[kept], partners]), (*notes, *reported)
-    return rows, notes
+        right = reference[rows[:, 0]]
+        partner = nearest_rows(stamps, right)
+        mutual = nearest_rows(right, stamps)[partner] == np.arange(len(right))
+        skew = NANOSECONDS * np.abs(stamps[partner] - right).astype(np.float64)
+        kept = np.flatnonzero(mutual & (skew <= tolerance + 0.5 * NANOSECONDS))
+        if len(kept) == 0:
+            spans = [f"{NANOSECONDS * s[0]:.3f} to {NANOSECONDS * s[-1]:.3f} s"
+                     for s in (right, stamps)]  # fmt: skip
+            raise DatasetError(
+                f"no image of {name} ({spans[0]}) has a partner in {other} ({spans[1]}) "
+                f"within {1e3 * tolerance:g} ms, the nearest differ by {1e3 * skew.min():.4g} ms; "
+                "raise dataset.pairing_tolerance_ms or restore the stamps"
+            )
+        notes += [
+            f"{n} {camera} images have no partner within {1e3 * tolerance:g} ms and are left out"
+            for camera, n in (("right", len(right) - len(kept)), (side, len(stamps) - len(kept)))
+            if n
+        ]
+        if (worst := float(skew[kept].max())) > _NAMED_SKEW_S:
+            notes.append(
+                f"the images of a pair differ in time by {1e3 * float(np.median(skew[kept])):.3g} "
+                f"ms in the median and {1e3 * worst:.3g} ms at most: cameras that are not "
+                "synchronised measure wrong depths while they turn"
+            )
+        rows = np.column_stack([rows[kept], partner[kept]])
+    return rows, tuple(notes)
 
 
 # --------------------------------------------------------------------------------------------
@@ -310,8 +297,6 @@ LISTS = (
 _ASSUMED_FPS = 10.0
 _UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _SLOWEST_S = 10.0  # between two images: what makes a unit plausible
-SLOWEST_MOTION_S = 1.0
-"""The same between two samples of odometry."""
 
 
 def stamps_of(
@@ -338,27 +323,27 @@ def stamps_of(
         return written
     rate = fps or _ASSUMED_FPS
     note = f"no list of times: taken as {rate:g} frames a second (--fps states otherwise)"
-    return np.array(_places(images, every)) / rate, () if fps else (note,), ()
+    place = {path: k for k, path in enumerate(every or images)}
+    return np.array([place[path] for path in images]) / rate, () if fps else (note,), ()
 
 
 def written_stamps(
     images: Sequence[Path], folders: Sequence[Path], every: Sequence[Path] | None = None
 ) -> tuple[FloatArray, tuple[str, ...], tuple[Path, ...]] | None:
     """As :func:`stamps_of`, from a list or from names; None where neither states anything."""
-    for folder in folders:
-        for path in (folder / name for name in LISTS):
-            if path.is_file():
-                return (*_in_seconds(_listed(path, images, every), str(path)), (path,))
+    for path in (folder / name for folder in folders for name in LISTS):
+        if path.is_file():
+            return (*_in_seconds(_listed(path, images, every or images), str(path)), (path,))
     names = [image.stem for image in images]
     by_date = _dates(names)
     if by_date is not None:
         return by_date, ("times are the dates in the names of the images",), ()
     parts = time_parts(names) if len(names) > 1 else None
-    if parts is not None:
-        texts = [f"{whole}.{part}" for whole, part in zip(*parts, strict=True)]
-        mend = "two names of a folder are one time: remove one"
-        return (*_in_seconds(_numbers(texts), "names of the images", mend), ())
-    return None
+    if parts is None:
+        return None
+    texts = [f"{whole}.{part}" for whole, part in zip(*parts, strict=True)]
+    mend = "two names of a folder are one time: remove one"
+    return (*_in_seconds(texts, "names of the images", mend), ())
 
 
 def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, float]:
@@ -373,23 +358,8 @@ def time_unit(times: FloatArray, slowest_s: float = _SLOWEST_S) -> tuple[str, fl
     )
 
 
-def _places(images: Sequence[Path], every: Sequence[Path] | None) -> list[int]:
-    """Of each image its place among all of the camera."""
-    known = {path: k for k, path in enumerate(every or images)}
-    return [known[path] for path in images]
-
-
-def _numbers(texts: Sequence[str]) -> tuple[FloatArray, float]:
-    """The numbers less the first's whole part, which doubles could not hold, and that part."""
-    if any("e" in text.lower() for text in texts):
-        return np.array([float(text) for text in texts]), 0.0
-    whole = [int(text.partition(".")[0]) for text in texts]
-    parts = [float(f"0.{text.partition('.')[2] or 0}") for text in texts]
-    return np.array([w - whole[0] for w in whole], np.float64) + parts, float(whole[0])
-
-
 def _in_seconds(
-    numbers: tuple[FloatArray, float],
+    texts: Sequence[str],
     where: str,
     mend: str = "put the lines in time order and remove duplicates",
 ) -> tuple[FloatArray, tuple[str, ...]]:
@@ -398,7 +368,13 @@ def _in_seconds(
     Raises:
         DatasetError: times do not increase.
     """
-    values, first = numbers
+    if any("e" in text.lower() for text in texts):
+        values, first = np.array([float(text) for text in texts]), 0.0
+    else:  # less the first's whole part: doubles cannot hold nanoseconds since 1970
+        whole = [int(text.partition(".")[0]) for text in texts]
+        parts = [float(f"0.{text.partition('.')[2] or 0}") for text in texts]
+        first = float(whole[0])
+        values = np.array([w - whole[0] for w in whole], np.float64) + parts
     steps = np.diff(values)
     if len(steps) and steps.min() <= 0.0:
         k = int(np.argmax(steps <= 0.0))
@@ -413,66 +389,58 @@ def _in_seconds(
 # Lists
 
 
+_NUMBER = re.compile(r"\d+(\.\d*)?([eE][-+]?\d+)?")
 _DATE = re.compile(r"^\d{4}-\d{2}-\d{2}[ T]\d{2}:\d{2}:\d{2}")
 
 
-def _listed(
-    path: Path, images: Sequence[Path], every: Sequence[Path] | None
-) -> tuple[FloatArray, float]:
-    """Times of the images by a list: a time a line, or name or number and time in either order."""
+def _listed(path: Path, images: Sequence[Path], every: Sequence[Path]) -> list[str]:
+    """Times of the images by a list: a time a line, or name or number and time in either order.
+
+    A column that names all images is looked for in the first three; another one is the time.
+    """
     lines = read_lines(path)
     if lines and _DATE.match(lines[0][1]):
         rows = [[_seconds_of_date(path, number, text)] for number, text in lines]
     else:
         rows = [[w for w in re.split(r"[,;\s]+", text) if w] for _, text in lines]
-        if rows and not any(_is_number(word) for word in rows[0]):
+        if rows and not any(map(_NUMBER.fullmatch, rows[0])):
             rows, lines = rows[1:], lines[1:]  # names of columns
-    if rows and all(len(row) >= 2 for row in rows):
-        return _listed_by_name(path, rows, images)
-    count = len(every or images)
-    if len(rows) < count:
-        raise DatasetError(
-            f"{path} has {len(rows)} times for {count} images; restore the list, or leave it "
-            "out and say --fps"
-        )
-    for row, (number, _) in zip(rows, lines, strict=True):
-        if not _is_number(row[0]):
-            raise DatasetError(f"{path}, line {number}: {row[0]!r} is no time; correct the line")
-    return _numbers([rows[k][0] for k in _places(images, every)])
-
-
-def _listed_by_name(
-    path: Path, rows: Sequence[Sequence[str]], images: Sequence[Path]
-) -> tuple[FloatArray, float]:
-    """By the column that names the images, one of the first three; another one is the time."""
-    columns = range(min(3, *(len(row) for row in rows)))
+    if not rows or any(len(row) < 2 for row in rows):
+        if len(rows) < len(every):
+            raise DatasetError(
+                f"{path} has {len(rows)} times for {len(every)} images; restore the list, or leave "
+                "it out and say --fps"
+            )
+        for row, (number, _) in zip(rows, lines, strict=True):
+            if not _NUMBER.fullmatch(row[0]):
+                text = f"{path}, line {number}: {row[0]!r} is no time; correct the line"
+                raise DatasetError(text)
+        place = {image: k for k, image in enumerate(every)}
+        return [rows[place[image]][0] for image in images]
+    columns = range(min(3, *map(len, rows)))
     for names in columns:
         known = {_stem(row[names]): row for row in rows}
         keys = [image.stem if image.stem in known else _stem(image.stem) for image in images]
         if not all(key in known for key in keys):
             continue
         others = ([known[key][k] for key in keys] for k in columns if k != names)
-        times = [texts for texts in others if all(map(_is_number, texts))]
-        if times:  # one that counts the images is their number
-            return _numbers(next((texts for texts in times if not _counts(texts)), times[0]))
+        times = [texts for texts in others if all(map(_NUMBER.fullmatch, texts))]
+        # One that counts the images is their number.
+        timed = [texts for texts in times if not (
+            all(map(str.isdecimal, texts)) and counts_by_one([int(t) for t in texts])
+        )]  # fmt: skip
+        if times:
+            return (timed or times)[0]
     raise DatasetError(
         f"{path}: neither column names all images ({images[0].name} to {images[-1].name}); each "
         "line must be: name or number of the image, seconds"
     )
 
 
-def _counts(texts: Sequence[str]) -> bool:
-    return all(text.isdecimal() for text in texts) and counts_by_one([int(t) for t in texts])
-
-
 def _stem(word: str) -> str:
     """A file's name without folder and ending; of a number its value."""
     name = re.sub(r"\.(png|jpe?g|p[gnp]m|bmp|tiff?|webp)$", "", word.rpartition("/")[2], flags=re.I)
     return str(int(name)) if name.isdecimal() else name
-
-
-def _is_number(word: str) -> bool:
-    return re.fullmatch(r"\d+(\.\d*)?([eE][-+]?\d+)?", word) is not None
 
 
 def _seconds_of_date(path: Path, line: int, text: str) -> str:
@@ -502,7 +470,11 @@ def _dates(names: Sequence[str]) -> FloatArray | None:
     What follows the seconds is their fraction, unless it counts the images: by one, or with fewer
     than three digits and no point. Neither are six digits from 000000 on that count by one.
     """
-    found = _dates_in(names)
+    found = [match for name in names if (match := _DATE_IN_NAME.search(name))]
+    if len({match.groups()[:6] for match in found}) == 1:  # the date of the drive; another follows?
+        after = [_DATE_IN_NAME.search(match.string, match.end(6)) for match in found]
+        second = [match for match in after if match]
+        found = second if len(second) == len(names) else found
     if len(names) < 2 or len(found) < len(names):
         return None
     try:
@@ -510,36 +482,17 @@ def _dates(names: Sequence[str]) -> FloatArray | None:
         whole = [date.replace(tzinfo=UTC).timestamp() for date in dates]
     except ValueError:  # no date
         return None
-    parts = _fractions(found)
+    written = [m[8] if m[8] and (m[7] in (".", ",") or len(m[8]) > 2) else "0" for m in found]
+    counts = counts_by_one([int(match[8]) for match in found if match[8]])
+    parts = [0.0 if counts else float(f"0.{digits}") for digits in written]
     clock = [match[4] + match[5] + match[6] for match in found]
     joined = all(digits in match[0] for digits, match in zip(clock, found, strict=True))
-    counted = joined and not any(parts) and int(clock[-1]) < _COUNTED
-    if counted and counts_by_one([int(digits) for digits in clock]):
+    counter = joined and not any(parts) and int(clock[-1]) < _COUNTED
+    if counter and counts_by_one([int(digits) for digits in clock]):
         return None
     stamps = np.array(whole) + parts
     steps = np.diff(stamps)
     return stamps if steps.min() > 0.0 and np.median(steps) >= _FASTEST_S else None
-
-
-def _dates_in(names: Sequence[str]) -> list[re.Match[str]]:
-    """The first date in each name; the second where that is the drive's, the same in all."""
-    found = [match for name in names if (match := _DATE_IN_NAME.search(name))]
-    if len({match.groups()[:6] for match in found}) > 1:
-        return found
-    after = [_DATE_IN_NAME.search(match.string, match.end(6)) for match in found]
-    second = [match for match in after if match]
-    return second if len(second) == len(names) else found
-
-
-def _fractions(found: Sequence[re.Match[str]]) -> list[float]:
-    """Of a second, by what follows it in each name; 0 where that counts the images."""
-    if counts_by_one([int(match[8]) for match in found if match[8]]):
-        return [0.0] * len(found)
-    written = [
-        match[8] if match[8] and (match[7] in (".", ",") or len(match[8]) > 2) else ""
-        for match in found
-    ]
-    return [float(f"0.{digits or 0}") for digits in written]
 
 
 # --------------------------------------------------------------------------------------------
@@ -549,10 +502,8 @@ def _fractions(found: Sequence[re.Match[str]]) -> list[float]:
 Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]
 """Files (right, left) of each moment, and notes on what is left out."""
 
-TOLERANCE_MS = 20.0
 
-
-def pair_files(found: CameraFiles, tolerance_ms: float | None = TOLERANCE_MS) -> Pairs:
+def pair_files(found: CameraFiles, tolerance_ms: float | None = 20.0) -> Pairs:
     """Pairs (right, left) in natural order, and notes on what is left out.
 
     Files are paired by their names without the side; where those do not match, by the times that
@@ -563,14 +514,17 @@ def pair_files(found: CameraFiles, tolerance_ms: float | None = TOLERANCE_MS) ->
         DatasetError: names do not match, and the cameras have different numbers of images, or names
             are times and no two are near.
     """
-    named = _by_names(found, _KEYS)
-    if named is not None:
+    if (named := _by_names(found, _KEYS)) is not None:
         return named
-    times = None if found.interleaved else _times(found)
-    if times is None:
+    right, left = (
+        None if found.interleaved or (written := written_stamps(files, ())) is None
+        else np.rint(written[0] / NANOSECONDS).astype(np.int64)
+        for files in (found.right, found.left)
+    )  # fmt: skip
+    if right is None or left is None:
         named = _by_names(found, _MOMENTS)
     elif tolerance_ms is not None:
-        named = _by_time(found, times, tolerance_ms)
+        named = _by_time(found, right, left, 1e-3 * tolerance_ms)
     return _by_order(found) if named is None else named
 
 
@@ -617,27 +571,16 @@ def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pair
     return pairs, (f"left and right images are paired by their order: {why}",)
 
 
-def _times(found: CameraFiles) -> tuple[IntArray, IntArray] | None:
-    """Nanoseconds (n,), (m,) of right and left files whose names are times; None otherwise."""
-    right, left = (written_stamps(files, ()) for files in (found.right, found.left))
-    if right is None or left is None:
-        return None
-    first, second = (np.rint(each[0] / NANOSECONDS).astype(np.int64) for each in (right, left))
-    return first, second
-
-
-def _by_time(found: CameraFiles, times: tuple[IntArray, IntArray], tolerance_ms: float) -> Pairs:
+def _by_time(found: CameraFiles, right: IntArray, left: IntArray, tolerance: float) -> Pairs:
     """The nearest in time; by order where each camera has a clock of its own that goes alike."""
-    right, left = times
-    names = (f"{found.folder}, right", f"{found.folder}, left")
     try:
-        (rows, partners), notes = pair_stamps(right, left, 1e-3 * tolerance_ms, names)
+        others = [("left", f"{found.folder}, left", left)]
+        rows, notes = pair_stamps(right, others, tolerance, f"{found.folder}, right")
     except DatasetError:
         apart = NANOSECONDS * (left - right) if len(left) == len(right) else np.array([np.inf])
-        if not np.ptp(apart) <= 1e-3 * tolerance_ms:
+        if not np.ptp(apart) <= tolerance:
             raise
         away = abs(float(np.median(apart)))
         return _by_order(found, f"the times that their names are lie {away:.6g} s apart throughout")
-    chosen = zip(rows.tolist(), partners.tolist(), strict=True)
     note = "left and right images are paired by the times that their names are"
-    return tuple((found.right[i], found.left[j]) for i, j in chosen), (note, *notes)
+    return tuple((found.right[i], found.left[j]) for i, j in rows.tolist()), (note, *notes)

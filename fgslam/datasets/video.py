@@ -34,7 +34,7 @@ from fgslam.datasets.recording import (
     recording_identity,
 )
 from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
-from fgslam.datasets.times import NANOSECONDS, pair_all
+from fgslam.datasets.times import NANOSECONDS, pair_stamps
 
 _VIEWS = {"side_by_side": (2, 1), "over_under": (1, 2)}
 """Views next to each other and above each other."""
@@ -279,7 +279,7 @@ def _by_time(films: list[VideoFrames], known: list[FloatArray], tolerance: float
     left, right, *third = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
     sides = zip(("left", "third"), (films[0], *films[2:]), (left, *third), strict=False)
     others = [(side, film.name, stamps) for side, film, stamps in sides]
-    rows, notes = pair_all(right, others, tolerance, films[1].name)
+    rows, notes = pair_stamps(right, others, tolerance, films[1].name)
     numbers = rows[:, [1, 0, *range(2, len(films))]]
     return Moments(numbers, known[0][numbers[:, 0]], notes)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -22,7 +23,12 @@ from fgslam.datasets.clock import (
     judged_turns,
     turn_between,
 )
-from fgslam.datasets.odometry import GyroscopeLog, integrated, recorded_motions
+from fgslam.datasets.odometry import (
+    GyroscopeNoise,
+    gyroscope_motions,
+    integrate_rates,
+    recorded_motions,
+)
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 
@@ -45,13 +51,13 @@ def seen_with(
     noise: float = 2e-3,
 ) -> SeenTurns:
     """Turns by images; and a gyroscope that is late, turned, in another unit, and biased."""
-    true = GyroscopeLog(SAMPLES, slow * shaken(SAMPLES))
-    rotations, _ = integrated(true, FRAMES)
+    true = slow * shaken(SAMPLES)
+    rotations, _ = integrate_rates(SAMPLES, true, FRAMES)
     rng = np.random.default_rng(5)
     turns = np.array([so3_log(r) for r in rotations]) + noise * rng.standard_normal((59, 3))
-    measured = unit * (true.rates @ (np.eye(3) if axes is None else axes).T + BIAS)
-    log = GyroscopeLog(SAMPLES + late, measured)
-    source = recorded_motions("shaken", lambda: log, RecordedOdometrySettings())
+    measured = unit * (true @ (np.eye(3) if axes is None else axes).T + BIAS)
+    late_motions = partial(gyroscope_motions, SAMPLES + late, measured, noise=GyroscopeNoise())
+    source = recorded_motions("shaken", lambda: late_motions)
     return SeenTurns("shaken", np.arange(1, 60), turns, FRAMES, source, by_gyroscope=True)
 
 

@@ -1,44 +1,71 @@
+"""Odometry: arcs worked out by hand, gyroscopes against fine steps, files, noise drawn on truth."""
+
 from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from dataset_builders import curve, image_folder, write_tum
+from bags import START_NS, gyroscope, stereo, write_bag
+from dataset_builders import PERIOD_NS, curve, euroc, image_folder, write_tum
+from dataset_builders import START_NS as EUROC_START_NS
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import DatasetError, OdometryError
-from fgslam.core.geometry import inverse
+from fgslam.core.errors import CalibrationError, DatasetError, OdometryError
+from fgslam.core.geometry import (
+    body_to_camera_motion,
+    inverse,
+    rotation_angle,
+    se3_log,
+    so3_exp,
+    so3_log,
+)
+from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import (
-    SpeedLog,
+    GyroscopeNoise,
+    Steps,
+    SyntheticOdometry,
     file_odometry,
-    motions_from_speed,
+    gyroscope_motions,
+    integrate_rates,
+    read_columns,
+    read_gyroscope_noise,
+    speed_motions,
     steps_covered,
 )
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
-from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
+from fgslam.datasets.settings import (
+    BagSettings,
+    EurocSettings,
+    ImageFolderSettings,
+    RecordedOdometrySettings,
+    SyntheticOdometrySettings,
+)
+from fgslam.runs.bare import bare_experiment
 
 DEFAULT = RecordedOdometrySettings()
 
 
-def speed_log(stamps: FloatArray, speed: float, rate: float) -> SpeedLog:
-    return SpeedLog(stamps, np.full(len(stamps), speed), np.full(len(stamps), rate))
-
-
-def known(steps: tuple[Odometry | None, ...]) -> list[Odometry]:
+def known(steps: Steps) -> list[Odometry]:
     assert all(step is not None for step in steps)
     return [step for step in steps if step is not None]
 
 
+def of_speed(stamps: FloatArray, speed: float, rate: float, frames: FloatArray) -> Steps:
+    ones = np.ones(len(stamps))
+    return speed_motions(stamps, speed * ones, rate * ones, frames, DEFAULT)
+
+
 @pytest.mark.parametrize("rate", [0.0, 1e-9, 0.7, -0.3])
 def test_constant_speed_and_turn_give_the_exact_arc(rate: float) -> None:
-    log = speed_log(np.linspace(0.0, 2.0, 9), 3.0, rate)
-    (step,) = known(motions_from_speed(log, np.array([0.3, 1.7]), DEFAULT))
+    (step,) = known(of_speed(np.linspace(0.0, 2.0, 9), 3.0, rate, np.array([0.3, 1.7])))
     angle, length = 1.4 * rate, 1.4 * 3.0
     radius = length / angle if abs(angle) > 1e-6 else None
     expected = [radius * np.sin(angle), radius * (1 - np.cos(angle))] if radius else [length, 0.0]
@@ -48,10 +75,9 @@ def test_constant_speed_and_turn_give_the_exact_arc(rate: float) -> None:
 
 
 def test_linear_speed_between_samples_is_integrated_exactly() -> None:
-    log = SpeedLog(np.array([0.0, 1.0, 3.0]), np.array([1.0, 2.0, 0.0]), np.zeros(3))
-    (step,) = known(
-        motions_from_speed(log, np.array([0.5, 2.0]), RecordedOdometrySettings(max_gap_s=5.0))
-    )
+    log = np.array([0.0, 1.0, 3.0]), np.array([1.0, 2.0, 0.0]), np.zeros(3)
+    settings = RecordedOdometrySettings(max_gap_s=5.0)
+    (step,) = known(speed_motions(*log, np.array([0.5, 2.0]), settings))
     # From 1.5 to 2 m/s in half a second, then from 2 to 1 m/s in one second.
     np.testing.assert_allclose(step.motion[:3, 3], [0.875 + 1.5, 0.0, 0.0], atol=1e-12)
 
@@ -64,24 +90,19 @@ def test_motions_compose_whatever_frames_are_chosen(seed: int, cuts: list[float]
     rng = np.random.default_rng(seed)
     stamps = np.sort(rng.uniform(0.0, 5.0, 60))
     stamps[[0, -1]] = [0.0, 5.0]
-    log = SpeedLog(stamps, rng.uniform(0, 9, 60), rng.uniform(-0.6, 0.6, 60))
+    log = stamps, rng.uniform(0, 9, 60), rng.uniform(-0.6, 0.6, 60)
     frames = np.array([0.0, *sorted(cuts), 5.0])
     wide = RecordedOdometrySettings(max_gap_s=5.0)
     composed = np.eye(4)
-    for step in known(motions_from_speed(log, frames, wide)):
+    for step in known(speed_motions(*log, frames, wide)):
         composed = composed @ step.motion
-    (whole,) = known(motions_from_speed(log, frames[[0, -1]], wide))
+    (whole,) = known(speed_motions(*log, frames[[0, -1]], wide))
     np.testing.assert_allclose(composed, whole.motion, atol=1e-9)
 
 
 def test_covariance_is_the_stated_noise_times_the_duration() -> None:
-    noise = RecordedOdometrySettings(
-        speed_sigma_mps=0.1,
-        yaw_rate_sigma_dps=3.0,
-    )
-    log = speed_log(np.linspace(0.0, 2.0, 9), 3.0, 0.1)
-    (step,) = known(motions_from_speed(log, np.array([0.5, 0.75]), noise))
-    sigmas = 0.25 * np.array([*np.radians([1.3, 1.9, 3.0]), 0.1, 0.08, 0.12])
+    (step,) = known(of_speed(np.linspace(0.0, 2.0, 9), 3.0, 0.1, np.array([0.5, 0.75])))
+    sigmas = 0.25 * np.array([*np.radians([1.3, 1.9, 0.3]), 0.1, 0.08, 0.12])
     np.testing.assert_allclose(step.covariance, np.diag(sigmas**2), rtol=1e-9)
 
 
@@ -90,8 +111,7 @@ def test_gaps_leave_steps_without_odometry_and_ends_are_held() -> None:
     frames = np.array([0.0, 0.5, 1.0, 1.5, 2.1, 2.6, 3.2])
     expected = [True, False, False, False, True, False]
     np.testing.assert_array_equal(steps_covered(stamps, frames, 0.5, 0.5), expected)
-    log = speed_log(stamps, 2.0, 0.0)
-    steps = motions_from_speed(log, frames, DEFAULT)
+    steps = of_speed(stamps, 2.0, 0.0, frames)
     assert [step is not None for step in steps] == expected
     assert steps[0] is not None
     assert steps[0].motion[0, 3] == pytest.approx(1.0)
@@ -237,11 +257,9 @@ def test_absurd_pose_names_the_line(tmp_path: Path) -> None:
 
 
 def test_log_of_another_clock(tmp_path: Path) -> None:
-    root = with_speeds(tmp_path, row="{t:.2f},5.0,0.1\n")
-    path = root / "odom_car.csv"
-    path.write_text("100.0,1,0\n101.0,1,0\n", encoding="utf-8")
+    (image_folder(tmp_path) / "odom_car.csv").write_text("100.0,1,0\n101.0,1,0\n")
     with pytest.raises(OdometryError, match=r"covers none of the frames .* one clock"):
-        opened(root).odometry(1)
+        opened(tmp_path).odometry(1)
 
 
 def test_ambiguous_and_absent_odometry_files(tmp_path: Path) -> None:
@@ -254,3 +272,444 @@ def test_ambiguous_and_absent_odometry_files(tmp_path: Path) -> None:
     ):
         opened(root)
     assert opened(root, odometry_file="odom_car.csv").odometry(1) is not None
+
+
+# --------------------------------------------------------------------------------------------
+# Named columns: every table is the same arc
+
+
+TIMES = 0.1 * np.arange(11)
+SPEED, YAW_RATE, TRACK = 0.8, 0.5, 0.4
+
+
+def table(path: Path, columns: dict[str, Any], separator: str = ",") -> Path:
+    rows = np.column_stack(list(columns.values()))
+    lines = [separator.join(columns), *(separator.join(f"{x:.12g}" for x in row) for row in rows)]
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+def step_of(path: Path, **settings: Any) -> Odometry:
+    """From 0.2 to 0.6 s."""
+    source = file_odometry(path, RecordedOdometrySettings(**settings))
+    assert source is not None
+    found = source(np.array([0.2, 0.6]))[0]
+    assert found is not None
+    return found
+
+
+def arc() -> tuple[FloatArray, FloatArray, FloatArray]:
+    yaw = YAW_RATE * TIMES
+    return SPEED / YAW_RATE * np.sin(yaw), SPEED / YAW_RATE * (1.0 - np.cos(yaw)), yaw
+
+
+X, Y, YAW = arc()
+WHEELS = (SPEED - 0.5 * YAW_RATE * TRACK, SPEED + 0.5 * YAW_RATE * TRACK)
+ONES = np.ones(11)
+TABLES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "speeds": ({"time": TIMES, "speed": SPEED * ONES, "yaw_rate": YAW_RATE * ONES}, {}),
+    "speeds as ROS names them, among others": (
+        {
+            "seq": ONES,
+            "twist.angular.z": YAW_RATE * ONES,
+            "twist.linear.x": SPEED * ONES,
+            "t": TIMES,
+        },
+        {},
+    ),
+    "units in the names": (
+        {
+            "timestamp_ms": 1e3 * TIMES,
+            "v [km/h]": 3.6 * SPEED * ONES,
+            "omega (deg/s)": np.degrees(YAW_RATE) * ONES,
+        },
+        {},
+    ),
+    "nanoseconds without a word": (
+        {"stamp": 1e9 * TIMES, "vx": SPEED * ONES, "wz": YAW_RATE * ONES},
+        {},
+    ),
+    "wheels": (
+        {"time": TIMES, "v_left": WHEELS[0] * ONES, "v_right": WHEELS[1] * ONES},
+        {"track_m": TRACK},
+    ),
+    "ticks": (
+        {
+            "time": TIMES,
+            "left_ticks": 7 + 1e6 * WHEELS[0] * TIMES,
+            "right_ticks": 1e6 * WHEELS[1] * TIMES,
+        },
+        {"track_m": TRACK, "metres_per_tick": 1e-6},
+    ),
+    "planar poses": ({"time": TIMES, "x": X, "y": Y, "theta": YAW}, {}),
+    "poses": (
+        {
+            "t": TIMES,
+            "x_m": X,
+            "y_m": Y,
+            "z_m": 0 * X,
+            "qx": 0 * X,
+            "qy": 0 * X,
+            "qz": np.sin(YAW / 2),
+            "qw": np.cos(YAW / 2),
+        },
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("separator", [",", ";", " "])
+@pytest.mark.parametrize("name", TABLES)
+def test_every_table_gives_the_same_arc(tmp_path: Path, name: str, separator: str) -> None:
+    columns, settings = TABLES[name]
+    if separator == " ":
+        columns = {key.replace(" ", "_"): value for key, value in columns.items()}
+    motion = step_of(table(tmp_path / "odom.csv", columns, separator), **settings).motion
+    turn = 0.4 * YAW_RATE
+    expected = SPEED / YAW_RATE * np.array([np.sin(turn), 1.0 - np.cos(turn)])
+    assert np.allclose(motion[:2, 3], expected, rtol=0.0, atol=2e-6)
+    assert np.arctan2(motion[1, 0], motion[0, 0]) == pytest.approx(turn, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"time": TIMES, "speed": ONES}, "columns speed, time were understood; needed are time"),
+        ({"speed": ONES, "yaw_rate": ONES}, "no column is named time"),
+        ({"time": TIMES, "v_left": ONES, "v_right": ONES}, r"--set odometry\.track_m="),
+        ({"time": TIMES, "left_ticks": ONES, "right_ticks": ONES}, r"odometry\.metres_per_tick="),
+        ({"time": 0 * TIMES, "v": ONES, "w": ONES}, "line 3: time 0.000000 s does not come after"),
+        ({"time": TIMES, "v": ONES, "w": 30 * ONES}, "absurd .* are these degrees"),
+    ],
+)
+def test_bad_tables(tmp_path: Path, columns: dict[str, Any], message: str) -> None:
+    with pytest.raises(OdometryError, match=message) as caught:
+        step_of(table(tmp_path / "odom.csv", columns))
+    assert "\n" not in str(caught.value)
+
+
+def test_words_and_short_lines_are_named_by_their_line(tmp_path: Path) -> None:
+    path = tmp_path / "odom.csv"
+    for line, message in (("0.1,fast,0", "line 3: v is 'fast'"), ("0.1,1", "line 3: 2 columns")):
+        path.write_text(f"time,v,w\n0.0,1,0\n{line}\n", encoding="utf-8")
+        with pytest.raises(OdometryError, match=message):
+            step_of(path)
+
+
+def test_without_names_the_columns_are_time_speed_and_yaw_rate(tmp_path: Path) -> None:
+    rows = [f"{t:.3e},{SPEED},{YAW_RATE}" for t in TIMES]
+    (tmp_path / "odom.csv").write_text("\n".join(rows), encoding="utf-8")
+    motion = step_of(tmp_path / "odom.csv").motion
+    assert np.arctan2(motion[1, 0], motion[0, 0]) == pytest.approx(0.4 * YAW_RATE, abs=1e-9)
+
+
+# --------------------------------------------------------------------------------------------
+# Gyroscope
+
+
+RATE = np.array([0.3, -0.2, 0.5])  # rad/s
+AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def tumbling(stamps: FloatArray) -> FloatArray:
+    """Rates (n, 3) whose axis turns, so that the order of turns counts."""
+    return np.column_stack([1.5 * np.sin(3 * stamps), np.cos(2 * stamps), 0.5 + stamps])
+
+
+def finely(stamps: FloatArray, start: float, end: float, bias: FloatArray) -> FloatArray:
+    """The rotation by many small steps of the interpolated rate in their middle."""
+    edges = np.linspace(start, end, 4001)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    rates = np.column_stack([np.interp(middle, stamps, axis) for axis in tumbling(stamps).T]) - bias
+    rotation = np.eye(3)
+    for rate in rates:
+        rotation = rotation @ so3_exp(rate * (end - start) / len(rates))
+    return rotation
+
+
+def write_rates(path: Path, stamps: FloatArray, rates: FloatArray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = (f"{int(t)},{x:.12g},{y:.12g},{z:.12g},0,0,9.8" for t, (x, y, z) in
+            zip(stamps, rates, strict=True))  # fmt: skip
+    head = "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],a,b,c"
+    path.write_text("\n".join([head, *rows]), encoding="utf-8")
+    return path
+
+
+def sampled(seconds: float, rate: FloatArray = RATE) -> tuple[FloatArray, FloatArray]:
+    """Stamps from a tenth before 0 to a tenth after, at 200 Hz, and one rate at all."""
+    stamps = np.arange(-0.1, seconds + 0.1, 0.005)
+    return stamps, np.tile(rate, (len(stamps), 1))
+
+
+def test_integration_is_that_of_many_small_steps() -> None:
+    stamps = np.arange(0.0, 1.2, 0.02)
+    turned, jacobians = integrate_rates(stamps, tumbling(stamps), np.array([0.103, 0.9]))
+    fine = finely(stamps, 0.103, 0.9, np.zeros(3))
+    assert rotation_angle(turned[0].T @ fine) < 1e-6, "by the mean rate of two samples 3e-5"
+    for axis in np.eye(3):
+        moved = so3_log(fine.T @ finely(stamps, 0.103, 0.9, 1e-3 * axis)) / 1e-3
+        np.testing.assert_allclose(jacobians[0] @ axis, moved, rtol=0.0, atol=1e-3)
+
+
+def test_a_steady_turn_is_exact_at_any_rate_of_samples() -> None:
+    for period in (0.005, 0.05):
+        stamps = np.arange(0.0, 1.0, period)
+        rates = np.tile(RATE, (len(stamps), 1))
+        turned, _ = integrate_rates(stamps, rates, np.array([0.1, 0.333, 0.8]))
+        np.testing.assert_allclose(turned[0], so3_exp(0.233 * RATE), rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(turned[1], so3_exp(0.467 * RATE), rtol=0.0, atol=1e-12)
+
+
+def test_steps_beyond_the_samples_and_over_gaps_are_not_measured() -> None:
+    stamps = np.array([0.0, 0.05, 0.1, 0.4, 0.45, 0.5])
+    frames = np.array([-0.2, 0.0, 0.1, 0.2, 0.42, 0.5, 0.6])
+    steps = gyroscope_motions(stamps, np.tile(RATE, (6, 1)), frames, GyroscopeNoise())
+    assert [step is not None for step in steps] == [False, True, False, False, True, False]
+
+
+def test_noise_grows_with_time_and_turn() -> None:
+    stamps, rates = sampled(1.0, np.zeros(3))
+    noise = GyroscopeNoise(density=0.01, walk=0.1)
+    frames = np.array([0.0, 0.25])
+    (step,) = known(gyroscope_motions(stamps, rates, frames, noise))
+    assert (step.measured, step.turned) == (False, True)
+    np.testing.assert_allclose(step.covariance[:3, :3], 0.25e-4 * np.eye(3), atol=1e-12)
+    assert step.covariance[3, 3] >= 100.0  # metres squared: nothing is known of it
+    assert step.bias is not None
+    assert step.bias.walk == pytest.approx(0.0025)
+    (turning,) = known(gyroscope_motions(stamps, rates + RATE, frames, noise))
+    assert turning.covariance[0, 0] > step.covariance[0, 0]
+
+
+def only_step(steps: Steps) -> FloatArray:
+    assert steps[0] is not None
+    return so3_log(steps[0].motion[:3, :3])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-6, 1e-9])
+def test_times_of_rates_are_in_any_unit(tmp_path: Path, unit: float) -> None:
+    stamps, rates = sampled(1.0)
+    path = tmp_path / "rates.csv"
+    rows = np.column_stack([stamps / unit, rates])
+    path.write_text("\n".join(",".join(f"{x:.12g}" for x in row) for row in rows))
+    table = read_columns(path, "rates")
+    np.testing.assert_allclose(table.column(0), stamps, rtol=0.0, atol=1e-9)
+
+
+def test_degrees_are_refused_by_their_size(tmp_path: Path) -> None:
+    stamps, rates = sampled(1.0)
+    path = write_rates(tmp_path / "imu.csv", 1e9 * stamps, np.degrees(rates))
+    with pytest.raises(OdometryError, match=r"line 2: angular velocity .*are these degrees\?"):
+        read(path)
+
+
+def test_noise_is_what_the_file_states(tmp_path: Path) -> None:
+    own = tmp_path / "imu.yaml"
+    own.write_text("imu0:\n  gyroscope_noise_density: 0.002\n  gyroscope_random_walk: 3.0e-05\n")
+    assert read_gyroscope_noise(own) == GyroscopeNoise(0.002, 3e-5)
+    own.write_text("update_rate: 200.0\n")
+    assert read_gyroscope_noise(own) == GyroscopeNoise()
+    own.write_text("gyroscope_noise_density: much\n")
+    with pytest.raises(CalibrationError, match="gyroscope_noise_density"):
+        read_gyroscope_noise(own)
+
+
+def pose_ahead() -> FloatArray:
+    out = np.eye(4)
+    out[:3, :3] = AHEAD
+    return out
+
+
+def euroc_with_gyroscope(root: Path) -> Path:
+    left = pose_ahead()
+    right = pose_ahead()
+    right[1, 3] = -0.1
+    root = euroc(root, (left, right))
+    stamps, rates = sampled(1.0)
+    stamps_ns = np.round(1e9 * stamps) + EUROC_START_NS
+    write_rates(root / "mav0" / "imu0" / "data.csv", stamps_ns, rates)
+    return root
+
+
+def test_euroc_turns_as_its_gyroscope_says(tmp_path: Path) -> None:
+    root = euroc_with_gyroscope(tmp_path)
+    steps = open_recording(EurocSettings(path=str(root))).odometry(1)
+    np.testing.assert_allclose(only_step((steps,)), 1e-9 * PERIOD_NS * RATE, rtol=0.0, atol=1e-6)
+    quarter = "[0, -1, 0, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"  # the sensor's x is the body's y
+    text = f"T_BS:\n  data: {quarter}\ngyroscope_noise_density: 0.5\n"
+    (root / "mav0" / "imu0" / "sensor.yaml").write_text(text)
+    turned = open_recording(EurocSettings(path=str(root))).odometry(1)
+    assert turned is not None
+    body = np.array([-RATE[1], RATE[0], RATE[2]])
+    np.testing.assert_allclose(only_step((turned,)), 1e-9 * PERIOD_NS * body, rtol=0.0, atol=1e-6)
+    assert turned.covariance[0, 0] > 0.25e-9 * PERIOD_NS, "the file's noise"
+
+
+def test_a_bare_recording_says_that_it_has_a_gyroscope(tmp_path: Path) -> None:
+    found = bare_experiment(euroc_with_gyroscope(tmp_path))
+    assert "; a gyroscope, no odometry" in found.said
+    assert found.config.odometry.kind == "recorded"
+
+
+NAMED = "timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],note"
+
+
+@pytest.mark.parametrize(
+    ("head", "unit"),
+    [(NAMED, 1.0), ("t_ns,gyro_x_dps,gyro_y_dps,gyro_z_dps", np.pi / 180.0), (None, 1.0)],
+)
+def test_a_folder_has_its_gyroscope_beside_its_images(
+    tmp_path: Path, head: str | None, unit: float
+) -> None:
+    root = image_folder(tmp_path)
+    stamps, rates = sampled(1.0)
+    rows = [f"{round(1e9 * t)},{x:.9g},{y:.9g},{z:.9g},0" for t, (x, y, z) in
+            zip(stamps, rates / unit, strict=True)]  # fmt: skip
+    (root / "imu.csv").write_text("\n".join([*([head] if head else []), *rows]))
+    step = open_recording(ImageFolderSettings(path=str(root))).odometry(1)
+    np.testing.assert_allclose(only_step((step,)), 0.1 * RATE, rtol=0.0, atol=1e-6)
+
+
+def test_a_bag_turns_by_its_imu(tmp_path: Path) -> None:
+    stamps = START_NS + 5_000_000 * np.arange(-20, 100)
+    bag = write_bag(tmp_path / "walk.bag", stereo(4) + gyroscope(stamps.tolist(), RATE))
+    recording = open_recording(BagSettings(path=str(bag)), DEFAULT)
+    np.testing.assert_allclose(only_step((recording.odometry(1),)), 0.1 * RATE, atol=1e-6)
+    assert "; a gyroscope, no odometry" in bare_experiment(bag).said
+
+
+# --------------------------------------------------------------------------------------------
+# Synthetic odometry
+
+
+SETTINGS = SyntheticOdometrySettings()
+FRAMES = 300
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = image_folder(tmp_path_factory.mktemp("synthetic"), FRAMES)
+    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(FRAMES), curve(FRAMES))
+    return root
+
+
+def mounted(root: Path, **settings: object) -> Recording:
+    mounting = {"lever_arm_m": (0.5, -0.2, 1.0), "camera_yaw_deg": 10.0}
+    return open_recording(ImageFolderSettings(path=str(root), **mounting, **settings))  # type: ignore[arg-type]
+
+
+def synthetic_step(sequence: SyntheticOdometry, i: int) -> Odometry:
+    odometry = sequence.odometry(i)
+    assert odometry is not None
+    return odometry
+
+
+def whitened_errors(sequence: SyntheticOdometry) -> FloatArray:
+    """Whitened error (n, 6) of every step against the truth, in the body's tangent space."""
+    truth = sequence.ground_truth
+    assert truth is not None
+    bTc = sequence.rig.bTc
+    out = []
+    for i in range(1, len(sequence)):
+        given = synthetic_step(sequence, i)
+        camera = inverse(truth.poses[i - 1]) @ truth.poses[i]
+        body = bTc @ camera @ inverse(bTc)
+        xi = se3_log(inverse(body) @ given.motion)
+        out.append(xi / np.sqrt(np.diag(given.covariance)))
+    return np.array(out)
+
+
+def test_synthetic_odometry_is_a_sequence_and_noted_as_synthetic(folder: Path) -> None:
+    recording = mounted(folder)
+    sequence = SyntheticOdometry(recording, SETTINGS, 3)
+    assert isinstance(sequence, ImageSequence)
+    assert (sequence.name, sequence.identity) == (recording.name, recording.identity)
+    assert len(sequence) == FRAMES
+    np.testing.assert_array_equal(sequence.timestamps, recording.timestamps)
+    np.testing.assert_array_equal(sequence.frame(5).images[1], recording.frame(5).images[1])
+    assert any("synthetic" in n and "2 %" in n and "1 degrees" in n for n in sequence.notes)
+
+
+def test_noise_is_the_stated_one(folder: Path) -> None:
+    """Sound statistics: each axis' whitened errors are standard normal, uncorrelated."""
+    white = whitened_errors(SyntheticOdometry(mounted(folder), SETTINGS, 11))
+    n = len(white)
+    low, high = stats.chi2.ppf([0.001, 0.999], n) / n
+    power = (white**2).mean(axis=0)
+    assert np.all((power > low) & (power < high))
+    assert np.all(np.abs(white.mean(axis=0)) < 3.3 / np.sqrt(n))
+    correlation = np.corrcoef(white.T) - np.eye(6)
+    assert np.abs(correlation).max() < 3.8 / np.sqrt(n)
+
+
+def test_standard_deviations_follow_the_settings(folder: Path) -> None:
+    sequence = SyntheticOdometry(mounted(folder), SETTINGS, 1)
+    truth = sequence.ground_truth
+    assert truth is not None
+    bTc = sequence.rig.bTc
+    body = bTc @ inverse(truth.poses[0]) @ truth.poses[1] @ inverse(bTc)
+    sigmas = np.sqrt(np.diag(synthetic_step(sequence, 1).covariance))
+    np.testing.assert_allclose(sigmas[:3], np.radians(1.0))
+    np.testing.assert_allclose(sigmas[3:], 0.02 * np.linalg.norm(body[:3, 3]))
+
+
+def test_without_noise_but_the_floor_it_is_the_truth(folder: Path) -> None:
+    still = SyntheticOdometrySettings(translation_sigma_fraction=0.0, rotation_sigma_deg=0.0)
+    sequence = SyntheticOdometry(mounted(folder), still, 1)
+    truth = sequence.ground_truth
+    assert truth is not None
+    for i in range(1, 8):
+        found = synthetic_step(sequence, i)
+        sigmas = np.sqrt(np.diag(found.covariance))
+        np.testing.assert_allclose(sigmas, np.repeat([np.radians(0.01), 0.001], 3))
+        camera = body_to_camera_motion(found.motion, sequence.rig.bTc)
+        expected = inverse(truth.poses[i - 1]) @ truth.poses[i]
+        np.testing.assert_allclose(camera, expected, atol=5.0 * 0.001)
+
+
+def test_seeds_repeat_and_differ(folder: Path) -> None:
+    recording = mounted(folder)
+    first, again, other = (SyntheticOdometry(recording, SETTINGS, seed) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(synthetic_step(first, 9).motion, synthetic_step(again, 9).motion)
+    assert not np.allclose(
+        synthetic_step(first, 9).motion, synthetic_step(other, 9).motion, atol=1e-6
+    )
+    assert not np.allclose(
+        synthetic_step(first, 9).motion, synthetic_step(first, 10).motion, atol=1e-6
+    )
+
+
+def test_a_part_of_the_recording_repeats_the_same_noise(folder: Path) -> None:
+    whole = SyntheticOdometry(mounted(folder), SETTINGS, 5)
+    part = SyntheticOdometry(mounted(folder, start=100, stop=200), SETTINGS, 5)
+    for i in (1, 50, 99):
+        np.testing.assert_array_equal(
+            synthetic_step(part, i).motion, synthetic_step(whole, 100 + i).motion
+        )
+
+
+def test_order_of_asking_does_not_matter(folder: Path) -> None:
+    sequence = SyntheticOdometry(mounted(folder), SETTINGS, 5)
+    forwards = [synthetic_step(sequence, i).motion for i in (1, 2, 3)]
+    backwards = [synthetic_step(sequence, i).motion for i in (3, 2, 1)][::-1]
+    np.testing.assert_array_equal(forwards, backwards)
+
+
+def test_needs_ground_truth(tmp_path: Path) -> None:
+    recording = mounted(image_folder(tmp_path))
+    with pytest.raises(DatasetError, match=r"no ground truth.*choose recorded") as error:
+        SyntheticOdometry(recording, SETTINGS, 1)
+    assert "\n" not in str(error.value)
+
+
+def test_gap_in_the_truth_leaves_the_step_without_odometry(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    keep = [0, 1, 4, 5]
+    write_tum(root / "gt_right_cam.txt", 0.1 * np.array(keep), curve(6)[keep])
+    sequence = SyntheticOdometry(mounted(root), SETTINGS, 1)
+    got = [sequence.odometry(i) is not None for i in range(1, 6)]
+    assert got == [True, False, False, False, True]
+    assert "2 frames have no ground truth, so no odometry" in sequence.notes
+    with pytest.raises(IndexError):
+        sequence.odometry(0)
