@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import io
+import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,48 +20,11 @@ from fgslam.core.geometry import congruence, inverse, quaternion_from_rotation
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Trajectory, pose_rows
 
-Records: TypeAlias = npt.NDArray[np.void]
-
 _COVARIANCE_NAMES = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 _UPPER = np.triu_indices(3)
 _INT32_MAX = 2**31 - 1
-
-# One landmark in the .ply file; `packed`, little-endian, as the format wants it.
-_PLY_DTYPE = np.dtype(
-    [(name, "<f8") for name in "xyz"]
-    + [(name, "u1") for name in ("red", "green", "blue")]
-    + [(name, "<i4") for name in ("landmark_id", "hits", "misses")]
-    + [(name, "<f8") for name in _COVARIANCE_NAMES]
-    + [(name, "u1") for name in ("valid", "permanent")]
-)
-# PCL's point types are single precision; double x, y, z would not be recognised by its tools.
-_PCD_DTYPE = np.dtype(
-    [(name, "<f4") for name in "xyz"]
-    + [(name, "<u4") for name in ("rgb", "landmark_id", "hits", "misses")]
-    + [(name, "<f4") for name in _COVARIANCE_NAMES]
-    + [(name, "u1") for name in ("valid", "permanent")]
-)
-_PLY_TYPES = {
-    "f8": "double",
-    "f4": "float",
-    "i4": "int",
-    "u4": "uint",
-    "i2": "short",
-    "u2": "ushort",
-    "i1": "char",
-    "u1": "uchar",
-}
-_PLY_SYNONYMS = {
-    "float64": "f8",
-    "float32": "f4",
-    "int32": "i4",
-    "uint32": "u4",
-    "int16": "i2",
-    "uint16": "u2",
-    "int8": "i1",
-    "uint8": "u1",
-} | {name: code for code, name in _PLY_TYPES.items()}
-_NORMALS = {".ply": ("nx", "ny", "nz"), ".pcd": ("normal_x", "normal_y", "normal_z")}
+_PLY_TYPES = {"f8": "double", "f4": "float", "i4": "int", "u1": "uchar"}
+_PLY_FORMAT = "format binary_little_endian 1.0"
 _PLY_COMMENTS = (
     "comment fgslam landmark map 1",
     "comment world = first reference camera: x right, y down, z forward, metres",
@@ -95,23 +59,14 @@ class MapPoints(Rows):
     normals: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        n = len(self.ids)
-        shapes = {
-            "positions": (n, 3),
-            "covariances": (n, 3, 3),
-            "colours": (n, 3),
-            "hits": (n,),
-            "misses": (n,),
-            "valid": (n,),
-            "permanent": (n,),
-        } | ({} if self.normals is None else {"normals": (n, 3)})
-        for name, shape in shapes.items():
-            if getattr(self, name).shape != shape:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}, not {shape}")
+        for each in fields(self):
+            values = getattr(self, each.name)
+            if values is not None and len(values) != len(self):
+                raise ValueError(f"{each.name} has {len(values)} rows, not {len(self)}")
 
 
 def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
-    """Write a map in the format that the suffix names: `.ply` or `.pcd`.
+    """Writes a map in the format that the suffix names: `.ply` or `.pcd`.
 
     Args:
         path: the file to write, atomically.
@@ -119,7 +74,8 @@ def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
         remark: ASCII, put into a comment of the file.
 
     Raises:
-        OutputError: the suffix is another one, a landmark is not finite, or writing failed.
+        OutputError: the suffix is another one, a landmark is not finite, an id needs more than 31
+            bits, or writing failed.
     """
     writers = {".ply": write_ply, ".pcd": write_pcd}
     writer = writers.get(path.suffix.lower())
@@ -130,41 +86,28 @@ def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
     writer(path, points, remark)
 
 
-# --------------------------------------------------------------------------------------------
-# PLY
-
-
 def write_ply(path: Path, points: MapPoints, remark: str = "") -> None:
-    """Write a binary little-endian .ply with every property of every landmark, exactly.
+    """Writes a binary little-endian .ply with every property of every landmark, exactly."""
+    _require_finite(path, positions=points.positions, covariances=points.covariances)
+    columns = dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
+    records = _records(path, points, _ply_type(points.normals is not None), columns)
+    lines = ["ply", _PLY_FORMAT, *_PLY_COMMENTS]
+    lines += [f"comment {remark}"] if remark else []
+    lines += [f"element vertex {len(points)}", *_ply_properties(records.dtype), "end_header\n"]
+    write_bytes(path, "\n".join(lines).encode("ascii") + records.tobytes())
 
-    Args:
-        path: the file to write, atomically.
-        points: the landmarks.
-        remark: ASCII, put into a comment of the header.
 
-    Raises:
-        OutputError: a landmark is not finite, an id needs more than 31 bits, or writing failed.
-    """
-    _require_writable(path, points)
-    records = np.empty(len(points), _with_normals(_PLY_DTYPE, points, ".ply"))
-    for column, name in enumerate("xyz"):
-        records[name] = points.positions[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        records[name] = points.colours[:, column]
-    _fill_bookkeeping(records, points)
-    header = ["ply", "format binary_little_endian 1.0", *_PLY_COMMENTS]
-    header += [f"comment {remark}"] if remark else []
-    header += [f"element vertex {len(points)}"]
-    header += [
-        f"property {_PLY_TYPES[records.dtype[name].str[1:]]} {name}"
-        for name in records.dtype.names or ()
-    ]
-    header += ["end_header\n"]
-    write_bytes(path, "\n".join(header).encode("ascii") + records.tobytes())
+def _ply_type(has_normals: bool) -> np.dtype[Any]:
+    return _landmark_type("f8", "i4", ("red", "green", "blue"), "u1", "n" if has_normals else None)
+
+
+def _ply_properties(dtype: np.dtype[Any]) -> list[str]:
+    names = dtype.names or ()
+    return [f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}" for name in names]
 
 
 def read_ply(path: Path) -> MapPoints:
-    """Read a map that :func:`write_ply` wrote.
+    """A map that :func:`write_ply` wrote.
 
     Raises:
         DatasetError: the file is missing, cut off, or not a landmark map of this program.
@@ -173,156 +116,131 @@ def read_ply(path: Path) -> MapPoints:
         content = path.read_bytes()
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
-    end = content.find(b"end_header\n")
-    if not content.startswith(b"ply") or end < 0:
+    header, end, body = content.partition(b"end_header\n")
+    lines = header.decode("ascii", errors="replace").splitlines()
+    if not lines or lines[0] != "ply" or not end:
         raise DatasetError(f"{path} is not a .ply file; give the map.ply of a run folder")
-    dtype, count = _parse_ply_header(path, content[:end].decode("ascii", errors="replace"))
-    body = content[end + len(b"end_header\n") :]
-    missing = [name for name in _PLY_DTYPE.names or () if name not in (dtype.names or ())]
-    if missing:
+    dtype = _ply_type(any(line.endswith(" nx") for line in lines))
+    found = [line for line in lines if line.startswith(("format", "property"))]
+    expected = [_PLY_FORMAT, *_ply_properties(dtype)]
+    counts = [line for line in lines if re.fullmatch(r"element vertex \d+", line)]
+    if found != expected or len(counts) != 1:
+        lacking = [line for line in expected if line not in found] or ["element vertex"]
         raise DatasetError(
-            f"{path} has no property '{missing[0]}'; give the map.ply of a run folder"
+            f"{path} is no landmark map: it has no line '{lacking[0]}' of its own; give the "
+            "map.ply of a run folder"
         )
+    count = int(counts[0].split()[2])
     if len(body) < count * dtype.itemsize:
         raise DatasetError(
             f"{path} is cut off: {len(body)} bytes of landmarks instead of "
             f"{count * dtype.itemsize}; run the experiment again"
         )
-    return _from_records(np.frombuffer(body, dtype, count))
+    records = np.frombuffer(body, dtype, count)
 
+    def columns(*names: str) -> npt.NDArray[Any]:
+        return np.column_stack([records[name] for name in names])
 
-def _parse_ply_header(path: Path, header: str) -> tuple[np.dtype[Any], int]:
-    fields: list[tuple[str, str]] = []
-    count = -1
-    for line in header.splitlines():
-        words = line.split()
-        if words[:1] == ["format"] and words[1:2] != ["binary_little_endian"]:
-            raise DatasetError(
-                f"{path} is not binary little-endian; give the map.ply of a run folder"
-            )
-        if words[:2] == ["element", "vertex"] and len(words) == 3 and words[2].isdigit():
-            count = int(words[2])
-        if words[:1] == ["property"]:
-            code = _PLY_SYNONYMS.get(words[1]) if len(words) == 3 else None
-            if code is None:
-                raise DatasetError(
-                    f"{path} has a property that maps do not have: '{line}'; "
-                    "give the map.ply of a run folder"
-                )
-            fields.append((words[2], f"<{code}"))
-    if count < 0:
-        raise DatasetError(f"{path} does not say how many points it holds; write it again")
-    return np.dtype(fields), count
-
-
-def _from_records(records: Records) -> MapPoints:
-    covariances = np.empty((len(records), 3, 3))
-    upper = np.column_stack([records[name] for name in _COVARIANCE_NAMES])
-    covariances[:, _UPPER[0], _UPPER[1]] = upper
-    covariances[:, _UPPER[1], _UPPER[0]] = upper
+    covariances = np.empty((count, 3, 3))
+    covariances[:, _UPPER[0], _UPPER[1]] = columns(*_COVARIANCE_NAMES)
+    covariances[:, _UPPER[1], _UPPER[0]] = columns(*_COVARIANCE_NAMES)
+    has_normals = "nx" in (dtype.names or ())
     return MapPoints(
         ids=records["landmark_id"].astype(np.int64),
-        positions=np.column_stack([records[name] for name in "xyz"]).astype(np.float64),
+        positions=columns("x", "y", "z"),
         covariances=covariances,
-        colours=np.column_stack([records[name] for name in ("red", "green", "blue")]),
+        colours=columns("red", "green", "blue"),
         hits=records["hits"].astype(np.int64),
         misses=records["misses"].astype(np.int64),
         valid=records["valid"] != 0,
         permanent=records["permanent"] != 0,
-        normals=_normals_in(records),
+        normals=columns("nx", "ny", "nz").astype(np.float64) if has_normals else None,
     )
 
 
-def _normals_in(records: Records) -> FloatArray | None:
-    names = _NORMALS[".ply"]
-    if not set(names) <= set(records.dtype.names or ()):
-        return None
-    return np.column_stack([records[name] for name in names]).astype(np.float64)
-
-
-# --------------------------------------------------------------------------------------------
-# PCD
-
-
 def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
-    """Write a binary .pcd 0.7 (PCL, Open3D, CloudCompare), single precision.
+    """Writes a binary .pcd 0.7 (PCL, Open3D, CloudCompare).
 
-    Args:
-        path: the file to write, atomically.
-        points: the landmarks.
-        remark: ASCII, put into a comment line.
-
-    Raises:
-        OutputError: as :func:`write_ply`.
+    Single precision: PCL's point types are, and its tools do not know doubles as x, y, z.
     """
-    _require_writable(path, points)
-    records = np.empty(len(points), _with_normals(_PCD_DTYPE, points, ".pcd"))
-    for column, name in enumerate("xyz"):
-        records[name] = points.positions[:, column]
+    _require_finite(path, positions=points.positions, covariances=points.covariances)
+    normals = None if points.normals is None else "normal_"
+    dtype = _landmark_type("f4", "u4", ("rgb",), "u4", normals)
     red, green, blue = points.colours.astype(np.uint32).T
-    records["rgb"] = (red << 16) | (green << 8) | blue
-    _fill_bookkeeping(records, points)
-    names = records.dtype.names or ()
-    kinds = [records.dtype[name] for name in names]
-    header = [
+    records = _records(path, points, dtype, {"rgb": (red << 16) | (green << 8) | blue})
+    kinds = [dtype[name] for name in dtype.names or ()]
+    lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
         *([f"# {remark}"] if remark else []),
         "VERSION 0.7",
-        f"FIELDS {' '.join(names)}",
+        f"FIELDS {' '.join(dtype.names or ())}",
         f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
         f"TYPE {' '.join(kind.kind.upper() for kind in kinds)}",
-        f"COUNT {' '.join('1' for _ in names)}",
+        f"COUNT {' '.join('1' for _ in kinds)}",
         f"WIDTH {len(points)}",
         "HEIGHT 1",
         "VIEWPOINT 0 0 0 1 0 0 0",
         f"POINTS {len(points)}",
         "DATA binary\n",
     ]
-    write_bytes(path, "\n".join(header).encode("ascii") + records.tobytes())
+    write_bytes(path, "\n".join(lines).encode("ascii") + records.tobytes())
 
 
-def _with_normals(dtype: np.dtype[Any], points: MapPoints, suffix: str) -> np.dtype[Any]:
-    """The type of a landmark, with a normal at its end where there are normals."""
-    if points.normals is None:
-        return dtype
-    return np.dtype([*dtype.descr, *((name, "<f4") for name in _NORMALS[suffix])])
+def _landmark_type(
+    real: str, whole: str, colours: Sequence[str], tint: str, normals: str | None
+) -> np.dtype[Any]:
+    """One landmark in a file, packed: kinds of its numbers, names of its colours and normals."""
+    return np.dtype(
+        [(name, f"<{real}") for name in "xyz"]
+        + [(name, f"<{tint}") for name in colours]
+        + [(name, f"<{whole}") for name in ("landmark_id", "hits", "misses")]
+        + [(name, f"<{real}") for name in _COVARIANCE_NAMES]
+        + [(name, "u1") for name in ("valid", "permanent")]
+        + [(f"{normals}{axis}", "<f4") for axis in "xyz" if normals is not None]
+    )
 
 
-def _fill_bookkeeping(records: Records, points: MapPoints) -> None:
-    records["landmark_id"] = points.ids
-    records["hits"] = points.hits
-    records["misses"] = points.misses
-    records["valid"] = points.valid
-    records["permanent"] = points.permanent
-    upper = points.covariances[:, _UPPER[0], _UPPER[1]]
-    for column, name in enumerate(_COVARIANCE_NAMES):
-        records[name] = upper[:, column]
-    if points.normals is not None:
-        for column, name in enumerate((records.dtype.names or ())[-3:]):
-            records[name] = points.normals[:, column]
-
-
-def _require_writable(path: Path, points: MapPoints) -> None:
-    finite = np.isfinite(points.positions).all(axis=1)
-    finite &= np.isfinite(points.covariances).all(axis=(1, 2))
-    if not finite.all():
-        worst = int(points.ids[int(np.argmin(finite))])
-        raise OutputError(
-            f"cannot write {path}: landmark {worst} is not finite; the estimator diverged, "
-            "check the measurements of that landmark"
-        )
+def _records(
+    path: Path, points: MapPoints, dtype: np.dtype[Any], colours: Mapping[str, npt.NDArray[Any]]
+) -> npt.NDArray[np.void]:
+    """The landmarks as they stand in a file. Raises OutputError of an id that does not fit."""
     if len(points) and (points.ids.min() < 0 or points.ids.max() > _INT32_MAX):
         raise OutputError(
             f"cannot write {path}: landmark ids must lie in 0 .. {_INT32_MAX}; renumber them"
         )
+    columns = [
+        *points.positions.T,
+        *colours.values(),
+        *(points.ids, points.hits, points.misses),
+        *points.covariances[:, _UPPER[0], _UPPER[1]].T,
+        *(points.valid, points.permanent),
+        *(() if points.normals is None else points.normals.T),
+    ]
+    records = np.empty(len(points), dtype)
+    for name, values in zip(dtype.names or (), columns, strict=True):
+        records[name] = values
+    return records
 
+
+def _require_finite(path: Path, **arrays: FloatArray) -> None:
+    """Raises OutputError, naming the first row that is not finite."""
+    for name, values in arrays.items():
+        bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        if bad.any():
+            raise OutputError(
+                f"cannot write {path}: {name} {int(np.argmax(bad))} is not finite; the estimator "
+                "diverged or the log is damaged, run the experiment again"
+            )
+
+
+# --------------------------------------------------------------------------------------------
+# g2o
 
 GRAPH_SUFFIX = ".g2o"
 EXACT_SIGMA = 1e-6
 """Standard deviation (m, rad) in place of zero: a file of information cannot say `exact`."""
 
 _OFFSET_ID = 0  # of the sensor in the pose's frame: the identity, poses are the camera's own
-_UPPER3, _UPPER6 = np.triu_indices(3), np.triu_indices(6)
 # From our tangent [rotation vector, translation] to g2o's [translation, quaternion's vector].
 _OURS_OF_G2O = np.block([[np.zeros((3, 3)), 2.0 * np.eye(3)], [np.eye(3), np.zeros((3, 3))]])
 
@@ -376,15 +294,30 @@ def write_g2o(path: Path, graph: PoseLandmarkGraph, remarks: Sequence[str] = ())
         OutputError: another ending, a number that is not finite, or writing failed.
     """
     require_graph_suffix(path)
-    _require_finite(path, graph)
-    blocks = [
-        *(f"# {remark}\n" for remark in remarks),
-        f"PARAMS_SE3OFFSET {_OFFSET_ID} 0 0 0 0 0 0 1\n",
-        *_vertices(graph),
-        *_motions(graph),
-        *_observations(graph),
-    ]
-    write_text(path, "".join(blocks))
+    arrays = ("poses", "landmarks", "motions", "motion_covariances", "points")
+    _require_finite(path, **{name: getattr(graph, name) for name in arrays})
+    n, (i3, j3), (i6, j6) = len(graph.poses), np.triu_indices(3), np.triu_indices(6)
+    motions = g2o_information(graph.motion_covariances)[:, i6, j6]
+    points = information_of(graph.point_covariances)[:, i3, j3]
+    motion_ends = np.column_stack([graph.motion_from, graph.motion_to])
+    seen_ends = np.column_stack([graph.seen_from, n + graph.seen])
+    lines = io.StringIO()
+    lines.writelines(f"# {remark}\n" for remark in remarks)
+    lines.write(f"PARAMS_SE3OFFSET {_OFFSET_ID} 0 0 0 0 0 0 1\n")
+    for tag, numbers, values, information in (
+        ("VERTEX_SE3:QUAT %d", np.arange(n)[:, None], pose_rows(graph.poses), None),
+        ("VERTEX_TRACKXYZ %d", n + np.arange(len(graph.landmarks))[:, None], graph.landmarks, None),
+        ("EDGE_SE3:QUAT %d %d", motion_ends, pose_rows(graph.motions), motions),
+        (f"EDGE_SE3_TRACKXYZ %d %d {_OFFSET_ID}", seen_ends, graph.points, points),
+    ):
+        table, row = [numbers, values], tag + values.shape[1] * " %.12g"
+        if information is not None:
+            table, row = [*table, information], row + information.shape[1] * " %.9g"
+        # Adding zero turns -0 into 0.
+        np.savetxt(lines, np.column_stack(table) + 0.0, fmt=row)
+        if tag.startswith("VERTEX_SE3") and n:
+            lines.write("FIX 0\n")
+    write_text(path, lines.getvalue())
 
 
 def g2o_information(covariances: FloatArray) -> FloatArray:
@@ -401,46 +334,8 @@ def information_of(covariances: FloatArray) -> FloatArray:
     return congruence(directions * np.sqrt(inverse)[:, None, :], np.eye(covariances.shape[-1]))
 
 
-def _vertices(graph: PoseLandmarkGraph) -> Iterator[str]:
-    numbers = np.arange(len(graph.poses))
-    yield _lines("VERTEX_SE3:QUAT %d" + 7 * " %.12g", numbers[:, None], pose_rows(graph.poses))
-    if len(graph.poses):
-        yield "FIX 0\n"
-    landmarks = len(graph.poses) + np.arange(len(graph.landmarks))
-    yield _lines("VERTEX_TRACKXYZ %d" + 3 * " %.12g", landmarks[:, None], graph.landmarks)
-
-
-def _motions(graph: PoseLandmarkGraph) -> Iterator[str]:
-    upper = g2o_information(graph.motion_covariances)[:, _UPPER6[0], _UPPER6[1]]
-    ends = np.column_stack([graph.motion_from, graph.motion_to])
-    row_format = "EDGE_SE3:QUAT %d %d" + 7 * " %.12g" + 21 * " %.9g"
-    yield _lines(row_format, ends, np.column_stack([pose_rows(graph.motions), upper]))
-
-
-def _observations(graph: PoseLandmarkGraph) -> Iterator[str]:
-    upper = information_of(graph.point_covariances)[:, _UPPER3[0], _UPPER3[1]]
-    ends = np.column_stack([graph.seen_from, len(graph.poses) + graph.seen])
-    row_format = f"EDGE_SE3_TRACKXYZ %d %d {_OFFSET_ID}" + 3 * " %.12g" + 6 * " %.9g"
-    yield _lines(row_format, ends, np.column_stack([graph.points, upper]))
-
-
-def _lines(row_format: str, numbers: IntArray, values: FloatArray) -> str:
-    buffer = io.StringIO()
-    # Adding zero turns -0 into 0.
-    np.savetxt(buffer, np.column_stack([numbers, values + 0.0]), fmt=row_format)
-    return buffer.getvalue()
-
-
-def _require_finite(path: Path, graph: PoseLandmarkGraph) -> None:
-    for name in ("poses", "landmarks", "motions", "motion_covariances", "points"):
-        array = getattr(graph, name)
-        bad = ~np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
-        if bad.any():
-            raise OutputError(
-                f"cannot write {path}: {name} {int(np.argmax(bad))} is not finite; the estimator "
-                "diverged or the log is damaged, run the experiment again"
-            )
-
+# --------------------------------------------------------------------------------------------
+# COLMAP
 
 _CAMERA = 1  # all images are of one camera: rectified rigs have equal intrinsics
 _PIXEL_CENTRE = 0.5
@@ -495,95 +390,46 @@ def write_colmap(folder: Path, model: ImageModel) -> None:
     Raises:
         OutputError: a pose or point is not finite, or writing failed.
     """
-    _require_finite_model(folder, model)
-    table = _Table.of(model)
-    for name, text in (
-        ("cameras.txt", _camera_text(model.rig)),
-        ("images.txt", _image_text(model, table)),
-        ("points3D.txt", _point_text(model, table)),
-    ):
-        write_text(folder / name, text)
-
-
-# --------------------------------------------------------------------------------------------
-# COLMAP's tables
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Table:
-    """The model by image and by point.
-
-    ``seven``: (n, 7) world-to-camera, w x y z and translation. ``first``: (n + 1,) first
-    observation of each image. ``by_point``: (k,) observations ordered by point, and ``tracks``:
-    (m + 1,) where each point's begin there. ``error``: (m,) mean of each point, pixels.
-    """
-
-    seven: FloatArray
-    first: IntArray
-    by_point: IntArray
-    tracks: IntArray
-    error: FloatArray
-
-    @staticmethod
-    def of(model: ImageModel) -> _Table:
-        by_point = np.argsort(model.point, kind="stable")
-        tracks = np.searchsorted(model.point[by_point], np.arange(len(model.ids) + 1))
-        first = np.searchsorted(model.image, np.arange(len(model.names) + 1))
-        seven = _world_to_camera(model.poses)
-        return _Table(seven, first, by_point, tracks, model.point_errors())
-
-    def track(self, model: ImageModel, row: int) -> IntArray:
-        """(l, 2) number of the image and row among its observations, of each time it is seen."""
-        seen = self.by_point[self.tracks[row] : self.tracks[row + 1]]
-        image = model.image[seen]
-        return np.column_stack([image + 1, seen - self.first[image]])
-
-
-def _world_to_camera(poses: FloatArray) -> FloatArray:
-    rows = pose_rows(np.array([inverse(wTi) for wTi in poses]).reshape(-1, 4, 4))
-    return rows[:, [6, 3, 4, 5, 0, 1, 2]] + 0.0
-
-
-def _camera_text(rig: CameraRig) -> str:
-    numbers = rig.fx, rig.fy, rig.cx + _PIXEL_CENTRE, rig.cy + _PIXEL_CENTRE
-    text = " ".join(f"{number:.17g}" for number in numbers)
-    head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy\n"
-    return head + f"{_CAMERA} PINHOLE {rig.width} {rig.height} {text}\n"
-
-
-def _image_text(model: ImageModel, table: _Table) -> str:
+    _require_finite(folder, poses=model.poses, positions=model.positions, pixels=model.pixels)
+    rig = model.rig
+    intrinsics = rig.fx, rig.fy, rig.cx + _PIXEL_CENTRE, rig.cy + _PIXEL_CENTRE
+    cameras = [
+        "# CAMERA_ID, MODEL, WIDTH, HEIGHT, fx, fy, cx, cy",
+        f"{_CAMERA} PINHOLE {rig.width} {rig.height} {_exact(intrinsics)}",
+    ]
+    first = np.searchsorted(model.image, np.arange(len(model.names) + 1))
+    iTw = pose_rows(np.array([inverse(wTi) for wTi in model.poses]).reshape(-1, 4, 4))
     seen = [
         f"{x:.9f} {y:.9f} {point}"
         for (x, y), point in zip(
             (model.pixels + _PIXEL_CENTRE).tolist(), (model.point + 1).tolist(), strict=True
         )
     ]
-    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# X, Y, POINT3D_ID, ..."]
-    for row, name in enumerate(model.names):
-        numbers = " ".join(f"{number:.17g}" for number in table.seven[row])
-        lines.append(f"{row + 1} {numbers} {_CAMERA} {name}")
-        lines.append(" ".join(seen[table.first[row] : table.first[row + 1]]))
-    return "\n".join(lines) + "\n"
-
-
-def _point_text(model: ImageModel, table: _Table) -> str:
-    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, (IMAGE_ID, POINT2D_IDX), ..."]
+    images = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# X, Y, POINT3D_ID, ..."]
+    # From x y z and quaternion x y z w to w x y z and x y z; adding zero turns -0 into 0.
+    for row, seven in enumerate(iTw[:, [6, 3, 4, 5, 0, 1, 2]] + 0.0):
+        images.append(f"{row + 1} {_exact(seven)} {_CAMERA} {model.names[row]}")
+        images.append(" ".join(seen[first[row] : first[row + 1]]))
+    by_point = np.argsort(model.point, kind="stable")
+    track = np.searchsorted(model.point[by_point], np.arange(len(model.ids) + 1))
+    errors = model.point_errors()
+    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, (IMAGE_ID, POINT2D_IDX), ..."]
     for row, (place, colour) in enumerate(zip(model.positions, model.colours, strict=True)):
-        numbers = " ".join(f"{number:.17g}" for number in place)
-        track = " ".join(map(str, table.track(model, row).ravel().tolist()))
-        tint = " ".join(map(str, colour.tolist()))
-        lines.append(f"{row + 1} {numbers} {tint} {table.error[row]:.9g} {track}")
-    return "\n".join(lines) + "\n"
+        own = by_point[track[row] : track[row + 1]]
+        image = model.image[own]
+        where = np.column_stack([image + 1, own - first[image]]).ravel().tolist()
+        numbers = f"{_exact(place)} {' '.join(map(str, colour.tolist()))} {errors[row]:.9g}"
+        points.append(f"{row + 1} {numbers} {' '.join(map(str, where))}")
+    for name, lines in (("cameras", cameras), ("images", images), ("points3D", points)):
+        write_text(folder / f"{name}.txt", "\n".join(lines) + "\n")
 
 
-def _require_finite_model(path: Path, model: ImageModel) -> None:
-    for name in ("poses", "positions", "pixels"):
-        if not np.isfinite(getattr(model, name)).all():
-            raise OutputError(
-                f"cannot write {path}: {name} are not all finite; the estimator diverged or the "
-                "log is damaged, run the experiment again"
-            )
+def _exact(numbers: Iterable[float]) -> str:
+    return " ".join(f"{number:.17g}" for number in numbers)
 
+
+# --------------------------------------------------------------------------------------------
+# ROS 2
 
 MCAP_SUFFIX = ".mcap"
 TOPIC = "/fgslam/pose"

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
+from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, DatasetError, FrameError
 from fgslam.core.files import clear_output_errors, require_output, write_bytes
-from fgslam.core.geometry import pose, triangulate, triangulation_covariance
+from fgslam.core.geometry import triangulate, triangulation_covariance
 from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.sensors import (
     CAMERA_NAMES,
-    CameraRig,
-    Increment,
-    Observations,
     pixel_model,
     vertical_to_horizontal,
 )
@@ -72,16 +69,6 @@ class Wanted:
     colour: bool = False
     overwrite: bool = False
 
-    @property
-    def targets(self) -> tuple[Path | None, ...]:
-        """All that may be written."""
-        return self.map, self.trajectory, self.graph, self.images
-
-    @property
-    def needs_run(self) -> bool:
-        """Whether something is asked for that a saved map does not hold."""
-        return self.colour or (self.graph, self.images, self.estimator) != (None, None, None)
-
 
 def export_run(run: Path, wanted: Wanted) -> list[str]:
     """Writes what was asked for; returns a line about each file.
@@ -91,16 +78,20 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
-    _require_outputs(run, wanted)
+    inputs = sources_of(run)
+    for path in filter(None, (wanted.map, wanted.trajectory, wanted.graph)):
+        require_output(path, wanted.overwrite, inputs)
+    if wanted.images is not None:
+        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
     if run.is_file():
-        if wanted.needs_run:
+        if wanted.colour or (wanted.graph, wanted.images, wanted.estimator) != (None, None, None):
             raise ConfigError(
                 f"{run}: a saved map has landmarks and a trajectory, no other estimators, graph or "
                 "images; give --map or --trajectory, or a run folder"
             )
-        return export_map(run, wanted.map, wanted.trajectory, wanted.valid_only)
+        return _export_map(run, wanted)
     folder = run / results_folder(run, wanted.estimator)
-    if not any(wanted.targets):
+    if not any((wanted.map, wanted.trajectory, wanted.graph, wanted.images)):
         raise ConfigError(
             "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or "
             "--images FOLDER"
@@ -108,17 +99,24 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
     if wanted.graph is not None:
         require_graph_suffix(wanted.graph)  # now, not after seconds of reading
     remark = read_metrics(run / "metrics.json").get("remark") or ""
-    lines = [f"note: {remark}"] if remark else []
-    return [*lines, *_export(run, folder, wanted, remark)]
-
-
-def _require_outputs(run: Path, wanted: Wanted) -> None:
-    """Nothing of the run is replaced, nor of what it was made from. Raises OutputError."""
-    inputs = sources_of(run)
-    for path in filter(None, (wanted.map, wanted.trajectory, wanted.graph)):
-        require_output(path, wanted.overwrite, inputs)
-    if wanted.images is not None:
-        require_output(wanted.images, wanted.overwrite, inputs, folder=True)
+    trajectory, lines = Trajectory.load(folder / "final.tum"), []
+    if wanted.trajectory is not None:
+        is_bag = wanted.trajectory.suffix.lower() == MCAP_SUFFIX
+        covariances = read_covariances(folder / "covariance.csv")[1] if is_bag else None
+        lines.append(_save(wanted.trajectory, trajectory, covariances, remark))
+    if wanted.graph or wanted.colour or wanted.images or wanted.map:
+        points, log = read_ply(folder / "map.ply"), cache(lambda: MeasurementLog.load(log_of(run)))
+        if wanted.graph is not None:
+            lines.append(export_graph(wanted.graph, log(), trajectory, points, remark))
+        points = points.select(points.valid) if wanted.valid_only else points
+        if wanted.colour or wanted.images:
+            config = load_config(run / RUN_MARKER)
+            points, line = export_images(wanted.images, config, log(), trajectory, points)
+            lines += [line] if line else []
+        if wanted.map is not None:
+            write_map(wanted.map, points, remark)
+            lines.append(f"{wanted.map}: {len(points)} landmarks")
+    return [*([f"note: {remark}"] if remark else []), *lines]
 
 
 def sources_of(run: Path) -> tuple[Path, ...]:
@@ -128,34 +126,12 @@ def sources_of(run: Path) -> tuple[Path, ...]:
     return (run, *load_experiment(run / RUN_MARKER).inputs)
 
 
-def _export(run: Path, folder: Path, wanted: Wanted, remark: str) -> Iterator[str]:
-    trajectory = Trajectory.load(folder / "final.tum")
-    if (path := wanted.trajectory) is not None:
-        covariances = None
-        if path.suffix.lower() == MCAP_SUFFIX:
-            covariances = read_covariances(folder / "covariance.csv")[1]
-        _save(path, trajectory, covariances, remark)
-        yield f"{path}: {len(trajectory)} poses"
-    if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
-        return
-    points, log = read_ply(folder / "map.ply"), cache(lambda: MeasurementLog.load(log_of(run)))
-    if wanted.graph is not None:
-        yield export_graph(wanted.graph, log(), trajectory, points, remark)
-    points = points.select(points.valid) if wanted.valid_only else points
-    if wanted.colour or wanted.images:
-        config = load_config(run / RUN_MARKER)
-        points, line = export_images(wanted.images, config, log(), trajectory, points)
-        yield from filter(None, [line])
-    if wanted.map is not None:
-        write_map(wanted.map, points, remark)
-        yield f"{wanted.map}: {len(points)} landmarks"
-
-
-def _save(path: Path, trajectory: Trajectory, covariances: FloatArray | None, remark: str) -> None:
+def _save(path: Path, trajectory: Trajectory, covariances: FloatArray | None, remark: str) -> str:
     if path.suffix.lower() == MCAP_SUFFIX:
         write_mcap(path, trajectory, covariances)
     else:
         trajectory.save(path, remark)
+    return f"{path}: {len(trajectory)} poses"
 
 
 def log_of(run: Path) -> Path:
@@ -173,9 +149,17 @@ def results_folder(run: Path, wanted: str | None) -> str:
     if not is_run_folder(run):
         raise DatasetError(f"{run}: not a run folder (no config.yaml); give what fgslam run wrote")
     if (task := read_mapping(run / RUN_MARKER).get("task")) is not None:
+        plain = ("*.csv", "*.npz", "*.json", "logs/*.npz")
+        found = sorted(
+            {
+                f"{p.parent.name}/*{p.suffix}" if p.parent != run else p.name
+                for pattern in plain
+                for p in run.glob(pattern)
+            }
+        )
         raise DatasetError(
             f"{run}: is a run of task {task}, not of SLAM: it has no map, trajectory or graph to "
-            f"export; take its tables and arrays as they are: {', '.join(_plain_files(run))}"
+            f"export; take its tables and arrays as they are: {', '.join(found)}"
         )
     found = sorted(path.parent.name for path in run.glob("*/final.tum"))
     if not found:
@@ -190,34 +174,20 @@ def results_folder(run: Path, wanted: str | None) -> str:
     return chosen
 
 
-def _plain_files(run: Path) -> list[str]:
-    """The files of a run that other programs read without an export, as one would name them."""
-    found = [path.name for pattern in ("*.csv", "*.npz", "*.json") for path in run.glob(pattern)]
-    return sorted(found) + (["logs/*.npz"] if any(run.glob("logs/*.npz")) else [])
-
-
-def export_map(
-    path: Path, map_file: Path | None, trajectory_file: Path | None, valid_only: bool
-) -> list[str]:
-    """Writes what was asked for, or says what is in the map; a line about each.
-
-    Raises:
-        MapError: it is not one.
-        OutputError: a file cannot be written, or its ending is not known.
-    """
+def _export_map(path: Path, wanted: Wanted) -> list[str]:
+    """Writes what was asked for of a saved map, or says what is in it; a line about each."""
     saved = load_map(path)
-    if map_file is None and trajectory_file is None:
+    if wanted.map is None and wanted.trajectory is None:
         return describe_map(saved, path)
     remark = remark_of_map(saved)
     lines = [f"note: {remark}"] if remark else []
-    if map_file is not None:
+    if wanted.map is not None:
         points = points_of(saved)
-        points = points.select(points.valid) if valid_only else points
-        write_map(map_file, points, remark)
-        lines.append(f"{map_file}: {len(points)} landmarks")
-    if trajectory_file is not None:
-        _save(trajectory_file, saved.trajectory, None, remark)
-        lines.append(f"{trajectory_file}: {len(saved.trajectory)} poses")
+        points = points.select(points.valid) if wanted.valid_only else points
+        write_map(wanted.map, points, remark)
+        lines.append(f"{wanted.map}: {len(points)} landmarks")
+    if wanted.trajectory is not None:
+        lines.append(_save(wanted.trajectory, saved.trajectory, None, remark))
     return lines
 
 
@@ -235,17 +205,13 @@ def describe_map(saved: SavedMap, path: Path) -> list[str]:
         low, high = trusted.min(axis=0), trusted.max(axis=0)
         spans = (f"{a} {x:.2f} to {y:.2f}" for a, x, y in zip("xyz", low, high, strict=True))
         lines.append(f"bounds      {', '.join(spans)} m (x right, y down, z forward)")
-    lines += [_about_drive(drive) for drive in drives_of(saved)]
-    lines.append(f"trajectory  {len(saved.trajectory)} poses")
-    return lines
-
-
-def _about_drive(drive: dict[str, Any]) -> str:
-    recording = drive.get("recording") or {}
-    return (
+    lines += [
         f"drive       {drive.get('name')}: {drive.get('frames')} frames of "
-        f"{recording.get('name')}, {drive.get('estimator')}, fgslam {drive.get('fgslam')}"
-    )
+        f"{(drive.get('recording') or {}).get('name')}, {drive.get('estimator')}, fgslam "
+        f"{drive.get('fgslam')}"
+        for drive in drives_of(saved)
+    ]
+    return [*lines, f"trajectory  {len(saved.trajectory)} poses"]
 
 
 # --------------------------------------------------------------------------------------------
@@ -303,15 +269,20 @@ def build_graph(
         positions: (m, 3) world, metres.
     """
     rows = rows_of_frames(log, trajectory)
-    kept = [_usable(increment) & (row >= 0) for increment, row in zip(log, rows, strict=True)]
-    seen = [s.observations.select(keep) for s, keep in zip(log, kept, strict=True)]
+    # The third number is disparity or range: only a positive one is that of a point.
+    kept = [~s.rejected & (s.observations.measurement[:, 2] > 0.0) for s in log]
+    seen = [
+        s.observations.select(keep & (row >= 0))
+        for s, keep, row in zip(log, kept, rows, strict=True)
+    ]
     measurement = np.concatenate([np.empty((0, 3)), *(o.measurement for o in seen)])
     covariance = np.concatenate([np.empty((0, 3, 3)), *(o.covariance for o in seen)])
     seen_ids = np.concatenate([np.empty(0, np.int64), *(o.ids for o in seen)])
     used, first, landmark = np.unique(seen_ids, return_index=True, return_inverse=True)
     seen_from = np.repeat(rows, [len(o) for o in seen])
     points = triangulate(log.rig, measurement)
-    start = _in_world(trajectory.poses[seen_from[first]], points[first])
+    wTc = trajectory.poses[seen_from[first]]
+    start = np.asarray(np.einsum("nij,nj->ni", wTc[:, :3, :3], points[first]) + wTc[:, :3, 3])
     mapped = np.isin(used, ids)
     start[mapped] = positions[np.searchsorted(ids, used[mapped])]
     moved = [
@@ -337,20 +308,11 @@ def build_graph(
     )
 
 
-def _usable(increment: Increment) -> BoolArray:
-    """Observations (k,) that were not rejected and have a place."""
-    # The third number is disparity or range: only a positive one is that of a point.
-    return ~increment.rejected & (increment.observations.measurement[:, 2] > 0.0)
-
-
-def _in_world(wTc: FloatArray, points: FloatArray) -> FloatArray:
-    """Points (n, 3), each of its own camera (n, 4, 4)."""
-    return np.asarray(np.einsum("nij,nj->ni", wTc[:, :3, :3], points) + wTc[:, :3, 3])
-
+# --------------------------------------------------------------------------------------------
+# A run as images with poses and points, and its map in their colours
 
 Pictures: TypeAlias = Callable[[int], tuple[Image, ...]]
 """Images (right, left[, top]) of a selected frame, grey or in red, green, blue."""
-
 
 _NEIGHBOURS = 12  # through which a plane is laid: three would fit any plane, many round off edges
 
@@ -376,35 +338,36 @@ def export_images(
     """
     rows, pictures = frames_of(config, trajectory)
     model = build_model(log, trajectory, points)
-    tints = Tints(len(model.ids))
-    missing = sum(
-        not _take(model, k, shown, folder, tints) for k, shown in enumerate(_read(rows, pictures))
-    )
+    tints, missing = Tints(len(model.ids)), 0
+    for k, row in enumerate(rows.tolist()):
+        try:
+            shown = pictures(row)
+        except FrameError:
+            missing += 1
+            continue
+        first = k * model.rig.cameras
+        if folder is not None:
+            for name, image in zip(model.names[first:], shown, strict=False):
+                write_bytes(_with_parents(folder / "images" / name), encoded_png(image))
+        tints.sample(model, first, shown[0])
     points = with_normals(tints.on(points, model), model)
     if folder is None:
         return points, ""
     model = replace(model, colours=points.colours[np.searchsorted(points.ids, model.ids)])
-    write_colmap(_made(folder / "sparse" / "0"), model)
-    return points, _about(folder, model, missing)
-
-
-def _about(folder: Path, model: ImageModel, missing: int) -> str:
+    write_colmap(_with_parents(folder / "sparse" / "0" / "cameras.txt").parent, model)
     error = float(model.point_errors().mean()) if len(model.ids) else 0.0
     lacking = f", {missing} frames without readable images" if missing else ""
-    return (
+    return points, (
         f"{folder}: {len(model.names)} images, {len(model.ids)} points, mean reprojection error "
         f"{error:.3f} px{lacking}"
     )
 
 
-def _made(folder: Path) -> Path:
-    with clear_output_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-    return folder
-
-
-# --------------------------------------------------------------------------------------------
-# The model
+def _with_parents(path: Path) -> Path:
+    """A file's path, its folder made. Raises OutputError."""
+    with clear_output_errors(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) -> ImageModel:
@@ -416,14 +379,23 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
         points: the map, ascending by identity.
     """
     rig, parts = log.rig, []
+    model = pixel_model(rig.cameras, vertical_to_horizontal(rig))
     for increment, row in zip(log, rows_of_frames(log, trajectory).tolist(), strict=True):
-        if row >= 0:
-            kept = increment.observations.select(~increment.rejected)
-            parts.append(_seen_in(row, kept.select(np.isin(kept.ids, points.ids)), rig))
+        if row < 0:
+            continue
+        seen = increment.observations.select(~increment.rejected)
+        seen = seen.select(np.isin(seen.ids, points.ids))
+        # What measurement and rig state together, where the camera saw the landmark at all.
+        pixels = (seen.measurement @ model.T).reshape(len(seen), rig.cameras, 2)
+        at, camera = np.nonzero(np.isfinite(seen.pixels[:, : rig.cameras, 0]))
+        parts.append((row * rig.cameras + camera, seen.ids[at], pixels[at, camera]))
     empty = np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2))
     image, ids, pixels = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
     used, point = np.unique(ids, return_inverse=True)
     of_map, order = np.searchsorted(points.ids, used), np.lexsort((point, image))
+    steps = np.array([[0, 0], [-rig.baseline, 0], [0, -(rig.vertical_baseline or 0.0)]])
+    cameras = np.tile(np.eye(4), (rig.cameras, 1, 1))
+    cameras[:, :2, 3] = steps[: rig.cameras]
     return ImageModel(
         rig=rig,
         names=tuple(
@@ -431,7 +403,7 @@ def build_model(log: MeasurementLog, trajectory: Trajectory, points: MapPoints) 
             for row in range(len(trajectory))
             for camera in CAMERA_NAMES[: rig.cameras]
         ),
-        poses=_camera_poses(rig, trajectory.poses),
+        poses=(trajectory.poses[:, None] @ cameras).reshape(-1, 4, 4),
         ids=used,
         positions=points.positions[of_map],
         colours=points.colours[of_map],
@@ -445,32 +417,6 @@ def rows_of_frames(log: MeasurementLog, trajectory: Trajectory) -> IntArray:
     """(n,) row of the trajectory for each frame of a log, -1 where it has no pose."""
     row_of = {round(t, 9): row for row, t in enumerate(trajectory.timestamps.tolist())}
     return np.array([row_of.get(round(s.timestamp, 9), -1) for s in log], np.int64)
-
-
-def _seen_in(row: int, seen: Observations, rig: CameraRig) -> tuple[IntArray, IntArray, FloatArray]:
-    """Images (k,), identities (k,) and pixels (k, 2) of one frame's observations, all cameras.
-
-    Pixels are what measurement and rig say together, where the camera saw the landmark at all.
-    """
-    model = pixel_model(rig.cameras, vertical_to_horizontal(rig))
-    pixels = (seen.measurement @ model.T).reshape(len(seen), rig.cameras, 2)
-    observation, camera = np.nonzero(np.isfinite(seen.pixels[:, : rig.cameras, 0]))
-    return row * rig.cameras + camera, seen.ids[observation], pixels[observation, camera]
-
-
-def _camera_poses(rig: CameraRig, wTc: FloatArray) -> FloatArray:
-    """(n * cameras, 4, 4), camera after camera of each pose (n, 4, 4) of the reference camera."""
-    steps = [
-        (0.0, 0.0, 0.0),
-        (-rig.baseline, 0.0, 0.0),
-        (0.0, -(rig.vertical_baseline or 0.0), 0.0),
-    ]
-    cameras = [pose(np.eye(3), np.array(step)) for step in steps[: rig.cameras]]
-    return (wTc[:, None] @ np.array(cameras)).reshape(-1, 4, 4)
-
-
-# --------------------------------------------------------------------------------------------
-# Images
 
 
 def frames_of(config: ExperimentConfig, trajectory: Trajectory) -> tuple[IntArray, Pictures]:
@@ -495,33 +441,6 @@ def frames_of(config: ExperimentConfig, trajectory: Trajectory) -> tuple[IntArra
             "times than the run; give the run's own recording"
         )
     return rows, pictures
-
-
-def _read(rows: IntArray, pictures: Pictures) -> Iterator[tuple[Image, ...] | None]:
-    for row in rows.tolist():
-        try:
-            yield pictures(row)
-        except FrameError:
-            yield None
-
-
-def _take(
-    model: ImageModel,
-    k: int,
-    shown: tuple[Image, ...] | None,
-    folder: Path | None,
-    tints: Tints,
-) -> bool:
-    """Whether the images of pose ``k`` could be read; if so, they are written and sampled."""
-    if shown is None:
-        return False
-    first = k * model.rig.cameras
-    if folder is not None:
-        for name, image in zip(model.names[first:], shown, strict=False):
-            path = folder / "images" / name
-            write_bytes(_made(path.parent) / path.name, encoded_png(image))
-    tints.sample(model, first, shown[0])
-    return True
 
 
 class Tints:

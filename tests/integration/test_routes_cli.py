@@ -258,7 +258,7 @@ def test_mistakes_of_a_film_of_a_route(
     replace(path, names=tuple(f"{name} again" for name in path.names)).save(route)
     config.write_text(kept.replace(str(taught), str(route)), encoding="utf-8")
     try:
-        assert "was taught anew since it was followed" in mistake(capfd, monkeypatch, *film)
+        assert "was taught again since it was followed" in mistake(capfd, monkeypatch, *film)
     finally:
         config.write_text(kept, encoding="utf-8")
     assert not (tmp_path / "way.gif").exists()

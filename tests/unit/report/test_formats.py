@@ -139,7 +139,7 @@ def test_unknown_format_and_landmarks_that_cannot_be_written(tmp_path: Path) -> 
         write_map(tmp_path / "map.xyz", a_map(1))
     broken = a_map(5)
     broken.positions[3, 1] = np.nan
-    with pytest.raises(OutputError, match=f"landmark {broken.ids[3]} is not finite"):
+    with pytest.raises(OutputError, match="positions 3 is not finite"):
         write_map(tmp_path / "map.ply", broken)
     with pytest.raises(OutputError, match="ids must lie"):
         write_map(tmp_path / "map.pcd", dataclasses.replace(a_map(1), ids=np.array([2**31])))
@@ -147,7 +147,7 @@ def test_unknown_format_and_landmarks_that_cannot_be_written(tmp_path: Path) -> 
 
 
 def test_columns_of_different_length_are_a_fault_of_ours() -> None:
-    with pytest.raises(ValueError, match="hits has shape"):
+    with pytest.raises(ValueError, match="hits has 3 rows, not 4"):
         dataclasses.replace(a_map(4), hits=np.zeros(3, np.int64))
 
 
@@ -164,13 +164,13 @@ def test_foreign_and_broken_ply_files(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="cut off"):
         read_ply(path)
     path.write_bytes(whole.replace(b" hits\n", b" hots\n"))
-    with pytest.raises(DatasetError, match="no property 'hits'"):
+    with pytest.raises(DatasetError, match="no line 'property int hits'"):
         read_ply(path)
     path.write_bytes(whole.replace(b"binary_little_endian", b"ascii"))
-    with pytest.raises(DatasetError, match="little-endian"):
+    with pytest.raises(DatasetError, match="no line 'format binary_little_endian"):
         read_ply(path)
     path.write_bytes(whole.replace(b"property double x", b"property list uchar int x"))
-    with pytest.raises(DatasetError, match="maps do not have"):
+    with pytest.raises(DatasetError, match="no line 'property double x'"):
         read_ply(path)
 
 
@@ -438,7 +438,7 @@ def test_a_model_that_is_not_finite_is_refused(model: ImageModel, tmp_path: Path
     bad = model.positions.copy()
     bad[0, 0] = np.nan
     broken = replace(model, positions=bad)
-    with pytest.raises(OutputError, match="positions are not all finite"):
+    with pytest.raises(OutputError, match="positions 0 is not finite"):
         write_colmap(tmp_path, broken)
 
 
