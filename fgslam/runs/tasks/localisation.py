@@ -1,4 +1,4 @@
-"""Task `localisation` and `fgslam localize`: a recording's frames are sought in a map.
+"""Task `localisation` and `fgslam localize`: where in a map were a recording's frames taken?
 
 Units: queries, one frame or a short submap each. Files: localisation.csv, timing.csv, metrics.json,
 a picture, the page. Numbers: queries answered, right, inexact and false ones, errors, NEES, times.
@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +33,7 @@ from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, require_rig
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import (
-    Floor,
-    LandmarkAppearances,
-    LandmarkMap,
-    Relocalisation,
-    StereoFeatures,
-)
+from fgslam.core.types import Floor, LandmarkMap, Relocalisation, StereoFeatures
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.evaluation.localisation import (
     Answers,
@@ -52,10 +46,8 @@ from fgslam.evaluation.localisation import (
     score,
 )
 from fgslam.evaluation.statistics import JsonValue
-from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import FrontendSettings
-from fgslam.frontend.stereo import RigStereo
-from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv, write_json
+from fgslam.report.content import Column, Figure, TextTable, write_csv, write_json
 from fgslam.report.homing_figures import Located, located_figure
 from fgslam.runs.bare import dataset_of, require_no_camera
 from fgslam.runs.config import (
@@ -66,14 +58,7 @@ from fgslam.runs.config import (
     load_experiment,
     make_experiment,
 )
-from fgslam.runs.engine import (
-    Context,
-    LocatedShare,
-    Opening,
-    RunResult,
-    Task,
-    provenance_of,
-)
+from fgslam.runs.engine import Context, LocatedShare, Opening, RunResult, Task, provenance_of
 from fgslam.runs.folder import (
     METRICS_FILE,
     ExistingFolder,
@@ -83,23 +68,27 @@ from fgslam.runs.folder import (
     write_config,
 )
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.results import write_page
+from fgslam.runs.results import PICTURES, UNKNOWN, number_text, write_page
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
-from fgslam.runs.tasks.slam_results import Sighted, TrueSights, TruthInMap, truth_in_map
+from fgslam.runs.tasks.slam_results import Sighted, TrueSights, truth_in_map
 from fgslam.runs.units import Progress, UnitStore
 from fgslam.runs.workers import InProcess
 from fgslam.slam.build import make_pipeline, make_relocaliser, make_stereo, make_stream, trusted
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
-from fgslam.slam.pipeline import SlamPipeline
 
-# ------------------------------------------------------------------------------------------
-# Asks a map where the frames of a recording were taken: one by one, or in short submaps
-
-_STREAM = 13  # of random numbers, beside those of the recording
+_STREAM = 13  # of random numbers, next to those of the recording
 _STAGE = "queries"
 SAVE_EVERY_S = 2.0
+_NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
+_WRONG_M, _WRONG_DEG = 0.30, 5.0  # an accepted pose farther off than this is false
+_LEAST_VISIBLE = 20
+"""A pose from which fewer of the map's landmarks are visible is counted apart; where depth is not
+known all count."""
+
+# ------------------------------------------------------------------------------------------
+# Queries and their answers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,8 +121,13 @@ class Attempt:
 
     @property
     def accepted(self) -> bool:
-        """Whether there is a pose to be believed."""
+        """Whether there is a pose that counts."""
         return self.found is not None and self.found.found
+
+    @property
+    def verdict(self) -> str:
+        """The relocalisation's status; ``no_image`` of a frame that could not be read."""
+        return "no_image" if self.found is None else self.found.status.value
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,91 +151,7 @@ class Asked:
         return tuple(one for one in self.attempts if one.frames == frames)
 
 
-def nothing_asked(why: str) -> Asked:
-    """No query at all, and why."""
-    none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
-    return Asked((), none, why, whole=False)
-
-
 _ANSWERS = tuple[Attempt, ...]
-
-
-class Asker:
-    """A map that has been learnt, and what it takes to ask it."""
-
-    def __init__(
-        self, config: LocalisationConfig, given: GivenMap, sequence: ImageSequence
-    ) -> None:
-        """Learns the map.
-
-        Raises:
-            MapError: other cameras made it, or it holds no landmark.
-        """
-        require_rig(given.saved, sequence.rig, str(given.path))
-        frontend = config.frontend
-        self.landmarks, looks = trusted(given.saved, frontend.database.valid_hits)
-        if not len(self.landmarks):
-            raise MapError(f"{given.path}: holds no trusted landmark; make the map again")
-        self._config, self._sequence = config, sequence
-        self._stereo: RigStereo = make_stereo(sequence.rig, frontend)
-        self._relocaliser: Relocaliser = make_relocaliser(sequence.rig, frontend)
-        self._relocaliser.learn(self.landmarks, looks)
-        self._floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
-        self.truth: TruthInMap = truth_in_map(given.saved, sequence, config.as_experiment())
-        self._sights = TrueSights(given.saved, self.landmarks, sequence, frontend)
-
-    def ask(self, found: list[FeatureFrame], sighted: Sighted) -> Attempt:
-        """One query: consecutive frames, the last of which is to be located.
-
-        Args:
-            found: the frames with their features.
-            sighted: landmarks truly in view of the last one.
-        """
-        last = found[-1]
-        frame = self._frame_number(last.i)
-        blank = Attempt(
-            i=last.i,
-            frame=frame,
-            frames=len(found),
-            features=0,
-            found=None,
-            problem=last.problem,
-            truth=self.truth.poses[last.i],
-            sighted=sighted,
-            milliseconds=float("nan"),
-            frontend_ms=last.sift_ms,
-        )
-        if last.frame is None:
-            return blank
-        rng = np.random.default_rng([self._config.seed, _STREAM, frame, len(found)])
-        start = time.perf_counter()
-        if len(found) == 1:
-            features, spread = self._stereo.match(last.frame, last.features).whole, None
-        else:
-            features, spread = submap_features(
-                self._sequence, found, self._config.frontend, self._config.odometry
-            )
-        matched = time.perf_counter()
-        answer = self._relocaliser.locate(features, rng)
-        done = time.perf_counter()
-        if spread is not None and np.isfinite(answer.covariance).all():
-            own = self._floor.allowed_part(answer.wTc, spread)
-            answer = dataclasses.replace(answer, covariance=answer.covariance + own)
-        return dataclasses.replace(
-            blank,
-            features=len(features),
-            found=answer,
-            milliseconds=1e3 * (done - matched),
-            frontend_ms=last.sift_ms + 1e3 * (matched - start),
-        )
-
-    def sighted(self, i: int) -> Sighted:
-        """Landmarks truly in view of the selected frame ``i``."""
-        return self._sights.of(i, self.truth.poses[i])
-
-    def _frame_number(self, i: int) -> int:
-        dataset = self._config.dataset
-        return dataset.start + i * dataset.stride
 
 
 def ask_all(
@@ -250,42 +160,76 @@ def ask_all(
     """All queries of a configuration; those of an earlier session are not asked again.
 
     Raises:
-        MapError: the map cannot be used with these cameras, or is empty.
+        MapError: other cameras made the map, or it holds no landmark.
         ConfigError: the recording is shorter than a query.
     """
-    wanted = config.localisation
-    if len(sequence) < max(wanted.frames):
+    wanted, frontend = config.localisation, config.frontend
+    longest = max(wanted.frames)
+    if len(sequence) < longest:
         raise ConfigError(
             f"{sequence.name}: {len(sequence)} frames are selected, and a query takes "
-            f"{max(wanted.frames)}; lower the frames of a query, or select more"
+            f"{longest}; lower the frames of a query, or select more"
         )
-    asker = Asker(config, given, sequence)
-    queries = len(range(max(wanted.frames) - 1, len(sequence), wanted.every))
-    answered = _answered(asker, config, sequence, queries, context)
-    attempts = [attempt for answers in answered.values() for attempt in answers]
-    attempts.sort(key=lambda one: (wanted.frames.index(one.frames), one.i))
-    whole = len(answered) == queries
-    return Asked(tuple(attempts), asker.landmarks, asker.truth.alignment, whole)
+    require_rig(given.saved, sequence.rig, str(given.path))
+    landmarks, appearances = trusted(given.saved, frontend.database.valid_hits)
+    if not len(landmarks):
+        raise MapError(f"{given.path}: holds no trusted landmark; make the map again")
+    stereo = make_stereo(sequence.rig, frontend)
+    relocaliser = make_relocaliser(sequence.rig, frontend)
+    relocaliser.learn(landmarks, appearances)
+    floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
+    truth = truth_in_map(given.saved, sequence, config.as_experiment())
+    sights = TrueSights(given.saved, landmarks, sequence, frontend)
 
+    def ask(found: list[FeatureFrame], sighted: Sighted) -> Attempt:
+        """One query: consecutive frames, the last of which is to be located."""
+        last, count = found[-1], len(found)
+        frame = config.dataset.start + last.i * config.dataset.stride
+        attempt = Attempt(
+            i=last.i,
+            frame=frame,
+            frames=count,
+            features=0,
+            found=None,
+            problem=last.problem,
+            truth=truth.poses[last.i],
+            sighted=sighted,
+            milliseconds=float("nan"),
+            frontend_ms=last.sift_ms,
+        )
+        if last.frame is None:
+            return attempt
+        rng = np.random.default_rng([config.seed, _STREAM, frame, count])
+        start = time.perf_counter()
+        if count == 1:
+            features, spread = stereo.match(last.frame, last.features).whole, None
+        else:
+            features, spread = submap_features(sequence, found, frontend, config.odometry)
+        matched = time.perf_counter()
+        answer = relocaliser.locate(features, rng)
+        done = time.perf_counter()
+        if spread is not None and np.isfinite(answer.covariance).all():
+            own = floor.allowed_part(answer.wTc, spread)
+            answer = dataclasses.replace(answer, covariance=answer.covariance + own)
+        return dataclasses.replace(
+            attempt,
+            features=len(features),
+            found=answer,
+            milliseconds=1e3 * (done - matched),
+            frontend_ms=last.sift_ms + 1e3 * (matched - start),
+        )
 
-def _answered(
-    asker: Asker,
-    config: LocalisationConfig,
-    sequence: ImageSequence,
-    queries: int,
-    context: Context,
-) -> dict[int, tuple[Attempt, ...]]:
-    """Answers by number of the query, in the order asked; kept in the run folder now and then."""
-    kept: dict[int, tuple[Attempt, ...]] = context.store.load(_STAGE, _ANSWERS)
+    # Answers by number of the query, kept in the run folder now and then.
+    queries = len(range(longest - 1, len(sequence), wanted.every))
+    kept: dict[int, _ANSWERS] = context.store.load(_STAGE, _ANSWERS)
     # Killed while it tidied up, a run has lost the first answers, but not the last ones.
     first = next(k for k in range(queries + 1) if k not in kept)
-    done, fresh = {k: kept[k] for k in range(first)}, dict[int, tuple[Attempt, ...]]()
+    done, fresh = {k: kept[k] for k in range(first)}, dict[int, _ANSWERS]()
     context.progress("localising", len(done), queries)
     saved = time.perf_counter()
     for k, found in _queries(config, sequence, first):
-        sighted = asker.sighted(found[-1].i)
-        frames = config.localisation.frames
-        fresh[k] = tuple(asker.ask(found[len(found) - n :], sighted) for n in frames)
+        sighted = sights.of(found[-1].i, truth.poses[found[-1].i])
+        fresh[k] = tuple(ask(found[len(found) - n :], sighted) for n in wanted.frames)
         context.progress("localising", len(done) + len(fresh), queries)
         stopped = context.stopped()
         if stopped or k == queries - 1 or time.perf_counter() - saved >= SAVE_EVERY_S:
@@ -293,7 +237,9 @@ def _answered(
             fresh, saved = {}, time.perf_counter()
         if stopped:
             break
-    return done
+    attempts = [attempt for answers in done.values() for attempt in answers]
+    attempts.sort(key=lambda one: (wanted.frames.index(one.frames), one.i))
+    return Asked(tuple(attempts), landmarks, truth.alignment, whole=len(done) == queries)
 
 
 def _queries(
@@ -319,9 +265,6 @@ def _queries(
         stream.close()
 
 
-_NEAREST_M = 0.1  # of the last camera's plane: nearer ones have no size in its image
-
-
 def submap_features(
     sequence: ImageSequence,
     found: Sequence[FeatureFrame],
@@ -339,52 +282,39 @@ def submap_features(
 
     Returns:
         The submap's landmarks in the last camera's frame, with fused covariances and their last
-        looks; those outside its image, too. And the covariance (6, 6) of that camera in the
-        submap, which whoever is located by the submap has beside the map's.
+        appearances; those outside its image, too. And the covariance (6, 6) of that camera in the
+        submap, which is added to the map's where the submap is located.
     """
+    rig = sequence.rig
     plain = dataclasses.replace(frontend, tracking="sift", loops=False, lost=False)
-    pipeline = make_pipeline(sequence.rig, plain, odometry, LandmarkKalmanSettings())
+    pipeline = make_pipeline(rig, plain, odometry, LandmarkKalmanSettings())
     for k, one in enumerate(found):
         timestamp = float(sequence.timestamps[one.i])
         body = body_motion(sequence, one.i, pipeline.motion) if k else None
         stats = pipeline.process(dataclasses.replace(one, i=k), k, timestamp, body).stats
-    return _as_features(pipeline, sequence.rig, stats.wTc), stats.covariance
-
-
-def _as_features(pipeline: SlamPipeline, rig: CameraRig, wTc: FloatArray) -> StereoFeatures:
-    """The landmarks as the camera at ``wTc`` would measure them, were its image large enough."""
+    # The landmarks as the last camera would measure them, were its image large enough.
     landmarks = pipeline.estimator.landmarks()
-    looks = _last_looks(pipeline.tracker.database.appearances(landmarks.ids))
-    points = transform_to_camera(wTc, landmarks.positions)
-    covariances = rotate_covariances(wTc[:3, :3].T, landmarks.covariances)
+    views = pipeline.tracker.database.appearances(landmarks.ids)
+    views = views.select(np.flatnonzero(np.diff(views.ids, append=-1)))  # the last of each
+    points = transform_to_camera(stats.wTc, landmarks.positions)
+    covariances = rotate_covariances(stats.wTc[:3, :3].T, landmarks.covariances)
     keep = np.abs(points[:, 2]) > _NEAREST_M
     points, covariances = points[keep], covariances[keep]
-    looks = looks.of(landmarks.ids[keep])
+    views = views.of(landmarks.ids[keep])
     measurement, noise = _measured(rig, points, covariances)
     pixels = np.full((len(points), 3, 2), np.nan)
     pixels[:, 0] = measurement[:, :2]
-    return StereoFeatures(
+    features = StereoFeatures(
         measurement=measurement,
         measurement_covariance=noise,
-        scale=looks.size / np.abs(points[:, 2]),
-        orientation=looks.orientation,
-        descriptors=looks.descriptors,
+        scale=views.size / np.abs(points[:, 2]),
+        orientation=views.orientation,
+        descriptors=views.descriptors,
         position=points,
         position_covariance=covariances,
         pixels=pixels,
     )
-
-
-def _last_looks(appearances: LandmarkAppearances) -> LandmarkAppearances:
-    """The view of each landmark that was seen last."""
-    last = np.flatnonzero(np.diff(appearances.ids, append=-1))
-    return LandmarkAppearances(
-        appearances.ids[last],
-        appearances.descriptors[last],
-        appearances.size[last],
-        appearances.orientation[last],
-        appearances.direction[last],
-    )
+    return features, stats.covariance
 
 
 def _measured(
@@ -400,14 +330,7 @@ def _measured(
 
 
 # ------------------------------------------------------------------------------------------
-# The answers of a localisation run judged: sentences, tables, and the files of the run
-
-LOCALISATION_FILE = "localisation.csv"
-_UNKNOWN = "-"
-_WRONG_M, _WRONG_DEG = 0.30, 5.0  # an accepted pose farther off than this is false
-_LEAST_VISIBLE = 20
-"""A pose from which fewer of the map's landmarks are visible is counted apart; where depth is not
-known all count."""
+# The task
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -416,6 +339,53 @@ class LocalisationResult(RunResult):
 
     config: LocalisationConfig
     asked: Asked = field(kw_only=True)
+
+
+def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[LocalisationResult]:
+    """Opens the recording, and the map where it is there already. Raises FgslamError."""
+    given = None if config.map.load is None else open_map(Path(config.map.load))
+    sequence = _open_queries(config, opening.progress)
+    if given is not None:
+        require_rig(given.saved, sequence.rig, str(given.path))
+    provenance = _provenance(given, sequence)
+    return Task(provenance, lambda context: _run(config, given, sequence, context))
+
+
+def _run(
+    config: LocalisationConfig, given: GivenMap | None, sequence: ImageSequence, context: Context
+) -> LocalisationResult:
+    """The drive that makes the map, where the run asks for one, and all queries."""
+    folder = context.folder
+    if given is None:
+        ended = drive_first(config.as_experiment(), context)
+        if ended is not None and ended.status == "interrupted":
+            none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+            nothing = Asked((), none, "the map was not finished", whole=False)
+            return result_of(config, folder, nothing, sequence.notes)
+        given = open_map(folder / FIRST_FOLDER / MAP_FILE)
+        write_config(folder, config, _provenance(given, sequence))
+    asked = ask_all(config, given, sequence, context)
+    result = result_of(config, folder, asked, sequence.notes)
+    subtitle = f"{sequence.name}, in a map of {len(asked.landmarks)} landmarks"
+    write_results(result, given, subtitle)
+    return result
+
+
+def _open_queries(config: LocalisationConfig, progress: Progress) -> ImageSequence:
+    return open_sequence(
+        config.as_experiment(), lambda done, total: progress("rendering", done, total)
+    )
+
+
+def _provenance(given: GivenMap | None, sequence: ImageSequence) -> dict[str, Any]:
+    out = provenance_of(sequence)
+    if given is not None:
+        out["map"] = {"path": str(given.path), "sha256": given.identity}
+    return out
+
+
+# ------------------------------------------------------------------------------------------
+# The answers judged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -456,40 +426,24 @@ def scored(config: LocalisationConfig, asked: Asked) -> tuple[Scored, ...]:
         attempts = asked.of(frames)
         answers = answers_of(attempts)
         visible, familiar = (enough(n, bounds) for n in (answers.visible, answers.familiar))
-        out.append(
-            Scored(
-                frames,
-                attempts,
-                answers,
-                localisation_errors(answers),
-                score(answers.select(visible), bounds),
-                score(answers.select(familiar), bounds),
-                score(answers.select(~visible), bounds),
-            )
-        )
+        parts = (score(answers.select(rows), bounds) for rows in (visible, familiar, ~visible))
+        out.append(Scored(frames, attempts, answers, localisation_errors(answers), *parts))
     return tuple(out)
 
 
 def answers_of(attempts: Sequence[Attempt]) -> Answers:
     """The same as arrays; NaN where there is no covariance or no truth."""
     found = [one.found for one in attempts]
-    nowhere = np.full((6, 6), np.nan)
+    poses = [np.eye(4) if f is None else f.wTc for f in found]
+    covariances = [np.full((6, 6), np.nan) if f is None else f.covariance for f in found]
     return Answers(
         accepted=np.array([one.accepted for one in attempts], np.bool_),
-        poses=_stacked([np.eye(4) if f is None else f.wTc for f in found], (4, 4)),
-        covariances=_stacked([nowhere if f is None else f.covariance for f in found], (6, 6)),
-        truth=_stacked([one.truth for one in attempts], (4, 4)),
+        poses=np.array(poses, np.float64).reshape(-1, 4, 4),
+        covariances=np.array(covariances, np.float64).reshape(-1, 6, 6),
+        truth=np.array([one.truth for one in attempts], np.float64).reshape(-1, 4, 4),
         visible=np.array([one.sighted.visible for one in attempts], np.int64),
         familiar=np.array([one.sighted.familiar for one in attempts], np.int64),
     )
-
-
-def _stacked(arrays: Sequence[FloatArray], shape: tuple[int, int]) -> FloatArray:
-    return np.array(arrays, np.float64).reshape(-1, *shape)
-
-
-# --------------------------------------------------------------------------------------------
-# Words
 
 
 def result_of(
@@ -497,15 +451,23 @@ def result_of(
 ) -> LocalisationResult:
     """Sentences and tables of a run."""
     judged = scored(config, asked)
-    tables = (_score_table(config, judged), _refusal_table(judged))
+    verdicts = [Counter(one.verdict for one in j.attempts) for j in judged]
+    rows = tuple(
+        (name, tuple(str(count[name]) for count in verdicts))
+        for name in sorted(set().union(*verdicts))
+    )
+    columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
     return LocalisationResult(
         config=config,
         folder=folder or Path(),
         status="finished" if asked.whole else "interrupted",
         lines=tuple(_sentence(config, one) for one in judged),
-        tables=tables,
+        tables=(
+            _score_table(config, judged),
+            TextTable("verdicts", "Verdicts", "verdict", columns, rows),
+        ),
         notes=(*notes, asked.alignment),
-        particulars=() if folder is None else (("queries", str(folder / LOCALISATION_FILE)),),
+        particulars=() if folder is None else (("queries", str(folder / "localisation.csv")),),
         written=folder is not None,
         asked=asked,
     )
@@ -516,34 +478,33 @@ def in_frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
 
+def _within(config: LocalisationConfig) -> str:
+    wanted = config.localisation
+    return f"within {100 * wanted.within_m:g} cm and {wanted.within_deg:g} degrees"
+
+
 def _sentence(config: LocalisationConfig, judged: Scored) -> str:
-    counts, wanted = judged.counts, config.localisation
+    counts, few = judged.counts, judged.apart
     start = f"from {in_frames(judged.frames)}: {counts.accepted} of {counts.queries} queries found"
     if not counts.known:
         return f"{start}; their errors are not known"
-    apart = ""
-    if judged.apart.queries:
-        apart = (
-            f"; counted apart: {judged.apart.queries} poses from which fewer than "
-            f"{_LEAST_VISIBLE} landmarks are visible, {judged.apart.accepted} of them found, "
-            f"{judged.apart.false} false"
-        )
+    apart = (
+        f"; counted apart: {few.queries} poses from which fewer than {_LEAST_VISIBLE} landmarks "
+        f"are visible, {few.accepted} of them found, {few.false} false"
+    ) * bool(few.queries)
     return (
-        f"{start}, {counts.right} ({_percent(counts.share_right)}) within "
-        f"{100 * wanted.within_m:g} cm and {wanted.within_deg:g} degrees, {counts.inexact} less "
-        f"exact, {counts.false} false{apart}"
+        f"{start}, {counts.right} ({_percent(counts.share_right)}) {_within(config)}, "
+        f"{counts.inexact} less exact, {counts.false} false{apart}"
     )
 
 
 def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTable:
-    wanted = config.localisation
-    right = f"accepted, within {100 * wanted.within_m:g} cm and {wanted.within_deg:g} degrees"
     columns = (
         Column("queries", "asked; those with too few landmarks in view are counted apart"),
-        Column("right", right),
+        Column("right", f"accepted, {_within(config)}"),
         Column("less exact", "accepted, neither right nor false"),
         Column("false", f"accepted, off by more than {_WRONG_M:g} m or {_WRONG_DEG:g} deg"),
-        Column("refused", "no pose was to be believed"),
+        Column("refused", "no pose is certain"),
         Column("cm: 50, 95, 100 %", "errors of accepted positions: median, 95 %, largest"),
         Column("deg: 50, 95, 100 %", "the same of rotations"),
         Column("NEES", "mean normalised error squared per degree of freedom; 1 is consistent"),
@@ -552,15 +513,13 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
     )
     rows = []
     for one in judged:
-        ms = Spread.of(np.array([a.milliseconds for a in one.attempts]))
-        times = f"{_number(ms.median, 0)}, {_number(ms.p95, 0)}"
-        rows.append((in_frames(one.frames), (*_score_cells(one.counts), times)))
+        name, ms = in_frames(one.frames), Spread.of(_milliseconds(one)[0])
+        times = f"{number_text(ms.median, '.0f')}, {number_text(ms.p95, '.0f')}"
+        shown = {name: (one.counts, times)}
         if one.apart.queries or one.familiar.queries != one.counts.queries:
-            least, name = _LEAST_VISIBLE, in_frames(one.frames)
-            familiar = f"{name}, {least} in view from familiar sides"
-            rows.append((familiar, (*_score_cells(one.familiar), _UNKNOWN)))
-            few = f"{name}, fewer than {least} in view"
-            rows.append((few, (*_score_cells(one.apart), _UNKNOWN)))
+            shown[f"{name}, {_LEAST_VISIBLE} in view from familiar sides"] = one.familiar, UNKNOWN
+            shown[f"{name}, fewer than {_LEAST_VISIBLE} in view"] = one.apart, UNKNOWN
+        rows += [(text, (*_score_cells(counts), last)) for text, (counts, last) in shown.items()]
     return TextTable("score", "Localisation", "query", columns, tuple(rows))
 
 
@@ -568,42 +527,29 @@ def _score_cells(counts: LocalisationScore) -> tuple[str, ...]:
     judged = [str(n) for n in (counts.right, counts.inexact, counts.false)]
     return (
         str(counts.queries),
-        *(judged if counts.known else [_UNKNOWN] * 3),
+        *(judged if counts.known else [UNKNOWN] * 3),
         str(counts.queries - counts.accepted),
-        _spread(counts.metres, 100.0, 1),
-        _spread(counts.degrees, 1.0, 2),
-        _number(counts.nees_per_dof, 2),
+        _spread(counts.metres, 100.0, ".1f"),
+        _spread(counts.degrees, 1.0, ".2f"),
+        number_text(counts.nees_per_dof),
         _percent(counts.held),
     )
 
 
-def _refusal_table(judged: Sequence[Scored]) -> TextTable:
-    """How many queries ended with which status of relocalisation."""
-    counts = [Counter(status_of(one) for one in j.attempts) for j in judged]
-    names = sorted({name for count in counts for name in count})
-    columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
-    rows = tuple((name, tuple(str(count[name]) for count in counts)) for name in names)
-    return TextTable("verdicts", "Verdicts", "verdict", columns, rows)
-
-
-def status_of(attempt: Attempt) -> str:
-    """Name of the relocalisation status; ``no_image`` of a frame that could not be read."""
-    return "no_image" if attempt.found is None else attempt.found.status.value
-
-
 def _percent(share: float | None) -> str:
-    return _UNKNOWN if share is None else f"{100 * share:.1f} %"
+    return UNKNOWN if share is None else f"{100 * share:.1f} %"
 
 
-def _number(value: float | None, digits: int) -> str:
-    return _UNKNOWN if value is None else f"{value:.{digits}f}"
+def _spread(values: Spread, factor: float, spec: str) -> str:
+    parts = [value for value in asdict(values).values() if value is not None]
+    return ", ".join(format(factor * part, spec) for part in parts) or UNKNOWN
 
 
-def _spread(values: Spread, factor: float, digits: int) -> str:
-    if values.median is None or values.p95 is None or values.largest is None:
-        return _UNKNOWN
-    parts = (values.median, values.p95, values.largest)
-    return ", ".join(f"{factor * part:.{digits}f}" for part in parts)
+def _milliseconds(judged: Scored) -> tuple[FloatArray, FloatArray]:
+    """(n,) times of the answers, and of the front-end."""
+    times = [(a.milliseconds, a.frontend_ms) for a in judged.attempts]
+    answers, frontend = np.array(times).reshape(-1, 2).T
+    return answers, frontend
 
 
 def sigmas_of(found: Relocalisation) -> tuple[float, float]:
@@ -616,109 +562,83 @@ def sigmas_of(found: Relocalisation) -> tuple[float, float]:
 # --------------------------------------------------------------------------------------------
 # Files
 
-TIMING_FILE = "timing.csv"
 _COLUMNS = (
-    "frame",
-    "frames",
-    "verdict",
-    "x_m",
-    "y_m",
-    "z_m",
-    "yaw_deg",
-    "pitch_deg",
-    "roll_deg",
-    "sigma_position_m",
-    "sigma_rotation_deg",
-    "features",
-    "candidates",
-    "inliers",
-    "expected",
-    "second",
-    "residual_px",
-    "visible",
-    "familiar",
-    "error_m",
-    "error_deg",
-    "nees",
-    "nees_dof",
+    "frame", "frames", "verdict", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg",
+    "sigma_position_m", "sigma_rotation_deg", "features", "candidates", "inliers", "expected",
+    "second", "residual_px", "visible", "familiar", "error_m", "error_deg", "nees", "nees_dof",
     "why",
-)
+)  # fmt: skip
 
 
 def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) -> None:
     """All files of a run into its folder, which holds its config.yaml. Raises OutputError."""
-    folder = result.folder
     if not result.written:
         return
-    judged = scored(result.config, result.asked)
+    folder, asked = result.folder, result.asked
+    judged = scored(result.config, asked)
     rows = (row for one in judged for row in _rows(one))
-    write_csv(folder / LOCALISATION_FILE, _COLUMNS, rows)
-    timing = ((a.frame, a.frames, a.milliseconds, a.frontend_ms) for a in result.asked.attempts)
-    write_csv(folder / TIMING_FILE, ("frame", "frames", "locate_ms", "frontend_ms"), timing)
-    write_json(folder / METRICS_FILE, _document(result, judged))
-    output = result.config.output
+    write_csv(folder / "localisation.csv", _COLUMNS, rows)
+    timing = ((a.frame, a.frames, a.milliseconds, a.frontend_ms) for a in asked.attempts)
+    write_csv(folder / "timing.csv", ("frame", "frames", "locate_ms", "frontend_ms"), timing)
+    document: dict[str, JsonValue] = {
+        "name": result.config.name,
+        "task": result.config.task,
+        "status": result.status,
+        "landmarks": len(asked.landmarks),
+        "alignment": asked.alignment,
+        "notes": list(result.notes),
+        "queries": {str(one.frames): _numbers(one) for one in judged},
+    }
+    write_json(folder / METRICS_FILE, document)
     bounds = bounds_of(result.config)
-    figures = {one.frames: _figure(given, one, bounds) for one in judged}
-    if output.pictures:
+    figures = [_figure(given, one, bounds) for one in judged]
+    if result.config.output.pictures:
         from fgslam.report.pictures import draw_figure  # Matplotlib takes a second
 
-        pictures = make_subfolder(folder, "pictures")
-        for frames, figure in figures.items():
-            draw_figure(pictures / f"localisation_{frames}.png", figure, figure.heading)
-    write_page(result, subtitle, tuple(figures.values()))
+        for one, figure in zip(judged, figures, strict=True):
+            path = make_subfolder(folder, PICTURES) / f"localisation_{one.frames}.png"
+            draw_figure(path, figure, figure.heading)
+    write_page(result, subtitle, figures)
 
 
-def _rows(judged: Scored) -> Iterator[tuple[Cell, ...]]:
+def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
+    errors = judged.errors
     for k, attempt in enumerate(judged.attempts):
-        errors = judged.errors
-        judgement = errors.metres[k], np.rad2deg(errors.radians[k]), errors.nees[k], errors.dof[k]
-        found = attempt.found
-        sighted = attempt.sighted
-        in_view = [n if n >= 0 else None for n in (sighted.visible, sighted.familiar)]
+        found, sighted = attempt.found, attempt.sighted
+        query = attempt.frame, attempt.frames, attempt.verdict
         if found is None:
-            nothing = [None] * (len(_COLUMNS) - 4)
-            yield (attempt.frame, attempt.frames, "no_image", *nothing, attempt.problem)
+            yield *query, *[None] * (len(_COLUMNS) - 4), attempt.problem
             continue
-        posed = np.isfinite(found.covariance).all()
-        pose = (*found.wTc[:3, 3], *np.rad2deg(yaw_pitch_roll(found.wTc)), *sigmas_of(found))
+        pose: Sequence[float | None] = [None] * 8
+        if np.isfinite(found.covariance).all():
+            angles = np.rad2deg(yaw_pitch_roll(found.wTc))
+            pose = [*found.wTc[:3, 3], *angles, *sigmas_of(found)]
         yield (
-            attempt.frame,
-            attempt.frames,
-            found.status.value,
-            *(pose if posed else [None] * len(pose)),
+            *query,
+            *pose,
             attempt.features,
             found.candidates,
             len(found.ids),
             found.expected,
             found.second,
             found.residual_px,
-            *in_view,
-            *judgement,
+            *(n if n >= 0 else None for n in (sighted.visible, sighted.familiar)),
+            errors.metres[k],
+            np.rad2deg(errors.radians[k]),
+            errors.nees[k],
+            errors.dof[k],
             found.why,
         )
 
 
-def _document(result: LocalisationResult, judged: Sequence[Scored]) -> dict[str, JsonValue]:
-    return {
-        "name": result.config.name,
-        "task": result.config.task,
-        "status": result.status,
-        "landmarks": len(result.asked.landmarks),
-        "alignment": result.asked.alignment,
-        "notes": list(result.notes),
-        "queries": {str(one.frames): _numbers(one) for one in judged},
-    }
-
-
 def _numbers(judged: Scored) -> dict[str, JsonValue]:
-    milliseconds = np.array([a.milliseconds for a in judged.attempts])
-    frontend = np.array([a.frontend_ms for a in judged.attempts])
+    answers, frontend = _milliseconds(judged)
     return {
         **_score_numbers(judged.counts),
         "familiar_view": _score_numbers(judged.familiar),
         "too_few_in_view": _score_numbers(judged.apart),
-        "verdicts": dict(sorted(Counter(status_of(a) for a in judged.attempts).items())),
-        "locate_ms": _spread_numbers(Spread.of(milliseconds)),
+        "verdicts": dict(sorted(Counter(a.verdict for a in judged.attempts).items())),
+        "locate_ms": _spread_numbers(Spread.of(answers)),
         "frontend_ms": _spread_numbers(Spread.of(frontend)),
     }
 
@@ -759,55 +679,11 @@ def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
     return located_figure(located, f"localisation-{judged.frames}", title)
 
 
-def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[LocalisationResult]:
-    """Opens the recording, and the map where it is there already. Raises FgslamError."""
-    given = None if config.map.load is None else open_map(Path(config.map.load))
-    sequence = open_queries(config, opening.progress)
-    if given is not None:
-        require_rig(given.saved, sequence.rig, str(given.path))
-    provenance = _provenance(given, sequence)
-    return Task(provenance, lambda context: _run(config, given, sequence, context))
+# ------------------------------------------------------------------------------------------
+# fgslam localize
 
 
-def _run(
-    config: LocalisationConfig, given: GivenMap | None, sequence: ImageSequence, context: Context
-) -> LocalisationResult:
-    """The drive that makes the map, where the run asks for one, and all queries."""
-    folder = context.folder
-    if given is None:
-        ended = drive_first(config.as_experiment(), context)
-        if ended is not None and ended.status == "interrupted":
-            nothing = nothing_asked("the map was not finished")
-            return result_of(config, folder, nothing, sequence.notes)
-        given = open_map(folder / FIRST_FOLDER / MAP_FILE)
-        write_config(folder, config, _provenance(given, sequence))
-    asked = ask_all(config, given, sequence, context)
-    result = result_of(config, folder, asked, sequence.notes)
-    subtitle = f"{sequence.name}, in a map of {len(asked.landmarks)} landmarks"
-    write_results(result, given, subtitle)
-    return result
-
-
-def open_queries(config: LocalisationConfig, progress: Progress) -> ImageSequence:
-    """Opens the recording whose frames are sought. Raises FgslamError."""
-    return open_sequence(
-        config.as_experiment(), lambda done, total: progress("rendering", done, total)
-    )
-
-
-def _provenance(given: GivenMap | None, sequence: ImageSequence) -> dict[str, Any]:
-    """What it takes to repeat the run, beside its configuration."""
-    out = provenance_of(sequence)
-    if given is not None:
-        out["map"] = {"path": str(given.path), "sha256": given.identity}
-    return out
-
-
-_YAML = (".yaml", ".yml")
-_NAME_WIDTH = 18
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Wanted:
     """What is asked.
 
@@ -843,9 +719,18 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
     if out is not None and wanted.existing == "refuse" and is_run_folder(out):
         raise OutputError(f"{out} holds a run already; choose another --out, or add --overwrite")
     given = open_map(wanted.map_file)
-    config = _config(wanted, given.saved)
-    sequence = _open(wanted, config, progress)
+    made_with = settings_of_map(given.saved)
+    config = _config_of(wanted, made_with)
+    sequence = _open_wanted(wanted, config, progress)
     require_rig(given.saved, sequence.rig, str(given.path))
+    # Features found otherwise than when the map was made are recognised less often.
+    other = settings_that_differ(made_with.get("frontend") or {}, config.as_values()["frontend"])
+    notes = list(sequence.notes)
+    if other:
+        keys = " and ".join(f"frontend.{name}" for name in other)
+        notes.insert(
+            0, f"{keys} differs from that of the map's drive: fewer features will be recognised"
+        )
     with ExitStack() as stack:
         if out is not None:
             begin_run_folder(out, wanted.existing, stack.enter_context(Owner(out)))
@@ -853,113 +738,39 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
         loop = (1, progress, stopped, InProcess())
         context = Context(out or Path(), False, UnitStore(None), *loop)
         asked = ask_all(config, given, sequence, context)
-        result = result_of(config, out, asked, sequence.notes)
-        notes = (*_other_frontend(config, given), *result.notes)
-        result = dataclasses.replace(result, notes=notes)
+        result = result_of(config, out, asked, notes)
         write_results(result, given, f"{sequence.name}, in the map {given.path}")
-        return dataclasses.replace(_one_by_one(result), located=_share(asked.attempts))
-
-
-def _share(attempts: Collection[Attempt]) -> LocatedShare:
-    found = [one for one in attempts if one.found is not None and one.found.found]
-    return LocatedShare(len(found), len(attempts))
-
-
-def _one_by_one(result: LocalisationResult) -> LocalisationResult:
-    """The result with a line for each query, or with a single one in full."""
-    attempts = result.asked.attempts
+    attempts = asked.attempts
+    share = LocatedShare(sum(one.accepted for one in attempts), len(attempts))
     if len(attempts) == 1:
-        lines = tuple(f"{name:<{_NAME_WIDTH}}{value}" for name, value in _details(attempts[0]))
-        return dataclasses.replace(result, lines=lines, tables=())
-    lines = tuple(_answer_line(attempt) for attempt in attempts)
-    return dataclasses.replace(result, lines=(*lines, *result.lines))
+        lines = tuple(f"{name:<18}{value}" for name, value in _details(attempts[0]))
+        return dataclasses.replace(result, lines=lines, tables=(), located=share)
+    lines = (*map(_answer_line, attempts), *result.lines)
+    return dataclasses.replace(result, lines=lines, located=share)
 
 
-def _config(wanted: Wanted, saved: SavedMap) -> LocalisationConfig:
+def _config_of(wanted: Wanted, made_with: Mapping[str, Any]) -> LocalisationConfig:
     """The experiment's settings for queries in this map; of a folder those that made the map."""
-    where = str(wanted.recording)
-    if wanted.recording.suffix.lower() in _YAML:
+    where, overrides = str(wanted.recording), wanted.overrides
+    if wanted.recording.suffix.lower() in (".yaml", ".yml"):
         require_no_camera(wanted.recording, wanted.camera)
-        given = load_experiment(wanted.recording, wanted.overrides)
+        given = load_experiment(wanted.recording, overrides)
         if not isinstance(given, ExperimentConfig | LocalisationConfig):
             load_config(wanted.recording)  # says which task this cannot do
             raise ConfigError(f"{where}: holds no recording of stereo images; give another")
-        values = given.as_values()
-        overrides: tuple[str, ...] = ()
+        values, overrides = given.as_values(), ()
     else:
         values = {
             "name": "localize",
-            "dataset": dataset_of(wanted.recording, wanted.camera, wanted.overrides),
+            "dataset": dataset_of(wanted.recording, wanted.camera, overrides),
             "odometry": {"kind": "recorded"},
-            "frontend": settings_of_map(saved).get("frontend", {}),
+            "frontend": made_with.get("frontend", {}),
         }
-        overrides = wanted.overrides
     known = LocalisationConfig.model_fields
     kept = {name: value for name, value in values.items() if name in known}
     queries = {**kept.get("localisation", {}), "frames": [wanted.frames], "every": 1}
     kept |= {"task": "localisation", "localisation": queries, "map": {"load": str(wanted.map_file)}}
     config = as_task(LocalisationConfig, make_experiment(kept, where, overrides), where)
-    return _of_one_frame(config, wanted)
-
-
-def _answer_line(attempt: Attempt) -> str:
-    """One query in a line, for the terminal."""
-    start = f"frame {attempt.frame:>5}  {status_of(attempt):<16}"
-    found = attempt.found
-    if found is None:
-        return f"{start}{attempt.problem}"
-    if not found.found:
-        return f"{start}{found.why}"
-    x, y, z = found.wTc[:3, 3]
-    yaw = np.rad2deg(yaw_pitch_roll(found.wTc)[0])
-    metres, degrees = sigmas_of(found)
-    where = f"({x:7.3f}, {y:6.3f}, {z:7.3f}) m  heading {yaw:7.2f} deg"
-    return (
-        f"{start}{where}  sigma {100 * metres:4.1f} cm {degrees:4.2f} deg  "
-        f"inliers {len(found.ids)} of {found.candidates}"
-    )
-
-
-def _details(attempt: Attempt) -> Iterator[tuple[str, str]]:
-    """One query in full: name and value of what there is to know."""
-    yield "frame", f"{attempt.frame}, from {in_frames(attempt.frames)}"
-    yield "verdict", status_of(attempt)
-    found = attempt.found
-    if found is None:
-        yield "why", attempt.problem
-        return
-    if np.isfinite(found.covariance).all():
-        x, y, z = found.wTc[:3, 3]
-        yaw, pitch, roll = np.rad2deg(yaw_pitch_roll(found.wTc))
-        metres, degrees = sigmas_of(found)
-        doubt = "" if found.found else ", not to be believed"
-        yield "position", f"{x:.3f} {y:.3f} {z:.3f} m (right, down, ahead){doubt}"
-        yield "yaw, pitch, roll", f"{yaw:.2f} {pitch:.2f} {roll:.2f} deg"
-        yield "sigma", f"{100 * metres:.1f} cm, {degrees:.2f} deg"
-    yield "features", str(attempt.features)
-    yield "candidates", f"{found.candidates} tentative matches by appearance"
-    yield "inliers", f"{len(found.ids)} matches that agree with the pose"
-    yield "expected", f"{found.expected} landmarks that should be recognised from there"
-    yield "residual", f"{found.residual_px:.2f} px" if len(found.ids) else "-"
-    yield "second-best place", f"{found.second} inliers"
-    yield "why", found.why
-    if np.isfinite(attempt.truth).all():
-        errors = localisation_errors(answers_of([attempt]))
-        if attempt.accepted:
-            error = f"{100 * errors.metres[0]:.1f} cm, {np.rad2deg(errors.radians[0]):.2f} deg"
-            yield "error", error
-
-
-def settings_of_map(saved: SavedMap) -> dict[str, Any]:
-    """Settings of the last drive that made the map; empty where it holds none."""
-    drives = saved.about.get("drives")
-    last = drives[-1] if isinstance(drives, list) and drives else {}
-    settings = last.get("settings") if isinstance(last, dict) else None
-    return settings if isinstance(settings, dict) else {}
-
-
-def _of_one_frame(config: LocalisationConfig, wanted: Wanted) -> LocalisationConfig:
-    """The configuration of one query alone, where only one is asked for."""
     frame, dataset = wanted.frame, config.dataset
     if frame is None:
         return config
@@ -979,12 +790,12 @@ def _of_one_frame(config: LocalisationConfig, wanted: Wanted) -> LocalisationCon
     return config.model_copy(update={"dataset": one})
 
 
-def _open(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> ImageSequence:
+def _open_wanted(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> ImageSequence:
     frame = wanted.frame
     if frame is None:
-        return open_queries(config, progress)
+        return _open_queries(config, progress)
     try:
-        sequence = open_queries(config, progress)
+        sequence = _open_queries(config, progress)
     except FgslamError as error:
         raise type(error)(f"--frame {frame}: {error}") from None
     if len(sequence) < wanted.frames:
@@ -995,16 +806,12 @@ def _open(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> Ima
     return sequence
 
 
-def _other_frontend(config: LocalisationConfig, given: GivenMap) -> tuple[str, ...]:
-    """A note where features are looked for otherwise than when the map was made."""
-    made, now = settings_of_map(given.saved).get("frontend"), config.as_values()["frontend"]
-    if not isinstance(made, dict):
-        return ()
-    other = settings_that_differ(made, now)
-    if not other:
-        return ()
-    keys = " and ".join(f"frontend.{name}" for name in other)
-    return (f"{keys} differs from that of the map's drive: fewer features will be recognised",)
+def settings_of_map(saved: SavedMap) -> dict[str, Any]:
+    """Settings of the last drive that made the map; empty where it holds none."""
+    drives = saved.about.get("drives")
+    last = drives[-1] if isinstance(drives, list) and drives else {}
+    settings = last.get("settings") if isinstance(last, dict) else None
+    return settings if isinstance(settings, dict) else {}
 
 
 def settings_that_differ(made: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -1012,10 +819,55 @@ def settings_that_differ(made: Mapping[str, Any], now: Mapping[str, Any]) -> lis
 
     Only what both know counts: maps of other versions have fewer settings or more.
     """
-    groups = ("sift", "appearance", "stereo")
-    then = {name: made.get(name) or {} for name in groups}
-    return [
-        name
-        for name in groups
-        if any(then[name][key] != now[name][key] for key in then[name].keys() & now[name].keys())
-    ]
+    different = []
+    for name in ("sift", "appearance", "stereo"):
+        then = made.get(name) or {}
+        if any(then[key] != now[name][key] for key in then.keys() & now[name].keys()):
+            different.append(name)
+    return different
+
+
+def _answer_line(attempt: Attempt) -> str:
+    """One query in a line, for the terminal."""
+    start = f"frame {attempt.frame:>5}  {attempt.verdict:<16}"
+    found = attempt.found
+    if found is None:
+        return f"{start}{attempt.problem}"
+    if not found.found:
+        return f"{start}{found.why}"
+    x, y, z = found.wTc[:3, 3]
+    yaw = np.rad2deg(yaw_pitch_roll(found.wTc)[0])
+    metres, degrees = sigmas_of(found)
+    where = f"({x:7.3f}, {y:6.3f}, {z:7.3f}) m  heading {yaw:7.2f} deg"
+    return (
+        f"{start}{where}  sigma {100 * metres:4.1f} cm {degrees:4.2f} deg  "
+        f"inliers {len(found.ids)} of {found.candidates}"
+    )
+
+
+def _details(attempt: Attempt) -> Iterator[tuple[str, str]]:
+    """One query in full: name and value of what there is to know."""
+    yield "frame", f"{attempt.frame}, from {in_frames(attempt.frames)}"
+    yield "verdict", attempt.verdict
+    found = attempt.found
+    if found is None:
+        yield "why", attempt.problem
+        return
+    if np.isfinite(found.covariance).all():
+        x, y, z = found.wTc[:3, 3]
+        yaw, pitch, roll = np.rad2deg(yaw_pitch_roll(found.wTc))
+        metres, degrees = sigmas_of(found)
+        uncertain = "" if found.found else ", not certain"
+        yield "position", f"{x:.3f} {y:.3f} {z:.3f} m (right, down, ahead){uncertain}"
+        yield "yaw, pitch, roll", f"{yaw:.2f} {pitch:.2f} {roll:.2f} deg"
+        yield "sigma", f"{100 * metres:.1f} cm, {degrees:.2f} deg"
+    yield "features", str(attempt.features)
+    yield "candidates", f"{found.candidates} tentative matches by appearance"
+    yield "inliers", f"{len(found.ids)} matches that agree with the pose"
+    yield "expected", f"{found.expected} landmarks that should be recognised from there"
+    yield "residual", f"{found.residual_px:.2f} px" if len(found.ids) else UNKNOWN
+    yield "second-best place", f"{found.second} inliers"
+    yield "why", found.why
+    errors = localisation_errors(answers_of([attempt]))
+    if np.isfinite(errors.metres[0]):
+        yield "error", f"{100 * errors.metres[0]:.1f} cm, {np.rad2deg(errors.radians[0]):.2f} deg"
