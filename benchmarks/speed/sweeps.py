@@ -23,8 +23,7 @@ import numpy as np
 
 from benchmarks.speed.blocks import resident_mb
 from fgslam.core.errors import ConfigError
-from fgslam.runs.sweeps.folder import JOURNAL_FILE
-from fgslam.runs.sweeps.sweep import make_plan, run_sweep, workers_of
+from fgslam.runs.sweep import JOURNAL_FILE, make_plan, run_sweep, workers_of
 
 CASES = 2_000
 _LEAST = 20

@@ -283,7 +283,7 @@ def sweep(  # noqa: PLR0913 - each option is a parameter
     it early with the table so far; the same command with --resume does what is missing.
     """
     from fgslam.cli.console import progress_with_table
-    from fgslam.runs.sweeps.sweep import make_plan, run_sweep, workers_of
+    from fgslam.runs.sweep import make_plan, run_sweep, workers_of
 
     existing = existing_folder(overwrite, resume)
     plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
@@ -437,7 +437,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     from fgslam.cli.console import show_parts
     from fgslam.core.errors import ConfigError
     from fgslam.runs.compare import Choice, ate_tables, compare_runs
-    from fgslam.runs.trials import Seeds, run_trials
+    from fgslam.runs.trials import run_trials
 
     names = None if estimators is None else tuple(estimators.split(","))
     choice, existing = Choice(names, tuple(overrides or ())), existing_folder(overwrite, resume)
@@ -449,7 +449,7 @@ def compare(  # noqa: PLR0913 - each option is a parameter
         if trials is None:
             results = compare_runs(runs, choice, out, existing, jobs, progress, stopped)
         else:
-            seeds = Seeds(trials, seed)
+            seeds = trials if seed is None else range(seed, seed + trials)
             tried = run_trials(runs[0], seeds, choice, out, existing, jobs, progress, stopped)
             results = [tried]
     show_all(results, same_with_resume())

@@ -26,10 +26,10 @@ from fgslam.runs.folder import (
     STATE_FILE,
     ExistingFolder,
     Owner,
-    begin_run_folder,
-    create_run_folder,
+    begin_folder,
     is_empty,
     is_run_folder,
+    require_usable,
     versions,
     write_config,
 )
@@ -217,7 +217,7 @@ def run_task(
         existing = _claim(folder, existing, config, owner)
         resumed = existing == "resume"
         task = opener(config, Opening(folder, resumed, progress))
-        begin_run_folder(folder, existing, owner)
+        begin_folder(folder, existing, owner)
         if resumed:
             require_same_ground(task.provenance, folder)
         else:
@@ -241,8 +241,7 @@ def _claim(
     """
     if existing == "resume" and folder.is_dir() and is_empty(folder):
         existing = "refuse"
-    if existing == "resume" or (existing == "refuse" and folder.exists()):
-        create_run_folder(folder, existing)
+    require_usable(folder, existing)
     if existing == "resume":
         require_unfinished(folder)
         require_same(config, folder)

@@ -15,7 +15,7 @@ from contextlib import suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from fgslam.core import __version__
 from fgslam.core.errors import OutputError
@@ -79,47 +79,34 @@ class Owner:
         Raises:
             OutputError: another process writes into it, or it cannot be written to.
         """
+        own = f"process {os.getpid()} on {platform.node()}"
         while self._file is None:
             with clear_output_errors(self._path):
                 file = os.open(self._path, _OPENED, 0o644)
             try:
-                self._lock(file)
-            except OutputError:
-                os.close(file)
-                raise
-            if self._is_at_its_place(file):
-                self._file = file
-                self._sign(file)
-                remove_unfinished_files(self._path.parent)
-            else:  # its owner gave it back, and with it this file, between opening and locking
-                os.close(file)
-
-    def _lock(self, file: int) -> None:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise OutputError(
-                f"{self._path.parent}: {_name_in(file) or 'another process'} is writing there; "
-                "wait for it to end, or choose another --out"
-            ) from None
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise OutputError(f"cannot lock {self._path}: {error.strerror}") from None
-
-    def _is_at_its_place(self, file: int) -> bool:
-        try:
-            return os.path.samestat(os.fstat(file), self._path.stat())
-        except FileNotFoundError:
-            return False
-
-    def _sign(self, file: int) -> None:
-        own = f"process {os.getpid()} on {platform.node()}"
-        found = _name_in(file)
-        if found != own:
-            self.before = found
-        with clear_output_errors(self._path):
-            os.pwrite(file, own.encode(), 0)
-            os.ftruncate(file, len(own.encode()))
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    why = f"cannot lock {self._path}: {error.strerror}"
+                    if isinstance(error, BlockingIOError):
+                        why = (
+                            f"{self._path.parent}: {_name_in(file) or 'another process'} is "
+                            "writing there; wait for it to end, or choose another --out"
+                        )
+                    os.close(file)
+                    raise OutputError(why) from None
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file), self._path.stat()):
+                    self._file = file
+            if self._file is None:
+                os.close(file)  # its owner gave it back between opening and locking
+                continue
+            found = _name_in(file)
+            self.before = "" if found == own else found
+            with clear_output_errors(self._path):
+                os.pwrite(file, own.encode(), 0)
+                os.ftruncate(file, len(own.encode()))
+            remove_unfinished_files(self._path.parent)
 
 
 def _name_in(file: int) -> str:
@@ -196,53 +183,99 @@ _RESULT_FILES = (
     "pictures/*.png",
     *(f"*/{name}" for name in _ESTIMATOR_FILES),
 )
+
+
+class FolderKind(NamedTuple):
+    """A kind of folder of results: its name, the file that marks it, patterns of what it holds."""
+
+    name: str
+    marker: str
+    files: tuple[str, ...]
+
+
 # What a run writes, and so all that overwriting one may delete; comparisons of it go along.
-_RUN_FILES = (
-    *_RESULT_FILES,
-    *(f"{inner}/{name}" for inner in ("compare", "trials", "first") for name in _RESULT_FILES),
-    "**/.*.partial*",
+RUN = FolderKind(
+    "run",
+    RUN_MARKER,
+    (
+        *_RESULT_FILES,
+        *(f"{inner}/{name}" for inner in ("compare", "trials", "first") for name in _RESULT_FILES),
+        "**/.*.partial*",
+    ),
 )
 
 # --------------------------------------------------------------------------------------------
-# The run folder
+# The folder of a run, or of a sweep
 
 
-def create_run_folder(path: Path, existing: ExistingFolder = "refuse") -> Path:
-    """Make the folder of a run, and make sure *now* that it can be written to.
+def require_usable(path: Path, existing: ExistingFolder = "refuse", kind: FolderKind = RUN) -> None:
+    """Looks whether results can go into a folder, which may be absent, and changes nothing.
 
     Args:
-        path: the folder itself; its parents are created too. An empty one is as good as none.
-        existing: what to do with a folder that holds a run already: refuse it, delete that run's
-            files (and only those), or keep them to resume.
-
-    Returns:
-        ``path``.
+        path: the folder itself; an empty one is as good as none.
+        existing: what is to be done with one that holds results already: refuse it, delete them
+            (and only those), or keep them to resume.
+        kind: of its results.
 
     Raises:
-        OutputError: it exists (`refuse`), holds something else than a run (`overwrite`), holds
-            no run (`resume`), or cannot be written to.
+        OutputError: it holds results (`refuse`), something else (`overwrite`), or none (`resume`);
+            or it cannot be written to.
     """
+    held = (path / kind.marker).is_file()
     if existing == "resume":
-        _require_run(path)
-    elif path.exists() or path.is_symlink():
-        _make_room(path, overwrite=existing == "overwrite")
+        if not held:
+            raise OutputError(
+                f"cannot resume {path}: it holds no {kind.name} (no {kind.marker}); name the "
+                f"folder of an interrupted {kind.name}, or start one without --resume"
+            )
+    elif (path.exists() or path.is_symlink()) and not path.is_dir():
+        raise OutputError(f"cannot write {path}: it is not a folder; choose another name")
+    elif held and existing == "refuse":
+        raise OutputError(
+            f"{path} holds a {kind.name} already; choose another --out, or add --overwrite or "
+            "--resume"
+        )
+    elif not held and path.exists() and not is_empty(path):
+        raise OutputError(
+            f"{path} exists and holds something else than a {kind.name}; choose another folder"
+        )
+    if path.is_dir():
+        require_writable(path)
+
+
+def create_folder(path: Path, existing: ExistingFolder = "refuse", kind: FolderKind = RUN) -> Path:
+    """Makes the folder of a run with its parents, and makes sure *now* that it can be written to.
+
+    Raises OutputError, also as :func:`require_usable`.
+    """
+    require_usable(path, existing, kind)
     with clear_output_errors(path):
+        if existing == "overwrite":
+            files = {file for one in kind.files for file in path.glob(one) if file.is_file()}
+            # The marker goes last: killed in the middle, the folder is still known for what it is.
+            for file in sorted(files, key=lambda file: (file == path / kind.marker, file)):
+                file.unlink()
+            for folder in sorted({file.parent for file in files} - {path}, reverse=True):
+                if not any(folder.iterdir()):
+                    folder.rmdir()
         path.mkdir(parents=True, exist_ok=True)
     require_writable(path)
     return path
 
 
-def begin_run_folder(path: Path, existing: ExistingFolder, owner: Owner) -> None:
-    """As :func:`create_run_folder`; from then on no other process writes into it.
+def begin_folder(
+    path: Path, existing: ExistingFolder, owner: Owner, kind: FolderKind = RUN
+) -> None:
+    """As :func:`create_folder`; from then on no other process writes into it.
 
     Raises:
         OutputError: as there, or another process writes into it.
     """
     if not owner.holds:
-        if not is_run_folder(path):
-            create_run_folder(path, existing)
+        if not (path / kind.marker).is_file():
+            create_folder(path, existing, kind)
         owner.take()
-    create_run_folder(path, existing)  # another run may have begun there before it was taken
+    create_folder(path, existing, kind)  # another may have begun there before it was taken
 
 
 def is_run_folder(path: Path) -> bool:
@@ -254,41 +287,6 @@ def is_empty(path: Path) -> bool:
     """Whether a folder holds nothing, or what a run left that was killed before its first file."""
     with clear_output_errors(path):
         return all(file.name == OWNER_NAME or is_unfinished_file(file) for file in path.iterdir())
-
-
-def _require_run(path: Path) -> None:
-    if not is_run_folder(path):
-        raise OutputError(
-            f"cannot resume {path}: it holds no run (no {RUN_MARKER}); "
-            "name the folder of an interrupted run, or start one without --resume"
-        )
-
-
-def _make_room(path: Path, *, overwrite: bool) -> None:
-    if not path.is_dir():
-        raise OutputError(f"cannot write {path}: it is not a folder; choose another name")
-    if is_empty(path):
-        return
-    if not is_run_folder(path):
-        raise OutputError(
-            f"{path} exists and holds something else than a run; choose another folder"
-        )
-    if not overwrite:
-        raise OutputError(
-            f"{path} holds a run already; choose another --out, or add --overwrite or --resume"
-        )
-    with clear_output_errors(path):
-        _delete_run_files(path)
-
-
-def _delete_run_files(path: Path) -> None:
-    files = {file for pattern in _RUN_FILES for file in path.glob(pattern) if file.is_file()}
-    # The marker goes last: killed in the middle, the folder is still known for a run.
-    for file in sorted(files, key=lambda file: (file == path / RUN_MARKER, file)):
-        file.unlink()
-    for folder in sorted({file.parent for file in files} - {path}, reverse=True):
-        if not any(folder.iterdir()):
-            folder.rmdir()
 
 
 # --------------------------------------------------------------------------------------------

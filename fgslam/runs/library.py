@@ -25,7 +25,7 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.session import Overrides, override_texts, slam_config
-from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, make_plan, run_sweep, workers_of
+from fgslam.runs.sweep import UNWATCHED, SweepResult, make_plan, run_sweep, workers_of
 from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log

@@ -1,27 +1,38 @@
-"""`fgslam compare --trials`: the same comparison over many worlds of noise, and what they say."""
+"""`fgslam compare --trials`: the same comparison over many worlds of noise, with paired tests."""
 
 from __future__ import annotations
 
-import functools
+import dataclasses
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fgslam.backend.settings import EstimatorSettings, family_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError, OutputError
+from fgslam.core.log import MeasurementLog
+from fgslam.core.threads import one_blas_thread
 from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsSettings
-from fgslam.evaluation.judging import MeanInterval, PairedTest, mean_interval, paired_test
-from fgslam.evaluation.statistics import Consistency, EstimatorMetrics, JsonValue, judge, value_at
+from fgslam.evaluation.judging import PairedTest, judge_replay, mean_interval, paired_test
+from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, Nees, judge, value_at
 from fgslam.report.content import write_metrics
 from fgslam.runs.compare import EVERY, Choice, choose, require_room
-from fgslam.runs.config import Experiment, ExperimentConfig, HomingTrialsConfig, load_experiment
+from fgslam.runs.config import (
+    Experiment,
+    ExperimentConfig,
+    HomingTrialsConfig,
+    OutputSettings,
+    load_experiment,
+)
 from fgslam.runs.engine import Context, Opener, Opening, RunResult, Status, Task, run_task
 from fgslam.runs.folder import (
+    LOG_FILE,
     METRICS_FILE,
     RUN_MARKER,
     TIMING_FILE,
@@ -30,43 +41,75 @@ from fgslam.runs.folder import (
     is_run_folder,
 )
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.slam_comparison import named, with_odometry
+from fgslam.runs.slam_comparison import load_truth, named, with_odometry
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, trials_table, write_comparison_csv
 from fgslam.runs.tasks.homing_replay import open_trials
-from fgslam.runs.trial import Trial, TrialTask, perform_trial
+from fgslam.runs.tasks.slam import open_slam
+from fgslam.runs.tasks.slam_map_entry import arrival_of
+from fgslam.runs.tasks.slam_measurements import open_measured, write_log_and_truth
 from fgslam.runs.units import Progress, Stopped, each_apart
+from fgslam.slam.replay import replay
 
 DEFAULT_FOLDER = "trials"
-_SIGNIFICANT = 0.05
-_AVERAGED = (
-    "ate_rmse_m",
-    "rpe_trans_m",
-    "rpe_rot_deg",
-    "drift_percent",
-    "end_error_m",
-    "end_error_deg",
-    "landmark_rmse_m",
-    "landmark_median_m",
-    "online.ate_rmse_m",
-    "online.rpe_trans_m",
-    "online.rpe_rot_deg",
-    "online.end_error_m",
-    "online.end_error_deg",
-    "nis_per_dof",
-)
+
+# --------------------------------------------------------------------------------------------
+# One trial: an experiment in one world of noise, through estimators
+
+_OUTPUT = OutputSettings(pictures=False, report=False, checkpoint_seconds=1e9)
 
 
 @dataclass(frozen=True, slots=True)
-class Seeds:
-    """How many worlds of noise, and the seed of the first; None: the configuration's."""
+class TrialTask:
+    """One world of noise for one process."""
 
-    count: int
-    first: int | None = None
+    config: ExperimentConfig
+    seed: int
+    estimators: tuple[EstimatorSettings, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """What one world gave: metrics and normalised errors by title of the estimator."""
+
+    seed: int
+    metrics: dict[str, EstimatorMetrics]
+    nees: dict[str, dict[str, Nees]]
+
+
+@one_blas_thread()
+def perform_trial(task: TrialTask) -> Trial:
+    """One trial, start to end, in a folder that is gone afterwards."""
+    with tempfile.TemporaryDirectory(prefix="fgslam-trial-") as scratch:
+        run = Path(scratch) / "run"
+        maps = dataclasses.replace(task.config.map, save=None)
+        config = task.config.model_copy(
+            update={"seed": task.seed, "compare": (), "map": maps, "output": _OUTPUT}
+        )
+        if config.on_measurements:
+            run.mkdir()
+            write_log_and_truth(run, open_measured(config))
+        else:
+            run_task(open_slam, config, run)
+        log = MeasurementLog.load(run / LOG_FILE)
+        truth = load_truth(run, log)
+        arrival = None if config.on_measurements else arrival_of(run)  # these begin in no map
+    metrics, nees = {}, {}
+    for settings in task.estimators:
+        answer = replay(log, settings, config.frontend.ego_motion, arrival=arrival)
+        judged = judge_replay(answer, truth)
+        # A process of several estimators has no memory of each.
+        metrics[settings.title] = dataclasses.replace(judged.metrics, peak_memory_mb=None)
+        nees[settings.title] = judged.nees
+    return Trial(task.seed, metrics, nees)
+
+
+# --------------------------------------------------------------------------------------------
+# All trials
 
 
 def run_trials(
     source: Path,
-    seeds: Seeds,
+    seeds: int | range,
     choice: Choice = EVERY,
     out: Path | None = None,
     existing: ExistingFolder = "refuse",
@@ -78,7 +121,7 @@ def run_trials(
 
     Args:
         source: an experiment's .yaml, or the run folder of one.
-        seeds: how many trials, from which seed on.
+        seeds: of the trials; or how many, the first one being the configuration's.
         choice: which estimators, and overrides of theirs and of the experiment.
         out: folder of the results; None: `trials` in the run folder, or `runs/NAME_trials`.
         existing: what to do where results are already; `resume` goes on with the trials left.
@@ -89,114 +132,197 @@ def run_trials(
     Raises:
         FgslamError: the experiment has one world of noise only, or cannot be run.
     """
-    config = _experiment(source, choice.of_experiment)
+    file = source / RUN_MARKER if is_run_folder(source) else source
+    config = load_experiment(file, choice.of_experiment)
+    if not isinstance(config, ExperimentConfig | HomingTrialsConfig):
+        raise ConfigError(
+            f"{source}: task {config.task_name} has no trials of estimators side by side; "
+            "--trials needs an experiment of SLAM or of the task homing_trials"
+        )
+    worlds = RenderedLabSettings | SimulatedMeasurementsSettings
+    if isinstance(config, ExperimentConfig) and not isinstance(config.dataset, worlds):
+        raise ConfigError(
+            f"{source}: dataset.kind {config.dataset.kind} is a recording with one world of noise; "
+            "--trials needs a rendered_lab or simulated_measurements data set"
+        )
     estimators = choose(config, choice.of_estimators)
-    folder = out or _default_folder(source, config)
+    alone = Path("runs") / f"{config.name}_{DEFAULT_FOLDER}"
+    folder = out or (source / DEFAULT_FOLDER if is_run_folder(source) else alone)
     require_room(folder, source, existing)
-    first = config.seed if seeds.first is None else seeds.first
-    opener: Opener[RunResult]
+    if isinstance(seeds, int):
+        seeds = range(config.seed, config.seed + seeds)
+    opener: Opener[RunResult] = open_trials
+    chosen: Experiment
     if isinstance(config, ExperimentConfig):
-        opener = functools.partial(_open, config, seeds.count, first, estimators)
-        chosen: Experiment = config.model_copy(update={"compare": estimators})
+        tasks = [TrialTask(config, seed, estimators) for seed in seeds]
+        opener = partial(_open, config, tasks)
+        chosen = config.model_copy(update={"compare": estimators})
     else:
-        opener = open_trials
-        changes: dict[str, Any] = {"trials": seeds.count, "seed": first}
+        changes: dict[str, Any] = {"trials": len(seeds), "seed": seeds.start}
         changes |= {"estimator": estimators[0], "compare": estimators[1:]}
         chosen = config.model_copy(update=changes)
     return run_task(opener, chosen, folder, existing, progress, stopped, jobs)
 
 
 def _open(
-    config: ExperimentConfig,
-    count: int,
-    first: int,
-    estimators: tuple[EstimatorSettings, ...],
-    chosen: Experiment,
-    opening: Opening,
+    config: ExperimentConfig, tasks: Sequence[TrialTask], chosen: Experiment, opening: Opening
 ) -> Task[RunResult]:
     """Trials of SLAM; what they share is rendered once, before several processes would do so."""
     if not config.on_measurements:
         open_sequence(config, lambda done, total: opening.progress("rendering", done, total))
-    tasks = [TrialTask(config, first + k, estimators) for k in range(count)]
-    provenance = {"trials": count, "first_seed": first}
-    return Task(provenance, lambda context: _run(config, tasks, context))
+
+    def run(context: Context) -> RunResult:
+        done = context.perform(each_apart(("trials", "trials"), perform_trial, tasks, Trial))
+        failures = sorted(f"trial with seed {tasks[k].seed}: {why}" for (k,), why in done.ended)
+        status: Status = "interrupted" if context.stopped() else "finished"
+        kinds = {settings.title: settings.kind for settings in tasks[0].estimators}
+        trials = list(done.results.values())
+        return write_trials(config, context.folder, status, trials, kinds, failures)
+
+    return Task({"trials": len(tasks), "first_seed": tasks[0].seed}, run)
 
 
-def _run(config: ExperimentConfig, tasks: Sequence[TrialTask], context: Context) -> RunResult:
-    """Finished trials by seed, and a line for each that ended without a result."""
-    done = context.perform(each_apart(("trials", "trials"), perform_trial, tasks, Trial))
-    failures = sorted(f"trial with seed {tasks[k].seed}: {why}" for (k,), why in done.ended)
-    if not done.results:
-        return _none(config, context, failures)
-    kinds = {settings.title: settings.kind for settings in tasks[0].estimators}
-    summary = summarise(list(done.results.values()), kinds)
-    status: Status = "interrupted" if context.stopped() else "finished"
-    write_trials(context.folder, config, summary, failures, status)
-    return _result(config, context.folder, status, summary, failures)
-
-
-def _none(config: ExperimentConfig, context: Context, failures: Sequence[str]) -> RunResult:
-    """Stopped before the first trial was finished. Raises OutputError where each one failed."""
-    if not context.stopped():
-        raise OutputError(f"no trial was finished; {failures[0]}")
-    about: dict[str, JsonValue] = {"name": config.name, "status": "interrupted", "trials": 0}
-    write_metrics(context.folder / METRICS_FILE, 0, {}, about)
-    return RunResult(config, context.folder, "interrupted", ("No trial was finished.",))
-
-
-def _result(
+def write_trials(
     config: ExperimentConfig,
     folder: Path,
     status: Status,
-    summary: TrialSummary,
-    failures: Sequence[str],
+    trials: Sequence[Trial],
+    kinds: Mapping[str, str],
+    failures: Sequence[str] = (),
 ) -> RunResult:
-    """Means over the trials, the verdict on each estimator, and who beats whom."""
-    values = {title: together(summary, title).as_json() for title in summary.means}
-    count = len(summary.trials)
-    heading = f"{named(config)}: {count} trials, mean [95 % interval]; NEES pooled, 1 is right"
-    failed = [("failed", line) for line in (*failures, *failures_of(summary))]
+    """trials.csv (the same bytes for the same seeds), trials_timing.csv and metrics.json.
+
+    Args:
+        config: of the experiment.
+        folder: of the results.
+        status: of the run.
+        trials: those that were finished.
+        kinds: of the estimators, by title.
+        failures: a line for each trial that ended without a result.
+
+    Raises:
+        OutputError: every trial failed, or a file cannot be written.
+    """
+    about: dict[str, JsonValue] = {"name": config.name, "status": status, "trials": len(trials)}
+    if not trials:
+        if status == "finished":
+            raise OutputError(f"no trial was finished; {failures[0]}")
+        write_metrics(folder / METRICS_FILE, 0, {}, about)
+        return RunResult(config, folder, status, ("No trial was finished.",))
+    found = {one.seed: {t: m.as_json() for t, m in one.metrics.items()} for one in trials}
+    rows = [(str(seed), with_odometry(config, values)) for seed, values in found.items()]
+    write_comparison_csv(folder / TRIALS_FILE, rows, RESULT_COLUMNS, "seed")
+    write_comparison_csv(folder / TIMING_FILE, rows, TIME_COLUMNS, "seed")
+    estimators = {title: pool_trials(trials, title, kind) for title, kind in kinds.items()}
+    pairs = compare_families(trials, kinds)
+    about = {
+        "name": config.name,
+        "status": status,
+        "odometry": config.odometry.kind,
+        "remark": config.remark or None,
+        "trials": len(rows),
+        "seeds": list(found),
+        "failures": list(failures),
+        "comparisons": [
+            {
+                "smoother": pair.smoother,
+                "filter": pair.filter,
+                "best_filter": pair.best_filter,
+                **asdict(pair.test),
+                "sentence": pair.sentence,
+            }
+            for pair in pairs
+        ],
+    }
+    frames = max(int(value_at(m, "frames") or 0) for one in found.values() for m in one.values())
+    write_metrics(folder / METRICS_FILE, frames, estimators, about)
+    heading = (
+        f"{named(config)}: {len(trials)} trials, mean [95 % interval]; NEES pooled, 1 is right"
+    )
+    ended = [
+        f"seed {seed}, {title}: {why}"
+        for seed, values in found.items()
+        for title, metrics in values.items()
+        if (why := metrics.get("failure"))
+    ]
     return RunResult(
         config,
         folder,
         status,
-        lines=tuple(pair.sentence for pair in summary.pairs),
-        tables=(trials_table(heading, values),),
-        particulars=(*failed, ("results", str(folder))),
+        lines=tuple(pair.sentence for pair in pairs),
+        tables=(trials_table(heading, {t: one.as_json() for t, one in estimators.items()}),),
+        particulars=(*(("failed", line) for line in (*failures, *ended)), ("results", str(folder))),
         failed=bool(failures),
     )
 
 
-def _experiment(source: Path, overrides: tuple[str, ...]) -> ExperimentConfig | HomingTrialsConfig:
-    """The configuration, if other seeds make other worlds of it."""
-    config = load_experiment(source / RUN_MARKER if is_run_folder(source) else source, overrides)
-    if isinstance(config, HomingTrialsConfig):
-        return config
-    if not isinstance(config, ExperimentConfig):
-        raise ConfigError(
-            f"{source}: task {config.task_name} has no trials of estimators side by side; "
-            "--trials needs an experiment of SLAM or of the task homing_trials"
-        )
-    if not isinstance(config.dataset, RenderedLabSettings | SimulatedMeasurementsSettings):
-        raise ConfigError(
-            f"{source}: dataset.kind {config.dataset.kind} is a recording with one world of noise; "
-            "--trials needs a rendered_lab or simulated_measurements data set"
-        )
-    return config
-
-
-def _default_folder(source: Path, config: Experiment) -> Path:
-    if is_run_folder(source):
-        return source / DEFAULT_FOLDER
-    return Path("runs") / f"{config.name}_{DEFAULT_FOLDER}"
-
-
 # --------------------------------------------------------------------------------------------
-# What all trials say: means, pooled consistency, paired tests
+# What all trials show: means, pooled consistency, paired tests
+
+_AVERAGED = (
+    "ate_rmse_m",
+    "rpe_trans_m",
+    "rpe_rot_deg",
+    "drift_percent",
+    "end_error_m",
+    "end_error_deg",
+    "landmark_rmse_m",
+    "landmark_median_m",
+    "nis_per_dof",
+)
+_AVERAGED_ONLINE = ("ate_rmse_m", "rpe_trans_m", "rpe_rot_deg", "end_error_m", "end_error_deg")
+_SIGNIFICANT = 0.05
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pair:
+def _values_of(trials: Sequence[Trial], title: str, path: str) -> FloatArray:
+    """A metric in all trials; NaN where it is not known, or the estimator ended early."""
+    found = [trial.metrics[title] for trial in trials]
+    values = [None if m.more.get("failure") else value_at(m.as_json(), path) for m in found]
+    return np.array([np.nan if value is None else value for value in values], np.float64)
+
+
+def pool_trials(trials: Sequence[Trial], title: str, kind: str) -> EstimatorMetrics:
+    """One estimator in all trials: names of the contract hold means; NEES is pooled."""
+    found = [one.metrics[title].more for one in trials]
+    predicted = [more.get("predicted_frames") for more in found]
+    pooled = {
+        name: judge(
+            [t.nees[title][name] for t in trials if not t.metrics[title].more.get("failure")]
+        )
+        for name in ("pose", "online_pose", "landmark")
+    }
+
+    def intervals(names: Sequence[str], before: str = "") -> dict[str, Any]:
+        means = {name: mean_interval(_values_of(trials, title, before + name)) for name in names}
+        return {name: None if mean is None else asdict(mean) for name, mean in means.items()}
+
+    final, online = intervals(_AVERAGED), intervals(_AVERAGED_ONLINE, "online.")
+    mean = {name: None if one is None else one["mean"] for name, one in final.items()}
+    pose, landmark = pooled["pose"], pooled["landmark"]
+    return EstimatorMetrics(
+        ate_rmse_m=mean["ate_rmse_m"],
+        rpe_trans_m=mean["rpe_trans_m"],
+        rpe_rot_deg=mean["rpe_rot_deg"],
+        drift_percent=mean["drift_percent"],
+        end_error_m=mean["end_error_m"],
+        end_error_deg=mean["end_error_deg"],
+        nees_pose_per_dof=None if pose is None else pose.per_dof,
+        nees_landmark_per_dof=None if landmark is None else landmark.per_dof,
+        more={
+            "kind": kind,
+            "predicted_frames": sum(count for count in predicted if isinstance(count, int)),
+            "landmark_rmse_m": mean["landmark_rmse_m"],
+            "landmark_median_m": mean["landmark_median_m"],
+            "online": {"ate_rmse_m": value_at(online, "ate_rmse_m.mean")},
+            "nis_per_dof": mean["nis_per_dof"],
+            **{f"nees_{k}": None if one is None else asdict(one) for k, one in pooled.items()},
+            "intervals": final,
+            "intervals_online": online,
+        },
+    )
+
+
+class Pair(NamedTuple):
     """Smoother against filter by final ATE."""
 
     smoother: str
@@ -207,156 +333,38 @@ class Pair:
     @property
     def sentence(self) -> str:
         """The outcome in plain words."""
-        test, n = self.test, self.test.difference.count
-        found = test.p_value is not None and test.p_value < _SIGNIFICANT
-        best = " (the best filter)" if self.best_filter else ""
-        if found and test.difference.mean < 0.0:
-            start = f"{self.smoother} beats {self.filter}{best} in {test.wins} of {n} trials"
-        elif found:
-            start = f"{self.filter}{best} beats {self.smoother} in {test.losses} of {n} trials"
-        else:
-            start = (
-                f"no difference shown between {self.smoother} and {self.filter}{best}: better in "
-                f"{test.wins}, worse in {test.losses} of {n} trials"
-            )
-        return f"{start}; {self._size()}"
-
-    def _size(self) -> str:
         test, mean = self.test, self.test.difference
+        best = " (the best filter)" if self.best_filter else ""
+        lower = mean.mean <= 0.0
+        if test.p_value is None or test.p_value >= _SIGNIFICANT:
+            outcome = (
+                f"no difference shown between {self.smoother} and {self.filter}{best}: better in "
+                f"{test.wins}, worse in {test.losses} of {mean.count} trials"
+            )
+        elif lower:
+            outcome = (
+                f"{self.smoother} beats {self.filter}{best} in {test.wins} of {mean.count} trials"
+            )
+        else:
+            outcome = (
+                f"{self.filter}{best} beats {self.smoother} in {test.losses} of {mean.count} trials"
+            )
+        interval = "one trial has no interval"
+        if mean.lower is not None and mean.upper is not None:
+            sign = -1.0 if lower else 1.0
+            low, high = sorted((100.0 * sign * mean.lower, 100.0 * sign * mean.upper))
+            interval = f"95 % [{low:.3f}, {high:.3f}]"
         ratio = "" if test.ratio is None else f", {test.ratio:.2f} times"
         p_value = "all equal" if test.p_value is None else f"p = {test.p_value:.2g}"
-        sign = -1.0 if mean.mean <= 0.0 else 1.0
-        ends = "one trial has no interval"
-        if mean.lower is not None and mean.upper is not None:
-            low, high = sorted((100.0 * sign * mean.lower, 100.0 * sign * mean.upper))
-            ends = f"95 % [{low:.3f}, {high:.3f}]"
-        word = "lower" if sign < 0.0 else "higher"
         return (
-            f"{self.smoother}'s final ATE is {word} by {100.0 * abs(mean.mean):.3f} cm, "
-            f"{ends}{ratio}; {p_value}"
+            f"{outcome}; {self.smoother}'s final ATE is {'lower' if lower else 'higher'} by "
+            f"{100.0 * abs(mean.mean):.3f} cm, {interval}{ratio}; {p_value}"
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrialSummary:
-    """All trials together.
-
-    Attributes:
-        trials: those that were finished.
-        means: mean and interval over the trials, by title and path in the metrics.
-        pooled: verdict on all trials, by title and `pose`, `online_pose` or `landmark`.
-        pairs: each smoother against each filter.
-        kinds: of the estimators, by title.
-    """
-
-    trials: tuple[Trial, ...]
-    means: dict[str, dict[str, MeanInterval | None]]
-    pooled: dict[str, dict[str, Consistency | None]]
-    pairs: tuple[Pair, ...]
-    kinds: dict[str, str]
-
-
-def summarise(trials: Sequence[Trial], kinds: Mapping[str, str]) -> TrialSummary:
-    """Means, pooled NEES and paired tests; ``kinds`` of the estimators by title."""
-    values = {t: {p: _column(trials, t, p) for p in _AVERAGED} for t in kinds}
-    means = {t: {p: mean_interval(v) for p, v in paths.items()} for t, paths in values.items()}
-    pooled = {
-        title: {
-            name: judge(
-                [one.nees[title][name] for one in trials if _ended_well(one.metrics[title])]
-            )
-            for name in ("pose", "online_pose", "landmark")
-        }
-        for title in kinds
-    }
-    ate = {title: paths["ate_rmse_m"] for title, paths in values.items()}
-    return TrialSummary(tuple(trials), means, pooled, tuple(_pairs(ate, kinds)), dict(kinds))
-
-
-def write_trials(
-    folder: Path,
-    config: ExperimentConfig,
-    summary: TrialSummary,
-    failures: Sequence[str],
-    status: Status,
-) -> None:
-    """trials.csv (the same bytes for the same seeds), trials_timing.csv and metrics.json."""
-    rows = [
-        (
-            str(one.seed),
-            with_odometry(config, {title: m.as_json() for title, m in one.metrics.items()}),
-        )
-        for one in summary.trials
-    ]
-    write_comparison_csv(folder / TRIALS_FILE, rows, RESULT_COLUMNS, "seed")
-    write_comparison_csv(folder / TIMING_FILE, rows, TIME_COLUMNS, "seed")
-    about: dict[str, JsonValue] = {
-        "name": config.name,
-        "status": status,
-        "odometry": config.odometry.kind,
-        "remark": config.remark or None,
-        "trials": len(rows),
-        "seeds": [one.seed for one in summary.trials],
-        "failures": list(failures),
-        "comparisons": [_pair_json(pair) for pair in summary.pairs],
-    }
-    frames = max(int(value_at(m, "frames") or 0) for _, values in rows for m in values.values())
-    estimators = {title: together(summary, title) for title in summary.means}
-    write_metrics(folder / METRICS_FILE, frames, estimators, about)
-
-
-def _pair_json(pair: Pair) -> dict[str, JsonValue]:
-    names = {"smoother": pair.smoother, "filter": pair.filter, "best_filter": pair.best_filter}
-    return {**names, **asdict(pair.test), "sentence": pair.sentence}
-
-
-def failures_of(summary: TrialSummary) -> list[str]:
-    """A line for each estimator that ended early in a trial."""
-    return [
-        f"seed {trial.seed}, {title}: {why}"
-        for trial in summary.trials
-        for title, one in trial.metrics.items()
-        if (why := one.more.get("failure"))
-    ]
-
-
-def together(summary: TrialSummary, title: str) -> EstimatorMetrics:
-    """Names of the contract hold means over the trials; NEES is pooled."""
-    means, pooled = summary.means[title], summary.pooled[title]
-    intervals: dict[str, JsonValue] = {
-        path: None if found is None else asdict(found) for path, found in means.items()
-    }
-    online = {
-        path.removeprefix("online."): intervals.pop(path)
-        for path in _AVERAGED
-        if path.startswith("online.")
-    }
-    return EstimatorMetrics(
-        ate_rmse_m=_mean(means["ate_rmse_m"]),
-        rpe_trans_m=_mean(means["rpe_trans_m"]),
-        rpe_rot_deg=_mean(means["rpe_rot_deg"]),
-        drift_percent=_mean(means["drift_percent"]),
-        end_error_m=_mean(means["end_error_m"]),
-        end_error_deg=_mean(means["end_error_deg"]),
-        nees_pose_per_dof=_per_dof(pooled["pose"]),
-        nees_landmark_per_dof=_per_dof(pooled["landmark"]),
-        more={
-            "kind": summary.kinds[title],
-            "predicted_frames": _predicted(summary, title),
-            "landmark_rmse_m": _mean(means["landmark_rmse_m"]),
-            "landmark_median_m": _mean(means["landmark_median_m"]),
-            "online": {"ate_rmse_m": _mean(means["online.ate_rmse_m"])},
-            "nis_per_dof": _mean(means["nis_per_dof"]),
-            "nees_pose": _json(pooled["pose"]),
-            "nees_online_pose": _json(pooled["online_pose"]),
-            "nees_landmark": _json(pooled["landmark"]),
-            "intervals": intervals,
-            "intervals_online": online,
-        },
-    )
-
-
-def _pairs(ate: Mapping[str, FloatArray], kinds: Mapping[str, str]) -> list[Pair]:
+def compare_families(trials: Sequence[Trial], kinds: Mapping[str, str]) -> list[Pair]:
+    """Each smoother against each filter; ``kinds`` of the estimators by title."""
+    ate = {title: _values_of(trials, title, "ate_rmse_m") for title in kinds}
     families = {title: family_of(kind) for title, kind in kinds.items()}
     filters = [t for t, f in families.items() if f == "filter" and np.isfinite(ate[t]).any()]
     smoothers = [t for t, family in families.items() if family == "smoother"]
@@ -365,32 +373,3 @@ def _pairs(ate: Mapping[str, FloatArray], kinds: Mapping[str, str]) -> list[Pair
     best = min(filters, key=lambda title: float(np.nanmean(ate[title])))
     tests = [(s, f, paired_test(ate[s], ate[f])) for s, f in product(smoothers, filters)]
     return [Pair(s, f, f == best, test) for s, f, test in tests if test is not None]
-
-
-def _column(trials: Sequence[Trial], title: str, path: str) -> FloatArray:
-    """One number of all trials; NaN where it is not known, or the estimator ended early."""
-    found = [trial.metrics[title] for trial in trials]
-    values = [value_at(m.as_json(), path) if _ended_well(m) else None for m in found]
-    return np.array([np.nan if value is None else value for value in values], np.float64)
-
-
-def _ended_well(metrics: EstimatorMetrics) -> bool:
-    return not metrics.more.get("failure")
-
-
-def _predicted(summary: TrialSummary, title: str) -> int:
-    """Poses of all its trials that no landmark measured."""
-    found = (one.metrics[title].more.get("predicted_frames") for one in summary.trials)
-    return sum(count for count in found if isinstance(count, int))
-
-
-def _mean(found: MeanInterval | None) -> float | None:
-    return None if found is None else found.mean
-
-
-def _per_dof(found: Consistency | None) -> float | None:
-    return None if found is None else found.per_dof
-
-
-def _json(found: Consistency | None) -> JsonValue:
-    return None if found is None else asdict(found)

@@ -23,7 +23,7 @@ from fgslam.runs.compare import Choice, compare_runs
 from fgslam.runs.config import make_experiment
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.run import opener_of, run_experiment
-from fgslam.runs.trials import Seeds, run_trials
+from fgslam.runs.trials import run_trials
 
 REFUSED = 2
 _STEPS = {
@@ -42,7 +42,7 @@ def perform(
     if do == "compare":
         compare_runs([Path(source)], Choice(tuple(values["names"])), folder, existing)
     elif do == "trials":
-        run_trials(Path(source), Seeds(2, 5), Choice(), folder, existing)
+        run_trials(Path(source), range(5, 7), Choice(), folder, existing)
     else:
         run_experiment(make_experiment(values, "test"), folder, existing)
 

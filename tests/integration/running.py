@@ -94,7 +94,7 @@ def units_in_this_process() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fgslam.runs.engine.Pool", lambda jobs: nullcontext(InProcess()))
-        patch.setattr("fgslam.runs.sweeps.sweep.Pool", lambda *_: nullcontext(InProcess()))
+        patch.setattr("fgslam.runs.sweep.Pool", lambda *_: nullcontext(InProcess()))
         yield
 
 

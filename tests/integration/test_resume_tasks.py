@@ -38,10 +38,10 @@ from fgslam.core.errors import ConfigError, OutputError
 from fgslam.runs.compare import Choice, compare_runs
 from fgslam.runs.config import make_experiment
 from fgslam.runs.engine import RunResult
-from fgslam.runs.folder import ExistingFolder, create_run_folder
+from fgslam.runs.folder import ExistingFolder, create_folder
 from fgslam.runs.run import run_experiment
 from fgslam.runs.tables import write_comparison_csv
-from fgslam.runs.trials import Seeds, run_trials
+from fgslam.runs.trials import run_trials
 from tests.textured_room import SMALL_CAMERA, folder_of
 
 QUIET = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
@@ -225,7 +225,7 @@ def doing(
             path = base / "trials.yaml"
             path.write_text(yaml.safe_dump(values_of("measurements")))
             return lambda folder, existing: run_trials(
-                path, Seeds(2, 5), Choice(), folder, existing
+                path, range(5, 7), Choice(), folder, existing
             )
         return lambda folder, existing: run(values_of(task), folder, existing)
 
@@ -389,7 +389,7 @@ def test_overwriting_deletes_every_file_of_a_run(
     for path in map(folder.joinpath, names):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
-    create_run_folder(folder, "overwrite")
+    create_folder(folder, "overwrite")
     assert list(folder.rglob("*")) == []
 
 
@@ -556,11 +556,11 @@ def test_trials_and_comparisons_are_resumed_only_on_what_they_were_begun_with(
     source, logged, out = tmp_path / "trials.yaml", tmp_path / "run", tmp_path / "out"
     values = values_of("measurements")
     source.write_text(yaml.safe_dump(values))
-    killed(lambda: run_trials(source, Seeds(2, 5), Choice(), out), 8)
+    killed(lambda: run_trials(source, range(5, 7), Choice(), out), 8)
     with pytest.raises(ConfigError, match="begun with first_seed 5, and now it is 6"):
-        run_trials(source, Seeds(2, 6), Choice(), out, "resume")
+        run_trials(source, range(6, 8), Choice(), out, "resume")
     with pytest.raises(ConfigError, match="begun with trials 2, and now it is 3"):
-        run_trials(source, Seeds(3, 5), Choice(), out, "resume")
+        run_trials(source, range(5, 8), Choice(), out, "resume")
     run(values, logged)
     killed(lambda: compare_runs([logged]), 4)
     other = tmp_path / "other"

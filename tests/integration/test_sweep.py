@@ -20,7 +20,7 @@ from running import HANGS_AFTER_S, main
 
 import fgslam
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.runs.sweeps.sweep import UNWATCHED, SweepResult, make_plan, run_sweep
+from fgslam.runs.sweep import UNWATCHED, SweepResult, make_plan, run_sweep
 from fgslam.runs.workers import InProcess
 
 DRIVE: dict[str, Any] = {
@@ -54,7 +54,7 @@ def drive(tmp_path: Path) -> Path:
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Cases are done in this process."""
-    monkeypatch.setattr("fgslam.runs.sweeps.sweep.Pool", lambda *_: nullcontext(InProcess()))
+    monkeypatch.setattr("fgslam.runs.sweep.Pool", lambda *_: nullcontext(InProcess()))
 
 
 def do(
@@ -130,23 +130,23 @@ def test_an_interrupted_sweep_has_a_table_and_goes_on_with_what_is_missing(
 def test_failed_cases_are_told_and_done_again_on_resuming(
     drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from fgslam.runs.sweeps import case
+    from fgslam.runs import sweep
 
-    real = case.perform_trial
+    real = sweep.perform_trial
 
     def failing(task: Any) -> Any:
         if task.seed == 1:
             raise OSError("no space left on device")
         return real(task)
 
-    monkeypatch.setattr(case, "perform_trial", failing)
+    monkeypatch.setattr(sweep, "perform_trial", failing)
     found = do(drive, ["seed=0:3"], tmp_path / "out")
     assert found.status == "finished"
     assert found.failed
     assert found.failures == {1: "OSError: no space left on device"}
     assert ("failed", "case 1: OSError: no space left on device") in found.particulars
     assert found.table().failure.isna().tolist() == [True, False, True]
-    monkeypatch.setattr(case, "perform_trial", real)
+    monkeypatch.setattr(sweep, "perform_trial", real)
     again = do(drive, ["seed=0:3"], tmp_path / "out", "resume")
     assert not again.failed
     assert again.table().failure.isna().all()

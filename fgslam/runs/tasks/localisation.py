@@ -63,7 +63,7 @@ from fgslam.runs.folder import (
     METRICS_FILE,
     ExistingFolder,
     Owner,
-    begin_run_folder,
+    begin_folder,
     is_run_folder,
     write_config,
 )
@@ -733,7 +733,7 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
         )
     with ExitStack() as stack:
         if out is not None:
-            begin_run_folder(out, wanted.existing, stack.enter_context(Owner(out)))
+            begin_folder(out, wanted.existing, stack.enter_context(Owner(out)))
             write_config(out, config, _provenance(given, sequence))
         loop = (1, progress, stopped, InProcess())
         context = Context(out or Path(), False, UnitStore(None), *loop)

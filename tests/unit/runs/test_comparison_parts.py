@@ -47,8 +47,7 @@ from fgslam.runs.tasks.slam_results import (
     points_under,
     rendered_landmark_truth,
 )
-from fgslam.runs.trials import Trial, summarise, together, write_trials
-from fgslam.runs.trials import _result as trials_result
+from fgslam.runs.trials import Trial, compare_families, pool_trials, write_trials
 
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
 
@@ -460,17 +459,16 @@ KINDS = {"kalman": "landmark_kalman", "worse": "ekf", "smooth": "isam2"}
 
 def test_trials_report_which_estimator_is_better() -> None:
     rows = [trial(k, 0.02 + 0.001 * k, 0.01 + 0.0005 * k) for k in range(8)]
-    summary = summarise(rows, KINDS)
-    first, second = summary.pairs
+    first, second = compare_families(rows, KINDS)
     assert (first.smoother, first.filter, first.best_filter) == ("smooth", "kalman", True)
     assert not second.best_filter
     assert first.sentence.startswith("smooth beats kalman (the best filter) in 8 of 8 trials; ")
     assert "final ATE is lower by 1.175 cm, 95 % [1.0" in first.sentence
     assert "0.50 times; p = 0.0078" in first.sentence
-    pooled = summary.pooled["kalman"]["pose"]
-    assert pooled is not None
-    assert (pooled.per_dof, pooled.independent) == (3.0, 8)
-    assert together(summary, "kalman").ate_rmse_m == pytest.approx(0.0235)
+    pooled = pool_trials(rows, "kalman", "landmark_kalman")
+    assert value_at(pooled.more, "nees_pose.independent") == 8
+    assert pooled.nees_pose_per_dof == 3.0
+    assert pooled.ate_rmse_m == pytest.approx(0.0235)
 
 
 def test_trials_count_predicted_poses_and_name_synthetic_odometry(tmp_path: Path) -> None:
@@ -478,36 +476,46 @@ def test_trials_count_predicted_poses_and_name_synthetic_odometry(tmp_path: Path
     for one in rows:
         more = {**one.metrics["smooth"].more, "predicted_frames": 2, "frames": 9}
         one.metrics["smooth"] = dataclasses.replace(one.metrics["smooth"], more=more)
-    summary, guessed = summarise(rows, KINDS), config(odometry={"kind": "synthetic"})
-    write_trials(tmp_path, guessed, summary, (), "finished")
+    guessed = config(odometry={"kind": "synthetic"})
+    (table,) = write_trials(guessed, tmp_path, "finished", rows, KINDS).tables
     found = list(csv.DictReader((tmp_path / "trials.csv").read_text().splitlines()))
     assert {row["odometry"] for row in found} == {"synthetic"}
     assert [row["predicted_frames"] for row in found[:3]] == ["", "", "2"]
     assert "ground truth" in json.loads((tmp_path / "metrics.json").read_text())["remark"]
-    (table,) = trials_result(guessed, tmp_path, "finished", summary, ()).tables
     assert table.heading.startswith("x (synthetic odometry): 3 trials, ")
     assert [name for name, _ in table.rows] == ["kalman", "worse", "smooth (6 poses predicted)"]
 
 
-def test_the_filter_can_be_better_and_few_trials_show_no_difference() -> None:
-    won = summarise([trial(k, 0.01 + 0.001 * k, 0.03) for k in range(8)], KINDS).pairs[0]
-    assert won.sentence.startswith("kalman (the best filter) beats smooth in 8 of 8 trials; ")
-    assert "higher by" in won.sentence
-    few = summarise([trial(k, 0.02, 0.01 + 0.001 * k) for k in range(3)], KINDS).pairs[0]
-    assert few.sentence.startswith("no difference shown between smooth and kalman")
-    assert "better in 3, worse in 0 of 3 trials" in few.sentence
-    one = summarise([trial(0, 0.02, 0.01)], KINDS).pairs[0]
-    assert "one trial has no interval" in one.sentence
+@pytest.mark.parametrize(
+    ("rows", "start", "words"),
+    [
+        (
+            [trial(k, 0.01 + 0.001 * k, 0.03) for k in range(8)],
+            "kalman (the best filter) beats smooth in 8 of 8 trials; ",
+            "higher by",
+        ),
+        (
+            [trial(k, 0.02, 0.01 + 0.001 * k) for k in range(3)],
+            "no difference shown between smooth and kalman",
+            "better in 3, worse in 0 of 3 trials",
+        ),
+        ([trial(0, 0.02, 0.01)], "no difference shown", "one trial has no interval"),
+    ],
+)
+def test_the_filter_can_be_better_and_few_trials_show_no_difference(
+    rows: list[Trial], start: str, words: str
+) -> None:
+    sentence = compare_families(rows, KINDS)[0].sentence
+    assert sentence.startswith(start)
+    assert words in sentence
 
 
 def test_a_failed_trial_does_not_count() -> None:
     rows = [trial(0, 0.02, 0.01), trial(1, 0.02, 0.01), trial(2, 0.02, 0.0001, "frame 2: no")]
-    summary = summarise(rows, KINDS)
-    assert summary.pairs[0].test.difference.count == 2
-    assert together(summary, "smooth").ate_rmse_m == pytest.approx(0.01)
-    pooled = summary.pooled["smooth"]["pose"]
-    assert pooled is not None
-    assert pooled.independent == 2
+    assert compare_families(rows, KINDS)[0].test.difference.count == 2
+    pooled = pool_trials(rows, "smooth", "isam2")
+    assert pooled.ate_rmse_m == pytest.approx(0.01)
+    assert value_at(pooled.more, "nees_pose.independent") == 2
 
 
 @pytest.mark.parametrize(("kind", "predicted"), [("isam2", 2), ("odometry", 0)])

@@ -11,7 +11,7 @@ import pytest
 
 from fgslam.core.errors import OutputError
 from fgslam.core.files import remove_unfinished_files, replacing, write_bytes
-from fgslam.runs.folder import OWNER_NAME, Owner, create_run_folder
+from fgslam.runs.folder import OWNER_NAME, Owner, create_folder
 
 
 def in_another_process(do: Callable[[], object]) -> int:
@@ -56,7 +56,7 @@ def test_a_dead_owner_s_folder_is_taken_over_with_a_word(tmp_path: Path) -> None
 
 def test_what_a_killed_owner_left_makes_no_folder_a_run(tmp_path: Path) -> None:
     kill(in_another_process(lambda: Owner(tmp_path).take()))
-    assert create_run_folder(tmp_path) == tmp_path
+    assert create_folder(tmp_path) == tmp_path
 
 
 def test_two_processes_that_write_one_file_tear_nothing(tmp_path: Path) -> None:

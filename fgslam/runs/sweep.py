@@ -1,0 +1,993 @@
+"""`fgslam sweep`: experiments over settings, recordings, estimators and seeds, on many workers.
+
+Every combination of values is a case. Each finished case is a line of cases.jsonl, by a digest of
+all that its numbers depend on: so a sweep that is resumed does what is missing. All cases become
+one table, and the table a page: means over the repetitions, and paired tests between variants.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import combinations, product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeAlias
+
+import numpy as np
+import yaml
+
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import ConfigError, FgslamError, OutputError
+from fgslam.core.files import clear_output_errors, write_text
+from fgslam.core.yaml_text import plain_values
+from fgslam.datasets.settings import SimulatedMeasurementsSettings
+from fgslam.evaluation.judging import MeanInterval, PairedTest, holm, mean_interval, paired_test
+from fgslam.evaluation.statistics import JsonValue, value_at
+from fgslam.report.content import (
+    Column,
+    Figure,
+    Page,
+    TextTable,
+    plain,
+    read_metrics,
+    write_parquet,
+)
+from fgslam.runs.bare import bare_experiment
+from fgslam.runs.compare import Choice, choose
+from fgslam.runs.config import Experiment, ExperimentConfig, make_experiment, read_mapping
+from fgslam.runs.engine import Opening, RunResult, run_task
+from fgslam.runs.folder import (
+    METRICS_FILE,
+    REPORT_FILE,
+    ExistingFolder,
+    FolderKind,
+    Owner,
+    begin_folder,
+    digest_of,
+    require_usable,
+    versions,
+)
+from fgslam.runs.named_experiments import find_experiment, suggestion
+from fgslam.runs.run import opener_of
+from fgslam.runs.session import override_texts
+from fgslam.runs.slam_comparison import judged_apart
+from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, measured_marks, with_marks
+from fgslam.runs.trials import TrialTask, perform_trial
+from fgslam.runs.units import Progress, Stopped
+from fgslam.runs.workers import NOT_BEGUN, Executor, Failed, InProcess, Pool
+
+if TYPE_CHECKING:
+    import pandas
+
+MARKER = "sweep.yaml"
+JOURNAL_FILE = "cases.jsonl"
+TABLE_FILE = "results.parquet"
+TIMES_FILE = "times.parquet"
+SWEEP = FolderKind("sweep", MARKER, (JOURNAL_FILE, TABLE_FILE, TIMES_FILE, REPORT_FILE, MARKER))
+
+_TABLE_EVERY_S = 2.0
+_TABLE_SHARE = 20.0  # the sweep goes on at least so many times as long as it writes its table
+_FAILURES_SHOWN = 8  # in the terminal; on the page
+_FAILURES_ON_PAGE = 20
+
+# --------------------------------------------------------------------------------------------
+# What is swept: sources, axes, and the cases that are their combinations
+
+SEED = "seed"
+MOST_CASES = 1_000_000
+_RANGE = re.compile(r"\s*(\d+):(\d+)(?::(\d+))?\s*")
+_PATHS = ("path", "camera_file", "odometry_file", "load")
+_VALUES_NAMED = 20
+
+
+class Source(NamedTuple):
+    """An experiment or a recording: its name in the table, plain values, source for messages."""
+
+    name: str
+    values: Mapping[str, Any]
+    where: str
+
+
+class Axis(NamedTuple):
+    """A key of the experiment and the values it takes, as typed."""
+
+    key: str
+    values: Sequence[str]
+
+    @property
+    def settings(self) -> list[Any]:
+        """The values as the table has them: numbers or booleans where all are, else text."""
+        found = [_plain(text) for text in self.values]
+        for kinds in ((bool,), (int,), (int, float)):
+            if all(type(value) in kinds for value in found):
+                return [float(value) for value in found] if float in map(type, found) else found
+        return list(self.values)
+
+
+def _plain(text: str) -> Any:
+    try:
+        return plain_values(text)
+    except yaml.YAMLError:
+        return text
+
+
+def read_source(path: Path) -> Source:
+    """An experiment's file, the name of a shipped one, or a recording's folder.
+
+    Raises:
+        FgslamError: it is none of these, or cannot be used.
+    """
+    found = find_experiment(path)
+    if not found.exists():
+        raise ConfigError(f"{found}: no such file or folder; {suggestion(found)}")
+    values = bare_experiment(found).values if found.is_dir() else read_mapping(found)
+    return Source(make_experiment(values, str(found)).name, _resolve_paths(values), str(found))
+
+
+def _resolve_paths(values: Any, key: str = "") -> Any:
+    """The values with paths of what exists made absolute: workers start in folders of their own."""
+    if isinstance(values, Mapping):
+        return {name: _resolve_paths(value, str(name)) for name, value in values.items()}
+    if key in _PATHS and isinstance(values, str) and values and Path(values).exists():
+        return str(Path(values).resolve())
+    return values
+
+
+def read_axes(sets: Iterable[str]) -> tuple[Axis, ...]:
+    """The axes of `KEY=VALUES`: one value, several with commas, or a range `FIRST:END[:STEP]`.
+
+    A comma in brackets or quotes belongs to its value. END is left out, as in Python.
+
+    Raises:
+        ConfigError: one is malformed, empty, or of a key that was given before.
+    """
+    axes: dict[str, Axis] = {}
+    for given in sets:
+        key, separator, text = given.partition("=")
+        key = key.strip()
+        if not separator or not key:
+            raise ConfigError(f"--set {given}: not of the form KEY=VALUES; e.g. --set seed=0:100")
+        if key in axes:
+            raise ConfigError(f"--set {given}: {key} is given twice; write {key}=A,B")
+        axes[key] = Axis(key, _read_values(given, text))
+    return tuple(axes.values())
+
+
+def _read_values(given: str, text: str) -> Sequence[str]:
+    found = _RANGE.fullmatch(text)
+    if found is None:
+        values = _split(text)
+        if len(values) > 1 and not all(values):
+            raise ConfigError(f"--set {given}: a value is empty; remove a comma")
+        if len(set(values)) < len(values):
+            raise ConfigError(f"--set {given}: a value is given twice; remove one")
+        return values
+    first, end, step = (int(part) for part in found.groups("1"))
+    count = len(range(first, end, step)) if step else 0
+    if not 1 <= count <= MOST_CASES:
+        raise ConfigError(
+            f"--set {given}: {count:,} values; give FIRST:END[:STEP] of 1 to {MOST_CASES:,}, END "
+            "not among them"
+        )
+    return [str(value) for value in range(first, end, step)]
+
+
+def _split(text: str) -> list[str]:
+    """At the commas outside brackets and quotes."""
+    parts, depth, quote = [""], 0, ""
+    for letter in text:
+        if quote:
+            quote = "" if letter == quote else quote
+        elif letter in "'\"" and not parts[-1].strip():
+            quote = letter
+        depth += not quote and (letter in "[{") - (letter in "]}")
+        if letter == "," and depth <= 0 and not quote:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return [part.strip() for part in parts]
+
+
+def make_axes(settings: Mapping[str, Any]) -> tuple[Axis, ...]:
+    """The axes of values by key: one, or several in a list, a range or an array.
+
+    Raises:
+        ConfigError: a value is not plain, or there is none.
+    """
+    axes = []
+    for key, value in settings.items():
+        several = isinstance(value, (list, tuple, range, np.ndarray))
+        values = list(value) if several else [value]
+        texts = [override_texts({key: one})[0].partition("=")[2] for one in values]
+        if not texts or len(set(texts)) < len(texts):
+            what = "one of its values is given twice" if texts else "it has no value"
+            raise ConfigError(f"settings: {key}: {what}; give some that differ")
+        axes.append(Axis(key, texts))
+    return tuple(axes)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What is swept.
+
+    Attributes:
+        sources: experiments and recordings.
+        axes: keys and their values.
+        names: estimators; None: those of each configuration.
+    """
+
+    sources: tuple[Source, ...]
+    axes: tuple[Axis, ...]
+    names: tuple[str, ...] | None = None
+
+    @cached_property
+    def cases(self) -> list[Case]:
+        """Every combination; the last axis turns fastest.
+
+        Raises:
+            ConfigError: two experiments have one name, or there are too many cases.
+        """
+        names = [source.name for source in self.sources]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ConfigError(f"two experiments are called {twice[0]}; give one another name")
+        count = len(names) * math.prod(len(axis.values) for axis in self.axes)
+        if count > MOST_CASES:
+            raise ConfigError(f"{count:,} cases; a sweep has at most {MOST_CASES:,}")
+        made_with, cases = versions(), []
+        own = [list(zip(axis.settings, axis.values, strict=True)) for axis in self.axes]
+        for source, *chosen in product(self.sources, *own):
+            texts = tuple(
+                f"{axis.key}={_resolve_paths(text, axis.key.split('.')[-1])}"
+                for axis, (_, text) in zip(self.axes, chosen, strict=True)
+            )
+            settings = tuple(setting for setting, _ in chosen)
+            cases.append(Case(source, settings, texts, self.names, made_with))
+        return cases
+
+    @property
+    def default_folder(self) -> Path:
+        """Where the results go unless another folder is named."""
+        return Path("runs") / f"{self.sources[0].name}_sweep"
+
+    @property
+    def description(self) -> str:
+        """The text of sweep.yaml; of many values the first and the last."""
+        axes = {
+            axis.key: ",".join(axis.values)
+            if len(axis.values) <= _VALUES_NAMED
+            else f"{axis.values[0]}, ..., {axis.values[-1]} ({len(axis.values)})"
+            for axis in self.axes
+        }
+        values = {
+            "experiments": {source.name: dict(source.values) for source in self.sources},
+            "axes": axes,
+            "estimators": None if self.names is None else list(self.names),
+            "versions": versions(),
+        }
+        return yaml.safe_dump(values, sort_keys=False)
+
+
+def make_plan(
+    sources: Sequence[Path],
+    settings: Mapping[str, Any] | Iterable[str],
+    names: Iterable[str] | None = None,
+) -> Plan:
+    """What is to be swept.
+
+    Args:
+        sources: experiments and recordings.
+        settings: axes as texts, `KEY=VALUES`, or by key one value or several.
+        names: estimators; None: those of each configuration.
+
+    Raises:
+        FgslamError: a source cannot be used, or an axis is malformed.
+    """
+    if not sources:
+        raise ConfigError("a sweep of no experiment: give the name of one, a file, or a recording")
+    axes = make_axes(settings) if isinstance(settings, Mapping) else read_axes(settings)
+    chosen = None if names is None else tuple(name.strip() for name in names)
+    return Plan(tuple(map(read_source, sources)), axes, chosen)
+
+
+# --------------------------------------------------------------------------------------------
+# One case on some worker
+
+_ABOUT = ("name", "task", "status", "remarks", "estimators")
+_TIMED = {"ms", "mb", "seconds", "second", "growth", "memory"}
+Settled: TypeAlias = tuple[Experiment, tuple[Any, ...]]
+"""A configuration, and the settings of its estimators."""
+
+
+class Row(NamedTuple):
+    """What one estimator gave in a case: numbers, and times, which no other execution repeats."""
+
+    estimator: str
+    numbers: Mapping[str, JsonValue]
+    times: Mapping[str, JsonValue]
+
+
+class CaseResult(NamedTuple):
+    """What a case gave, and how many seconds it took."""
+
+    seconds: float
+    rows: tuple[Row, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """One combination: plain values, that a worker checks as the command did.
+
+    Attributes:
+        source: the experiment.
+        settings: value on each axis, as the table has it.
+        overrides: `key=value` of each axis; with the prefix `estimators.NAME.` of one estimator.
+        names: estimators; None: those of the configuration.
+        made_with: versions of the program that began the sweep.
+    """
+
+    source: Source
+    settings: tuple[Any, ...]
+    overrides: tuple[str, ...]
+    names: tuple[str, ...] | None
+    made_with: Mapping[str, str | None]
+
+    def settled(self) -> Settled:
+        """The configuration, and settings of the estimators. Raises ConfigError."""
+        choice, where = Choice(self.names, self.overrides), self.source.where
+        config = make_experiment(self.source.values, where, choice.of_experiment)
+        own: tuple[Any, ...] = config.estimators
+        if isinstance(config, ExperimentConfig):
+            if config.map.save is not None:
+                raise ConfigError(
+                    f"{where}: map.save: a sweep saves no map; leave it out, or --set "
+                    "map.save=null, and save one with fgslam run"
+                )
+            # Those whose replay means something, as a run compares them.
+            own = judged_apart(config, own) or own
+        if not own:
+            if self.names is not None:
+                raise ConfigError(
+                    f"{where}: task {config.task_name} has no estimators; leave them out"
+                )
+            return config, ()
+        names = self.names or tuple(settings.title for settings in own)
+        return config, choose(config, Choice(names, choice.of_estimators.overrides))
+
+    def key(self, identity: str, settled: Settled) -> str:
+        """Digest of all that its numbers depend on; ``identity`` is the recording's."""
+        values = _with_estimators(*settled).as_values()
+        values = {name: value for name, value in values.items() if name not in ("name", "output")}
+        text = json.dumps([values, identity, dict(self.made_with)], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def _with_estimators(config: Experiment, estimators: tuple[Any, ...]) -> Experiment:
+    """The configuration with these estimators alone."""
+    if not estimators:
+        return config
+    if isinstance(config, ExperimentConfig):
+        return config.model_copy(update={"compare": estimators})
+    return config.model_copy(update={"estimator": estimators[0], "compare": estimators[1:]})
+
+
+def perform_case(case: Case) -> CaseResult | Failed:
+    """One case, start to end; what it fails with is handed back, to be tried elsewhere."""
+    begun, own = time.monotonic(), versions()
+    try:
+        other = [f"{k} {own.get(k)} for {v}" for k, v in case.made_with.items() if own.get(k) != v]
+        if other:
+            raise ConfigError(
+                f"this worker has other versions than the sweep was begun with ({', '.join(other)}"
+                "), which would not give the same bytes; install these there"
+            )
+        rows = tuple(_rows_of_case(*case.settled()))
+    except Exception as error:  # one case that fails shall not end the others
+        kind = "" if isinstance(error, FgslamError) else f"{type(error).__name__}: "
+        return Failed(f"{kind}{' '.join(str(error).split())[:500]}")
+    return CaseResult(time.monotonic() - begun, rows)
+
+
+def _rows_of_case(config: Experiment, estimators: tuple[Any, ...]) -> Iterator[Row]:
+    if isinstance(config, ExperimentConfig):
+        trial = perform_trial(TrialTask(config, config.seed, estimators))
+        for title, metrics in trial.metrics.items():
+            values = {**plain(metrics.as_json()), "odometry": config.odometry.kind}
+            numbers = {name: value_at(values, path) for name, path in RESULT_COLUMNS}
+            times = {name: value_at(values, path) for name, path in TIME_COLUMNS}
+            yield Row(title, numbers, times)
+        return
+    config = _with_estimators(config, estimators)
+    with tempfile.TemporaryDirectory(prefix="fgslam-case-") as scratch:
+        run = Path(scratch) / "run"
+        run_task(opener_of(config), config, run, jobs=1, executor=InProcess())
+        document = read_metrics(run / METRICS_FILE)
+    alone = {name: value for name, value in document.items() if name not in _ABOUT}
+    for title, values in (document.get("estimators") or {"": alone}).items():
+        flat = dict(_leaves(values))
+        timed = {name for name in flat if set(re.split(r"[._]", name)) & _TIMED}
+        numbers = {name: value for name, value in flat.items() if name not in timed}
+        yield Row(title, numbers, {name: flat[name] for name in flat if name in timed})
+
+
+def _leaves(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Single values below a mapping, by dotted name; lists are left out."""
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{before}{name}.")
+        elif not isinstance(value, list):
+            yield f"{before}{name}", value
+
+
+# --------------------------------------------------------------------------------------------
+# Finished cases: the journal, and the table of all
+
+
+class Journal:
+    """Results by key, a line of JSON each, appended as they come; memory holds their places.
+
+    A line that was cut off, because the process was killed or the disk was full, is dropped when
+    the file is opened again: that case is done again, nothing else.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Opens or begins it. Raises OutputError where it cannot be written."""
+        self._path, self._places = path, dict[str, int]()
+        with clear_output_errors(path):
+            self._file: BinaryIO = path.open("a+b")
+            self._file.seek(0)
+            at = 0
+            while line := self._file.readline():
+                if not line.endswith(b"\n"):
+                    self._file.truncate(at)
+                    break
+                with suppress(ValueError, TypeError):  # a line of something else is passed over
+                    key, _, _ = json.loads(line)
+                    self._places[str(key)] = at
+                at += len(line)
+
+    def __enter__(self) -> Journal:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._places
+
+    def add(self, key: str, result: CaseResult) -> None:
+        """Keeps a result. Raises OutputError."""
+        line = json.dumps([key, *result], allow_nan=False).encode() + b"\n"
+        with clear_output_errors(self._path):
+            at = self._file.seek(0, os.SEEK_END)
+            try:
+                self._file.write(line)
+                self._file.flush()
+            except OSError:
+                self._file.truncate(at)
+                raise
+        self._places[key] = at
+
+    def result(self, key: str) -> CaseResult:
+        """What was kept."""
+        self._file.seek(self._places[key])
+        _, seconds, rows = json.loads(self._file.readline())
+        return CaseResult(seconds, tuple(Row(*row) for row in rows))
+
+
+CASE, EXPERIMENT, ESTIMATOR, FAILURE = "case", "experiment", "estimator", "failure"
+Columns: TypeAlias = dict[str, list[Any]]
+"""Cells by name of the column, all of one length; None where a value is not known."""
+
+
+class SweepTable(NamedTuple):
+    """A row for each case and estimator.
+
+    Attributes:
+        keys: columns that say which case and estimator a row is of.
+        numbers: columns of metrics; the same cases give the same bytes.
+        times: columns of what differs between executions.
+    """
+
+    keys: Columns
+    numbers: Columns
+    times: Columns
+
+    def write(self, folder: Path, plan: Plan) -> None:
+        """Both tables as Parquet, with the experiments in their metadata. Raises OutputError."""
+        about = {
+            f"fgslam.experiment.{source.name}": yaml.safe_dump(dict(source.values), sort_keys=False)
+            for source in plan.sources
+        }
+        write_parquet(folder / TABLE_FILE, self.keys | self.numbers, about)
+        write_parquet(folder / TIMES_FILE, self.keys | self.times, about)
+
+
+def make_table(plan: Plan, found: Iterable[tuple[int, CaseResult | str]]) -> SweepTable:
+    """The table of cases by their numbers; a text says why a case has no result."""
+    names = (CASE, EXPERIMENT, *(axis.key for axis in plan.axes), ESTIMATOR)
+    keys: list[tuple[Any, ...]] = []
+    numbers: list[Mapping[str, Any]] = []
+    times: list[Mapping[str, Any]] = []
+    for number, result in found:
+        case = plan.cases[number]
+        took: dict[str, Any] = {}
+        if isinstance(result, str):
+            rows: Sequence[Row] = [Row("", {FAILURE: result}, {})]
+        else:
+            rows, took = result.rows, {"case_seconds": result.seconds}
+        for row in rows:
+            keys.append((number, case.source.name, *case.settings, row.estimator or None))
+            numbers.append(row.numbers)
+            times.append({**took, **row.times})
+    columns = {name: [row[k] for row in keys] for k, name in enumerate(names)}
+    return SweepTable(columns, _columns(numbers), _columns(times))
+
+
+def _columns(rows: Sequence[Mapping[str, Any]]) -> Columns:
+    """Columns of one type each, in the order in which they are found; the failure last."""
+    names = sorted(dict.fromkeys(name for row in rows for name in row), key=FAILURE.__eq__)
+    columns: Columns = {}
+    for name in names:
+        cells = [row.get(name) for row in rows]
+        kinds = {type(cell) for cell in cells if cell is not None}
+        if len(kinds) > 1:
+            kind = float if kinds == {int, float} else str
+            cells = [None if cell is None else kind(cell) for cell in cells]
+        columns[name] = cells
+    return columns
+
+
+# --------------------------------------------------------------------------------------------
+# What the table shows: variants, repeated over seeds and experiments, and compared with each other
+
+METRICS = ("ate_final_m", "ate_online_m", "end_error_final_m", "nees_pose_final_per_dof")
+"""What is shown of a sweep where its table has it; the first one is tested, the smaller better."""
+ALL_PAIRS_OF = 12
+"""Variants of which every two are compared; of more each one with the first."""
+SIGNIFICANT = 0.05
+_VARIANTS_SHOWN = 400
+_VARIANTS_WHILE_RUNNING = 16
+_SERIES_SHOWN = 24
+
+
+class Comparison(NamedTuple):
+    """Variant A against B; ``p_value`` is corrected for all comparisons of the sweep."""
+
+    a: str
+    b: str
+    test: PairedTest
+    p_value: float | None
+
+    @property
+    def better(self) -> str:
+        """Which of them is; empty where none is shown to be."""
+        if self.p_value is None or self.p_value >= SIGNIFICANT:
+            return ""
+        return self.a if self.test.difference.mean < 0.0 else self.b
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the table says of its metrics.
+
+    Attributes:
+        frame: the rows, with columns `variant`, a combination of settings and an estimator, and
+            `series`, the variants that differ in axes of numbers alone; both in words, with marks
+            of what is not measured.
+        metrics: that are shown; the first is tested.
+        axes: keys of the axes that have several numbers for values, but the seed's.
+        repeated: columns of what a variant is repeated over: experiments and seeds.
+    """
+
+    frame: pandas.DataFrame
+    metrics: tuple[str, ...]
+    axes: tuple[str, ...]
+    repeated: tuple[str, ...]
+
+    @property
+    def well(self) -> pandas.DataFrame:
+        """Rows that ended well: an estimator that gave up early has an easier drive."""
+        return self.frame[self.frame[FAILURE].isna()]
+
+    @cached_property
+    def variants(self) -> list[str]:
+        """In the order of the table."""
+        return list(self.frame["variant"].unique())
+
+    def means(self, metric: str) -> dict[str, MeanInterval | None]:
+        """Over the repetitions of each variant."""
+        found = {name: own[metric] for name, own in self.well.groupby("variant", sort=False)}
+        return {v: mean_interval(_numbers(found[v])) if v in found else None for v in self.variants}
+
+    @cached_property
+    def comparisons(self) -> list[Comparison]:
+        """Of every two variants, or of each with the first, over the repetitions that both have."""
+        values = self.well.pivot_table(
+            self.metrics[0], [*self.repeated], "variant", dropna=False, sort=False
+        )
+        first, *others = self.variants
+        every = len(self.variants) <= ALL_PAIRS_OF
+        pairs = combinations(self.variants, 2) if every else ((v, first) for v in others)
+        known = []
+        for a, b in pairs:
+            if a in values and b in values:
+                test = paired_test(_numbers(values[a]), _numbers(values[b]))
+                if test is not None and test.difference.count > 1:
+                    known.append((a, b, test))
+        corrected = iter(holm([t.p_value for _, _, t in known if t.p_value is not None]))
+        return [
+            Comparison(a, b, test, None if test.p_value is None else next(corrected))
+            for a, b, test in known
+        ]
+
+
+def _numbers(column: pandas.Series[Any]) -> FloatArray:
+    return column.to_numpy(np.float64)
+
+
+def find(table: SweepTable, plan: Plan, metric: str | None = None) -> Findings | None:
+    """Findings; None where the table has no number.
+
+    Raises:
+        ConfigError: ``metric`` is no column of numbers.
+    """
+    import pandas  # half a second, that a worker does not need
+
+    frame = pandas.DataFrame({FAILURE: None} | table.keys | table.numbers)
+    numeric = set(frame.select_dtypes("number"))
+    known = [name for name in table.numbers if name in numeric]
+    if not known:
+        return None
+    if metric is not None and metric not in known:
+        raise ConfigError(f"--metric {metric}: no column of numbers; known: {', '.join(known)}")
+    preferred = [name for name in METRICS if name in known] or known[:1]
+    metrics = tuple(dict.fromkeys([*([metric] if metric else []), *preferred]))
+    varied = [axis.key for axis in plan.axes if len(axis.values) > 1 and axis.key != SEED]
+    axes = tuple(key for key in varied if key in numeric)
+    seeds = [axis.key for axis in plan.axes if axis.key == SEED]
+    frame = frame[frame[ESTIMATOR].notna() | frame[FAILURE].isna()]
+    titles = frame[ESTIMATOR].fillna("")
+    several = titles[titles != ""].nunique() > 1
+
+    def marked_label(keys: Sequence[str], titled: bool) -> pandas.Series[Any]:
+        """The rows' settings and estimator in words, with what is not measured of all such rows."""
+        words = [key.split(".")[-1] + "=" + frame[key].map(str) for key in keys]
+        words += [titles] if titled or not words else []
+        joined = [" ".join(filter(None, row)) or "all" for row in zip(*words, strict=True)]
+        label = pandas.Series(joined, frame.index)
+        for name, own in frame.groupby(label):
+            predicted = own["predicted_frames"].sum() if "predicted_frames" in own else 0
+            synthetic = "odometry" in own and bool((own["odometry"] == "synthetic").any())
+            marks = measured_marks(int(predicted), synthetic)
+            label[own.index] = with_marks(str(name), marks)
+        return label
+
+    series = marked_label([key for key in varied if key not in axes], titled=True)
+    frame = frame.assign(variant=marked_label(varied, several), series=series)
+    return Findings(frame, metrics, axes, (EXPERIMENT, *seeds))
+
+
+def summarise(findings: Findings | None, cases: int, done: int, failed: int) -> tuple[str, ...]:
+    """How many cases there are, and which variant is the best, if one is."""
+    first = f"{done:,} of {cases:,} cases done" + (f", {failed:,} failed" if failed else "")
+    if findings is None:
+        return (first,)
+    metric, shown = findings.metrics[0], [one for one in findings.comparisons if one.better]
+    means = [(found.mean, v) for v, found in findings.means(metric).items() if found]
+    if len(means) < 2:
+        return (first,)
+    return (
+        first,
+        "smallest mean of {}: {:.4g}, {}".format(metric, *min(means)),
+        f"{len(shown)} of {len(findings.comparisons)} paired comparisons differ at p < "
+        f"{SIGNIFICANT}, corrected by Holm",
+    )
+
+
+def table_of_means(findings: Findings, most: int = _VARIANTS_SHOWN) -> TextTable:
+    """Means of the variants, of at most so many."""
+    columns = (
+        Column("cases", "repetitions, over seeds and experiments, in which it ended well"),
+        *(Column(name, "mean and 95 % interval by Student's t") for name in findings.metrics),
+        Column("failed", "repetitions in which it failed"),
+    )
+    means = [findings.means(metric) for metric in findings.metrics]
+    failed = findings.frame.groupby("variant")[FAILURE].count()
+    rows = []
+    for name in findings.variants[:most]:
+        count = "0" if (tested := means[0][name]) is None else str(tested.count)
+        cells = (count, *(_interval_text(one[name]) for one in means), str(failed[name]))
+        rows.append((name, cells))
+    more = f"; {len(findings.variants) - most} more" if len(findings.variants) > most else ""
+    return TextTable("means", f"Means{more}", "variant", columns, tuple(rows))
+
+
+def table_of_pairs(findings: Findings) -> TextTable:
+    """Each two variants against each other."""
+    metric = findings.metrics[0]
+    columns = (
+        Column("cases", "repetitions that both have"),
+        Column("difference", f"mean of A minus B in {metric}, with its 95 % interval"),
+        Column("A smaller", "repetitions in which A has the smaller value"),
+        Column("p", "Wilcoxon's signed-rank test, two-sided; fewer than 6 pairs cannot reach 0.05"),
+        Column("p by Holm", "the same corrected for all rows of this table (Holm 1979)"),
+        Column("smaller", "the one that is shown to be smaller at p < 0.05 by Holm"),
+    )
+    rows = []
+    for one in findings.comparisons:
+        count, p_values = one.test.difference.count, (one.test.p_value, one.p_value)
+        cells = (
+            str(count),
+            _interval_text(one.test.difference),
+            f"{one.test.wins} of {count}",
+            *("-" if p is None else f"{p:.2g}" for p in p_values),
+            one.better or "-",
+        )
+        rows.append((f"{one.a} | {one.b}", cells))
+    heading = f"A against B: {metric}"
+    if len(findings.variants) > ALL_PAIRS_OF:
+        heading += " (each against the first; with fewer variants every two are compared)"
+    return TextTable("pairs", heading, "A | B", columns, tuple(rows))
+
+
+def _interval_text(found: MeanInterval | None) -> str:
+    if found is None:
+        return "-"
+    ends = "" if found.lower is None else f"\n[{found.lower:.4g}, {found.upper:.4g}]"
+    return f"{found.mean:.4g}{ends}"
+
+
+def write_sweep_page(
+    path: Path,
+    headline: Sequence[str],
+    failures: Mapping[int, str],
+    findings: Findings | None,
+    description: str,
+) -> None:
+    """The page, with the text of sweep.yaml. Raises OutputError."""
+    from fgslam.report.page import write_html  # loads Plotly
+
+    page = Page(
+        title=f"Sweep: {path.parent.resolve().name}",
+        subtitle="means over the cases that ended well",
+        headline=tuple(headline),
+        notes=tuple(f"case {k}: {why}" for k, why in sorted(failures.items()))[:_FAILURES_ON_PAGE],
+        tables=() if findings is None else (table_of_means(findings), table_of_pairs(findings)),
+        figures=() if findings is None else tuple(_figures(findings)),
+        config_yaml=description,
+        versions=versions(),
+    )
+    write_html(path, page)
+
+
+def _figures(findings: Findings) -> Iterator[Figure]:
+    """A curve for each metric and axis of numbers, and the spread of the first metric."""
+    from fgslam.report.homing_figures import effect_figure, sorted_errors
+
+    groups = list(findings.well.groupby("series", sort=False))[:_SERIES_SHOWN]
+    series = {str(name): own for name, own in groups}
+    for metric, axis in product(findings.metrics, findings.axes):
+        curves = {name: _effect_curve(own, findings, axis, metric) for name, own in series.items()}
+        yield effect_figure(curves, axis, metric, several=len(findings.axes) > 1)
+    metric = findings.metrics[0]
+    pooled = {name: _numbers(own[metric].dropna()) for name, own in series.items()}
+    yield sorted_errors(pooled, metric, ("spread", f"Spread of {metric} over all cases"))
+
+
+def _effect_curve(rows: pandas.DataFrame, findings: Findings, axis: str, metric: str) -> FloatArray:
+    """(n, 4): value on the axis, mean over the other settings and the seeds, ends of its interval.
+
+    The interval is over the repetitions, each averaged over the other settings.
+    """
+    repetitions = rows.groupby([axis, *findings.repeated])[metric].mean()
+    on_axis = repetitions.index.get_level_values(axis).to_numpy(np.float64)
+    curve = []
+    for value in np.unique(on_axis):
+        mean = mean_interval(_numbers(repetitions[on_axis == value]))
+        if mean is not None:
+            ends = [math.nan if end is None else end for end in (mean.lower, mean.upper)]
+            curve.append((value, mean.mean, *ends))
+    return np.array(curve, np.float64).reshape(-1, 4)
+
+
+# --------------------------------------------------------------------------------------------
+# The sweep
+
+Watch: TypeAlias = tuple[Progress, Stopped, Callable[[TextTable], None]]
+"""Called after each case; asked whether to end, within a moment; called with the means so far."""
+
+UNWATCHED: Watch = (lambda what, done, total: None, lambda: False, lambda table: None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepResult(RunResult):
+    """How a sweep ended.
+
+    Attributes:
+        cases: how many there are; ``done`` have a result, ``failures`` say why others have none.
+    """
+
+    cases: int = field(kw_only=True)
+    done: int = field(kw_only=True)
+    failures: Mapping[int, str] = field(kw_only=True)
+
+    def table(self) -> pandas.DataFrame:
+        """A row for each case and estimator: settings, metrics, and why a case failed."""
+        import pandas
+
+        return pandas.read_parquet(self.folder / TABLE_FILE)
+
+
+def workers_of(jobs: int | None, scheduler: str | None) -> Pool:
+    """Workers of a scheduler, or so many of this machine; None: one a core.
+
+    Raises:
+        ConfigError: both are given, or there would be no worker.
+    """
+    if jobs is not None and jobs < 1:
+        raise ConfigError(f"jobs is {jobs}; give at least 1, or none for one a core")
+    if jobs is not None and scheduler is not None:
+        raise ConfigError("--jobs is for workers of this machine; leave it out with --scheduler")
+    return Pool(jobs, scheduler)
+
+
+def run_sweep(
+    plan: Plan,
+    folder: Path,
+    pool: AbstractContextManager[Executor],
+    existing: ExistingFolder = "refuse",
+    metric: str | None = None,
+    watch: Watch = UNWATCHED,
+) -> SweepResult:
+    """Runs the cases of a sweep that have no result yet, and writes table and page.
+
+    Args:
+        plan: what is swept.
+        folder: of the results.
+        pool: does the cases, as :func:`workers_of` makes it.
+        existing: what to do where it holds a sweep: `resume` does what is missing, also of axes
+            that have become longer.
+        metric: column of the table that curves and tests are of; None: the first that is known.
+        watch: who is told, and who may end it; the cases so far are kept and in the table.
+
+    Raises:
+        FgslamError: a case is impossible, the recording cannot be opened, or the results cannot be
+            written.
+    """
+    progress, stopped, shown = watch
+    cases = plan.cases
+    require_usable(folder, existing, SWEEP)
+    if existing == "resume":
+        _require_same_experiments(folder, plan)
+    with pool as workers, Owner(folder) as owner:
+        keys, config = check_cases(plan, watch)
+        begin_folder(folder, existing, owner, SWEEP)
+        write_text(folder / MARKER, plan.description)
+        reasons: dict[str, str] = {}
+        with Journal(folder / JOURNAL_FILE) as journal:
+
+            def write_table() -> SweepTable:
+                """Whole or not at all: killed, the sweep leaves one of a moment ago."""
+                table = make_table(
+                    plan,
+                    (
+                        (k, journal.result(key) if key in journal else reasons[key])
+                        for k, key in enumerate(keys)
+                        if key in journal or key in reasons
+                    ),
+                )
+                table.write(folder, plan)
+                return table
+
+            write_table()
+            missing: dict[str, int] = {}
+            for number, key in enumerate(keys):
+                if key not in journal:
+                    missing.setdefault(key, number)
+            todo = list(missing.values())
+            had, due = len(cases) - len(todo), 0.0
+            progress("cases", had, len(cases))
+            units = [cases[k] for k in todo]
+            for index, outcome in workers.run(perform_case, units, stopped):
+                key = keys[todo[index]]
+                if isinstance(outcome, CaseResult):
+                    journal.add(key, outcome)
+                elif outcome.why == NOT_BEGUN:
+                    continue
+                else:
+                    reasons[key] = outcome.why
+                had += 1
+                progress("cases", had, len(cases))
+                begun = time.monotonic()
+                if begun > due:
+                    so_far = find(write_table(), plan, metric)
+                    if so_far is not None:
+                        shown(table_of_means(so_far, _VARIANTS_WHILE_RUNNING))
+                    took = time.monotonic() - begun
+                    due = begun + max(_TABLE_EVERY_S, _TABLE_SHARE * took)
+            table = write_table()
+            done = sum(key in journal for key in keys)
+        lost = workers.lost
+    failures = {k: reasons[key] for k, key in enumerate(keys) if key in reasons}
+    complete = done + len(failures) == len(cases)
+    # An interrupted sweep has its table at once; tests and page are of all cases.
+    findings = find(table, plan, metric) if complete else None
+    lines = summarise(findings, len(cases), done, len(failures))
+    if complete:
+        write_sweep_page(folder / REPORT_FILE, lines, failures, findings, plan.description)
+    told = [("failed", f"case {k}: {why}") for k, why in sorted(failures.items())]
+    if len(told) > _FAILURES_SHOWN:
+        more = len(told) - _FAILURES_SHOWN
+        told = [*told[:_FAILURES_SHOWN], ("failed", f"and {more} more, see {TABLE_FILE}")]
+    if lost:
+        told.append(("scheduler", "it has gone, and what was under way with it"))
+    return SweepResult(
+        config,
+        folder,
+        "finished" if complete else "interrupted",
+        lines=lines,
+        tables=() if findings is None else (table_of_means(findings),),
+        particulars=(*told, ("table", str(folder / TABLE_FILE))),
+        failed=bool(failures),
+        reached=f"after {done + len(failures)} of {len(cases)} cases",
+        cases=len(cases),
+        done=done,
+        failures=failures,
+    )
+
+
+def _require_same_experiments(folder: Path, plan: Plan) -> None:
+    path = folder / MARKER
+    try:
+        held = yaml.safe_load(path.read_text(encoding="utf-8"))
+        names = sorted(held["experiments"])
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        raise OutputError(f"{path}: cannot be read; start again with --overwrite") from None
+    own = sorted(source.name for source in plan.sources)
+    if not set(names) <= set(own):
+        raise ConfigError(
+            f"{path}: is a sweep of {', '.join(names)}, not of {', '.join(own)}; resume with the "
+            "same experiments, or choose another --out"
+        )
+
+
+def check_cases(plan: Plan, watch: Watch = UNWATCHED) -> tuple[list[str], Experiment]:
+    """Key of every case, and the first configuration; what cannot be run is refused now.
+
+    Recordings are opened, each once; what has to be rendered is rendered before workers would.
+    """
+    progress, stopped, _ = watch
+    opened: dict[str, str] = {}
+    keys: list[str] = []
+    for case in plan.cases:
+        config, estimators = case.settled()
+        identity = ""
+        if not isinstance(getattr(config, "dataset", None), SimulatedMeasurementsSettings):
+            values = config.as_values()
+            parts = {name: values.get(name) for name in ("task", "dataset", "odometry", "map")}
+            ground = json.dumps(parts, sort_keys=True)
+            if ground not in opened:
+                opened[ground] = _identity(config, progress)
+            identity = opened[ground]
+        keys.append(case.key(identity, (config, estimators)))
+        if stopped():
+            raise KeyboardInterrupt
+    return keys, plan.cases[0].settled()[0]
+
+
+def _identity(config: Experiment, progress: Progress) -> str:
+    """Digests of the recording and of the map that is given. Raises FgslamError."""
+    task = opener_of(config)(config, Opening(Path("no such run"), False, progress))
+    recording = str((task.provenance.get("dataset") or {}).get("identity", ""))
+    given = getattr(getattr(config, "map", None), "load", None)
+    return recording if given is None else f"{recording} {digest_of([Path(given)])}"

@@ -1,1 +1,0 @@
-"""Sweeps: experiments over settings, recordings, estimators and seeds, on many workers."""
