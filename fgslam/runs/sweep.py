@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeAlias
@@ -304,6 +304,10 @@ def make_plan(
 
 _ABOUT = ("name", "task", "status", "remarks", "estimators")
 _TIMED = {"ms", "mb", "seconds", "second", "growth", "memory"}
+# What else a case may end with, without ending its worker.
+_WRONG_VALUES = (ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
+_FAULTS = (*_WRONG_VALUES, ImportError, MemoryError, OSError, RuntimeError)
+
 Settled: TypeAlias = tuple[Experiment, tuple[Any, ...]]
 """A configuration, and the settings of its estimators."""
 
@@ -391,7 +395,7 @@ def perform_case(case: Case) -> CaseResult | Failed:
                 "), which would not give the same bytes; install these there"
             )
         rows = tuple(_rows_of_case(*case.settled()))
-    except Exception as error:  # one case that fails shall not end the others
+    except (FgslamError, *_FAULTS) as error:
         kind = "" if isinstance(error, FgslamError) else f"{type(error).__name__}: "
         return Failed(f"{kind}{' '.join(str(error).split())[:500]}")
     return CaseResult(time.monotonic() - begun, rows)
@@ -875,20 +879,7 @@ def run_sweep(
         write_text(folder / MARKER, plan.description)
         reasons: dict[str, str] = {}
         with Journal(folder / JOURNAL_FILE) as journal:
-
-            def write_table() -> SweepTable:
-                """Whole or not at all: killed, the sweep leaves one of a moment ago."""
-                table = make_table(
-                    plan,
-                    (
-                        (k, journal.result(key) if key in journal else reasons[key])
-                        for k, key in enumerate(keys)
-                        if key in journal or key in reasons
-                    ),
-                )
-                table.write(folder, plan)
-                return table
-
+            write_table = partial(_write_table, plan, folder, keys, journal, reasons)
             write_table()
             missing: dict[str, int] = {}
             for number, key in enumerate(keys):
@@ -944,6 +935,20 @@ def run_sweep(
         done=done,
         failures=failures,
     )
+
+
+def _write_table(
+    plan: Plan, folder: Path, keys: Sequence[str], journal: Journal, reasons: Mapping[str, str]
+) -> SweepTable:
+    """The table so far, whole or not at all: killed, the sweep leaves one of a moment ago."""
+    found = (
+        (number, journal.result(key) if key in journal else reasons[key])
+        for number, key in enumerate(keys)
+        if key in journal or key in reasons
+    )
+    table = make_table(plan, found)
+    table.write(folder, plan)
+    return table
 
 
 def _require_same_experiments(folder: Path, plan: Plan) -> None:

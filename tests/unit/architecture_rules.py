@@ -448,7 +448,6 @@ PRIVATE_IN_TESTS = frozenset(
         "tests/unit/backend/test_rig_doubt.py",
         "tests/unit/backend/test_sampled_errors.py",
         "tests/unit/backend/test_submaps.py",
-        "tests/unit/runs/test_comparison_parts.py",
         "tests/unit/runs/test_sweep_grid.py",
     }
 )

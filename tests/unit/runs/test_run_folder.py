@@ -178,7 +178,7 @@ def names_of_files() -> list[str]:
 
 def test_overwriting_deletes_every_file_that_a_task_writes(tmp_path: Path) -> None:
     names = names_of_files()
-    assert {"config.yaml", "loops.csv", "legs.csv", "map.fgmap"} <= set(names)
+    assert {"config.yaml", "loops.csv", "follow.csv", "map.fgmap"} <= set(names)
     for name in names:
         write_text(tmp_path / name, "")
     create_folder(tmp_path, "overwrite")
