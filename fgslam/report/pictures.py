@@ -42,13 +42,10 @@ MAP_COLOURS = "viridis"
 
 DPI = 160
 
-_NO_METADATA: dict[str, Any] = {"Software": None}
-_PACKING: dict[str, Any] = {"compress_level": 3}  # half the time of 6, the same size within a tenth
 # On the screen whites become this grey, so that bright marks stand out on windows and posters.
 _WHITE = 0.78
 
 PICTURE_STYLE: dict[str, Any] = {
-    "font.family": "DejaVu Sans",
     "font.size": 12.0,
     "axes.titlesize": 14.0,
     "axes.titleweight": "bold",
@@ -56,23 +53,18 @@ PICTURE_STYLE: dict[str, Any] = {
     "axes.labelsize": 12.0,
     "axes.edgecolor": INK,
     "axes.labelcolor": INK,
-    "axes.linewidth": 0.8,
     "axes.axisbelow": True,
     "axes.xmargin": 0.01,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.unicode_minus": True,
     "text.color": INK,
     "xtick.color": INK,
     "ytick.color": INK,
     "xtick.labelsize": 11.0,
     "ytick.labelsize": 11.0,
     "grid.color": FAINT,
-    "grid.linewidth": 0.8,
     "legend.fontsize": 11.0,
     "legend.frameon": False,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
     "path.simplify": False,
 }
 
@@ -92,14 +84,11 @@ def picture(path: Path, width: float, height: float) -> Iterator[Canvas]:
         FigureCanvasAgg(figure)
         yield figure
         with replacing(path) as partial:
-            figure.savefig(
-                partial,
-                format="png",
-                bbox_inches="tight",
-                pad_inches=0.1,
-                metadata=_NO_METADATA,
-                pil_kwargs=_PACKING,
-            )
+            # Level 3 takes half the time of 6, for the same size within a tenth.
+            packing: dict[str, Any] = {"compress_level": 3}
+            nothing: dict[str, Any] = {"Software": None}
+            look = {"bbox_inches": "tight", "pad_inches": 0.1}
+            figure.savefig(partial, format="png", metadata=nothing, pil_kwargs=packing, **look)
 
 
 def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
@@ -107,14 +96,8 @@ def show_image(axes: Axes, image: Image, title: str, note: str = "") -> None:
     height, width = image.shape[:2]
     darkest, brightest = np.percentile(image, [0.5, 99.5])
     span = max(float(brightest - darkest), 32.0) / _WHITE
-    axes.imshow(
-        image,
-        cmap="gray",
-        vmin=darkest,
-        vmax=darkest + span,
-        interpolation="bicubic",
-        interpolation_stage="data",
-    )
+    smooth: dict[str, Any] = {"interpolation": "bicubic", "interpolation_stage": "data"}
+    axes.imshow(image, cmap="gray", vmin=darkest, vmax=darkest + span, **smooth)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
     axes.set_title(title)
@@ -152,6 +135,7 @@ _DASHES = {"solid": "-", "dash": "--", "dot": ":"}
 _MARKERS = {"circle": "o", "cross": "P", "square": "s", "x-thin-open": "x", "x": "x"}
 _POINTS_A_PIXEL = 0.75
 _STEEP = 45.0
+_SUPTITLE: dict[str, Any] = {"fontsize": 16, "fontweight": "bold", "x": 0.01, "ha": "left"}
 _BAND = {"color": "#c9d3dc", "linewidth": 0.0}
 _FEW_ENTRIES = 3
 _FINE = 3.0e4
@@ -230,7 +214,7 @@ def draw_views(path: Path, figure: Figure, title: str) -> None:
             # Beside the first view its neighbour leaves no room for these.
             axes.set_ylabel("ahead (m)")
             axes.set_zlabel("up (m)", labelpad=-2.0)
-        canvas.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
+        canvas.suptitle(title, **_SUPTITLE)
         canvas.supxlabel(figure.note, fontsize=12.0)
         _legend(canvas, canvas.axes[0], "outside upper right")
 
@@ -241,42 +225,28 @@ def _seen(figure: Figure, shown: Collection[str]) -> list[Any]:
 
 def _draw(axes: Any, trace: Any, order: int, names: str = "xy") -> None:
     points = [trace[name] for name in names]
+    style: dict[str, Any] = {"label": html.unescape(trace.name), "zorder": 2.0 + 0.01 * order}
     if trace.type == "scatter" and trace.fill == "toself":
-        axes.fill(*points, label=_label(trace), zorder=2.0 + 0.01 * order, **_BAND)
-        return
-    if "lines" in trace.mode:
-        style = {"color": trace.line.color, "linestyle": _DASHES[trace.line.dash]}
+        axes.fill(*points, **style, **_BAND)
+    elif "lines" in trace.mode:
         width = trace.line.width * (0.5 if len(names) == 3 else _POINTS_A_PIXEL)
-        axes.plot(*points, linewidth=width, label=_label(trace), zorder=2.0 + 0.01 * order, **style)
+        style |= {"color": trace.line.color, "linestyle": _DASHES[trace.line.dash]}
+        axes.plot(*points, linewidth=width, **style)
     elif len(points[0]):
-        _draw_markers(axes, trace, order, points)
-
-
-def _draw_markers(axes: Any, trace: Any, order: int, points: Sequence[FloatArray]) -> None:
-    marker = trace.marker
-    style: dict[str, Any] = {
-        "label": _label(trace),
-        "marker": _MARKERS[marker.symbol],
-        "zorder": 2.0 + 0.01 * order,
-    }
-    # Dense maps get finer dots.
-    size = (_POINTS_A_PIXEL * marker.size) ** 2
-    style["s"] = min(size, max(_FINE / len(points[0]), 1.0))
-    if len(points) == 3:
-        style["depthshade"] = False
-    if isinstance(marker.color, str):
-        axes.scatter(*points, color=marker.color, linewidths=1.4, **style)
-        return
-    norm = Normalize(marker.cmin, marker.cmax)
-    axes.scatter(*points, c=marker.color, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
-    if len(points) == 2:
-        bar = marker.colorbar.title.text
-        colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
-
-
-def _label(trace: Any) -> str:
-    """Words of the legend."""
-    return html.unescape(trace.name)
+        marker = trace.marker
+        # Dense maps get finer dots.
+        size = min((_POINTS_A_PIXEL * marker.size) ** 2, max(_FINE / len(points[0]), 1.0))
+        style |= {"marker": _MARKERS[marker.symbol], "s": size}
+        if len(points) == 3:
+            style["depthshade"] = False
+        if isinstance(marker.color, str):
+            axes.scatter(*points, color=marker.color, linewidths=1.4, **style)
+            return
+        norm = Normalize(marker.cmin, marker.cmax)
+        axes.scatter(*points, c=marker.color, cmap=MAP_COLOURS, norm=norm, linewidths=0, **style)
+        if len(points) == 2:
+            bar = marker.colorbar.title.text
+            colour_bar(axes, ScalarMappable(norm, MAP_COLOURS), bar, extend="both")
 
 
 def _dress(axes: Axes, layout: Any, panel: str) -> None:
@@ -312,14 +282,18 @@ def _paper_size(layout: Any, panels: int) -> tuple[float, float]:
     return min(height / aspect, 16.0) + 2.4, height + 1.8
 
 
+# --------------------------------------------------------------------------------------------
+# Images with what was found in them
+
 _CAMERAS = ("Right", "Left", "Top")
 # The descriptor looks at a window of about twelve scales; a square of four stays readable.
 _SQUARE_SIDE_IN_SCALES = 4.0
 # Wider images than this are stacked rather than set side by side.
 _PANORAMIC_ASPECT = 2.2
-_IMAGE_INCHES = 5.6
 # Without the dark end, which would be lost in the shadows of the image.
 _DISPARITY_COLOURS = ListedColormap(matplotlib.colormaps["plasma"](np.linspace(0.3, 1.0, 256)))
+_ALONE_INCHES, _IMAGE_INCHES = 9.0, 5.6  # widths of images, alone in a row or not
+_HEADING_INCHES, _TITLE_INCHES = 0.42, 0.45
 
 
 def draw_features(
@@ -336,16 +310,18 @@ def draw_features(
     Raises:
         OutputError: the file cannot be written.
     """
-    order = tuple(reversed(range(len(features))))
-    stacked = images[0].shape[1] > _PANORAMIC_ASPECT * images[0].shape[0]
-    rows, columns = (len(order), 1) if stacked else (1, len(order))
-    width, height = _size(images[0], rows, columns, bool(title))
-    with picture(path, width, height) as figure:
+    count, (height, width) = len(features), images[0].shape
+    stacked = count == 1 or width > _PANORAMIC_ASPECT * height
+    rows, columns = (count, 1) if stacked else (1, count)
+    inches = _ALONE_INCHES if stacked else _IMAGE_INCHES
+    tall = rows * (inches * height / width + _HEADING_INCHES) + (_TITLE_INCHES if title else 0.0)
+    with picture(path, columns * inches + 0.2, tall) as figure:
         panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axes, camera in zip(panels, order, strict=True):
-            show_image(axes, images[camera], _CAMERAS[camera], f"{len(features[camera])} features")
-            add_segments(axes, oriented_squares(features[camera]), 1.1, color=YELLOW)
-        _heading(figure, title)
+        for axes, k in zip(panels, reversed(range(count)), strict=True):
+            show_image(axes, images[k], _CAMERAS[k], f"{len(features[k])} features")
+            add_segments(axes, oriented_squares(features[k]), 1.1, color=YELLOW)
+        if title:
+            figure.suptitle(title, **_SUPTITLE)
 
 
 def oriented_squares(features: Features) -> FloatArray:
@@ -371,29 +347,23 @@ def draw_disparities(path: Path, image: Image, pixels: FloatArray, title: str = 
     Raises:
         OutputError: the file cannot be written.
     """
-    horizontal = pixels[:, 1, 0] - pixels[:, 0, 0]
-    vertical = pixels[:, 2, 1] - pixels[:, 0, 1]
-    trinocular = bool(np.isfinite(vertical).any())
-    colours: dict[str, Any] = {"cmap": _DISPARITY_COLOURS, "norm": _disparity_norm(horizontal)}
-    width, height = _size(image, 1, 1, has_title=True, inches=9.0)
-    with picture(path, width + 1.2, height) as figure:
-        axes = figure.subplots()
-        show_image(axes, image, title or "Stereo matches", f"{len(pixels)} matches")
-        start = pixels[:, 0]
-        lines = add_segments(axes, _rays(start, horizontal, 0), 1.6, array=horizontal, **colours)
-        if trinocular:
-            add_segments(axes, _rays(start, vertical, 1), 1.6, array=horizontal, **colours)
-        axes.scatter(
-            start[:, 0],
-            start[:, 1],
-            s=16,
-            c=horizontal,
-            edgecolors="black",
-            linewidths=0.6,
-            **colours,
-        )
+    right, left, top = pixels.transpose(1, 0, 2)
+    disparity = left[:, 0] - right[:, 0]
+    low, high = (float(disparity.min()), float(disparity.max())) if len(pixels) else (0.0, 1.0)
+    # Logarithmic where disparities span a wide range, so that far features differ too.
+    wide = low > 0.0 and high > 8.0 * low
+    norm = LogNorm(low, high) if wide else Normalize(low, max(high, low + 1.0))
+    colours: dict[str, Any] = {"cmap": _DISPARITY_COLOURS, "norm": norm}
+    with _one_image(path, image, title or "Stereo matches", f"{len(pixels)} matches", 1.2) as axes:
+        across = np.stack([right, np.column_stack([left[:, 0], right[:, 1]])], axis=1)
+        lines = add_segments(axes, across, 1.6, array=disparity, **colours)
+        if np.isfinite(top).any():
+            down = np.stack([right, np.column_stack([right[:, 0], top[:, 1]])], axis=1)
+            add_segments(axes, down, 1.6, array=disparity, **colours)
+        rims: dict[str, Any] = {"edgecolors": "black", "linewidths": 0.6}
+        axes.scatter(*right.T, s=16, c=disparity, **rims, **colours)
         colour_bar(axes, lines, "horizontal disparity (px)")
-        if isinstance(colours["norm"], LogNorm):
+        if wide:
             scale = axes.child_axes[0].yaxis
             scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             scale.set_major_formatter(ScalarFormatter())
@@ -415,80 +385,44 @@ def draw_flow(
     Raises:
         OutputError: the file cannot be written.
     """
-    length = np.linalg.norm(after - before, axis=1)
     note = f"{len(before)} matches"
     if len(before):
-        note += f", median flow {np.median(length):.1f} px"
-    width, height = _size(image, 1, 1, has_title=True, inches=9.0)
-    with picture(path, width, height + 0.15) as figure:
-        axes = figure.subplots()
-        show_image(axes, image, title or "Flow between frames", note)
+        flow = np.linalg.norm(after - before, axis=1)
+        note += f", median flow {np.median(flow):.1f} px"
+    alone: dict[str, Any] = {"linestyle": "none"}
+    with _one_image(path, image, title or "Flow between frames", note, higher=0.15) as axes:
         add_segments(axes, np.stack([before, after], axis=1), 1.6, color=SKY)
+        rims: dict[str, Any] = {"edgecolors": "black", "linewidths": 0.7, "zorder": 3}
+        axes.scatter(*before.T, s=26, c=YELLOW, **rims)
         cross: dict[str, Any] = {"s": 42, "marker": "x", "zorder": 4}
-        axes.scatter(
-            before[:, 0], before[:, 1], s=26, c=YELLOW, edgecolors="black", linewidths=0.7, zorder=3
-        )
-        axes.scatter(after[:, 0], after[:, 1], c="black", alpha=0.6, linewidths=3.4, **cross)
-        axes.scatter(after[:, 0], after[:, 1], c=ORANGE, linewidths=1.8, **cross)
-        figure.legend(handles=_flow_legend(), loc="outside lower center", ncols=3)
+        axes.scatter(*after.T, c="black", alpha=0.6, linewidths=3.4, **cross)
+        axes.scatter(*after.T, c=ORANGE, linewidths=1.8, **cross)
+        dot = Line2D([], [], label="position in the earlier frame", marker="o", markersize=7,
+                     markeredgecolor=INK, color=YELLOW, **alone)  # fmt: skip
+        mark = Line2D([], [], label="position in the later frame", marker="x", markersize=8,
+                      markeredgewidth=2.0, color=ORANGE, **alone)  # fmt: skip
+        motion = Line2D([], [], label="motion", color=SKY, linewidth=2.0)
+        figure = axes.get_figure(root=True)
+        figure.legend(handles=[dot, mark, motion], loc="outside lower center", ncols=3)
 
 
-def _flow_legend() -> list[Line2D]:
-    dot: dict[str, Any] = {
-        "marker": "o",
-        "markeredgecolor": INK,
-        "color": YELLOW,
-        "linestyle": "none",
-    }
-    cross: dict[str, Any] = {
-        "marker": "x",
-        "color": ORANGE,
-        "linestyle": "none",
-        "markeredgewidth": 2.0,
-    }
-    return [
-        Line2D([], [], label="position in the earlier frame", markersize=7, **dot),
-        Line2D([], [], label="position in the later frame", markersize=8, **cross),
-        Line2D([], [], label="motion", color=SKY, linewidth=2.0),
-    ]
-
-
-def _rays(start: FloatArray, length: FloatArray, axis: int) -> FloatArray:
-    """Segments (n, 2, 2) from ``start`` along +column (0) or +row (1)."""
-    end = start.copy()
-    end[:, axis] += length
-    return np.stack([start, end], axis=1)
-
-
-def _disparity_norm(disparity: FloatArray) -> Normalize:
-    """Logarithmic where disparities span a wide range, so that far features differ too."""
-    if len(disparity) == 0:
-        return Normalize(0.0, 1.0)
-    low, high = float(disparity.min()), float(disparity.max())
-    if low > 0.0 and high > 8.0 * low:
-        return LogNorm(low, high)
-    return Normalize(low, max(high, low + 1.0))
-
-
-def _size(
-    image: Image, rows: int, columns: int, has_title: bool, inches: float = _IMAGE_INCHES
-) -> tuple[float, float]:
-    """Width and height of the figure in inches: panels of ``inches`` width, headings above."""
+@contextmanager
+def _one_image(
+    path: Path, image: Image, title: str, note: str, wider: float = 0.0, higher: float = 0.0
+) -> Iterator[Any]:
+    """Axes that show an image; a picture of it with room for a bar (wider) or a legend (higher)."""
     height, width = image.shape
-    if columns == 1:
-        inches = max(inches, 9.0)
-    panel = inches * height / width
-    return columns * inches + 0.2, rows * (panel + 0.42) + (0.45 if has_title and rows else 0.0)
+    tall = _ALONE_INCHES * height / width + _HEADING_INCHES + _TITLE_INCHES
+    with picture(path, _ALONE_INCHES + 0.2 + wider, tall + higher) as figure:
+        axes = figure.subplots()
+        show_image(axes, image, title, note)
+        yield axes
 
 
-def _heading(figure: Canvas, title: str) -> None:
-    if title:
-        figure.suptitle(title, fontsize=16, fontweight="bold", x=0.01, ha="left")
-
-
-_PAIR_WIDTH_IN = 9.0
+_PAIR_WIDTH_IN, _VIEW_WIDTH_IN, _SHEET_WIDTH_IN = 9.0, 11.0, 11.0
+_SHEET_COLUMNS = 4
 _SHOWN_PX = 1100  # columns of a picture; more would not show
-_PAIR_DIMMED = 0.6
+_PAIR_DIMMED, _VIEW_DIMMED = 0.6, 0.7
 _EDGE_PART = 0.04  # of a picture: a mark with its number is no wider, nor as high
 
 
@@ -531,44 +465,23 @@ def draw_view_matches(
             (upper, images[0], matches.a, titles[0]),
             (lower, images[1], matches.b, titles[1]),
         ):
-            _show(axes, image, title)
-            _mark(axes, points, matches.columns, colours)
-
-
-def _show(axes: Axes, image: Image, title: str) -> None:
-    step = max(1, image.shape[1] // _SHOWN_PX)
-    height, width = image.shape[:2]
-    dimmed = (_PAIR_DIMMED * image[::step, ::step]).astype(np.uint8)
-    axes.imshow(dimmed, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
-    axes.set(xticks=[], yticks=[])
-    axes.spines[:].set_visible(False)
-    axes.set_title(title)
-
-
-def _mark(axes: Axes, points: FloatArray, columns: BoolArray, colours: FloatArray) -> None:
-    # Lists of tuples: the drawing library takes arrays, its types do not.
-    tints = [tuple(colour) for colour in colours.tolist()]
-    outer = _near_edge(axes, points).tolist()
-    for number, (point, tint) in enumerate(zip(points.tolist(), tints, strict=True)):
-        common: dict[str, Any] = {"color": tint, "in_layout": outer[number]}
-        if columns[number]:
-            axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, **common)
-        else:
-            axes.plot(*point, marker="o", markersize=5, fillstyle="none", **common)
-        axes.annotate(
-            str(number), point, (3.0, 3.0), textcoords="offset points", fontsize=5.5, **common
-        )
-
-
-def _near_edge(axes: Axes, points: FloatArray) -> BoolArray:
-    """(n,) which marks may reach beyond the picture (n, 2); the layout need not measure others."""
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    part = np.abs((points - [left, bottom]) / [right - left, top - bottom] - 0.5)
-    return np.asarray((part > 0.5 - _EDGE_PART).any(axis=1))
-
-
-_VIEW_WIDTH_IN = 11.0
-_VIEW_DIMMED = 0.7
+            step = max(1, image.shape[1] // _SHOWN_PX)
+            height, width = image.shape[:2]
+            dimmed = (_PAIR_DIMMED * image[::step, ::step]).astype(np.uint8)
+            axes.imshow(dimmed, extent=(-0.5, width - 0.5, height - 0.5, -0.5))
+            axes.set(xticks=[], yticks=[], title=title)
+            axes.spines[:].set_visible(False)
+            # Marks may reach beyond the picture near its edge; the layout need not measure others.
+            outer = (np.abs((points + 0.5) / [width, height] - 0.5) > 0.5 - _EDGE_PART).any(axis=1)
+            for number, point in enumerate(points.tolist()):
+                tint: Any = tuple(colours[number].tolist())
+                mark: dict[str, Any] = {"color": tint, "in_layout": bool(outer[number])}
+                if matches.columns[number]:
+                    axes.plot(*point, marker="|", markersize=9, markeredgewidth=1.6, **mark)
+                else:
+                    axes.plot(*point, marker="o", markersize=5, fillstyle="none", **mark)
+                place: dict[str, Any] = {"textcoords": "offset points", "fontsize": 5.5}
+                axes.annotate(str(number), point, (3.0, 3.0), **place, **mark)
 
 
 def draw_view_tracks(path: Path, view: Image, trails: Sequence[FloatArray], title: str) -> None:
@@ -588,21 +501,14 @@ def draw_view_tracks(path: Path, view: Image, trails: Sequence[FloatArray], titl
         axes = figure.subplots()
         axes.imshow((_VIEW_DIMMED * view).astype(np.uint8), cmap="gray", vmin=0, vmax=255)
         for trail in trails:
-            for part in _unbroken(trail, width / 2.0):
+            # Parts between crossings of the seam.
+            seams = np.flatnonzero(np.abs(np.diff(trail[:, 0])) > width / 2.0) + 1
+            for part in np.split(trail, seams):
                 axes.plot(part[:, 0], part[:, 1], color=YELLOW, linewidth=0.7)
             tint = SKY if len(trail) > 1 else VERMILLION
             axes.plot(*trail[-1].tolist(), "o", markersize=3.5, fillstyle="none", color=tint)
         axes.set(xticks=[], yticks=[], xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
         axes.set_title(title)
-
-
-def _unbroken(trail: FloatArray, most: float) -> list[FloatArray]:
-    """Parts of a trail between crossings of the seam."""
-    return np.split(trail, np.flatnonzero(np.abs(np.diff(trail[:, 0])) > most) + 1)
-
-
-_SHEET_COLUMNS = 4
-_SHEET_WIDTH_IN = 11.0
 
 
 def draw_sheet(path: Path, images: Sequence[Image], titles: Sequence[str]) -> None:
