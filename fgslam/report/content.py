@@ -134,29 +134,13 @@ class Page:
 # black lighter than the originals, for a contrast of at least 3 to 1 (WCAG 2.2, 1.4.11).
 
 ON_LIGHT = (
-    "#0072b2",
-    "#c64f00",
-    "#00805e",
-    "#a8457f",
-    "#8f6b00",
-    "#5b4bb5",
-    "#7a3e12",
-    "#1f86bf",
-    "#5f6b00",
-    "#6a7480",
-)
+    "#0072b2", "#c64f00", "#00805e", "#a8457f", "#8f6b00",
+    "#5b4bb5", "#7a3e12", "#1f86bf", "#5f6b00", "#6a7480",
+)  # fmt: skip
 ON_DARK = (
-    "#4aa8e8",
-    "#f5803e",
-    "#22c79a",
-    "#e28cc0",
-    "#e6b52e",
-    "#a99cf2",
-    "#d0966a",
-    "#9bd6f7",
-    "#b9c84a",
-    "#b4bcc6",
-)
+    "#4aa8e8", "#f5803e", "#22c79a", "#e28cc0", "#e6b52e",
+    "#a99cf2", "#d0966a", "#9bd6f7", "#b9c84a", "#b4bcc6",
+)  # fmt: skip
 COLOURS = len(ON_LIGHT)
 """How many series have a colour of their own; more share them."""
 
@@ -192,14 +176,12 @@ def bulk_limits(path: FloatArray, *maps: FloatArray) -> list[list[float]]:
 
     A few far landmarks of tiny disparity must not shrink the rest to a dot.
     """
-    corners = [path[np.isfinite(path).all(axis=1)]]
-    corners += [np.percentile(points, _BULK, axis=0) for points in maps if len(points)]
-    everything = np.concatenate(corners)
+    corners = [np.percentile(points, _BULK, axis=0) for points in maps if len(points)]
+    everything = np.concatenate([path[np.isfinite(path).all(axis=1)], *corners])
     low, high = everything.min(axis=0), everything.max(axis=0)
     centre, half = 0.5 * (low + high), 0.53 * np.maximum(high - low, 0.2)
-    return [
-        [float(a), float(b)] for a, b in np.column_stack([centre - half, centre + half]).tolist()
-    ]
+    limits: list[list[float]] = np.column_stack([centre - half, centre + half]).tolist()
+    return limits
 
 
 def thinned(count: int, limit: int) -> IntArray:
@@ -419,12 +401,8 @@ def write_metrics(
     Raises:
         OutputError: the file cannot be written.
     """
-    document: dict[str, Any] = {
-        "frames": frames,
-        **(more or {}),
-        "estimators": {kind: metrics.as_json() for kind, metrics in estimators.items()},
-    }
-    write_json(path, document)
+    numbers = {kind: metrics.as_json() for kind, metrics in estimators.items()}
+    write_json(path, {"frames": frames, **(more or {}), "estimators": numbers})
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
@@ -446,11 +424,12 @@ def read_metrics(path: Path) -> dict[str, Any]:
 
 def write_timing(path: Path, times: Sequence[StageTime]) -> None:
     """Write timing.csv: frame, timestamp (s), stage, milliseconds. Raises OutputError."""
-    lines = ["frame,timestamp,stage,milliseconds"]
-    lines += [
-        f"{time.frame},{time.timestamp:.9f},{time.stage},{time.milliseconds:.4f}" for time in times
-    ]
-    write_text(path, "\n".join(lines) + "\n")
+    columns = ("frame", "timestamp", "stage", "milliseconds")
+    write_csv(
+        path,
+        columns,
+        [(t.frame, f"{t.timestamp:.9f}", t.stage, f"{t.milliseconds:.4f}") for t in times],
+    )
 
 
 def plain(value: Any) -> Any:

@@ -17,15 +17,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fgslam.core.files import write_text
 from fgslam.report import figures as drawn
 from fgslam.report.content import Page, Picture
 from fgslam.report.results import EstimatorReport, ReportData
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 MAX_WIDTH = 1100
 BUDGET_BYTES = 440_000
@@ -113,50 +109,35 @@ class Embedded:
 def embed(pictures: Sequence[Picture]) -> tuple[list[Embedded], list[str]]:
     """Pictures as data URIs, and a line about each one that could not be shown.
 
-    Later ones are left out when the budget of bytes is used up.
+    Large ones are made smaller; later ones are left out when the budget of bytes is used up.
     """
+    from PIL import Image, UnidentifiedImageError  # what draws no page needs none
+
     shown: list[Embedded] = []
     left_out: list[str] = []
     spent = 0
     for picture in pictures:
-        found = _embed(picture)
-        if found is None:
+        content = picture.content
+        try:
+            with Image.open(io.BytesIO(content)) as opened:
+                opened.load()  # a truncated file is found only now
+                (width, height), kind = opened.size, opened.format
+                if len(content) > _KEPT_AS_IT_IS or kind not in ("PNG", "JPEG", "WEBP"):
+                    small, kind, out = opened.convert("RGB"), "WEBP", io.BytesIO()
+                    small.thumbnail((MAX_WIDTH, height), Image.Resampling.LANCZOS)
+                    small.save(out, format=kind, quality=_QUALITY, method=4)
+                    content = out.getvalue()
+        except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
             left_out.append(f"Picture not readable: {picture.caption}")
-        elif spent + len(found.uri) > BUDGET_BYTES * 4 / 3:
+            continue
+        text = base64.b64encode(content).decode("ascii")
+        uri = f"data:image/{kind.lower()};base64,{text}"
+        if spent + len(uri) > BUDGET_BYTES * 4 / 3:
             left_out.append(f"{_TOO_MUCH}: {picture.caption}")
         else:
-            spent += len(found.uri)
-            shown.append(found)
+            spent += len(uri)
+            shown.append(Embedded(picture.caption, uri, width, height))
     return shown, left_out
-
-
-def _embed(picture: Picture) -> Embedded | None:
-    from PIL import Image, UnidentifiedImageError  # what draws no page needs none
-
-    try:
-        with Image.open(io.BytesIO(picture.content)) as opened:
-            opened.load()  # a truncated file is found only now
-            width, height = opened.size
-            if len(picture.content) <= _KEPT_AS_IT_IS and opened.format in ("PNG", "JPEG", "WEBP"):
-                mime, content = f"image/{opened.format.lower()}", picture.content
-            else:
-                mime, content = "image/webp", _as_webp(opened)
-    except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
-        return None
-    text = base64.b64encode(content).decode("ascii")
-    return Embedded(picture.caption, f"data:{mime};base64,{text}", width, height)
-
-
-def _as_webp(image: Image.Image) -> bytes:
-    from PIL.Image import Resampling
-
-    small = image.convert("RGB")
-    if small.width > MAX_WIDTH:
-        height = round(small.height * MAX_WIDTH / small.width)
-        small = small.resize((MAX_WIDTH, max(height, 1)), Resampling.LANCZOS)
-    out = io.BytesIO()
-    small.save(out, format="WEBP", quality=_QUALITY, method=4)
-    return out.getvalue()
 
 
 # --------------------------------------------------------------------------------------------

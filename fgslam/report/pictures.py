@@ -87,7 +87,7 @@ def picture(path: Path, width: float, height: float) -> Iterator[Canvas]:
             # Level 3 takes half the time of 6, for the same size within a tenth.
             packing: dict[str, Any] = {"compress_level": 3}
             nothing: dict[str, Any] = {"Software": None}
-            look = {"bbox_inches": "tight", "pad_inches": 0.1}
+            look: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1}
             figure.savefig(partial, format="png", metadata=nothing, pil_kwargs=packing, **look)
 
 
@@ -472,7 +472,8 @@ def draw_view_matches(
             axes.set(xticks=[], yticks=[], title=title)
             axes.spines[:].set_visible(False)
             # Marks may reach beyond the picture near its edge; the layout need not measure others.
-            outer = (np.abs((points + 0.5) / [width, height] - 0.5) > 0.5 - _EDGE_PART).any(axis=1)
+            off = np.abs((points + 0.5) / [width, height] - 0.5)
+            outer = np.asarray((off > 0.5 - _EDGE_PART).any(axis=1))
             for number, point in enumerate(points.tolist()):
                 tint: Any = tuple(colours[number].tolist())
                 mark: dict[str, Any] = {"color": tint, "in_layout": bool(outer[number])}
