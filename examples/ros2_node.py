@@ -29,7 +29,7 @@ from fgslam.core.geometry import (
     pose,
     rotation_from_quaternion,
 )
-from fgslam.datasets.bag_messages import calibration_of, grey_of, motion_of
+from fgslam.datasets.bag_messages import calibration_of, image_of, motion_of
 from fgslam.report.formats import pose_message
 
 SIDES = ("left", "right")
@@ -85,7 +85,7 @@ class StereoMapper:
         if self.body is not None and self.body_before is not None:
             moved = inverse(self.body_before) @ self.body
         self.body_before = self.body
-        images = [grey_of(one, name) for name, one in zip(SIDES, (left, right), strict=True)]
+        images = [image_of(one, name) for name, one in zip(SIDES, (left, right), strict=True)]
         return self.slam.track(seconds(right), images, moved)
 
 

@@ -14,7 +14,6 @@ from fgslam.core.errors import CalibrationError, FrameError
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,
     inverse,
-    is_rigid,
     pose,
     rotation_from_quaternion,
 )
@@ -36,138 +35,104 @@ IMU = "sensor_msgs/msg/Imu"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 # --------------------------------------------------------------------------------------------
-# Images
+# Images and depth
 
 
-_Code: TypeAlias = int | None  # of cv2.cvtColor; None: the pixels as they are
-
-_GREY = {"mono8", "8UC1", "mono16", "16UC1"}
-
-_PLANES: Mapping[str, int] = {"nv12": cv2.COLOR_YUV2RGB_NV12, "nv21": cv2.COLOR_YUV2RGB_NV21}
-"""Encodings of a plane of grey, and one of two colours and half its height below it."""
-
-_COLOURS: Mapping[str, tuple[int, _Code, _Code]] = {
-    **dict.fromkeys(("bgr8", "8UC3", "bgr16"), (3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB)),
-    **dict.fromkeys(("rgb8", "rgb16"), (3, cv2.COLOR_RGB2GRAY, None)),
-    **dict.fromkeys(("bgra8", "8UC4"), (4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB)),
-    "rgba8": (4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
-    **dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY)),
-    **dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV)),
-}
-"""Encodings of colour: channels, and how they become grey, and red, green, blue."""
+_Codes: TypeAlias = tuple[int | None, int | None]
+"""Of cv2.cvtColor: how pixels become grey, and red, green, blue; None: as they are."""
 
 # ROS names the first pixels of the first two rows, OpenCV those of the second row from the second.
-_MOSAICS = {
-    "rggb": (cv2.COLOR_BayerBG2GRAY, cv2.COLOR_BayerBG2RGB),
-    "bggr": (cv2.COLOR_BayerRG2GRAY, cv2.COLOR_BayerRG2RGB),
-    "gbrg": (cv2.COLOR_BayerGR2GRAY, cv2.COLOR_BayerGR2RGB),
-    "grbg": (cv2.COLOR_BayerGB2GRAY, cv2.COLOR_BayerGB2RGB),
+_MOSAICS: Mapping[str, _Codes] = {
+    f"bayer_{pattern}{bits}": (grey, colour)
+    for pattern, grey, colour in (
+        ("rggb", cv2.COLOR_BayerBG2GRAY, cv2.COLOR_BayerBG2RGB),
+        ("bggr", cv2.COLOR_BayerRG2GRAY, cv2.COLOR_BayerRG2RGB),
+        ("gbrg", cv2.COLOR_BayerGR2GRAY, cv2.COLOR_BayerGR2RGB),
+        ("grbg", cv2.COLOR_BayerGB2GRAY, cv2.COLOR_BayerGB2RGB),
+    )
+    for bits in (8, 16)
 }
+_ENCODINGS: Mapping[str, tuple[int, _Codes]] = {
+    name: (channels, (grey, colour))
+    for names, channels, grey, colour in (
+        ("mono8 8UC1 mono16 16UC1", 1, None, None),
+        ("bgr8 8UC3 bgr16", 3, cv2.COLOR_BGR2GRAY, cv2.COLOR_BGR2RGB),
+        ("rgb8 rgb16", 3, cv2.COLOR_RGB2GRAY, None),
+        ("bgra8 8UC4", 4, cv2.COLOR_BGRA2GRAY, cv2.COLOR_BGRA2RGB),
+        ("rgba8", 4, cv2.COLOR_RGBA2GRAY, cv2.COLOR_RGBA2RGB),
+        ("yuv422 uyvy", 2, cv2.COLOR_YUV2GRAY_UYVY, cv2.COLOR_YUV2RGB_UYVY),
+        ("yuv422_yuy2 yuyv", 2, cv2.COLOR_YUV2GRAY_YUYV, cv2.COLOR_YUV2RGB_YUYV),
+        ("nv12", 1, cv2.COLOR_YUV2GRAY_NV12, cv2.COLOR_YUV2RGB_NV12),
+        ("nv21", 1, cv2.COLOR_YUV2GRAY_NV21, cv2.COLOR_YUV2RGB_NV21),
+    )
+    for name in names.split()
+} | {name: (1, codes) for name, codes in _MOSAICS.items()}
+"""Encodings of an Image: channels, and how they become grey and colour."""
 
 
-def grey_of(message: Any, where: str, bits: int = 16) -> Image:
-    """Grey image (height, width), uint8, of an Image or CompressedImage message.
+def image_of(message: Any, where: str, bits: int = 16, colour: bool = False) -> Image:
+    """Grey (height, width) of an Image or CompressedImage; or red, green, blue, if it has colour.
 
     Args:
         message: the message.
         where: in messages to the user.
         bits: that pixels of 16 bits hold.
+        colour: whether colours are asked for.
 
     Raises:
         FrameError: its encoding is not known, or its data are incomplete.
     """
     if hasattr(message, "encoding"):
-        pixels, grey, _ = _raw(message, where)
-        return of_8_bits(_converted(pixels, grey), where, bits)
-    data, mosaic = _compressed(message)
-    if mosaic is not None and (stored := decode_stored(data, where)).ndim == 2:
-        return of_8_bits(_converted(stored, mosaic[0]), where, bits)
-    return decode_grey(data, where, bits)
-
-
-def colour_of(message: Any, where: str, bits: int = 16) -> Image:
-    """The same in red, green, blue, (height, width, 3); in grey where it has no colour."""
-    if hasattr(message, "encoding"):
-        if message.encoding in _PLANES:
-            return _colour_of_planes(message, where)
-        pixels, _, colour = _raw(message, where)
-        return of_8_bits(_converted(pixels, colour), where, bits)
-    data, mosaic = _compressed(message)
-    stored = decode_stored(data, where)
-    if stored.ndim == 2:
-        return of_8_bits(stored if mosaic is None else _converted(stored, mosaic[1]), where, bits)
-    return decode_colour(data, where, bits)
+        pixels = stored_of(message, where)
+        codes = _ENCODINGS[message.encoding][1]
+    else:
+        decode = decode_colour if colour else decode_grey
+        data = bytes(memoryview(message.data))
+        mosaic = _MOSAICS.get(message.format.partition(";")[0])
+        if mosaic is None and not colour:
+            return decode_grey(data, where, bits)
+        pixels = decode_stored(data, where)
+        if pixels.ndim == 3:
+            return decode(data, where, bits)
+        codes = mosaic or (None, None)
+    code = codes[colour]
+    if code is not None:
+        pixels = cv2.cvtColor(np.ascontiguousarray(pixels), code)
+    return of_8_bits(pixels, where, bits)
 
 
 def stored_of(message: Any, where: str) -> npt.NDArray[Any]:
-    """The pixels as they are stored. Raises FrameError as :func:`grey_of`."""
-    if hasattr(message, "encoding"):
-        return _raw(message, where)[0]
-    return decode_stored(_compressed(message)[0], where)
-
-
-def _raw(message: Any, where: str) -> tuple[npt.NDArray[Any], _Code, _Code]:
-    """Pixels (height, width[, channels]), and how they become grey, and red, green, blue."""
-    encoding, height, width = message.encoding, int(message.height), int(message.width)
-    mosaic = _mosaic_of(encoding)
-    if encoding not in (*_GREY, *_PLANES, *_COLOURS) and mosaic is None:
-        known = ", ".join((*sorted(_GREY), *_PLANES, *_COLOURS, "bayer_*"))
+    """The pixels as they are stored. Raises FrameError as :func:`image_of`."""
+    if not hasattr(message, "encoding"):
+        return decode_stored(bytes(memoryview(message.data)), where)
+    encoding = message.encoding
+    if encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
         raise FrameError(f"{where}: encoding {encoding!r} is not read; known: {known}")
-    channels, grey, colour = _COLOURS.get(encoding, (1, *(mosaic or (None, None))))
-    pixels = _pixels(message, encoding, channels, where)
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    return pixels.reshape(shape), grey, colour
+    # Of nv12 and nv21 a plane of colours of half the height follows that of grey.
+    half = int(message.height) // 2 if encoding.startswith("nv") else 0
+    return _pixels(message, _ENCODINGS[encoding][0], where, half)
 
 
-def _colour_of_planes(message: Any, where: str) -> Image:
-    """Red, green, blue (height, width, 3) of grey above colours of half the resolution."""
-    height, width = int(message.height), int(message.width)
-    if height % 2 or width % 2:
-        raise FrameError(
-            f"{where}: {width}x{height} is no size of {message.encoding}, whose colours belong to "
-            "two by two pixels; record it in another encoding"
-        )
-    pixels = _pixels(message, message.encoding, 1, where, planes=1.5)
-    return np.asarray(cv2.cvtColor(pixels, _PLANES[message.encoding]), np.uint8)
-
-
-def _compressed(message: Any) -> tuple[bytes, tuple[int, int] | None]:
-    """The encoded image, and how its mosaic becomes grey and colour, where it may be one."""
-    mosaic = _mosaic_of(message.format.partition(";")[0])
-    return bytes(memoryview(message.data)), mosaic
-
-
-def _converted(pixels: npt.NDArray[Any], code: _Code) -> npt.NDArray[Any]:
-    return pixels if code is None else cv2.cvtColor(np.ascontiguousarray(pixels), code)
-
-
-def _mosaic_of(encoding: str) -> tuple[int, int] | None:
-    return _MOSAICS.get(encoding[6:10]) if encoding.startswith("bayer_") else None
-
-
-def _pixels(
-    message: Any, encoding: str, channels: int, where: str, planes: float = 1.0
-) -> npt.NDArray[Any]:
-    """The rows of the image, ``planes`` times its height, without their padding."""
+def _pixels(message: Any, channels: int, where: str, more_rows: int = 0) -> npt.NDArray[Any]:
+    """Pixels (height + more_rows, width[, channels]) without the padding of their rows."""
+    encoding = message.encoding
     wide = encoding.endswith("16") or encoding.startswith("16")
     kind = np.dtype(np.float32 if encoding == "32FC1" else np.uint16 if wide else np.uint8)
     if kind.itemsize > 1 and message.is_bigendian:
         kind = kind.newbyteorder(">")
     data = np.frombuffer(memoryview(message.data), np.uint8)
-    height = int(planes * int(message.height))
-    used = int(message.width) * channels * kind.itemsize
+    height, used = int(message.height) + more_rows, int(message.width) * channels * kind.itemsize
     step = int(message.step) or used
-    if height < 1 or used < 1 or step < used or len(data) < height * step:
+    odd = more_rows and (int(message.height) % 2 or int(message.width) % 2)
+    if height < 1 or used < 1 or step < used or len(data) < height * step or odd:
         raise FrameError(
             f"{where}: {len(data)} bytes are no image of {message.width}x{message.height} "
             f"{encoding}; record it again"
         )
-    rows = data[: height * step].reshape(height, step)[:, :used]
-    return np.ascontiguousarray(rows).view(kind).astype(kind.newbyteorder("="), copy=False)
-
-
-# --------------------------------------------------------------------------------------------
-# Depth
+    rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :used])
+    pixels = rows.view(kind).astype(kind.newbyteorder("="), copy=False)
+    return pixels if channels == 1 else pixels.reshape(height, -1, channels)
 
 
 _HEADER = 12  # bytes before a compressed depth: a kind, and two numbers by which floats are coded
@@ -187,24 +152,24 @@ def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
             raise FrameError(
                 f"{where}: encoding {message.encoding!r} is no depth: 16UC1 or 32FC1 is"
             )
-        pixels = _pixels(message, message.encoding, 1, where)
-        return pixels if message.encoding == "32FC1" else _of_millimetres(pixels)
-    data = bytes(memoryview(message.data))
-    packed = "compressedDepth" in message.format
-    if "rvl" in message.format.lower():
-        raise FrameError(f"{where}: depth in the format RVL is not read; record it as PNG, or raw")
-    stored = decode_stored(data[_HEADER:] if packed else data, where)
-    if stored.dtype != np.uint16 or stored.ndim != 2:
-        raise FrameError(f"{where}: its images of {stored.dtype} are no depth; record them as PNG")
-    if packed and message.format.startswith("32FC1"):
-        a, b = np.frombuffer(data[4:_HEADER], "<f4")
-        with np.errstate(divide="ignore"):
-            return np.where(stored > 0, a / (stored.astype(np.float32) - b), np.float32(np.nan))
-    return _of_millimetres(stored)
-
-
-def _of_millimetres(pixels: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    return without_unknown(pixels).astype(np.float32) * np.float32(1e-3)
+        stored = _pixels(message, 1, where)
+        if message.encoding == "32FC1":
+            return stored
+    else:
+        data = bytes(memoryview(message.data))
+        packed = "compressedDepth" in message.format
+        if "rvl" in message.format.lower():
+            raise FrameError(f"{where}: depth in the format RVL is not read; record it as PNG")
+        stored = decode_stored(data[_HEADER:] if packed else data, where)
+        if stored.dtype != np.uint16 or stored.ndim != 2:
+            text = f"{where}: its images of {stored.dtype} are no depth; record them as PNG"
+            raise FrameError(text)
+        if packed and message.format.startswith("32FC1"):
+            a, b = np.frombuffer(data[4:_HEADER], "<f4")
+            with np.errstate(divide="ignore"):
+                inverses = a / (stored.astype(np.float32) - b)
+            return np.where(stored > 0, inverses, np.float32(np.nan))
+    return without_unknown(stored).astype(np.float32) * np.float32(1e-3)
 
 
 # --------------------------------------------------------------------------------------------
@@ -280,12 +245,10 @@ def transforms_of(message: Any) -> list[tuple[str, str, FloatArray]]:
 class FrameTree:
     """Transforms between frames that do not move against each other."""
 
-    def __init__(self, transforms: Iterable[tuple[str, str, FloatArray]] = ()) -> None:
-        """Takes what :meth:`add` takes."""
+    def __init__(self) -> None:
+        """An empty tree."""
         self._parents: dict[str, tuple[str, FloatArray]] = {}
         self._moving: set[str] = set()
-        self._other: dict[str, str] = {}
-        self.add(transforms, static=True)
 
     def add(self, transforms: Iterable[tuple[str, str, FloatArray]], static: bool) -> None:
         """Takes parent, child, and (7,) position and quaternion x, y, z, w of the child in it.
@@ -294,25 +257,12 @@ class FrameTree:
         tf_static count as long as they stay the same.
         """
         for parent, child, numbers in transforms:
-            if child in self._moving:
-                continue
-            before = self._parents.get(child)
-            if before is not None and before[0] != parent:
-                text = f"{child} has two parents, {before[0]} and {parent}; the latter counts"
-                self._other[child] = f"tf_static: {text}"
-            elif before is not None and not static and np.abs(before[1] - numbers).max() > _STILL:
+            name, before = self._parents.get(child, ("", numbers))
+            if not static and name == parent and np.abs(before - numbers).max() > _STILL:
                 self._moving.add(child)
                 del self._parents[child]
-                continue
-            self._parents[child] = parent, numbers
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What is not as it should be, a line each."""
-        return tuple(self._other.values())
-
-    def __bool__(self) -> bool:
-        return bool(self._parents)
+            if child not in self._moving:
+                self._parents[child] = parent, numbers
 
     @property
     def frames(self) -> set[str]:
@@ -327,41 +277,30 @@ class FrameTree:
                 is none.
         """
         names = sorted(self.frames)
-        for name in (frame, base):
-            if name not in names:
+        above = []  # of both frames the poses in themselves and in all above, nearest first
+        for at in (frame, base):
+            if at not in names:
                 more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
                 raise CalibrationError(
-                    f"tf_static has no frame {name or 'without a name'}; it has "
+                    f"tf_static has no frame {at or 'without a name'}; it has "
                     f"{', '.join(names[:_NAMED]) + more or 'none'}"
                 )
-        ups = [self._up(name) for name in (frame, base)]
-        common = next((name for name in ups[0] if name in ups[1]), None)
+            found = {at: np.eye(4)}
+            while at in self._parents:
+                parent, numbers = self._parents[at]
+                if parent in found:
+                    circle = " under ".join([*list(found)[list(found).index(parent) :], parent])
+                    raise CalibrationError(f"tf_static runs in a circle: {circle}")
+                if not np.isfinite(numbers).all() or np.linalg.norm(numbers[3:]) <= 0.5:
+                    listed = ", ".join(f"{v:g}" for v in numbers)
+                    raise CalibrationError(f"tf_static: the transform of {at} is none: {listed}")
+                found[parent] = pose(rotation_from_quaternion(numbers[3:]), numbers[:3]) @ found[at]
+                at = parent
+            above.append(found)
+        common = next((name for name in above[0] if name in above[1]), None)
         if common is None:
             raise CalibrationError(f"tf_static does not connect {frame} with {base}")
-        return np.asarray(inverse(ups[1][common]) @ ups[0][common])
-
-    def _up(self, frame: str) -> dict[str, FloatArray]:
-        """Poses of a frame in itself and in all that are above it, nearest first."""
-        found = {frame: np.eye(4)}
-        while frame in self._parents:
-            parent, numbers = self._parents[frame]
-            if parent in found:
-                circle = " under ".join([*list(found)[list(found).index(parent) :], parent])
-                raise CalibrationError(f"tf_static runs in a circle: {circle}")
-            found[parent] = _rigid_pose(frame, numbers) @ found[frame]
-            frame = parent
-        return found
-
-
-def _rigid_pose(child: str, numbers: FloatArray) -> FloatArray:
-    quaternion = numbers[3:]
-    if np.isfinite(numbers).all() and np.linalg.norm(quaternion) > 0.5:
-        found = pose(rotation_from_quaternion(quaternion), numbers[:3])
-        if is_rigid(found):
-            return found
-    raise CalibrationError(
-        f"tf_static: the transform of {child} is none: {', '.join(f'{v:g}' for v in numbers)}"
-    )
+        return np.asarray(inverse(above[1][common]) @ above[0][common])
 
 
 def view_axes(tree: FrameTree, left: str, right: str, body: str) -> tuple[FloatArray, str]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
+from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rig import is_stereo_pair, read_calibration_file
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.sides import camera_pairs, differ_in_number, is_view
+from fgslam.core.sides import camera_pairs, is_view
 from fgslam.datasets import bag_messages as messages
 from fgslam.datasets.settings import BagSettings
 
@@ -24,6 +25,40 @@ class Topic:
     count: int
 
 
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Topics that are used.
+
+    Attributes:
+        views: of left and right images, perhaps of top ones; or of depth and of colour.
+        numbers: which cameras of the calibration file the views are, so that it determines the
+            sides; empty: the topics do.
+        notes: what else could have been taken.
+        depth: whether left is the depth of right, in place of a second camera.
+        infos: of the camera_info of left and right; None where there is none.
+        motion: of odometry, or None.
+        transforms: of tf_static; where the bag has none, of tf, which states again what stays.
+    """
+
+    views: tuple[str, ...]
+    numbers: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+    depth: bool = False
+    infos: tuple[str | None, str | None] = (None, None)
+    motion: Topic | None = None
+    transforms: tuple[str, ...] = ()
+
+    @property
+    def left(self) -> str:
+        """Topic of the left images, or of depth."""
+        return self.views[0]
+
+    @property
+    def right(self) -> str:
+        """Topic of the right images, or of colour."""
+        return self.views[1]
+
+
 IMAGES = (messages.IMAGE, messages.COMPRESSED)
 MOTIONS = (messages.ODOMETRY, messages.TWIST, messages.TWIST_WITH_COVARIANCE, messages.IMU)
 """The first that a bag has is its odometry."""
@@ -33,99 +68,14 @@ _PREFERRED = ("image_raw", "image_rect", "image_rect_raw", "image", "image_mono"
 """Last parts of topics, grey and raw ones first; others after them."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Views:
-    """Topics of left, right[, top], their cameras in the file, and what else could be taken."""
-
-    topics: tuple[str, ...]
-    numbers: tuple[int, ...] = ()
-    notes: tuple[str, ...] = ()
-    depth: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """Topics that are used.
-
-    Attributes:
-        views: of left and right images, perhaps of top ones.
-        left_info, right_info: of their camera_info; None where there is none.
-        motion: of odometry, or None.
-        transforms: of tf_static; where the bag has none, of tf, which states again what stays.
-        notes: what else could have been taken.
-        numbers: which cameras of the calibration file the views are, so that it determines the
-            sides; empty: the topics do.
-        depth: whether left is the depth of right, in place of a second camera.
-    """
-
-    views: tuple[str, ...]
-    left_info: str | None
-    right_info: str | None
-    motion: Topic | None
-    transforms: tuple[str, ...]
-    notes: tuple[str, ...]
-    numbers: tuple[int, ...] = ()
-    depth: bool = False
-
-    @property
-    def left(self) -> str:
-        """Topic of the left images, or of depth."""
-        return self.views[0]
-
-    @property
-    def right(self) -> str:
-        """Topic of the right images."""
-        return self.views[1]
-
-
-@dataclass(frozen=True, slots=True)
-class FileCameras:
-    """The cameras of a calibration file.
-
-    Attributes:
-        file: its name; empty: there is none.
-        topics: of each camera's images, empty where it states none; () where it cannot be read
-            before the images' size is known.
-        ahead: of more than three cameras the only two that form a stereo pair; () where there are
-            several such pairs, or none.
-    """
-
-    file: str = ""
-    topics: tuple[str, ...] = ()
-    ahead: tuple[int, ...] = ()
-
-
-def file_cameras(settings: BagSettings) -> FileCameras:
-    """What the calibration file states of topics; a file at fault is refused with the rig."""
-    if settings.camera_file is None:
-        return FileCameras()
-    file = Path(settings.camera_file)
-    try:
-        cameras = read_calibration_file(file).cameras
-    except CalibrationError:
-        return FileCameras(file.name)
-    ahead: list[tuple[int, ...]] = []
-    if len(cameras) > 3:
-        pairs = combinations(range(len(cameras)), 2)
-        ahead = [pair for pair in pairs if is_stereo_pair([cameras[k] for k in pair])]
-    topics = tuple(camera.topic for camera in cameras)
-    return FileCameras(file.name, topics, ahead[0] if len(ahead) == 1 else ())
-
-
 def choose_topics(
-    topics: Sequence[Topic],
-    wanted: Sequence[str],
-    where: str,
-    cameras: FileCameras,
-    frame_of: Callable[[Topic], str] = lambda _: "",
+    topics: Sequence[Topic], settings: BagSettings, frame_of: Callable[[Topic], str]
 ) -> Chosen:
-    """The topics of two or three cameras and of their odometry.
+    """The topics of two or three cameras, or of one and its depth, and of their odometry.
 
     Args:
         topics: of the bag.
-        wanted: named by the user: images of each camera, and perhaps odometry.
-        where: the bag, in messages.
-        cameras: of the calibration file.
+        settings: with the topics that the user names: images of each camera, perhaps odometry.
         frame_of: the frame in which a topic states its first message.
 
     Raises:
@@ -133,89 +83,109 @@ def choose_topics(
     """
     used = [topic for topic in topics if topic.count]
     by_name = {topic.name: topic for topic in used}
-    for name in wanted:
+    for name in settings.topics:
         if name not in by_name:
-            raise DatasetError(f"{where} has no topic {name} with messages; it has {_list(used)}")
+            raise DatasetError(
+                f"{settings.path} has no topic {name} with messages; it has {_list(used)}"
+            )
         if by_name[name].kind not in (*IMAGES, *MOTIONS):
             raise DatasetError(
-                f"{where}: {name} is {by_name[name].kind}, which is no image and no odometry; name "
-                "the left camera's images, the right one's, then perhaps one of odometry"
+                f"{settings.path}: {name} is {by_name[name].kind}, which is no image and no "
+                "odometry; name the left camera's images, the right one's, then perhaps one of "
+                "odometry"
             )
-    named = [name for name in wanted if by_name[name].kind in IMAGES]
+    images = [topic.name for topic in used if topic.kind in IMAGES]
+    named = [name for name in settings.topics if by_name[name].kind in IMAGES]
+    cameras = _cameras_of_file(settings)
     if named:
-        views = _views_as_named(named, used, cameras, where)
+        chosen = _as_named(named, images, cameras, settings)
     else:
-        views = _views_by_file(used, cameras, where) or _views_by_names(used, cameras, where)
-    motions = [by_name[name] for name in wanted if by_name[name].kind in MOTIONS]
-    motion, others = (motions[0], ()) if motions else motion_of_bag(used, frame_of)
-    of_frames = tuple(topic.name for topic in used if topic.kind in messages.TRANSFORMS)
-    return Chosen(
-        views.topics,
-        *_infos(used, *views.topics[:2]),
-        motion,
-        tuple(name for name in of_frames if name.endswith("tf_static")) or of_frames,
-        (*views.notes, *others),
-        views.numbers,
-        views.depth,
-    )
+        chosen = _by_rostopics(images, cameras, settings) or _by_names(used, cameras, settings)
+    motion = next((by_name[n] for n in settings.topics if by_name[n].kind in MOTIONS), None)
+    notes = chosen.notes
+    if motion is None:
+        motion, others = find_motion(used, frame_of)
+        notes = (*notes, *others)
+    trees = tuple(topic.name for topic in used if topic.kind in messages.TRANSFORMS)
+    static = tuple(name for name in trees if name.endswith("tf_static"))
+    infos = _infos([t.name for t in used if t.kind == messages.CAMERA_INFO], *chosen.views[:2])
+    return replace(chosen, notes=notes, infos=infos, motion=motion, transforms=static or trees)
 
 
-def _views_as_named(
-    names: Sequence[str], topics: Sequence[Topic], cameras: FileCameras, where: str
-) -> _Views:
+def _cameras_of_file(settings: BagSettings) -> tuple[RawCamera, ...]:
+    """Of the calibration file; none where it cannot be read before the images' size is known."""
+    try:
+        file = settings.camera_file
+        return () if file is None else read_calibration_file(Path(file)).cameras
+    except CalibrationError:  # a file at fault is refused with the rig
+        return ()
+
+
+def _as_named(
+    names: Sequence[str],
+    images: Sequence[str],
+    cameras: tuple[RawCamera, ...],
+    settings: BagSettings,
+) -> Chosen:
     """The user's topics and, where the file names them or must, their cameras in it."""
-    images = [topic.name for topic in topics if topic.kind in IMAGES]
     depths = [name for name in names if _is_depth(name, images)]
     if len(names) == 2 and len(depths) == 1:
-        (colour,) = set(names) - set(depths)
-        return _Views((depths[0], colour), depth=True)
+        return Chosen((depths[0], next(name for name in names if name not in depths)), depth=True)
     if len(names) not in (2, 3):
         raise DatasetError(
-            f"{where}: {len(names)} topics of images are named; name the left camera's and the "
-            "right one's, or those of three cameras in the order of their --camera FILE"
+            f"{settings.path}: {len(names)} topics of images are named; name the left camera's and "
+            "the right one's, or those of three cameras in the order of their --camera FILE"
         )
-    numbers = {_absolute(topic): k for k, topic in enumerate(cameras.topics) if topic}
-    found = [numbers.get(name.removesuffix(TRANSPORT)) for name in names]
-    known = tuple(k for k in found if k is not None)
-    if len(set(known)) == len(names):
-        return _Views(tuple(names), known)
+    numbers = {_absolute(c.topic): k for k, c in enumerate(cameras) if c.topic}
+    known = {numbers.get(name.removesuffix(TRANSPORT), -1): name for name in names}
+    if -1 not in known and len(known) == len(names):
+        return Chosen(tuple(names), tuple(known))
     if len(names) == 2:
-        return _Views(tuple(names), _numbered_of_many(names, cameras))
-    if not cameras.file or len(cameras.topics) not in (0, 3):
-        known_of = f"{cameras.file} is of {len(cameras.topics)}" if cameras.file else "none"
+        return Chosen(tuple(names))
+    if settings.camera_file is None or len(cameras) not in (0, 3):
+        file = Path(settings.camera_file or "").name
         raise DatasetError(
-            f"{where}: three topics of images are named, which need one calibration of all three "
-            f"cameras ({known_of}); give it by --camera FILE, or name two topics"
+            f"{settings.path}: three topics of images are named, which need one calibration of all "
+            f"three cameras ({f'{file} is of {len(cameras)}' if file else 'none'}); give it by "
+            "--camera FILE, or name two topics"
         )
-    return _Views(tuple(names), (0, 1, 2))
+    return Chosen(tuple(names), (0, 1, 2))
 
 
-def _views_by_file(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Views | None:
+def _by_rostopics(
+    images: Sequence[str], cameras: tuple[RawCamera, ...], settings: BagSettings
+) -> Chosen | None:
     """The topics that the calibration file states; None where the bag has not two of them."""
-    by_view = _by_view([topic.name for topic in topics if topic.kind in IMAGES])
-    stated = {k: _absolute(topic) for k, topic in enumerate(cameras.topics) if topic}
-    found = {k: by_view[view] for k, view in stated.items() if view in by_view}
+    by_view = _by_view(images)
+    found = {k: by_view[view] for k, c in enumerate(cameras)
+             if c.topic and (view := _absolute(c.topic)) in by_view}  # fmt: skip
     if len(found) < 2:
         return None
-    listed = ", ".join(found.values())
-    note = f"topics by rostopic of {cameras.file}: {listed}"
+    file, listed = Path(settings.camera_file or "").name, ", ".join(found.values())
+    note = f"topics by rostopic of {file}: {listed}"
     if len(found) > 3:
-        if not cameras.ahead or not found.keys() >= set(cameras.ahead):
+        pairs = [p for p in combinations(range(len(cameras)), 2)
+                 if is_stereo_pair([cameras[k] for k in p])]  # fmt: skip
+        if len(pairs) != 1 or not found.keys() >= set(pairs[0]):
             raise DatasetError(
-                f"{where}: {cameras.file} names the topics of {len(found)} cameras, {listed}; say "
+                f"{settings.path}: {file} names the topics of {len(found)} cameras, {listed}; say "
                 "which two or three form the rig: --topics"
             )
-        found = {k: found[k] for k in cameras.ahead}
+        found = {k: found[k] for k in pairs[0]}
         note += (
             f"; {' and '.join(found.values())} are the only two of them that form a stereo pair "
             "(--topics chooses others)"
         )
-    return _Views(tuple(found.values()), tuple(found), (note,))
+    return Chosen(tuple(found.values()), tuple(found), (note,))
 
 
-def _views_by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -> _Views:
+def _by_names(
+    topics: Sequence[Topic], cameras: tuple[RawCamera, ...], settings: BagSettings
+) -> Chosen:
     """The preferred pair; with a file of three cameras the one that the next number names, too."""
-    views = [t.name for t in topics if t.kind in IMAGES and is_view(t.name)]
+    where = settings.path
+    images = [topic.name for topic in topics if topic.kind in IMAGES]
+    views = [name for name in images if is_view(name)]
     by_view = _by_view(views)
     # Cameras that look ahead come first: those called left and right may look sideways (Spot).
     ranked = sorted(
@@ -223,59 +193,38 @@ def _views_by_names(topics: Sequence[Topic], cameras: FileCameras, where: str) -
         key=lambda pair: ("front" not in pair[0].lower(), _rank(pair[0]), pair),
     )
     if not ranked:
-        if (with_depth := _colour_and_depth(topics)) is not None:
+        if (with_depth := _colour_and_depth(images)) is not None:
             return with_depth
-        raise DatasetError(_no_pair(topics, views, where))
-    if cameras.ahead:
-        ranked = sorted(ranked, key=lambda pair: _differing_numbers(pair) != cameras.ahead)
+        if not views:
+            raise DatasetError(
+                f"{where} has no topic of camera images (sensor_msgs Image or CompressedImage); it "
+                f"has {_list(topics)}: record both cameras' images"
+            )
+        if len(views) == 1:
+            raise DatasetError(
+                f"{where} has images of one camera only, {views[0]}; a stereo pair is the least: "
+                "record both cameras"
+            )
+        raise DatasetError(
+            f"{where}: which of {', '.join(views)} are left and right is unknown by their names; "
+            "say it: --topics LEFT,RIGHT"
+        )
     used, *others = ranked
-    third = [pair for pair in others if pair[0] == used[1] and len(cameras.topics) == 3][:1]
-    names = (*used, *(pair[1] for pair in third))
+    third = [pair for pair in others if pair[0] == used[1] and len(cameras) == 3][:1]
     also = ", ".join(f"{a} with {b}" for a, b in others if (a, b) not in third)
     notes = [f"also there: {also}; --topics chooses"] if also else []
-    shown = set(_by_view([topic.name for topic in topics if topic.kind in IMAGES]))
-    absent = [topic for topic in cameras.topics if topic and _absolute(topic) not in shown]
+    absent = [c.topic for c in cameras if c.topic and _absolute(c.topic) not in _by_view(images)]
     if absent:
-        text = f"no images here of {', '.join(absent)}, the rostopic in {cameras.file}"
+        file = Path(settings.camera_file or "").name
+        text = f"no images here of {', '.join(absent)}, the rostopic in {file}"
         notes.insert(0, f"{text}: topics are recognised by their names")
-    numbers = (0, 1, 2) if third else _numbered_of_many(used, cameras)
-    return _Views(tuple(by_view[name] for name in names), numbers, tuple(notes))
-
-
-def _no_pair(topics: Sequence[Topic], views: Sequence[str], where: str) -> str:
-    if not views:
-        return (
-            f"{where} has no topic of camera images (sensor_msgs Image or CompressedImage); it has "
-            f"{_list(topics)}: record both cameras' images"
-        )
-    if len(views) == 1:
-        return (
-            f"{where} has images of one camera only, {views[0]}; a stereo pair is the least: "
-            "record both cameras"
-        )
-    return (
-        f"{where}: which of {', '.join(views)} are left and right is unknown by their names; "
-        "say it: --topics LEFT,RIGHT"
-    )
+    names = (*used, *(pair[1] for pair in third))
+    numbers = (0, 1, 2) if third else ()
+    return Chosen(tuple(by_view[name] for name in names), numbers, tuple(notes))
 
 
 def _list(topics: Sequence[Topic]) -> str:
     return ", ".join(f"{t.name} ({t.kind.rpartition('/')[2]})" for t in topics) or "no message"
-
-
-def _numbered_of_many(names: Sequence[str], cameras: FileCameras) -> tuple[int, ...]:
-    """Of a file of more than three cameras those that numbers in names state; () where none do."""
-    numbers = _differing_numbers(names)
-    count = len(cameras.topics)
-    return numbers if count > 3 and numbers and max(numbers) < count else ()
-
-
-def _differing_numbers(names: Sequence[str]) -> tuple[int, ...]:
-    """The first number in which two names differ, of each; () where they differ in more."""
-    if not differ_in_number(*names):
-        return ()
-    words = zip(*(re.findall(r"\d+", name) for name in names), strict=False)
-    return next((tuple(map(int, both)) for both in words if len(set(both)) > 1), ())
 
 
 def _absolute(topic: str) -> str:
@@ -295,9 +244,8 @@ def _rank(view: str) -> int:
     return _PREFERRED.index(last) if last in _PREFERRED else len(_PREFERRED)
 
 
-def _infos(topics: Sequence[Topic], left: str, right: str) -> tuple[str | None, str | None]:
+def _infos(names: Sequence[str], left: str, right: str) -> tuple[str | None, str | None]:
     """camera_info next to each image topic; else the only pair of camera_info that there is."""
-    names = {topic.name for topic in topics if topic.kind == messages.CAMERA_INFO}
     found = []
     for topic in (left, right):
         plain = topic.removesuffix(_DEPTHS[1]).removesuffix(TRANSPORT)
@@ -311,6 +259,7 @@ def _infos(topics: Sequence[Topic], left: str, right: str) -> tuple[str | None, 
     return found[0], found[1]
 
 
+# --------------------------------------------------------------------------------------------
 # Colour and depth
 
 
@@ -322,17 +271,22 @@ _DEPTHS = ("", "/compressedDepth", TRANSPORT)
 """Endings of topics of depth, plain before compressed."""
 
 
-def _colour_and_depth(topics: Sequence[Topic]) -> _Views | None:
+def _colour_and_depth(images: Sequence[str]) -> Chosen | None:
     """A camera's images and their depth; None where there is no depth, or no image."""
-    images = [topic.name for topic in topics if topic.kind in IMAGES]
-    depths = sorted((name for name in images if _is_depth(name, images)), key=_depth_rank)
-    by_view = _by_view([name for name in images if not _is_depth(name, images)])
-    colours = sorted(by_view, key=lambda v: (not _COLOUR.search(v), _rank(v), v))
-    colours = [view for view in colours if is_view(_own_part(view, images))]
+    depths = [name for name in images if _is_depth(name, images)]
+    by_view = _by_view([name for name in images if name not in depths])
+    colours = [view for view in by_view if is_view(_own_part(view, images))]
     if not depths or not colours:
         return None
-    note = f"{depths[0]} is the depth of {colours[0]} (--topics COLOUR,DEPTH chooses others)"
-    return _Views((depths[0], by_view[colours[0]]), notes=(note,), depth=True)
+
+    def depth_rank(name: str) -> tuple[bool, int, int, str]:
+        ending = max((k for k, e in enumerate(_DEPTHS) if name.endswith(e)), default=0)
+        return not is_registered(name), ending, len(name), name
+
+    depth = min(depths, key=depth_rank)
+    colour = min(colours, key=lambda v: (not _COLOUR.search(v), _rank(v), v))
+    note = f"{depth} is the depth of {colour} (--topics COLOUR,DEPTH chooses others)"
+    return Chosen((depth, by_view[colour]), notes=(note,), depth=True)
 
 
 def is_registered(topic: str) -> bool:
@@ -354,11 +308,7 @@ def _own_part(name: str, images: Sequence[str]) -> str:
     return "/".join(name.split("/")[common:])
 
 
-def _depth_rank(name: str) -> tuple[bool, int, int, str]:
-    ending = max((k for k, e in enumerate(_DEPTHS) if name.endswith(e)), default=0)
-    return not is_registered(name), ending, len(name), name
-
-
+# --------------------------------------------------------------------------------------------
 # Odometry: poses of nav_msgs/Odometry, speeds of a stamped twist, turns of an Imu
 
 
@@ -373,7 +323,7 @@ _OF_WHEELS = re.compile(r"wheel|encoder", re.IGNORECASE)
 _SIMULATED = re.compile(r"^/(airsim|carla|tesse)|/segmentation(/|$)|/seg_cam/", re.IGNORECASE)
 
 
-def motion_of_bag(
+def find_motion(
     topics: Sequence[Topic], frame_of: Callable[[Topic], str]
 ) -> tuple[Topic | None, tuple[str, ...]]:
     """Odometry, of the preferred type the topic whose name states so; and what is none, in a note.
@@ -381,22 +331,20 @@ def motion_of_bag(
     Truth, and others' answers in a global frame, would make the drive look better than it is.
     """
     simulated = next((t.name for t in topics if _SIMULATED.search(t.name)), "")
-
-    def why_none(topic: Topic) -> str:
+    used, left_out = [], []
+    for topic in (topic for topic in topics if topic.kind in MOTIONS):
+        reason = ""
         if _TRUTH.search(topic.name):
-            return "truth by its name"
-        if topic.kind != messages.ODOMETRY or _OF_WHEELS.search(topic.name):
-            return ""
-        if simulated:
-            return f"truth of a simulator, by {simulated}"
-        frame = frame_of(topic)
-        return f"in the global frame {frame}" if _GLOBAL.fullmatch(frame.strip("/")) else ""
-
-    reasons = {topic: why_none(topic) for topic in topics if topic.kind in MOTIONS}
-    left_out = ", ".join(f"{topic.name} ({why})" for topic, why in reasons.items() if why)
-    used = sorted(
-        (topic for topic, reason in reasons.items() if not reason),
-        key=lambda t: (MOTIONS.index(t.kind), "odom" not in t.name, len(t.name), t.name),
-    )
-    note = f"not taken for odometry: {left_out}; --topics LEFT,RIGHT,ODOMETRY takes one"
+            reason = "truth by its name"
+        elif topic.kind == messages.ODOMETRY and not _OF_WHEELS.search(topic.name):
+            if simulated:
+                reason = f"truth of a simulator, by {simulated}"
+            elif _GLOBAL.fullmatch((frame := frame_of(topic)).strip("/")):
+                reason = f"in the global frame {frame}"
+        if reason:
+            left_out.append(f"{topic.name} ({reason})")
+        else:
+            used.append(topic)
+    used.sort(key=lambda t: (MOTIONS.index(t.kind), "odom" not in t.name, len(t.name), t.name))
+    note = f"not taken for odometry: {', '.join(left_out)}; --topics LEFT,RIGHT,ODOMETRY takes one"
     return next(iter(used), None), (note,) if left_out else ()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -27,10 +26,9 @@ from bags import (
 from dataset_builders import CALIBRATION, HEIGHT, WIDTH, picture, write_calibration
 
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.errors import CalibrationError, FrameError
+from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA as AHEAD
 from fgslam.core.geometry import inverse, pose, so3_exp
-from fgslam.datasets.bag_messages import FrameTree, colour_of
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
@@ -190,11 +188,6 @@ def test_without_tf_static_what_stays_in_tf_counts(tmp_path: Path) -> None:
     recording = opened(write_bag(tmp_path / "a.bag", messages))
     expected = ON_MAST @ AHEAD @ shifted(BASELINE)
     np.testing.assert_allclose(recording.rig.bTc, expected, rtol=0.0, atol=1e-9)
-    tree = FrameTree(())
-    for k in range(2):
-        tree.add([("a", "b", np.array([float(k), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))], static=False)
-    with pytest.raises(CalibrationError, match="has no frame b"):
-        tree.pose("b", "a")
 
 
 # --------------------------------------------------------------------------------------------
@@ -255,13 +248,6 @@ def test_a_tree_that_says_nothing_is_one_line(tmp_path: Path, words: str) -> Non
     assert "give the calibration of both by --camera FILE" in str(raised.value)
     write_calibration(tmp_path)
     assert opened(path, camera_file=str(tmp_path / "calib.json")).rig.baseline == BASELINE
-
-
-def test_of_two_parents_the_latter_counts_and_is_said() -> None:
-    numbers = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-    tree = FrameTree([("a", "c", numbers), ("b", "c", 2.0 * numbers)])
-    assert tree.pose("c", "b")[0, 3] == 2.0
-    assert tree.notes == ("tf_static: c has two parents, a and b; the latter counts",)
 
 
 # --------------------------------------------------------------------------------------------
@@ -417,15 +403,11 @@ def test_the_encodings_of_video_have_colour(tmp_path: Path, name: str) -> None:
 
 
 def test_planes_that_are_cut_or_odd_are_refused(tmp_path: Path) -> None:
-    """Grey is whole in its own plane: only colour is missing."""
-    cut = raw_image(of_planes(False)[:HEIGHT], "nv12")
-    recording = opened(write_bag(tmp_path / "a.mcap", stereo(1, lambda _: cut)))
-    assert recording.frame(0).images[0].shape == (HEIGHT, WIDTH)
-    with pytest.raises(FrameError, match="768 bytes are no image of 32x24 nv12; record it again"):
-        recording.colour(0)
-    odd = SimpleNamespace(encoding="nv21", height=23, width=32, step=32, data=bytes(1200))
-    with pytest.raises(FrameError, match="32x23 is no size of nv21"):
-        colour_of(odd, "a.bag, /cam")
+    for image in (of_planes(False)[:HEIGHT], of_planes(False)[:, 1:]):
+        fields = raw_image(image, "nv12") | {"height": HEIGHT}
+        bag = write_bag(tmp_path / f"{image.shape}.mcap", stereo(1, lambda _, f=fields: f))
+        with pytest.raises(DatasetError, match=r"bytes are no image of 3.x24 nv12; record"):
+            opened(bag)
 
 
 def test_grey_images_have_no_colour(tmp_path: Path) -> None:
