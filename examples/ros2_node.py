@@ -20,8 +20,8 @@ from typing import Any
 from rosbags.highlevel import AnyReader
 
 import fgslam as fg
+from fgslam.cameras.formats import read_camera_info_pair
 from fgslam.cameras.rig import rig_of
-from fgslam.cameras.stereo_formats import read_camera_info_pair
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,

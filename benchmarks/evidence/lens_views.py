@@ -16,9 +16,10 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.cameras.rig import StereoRig, load_rig
-from fgslam.cameras.write_formats import raw_values, write_calibration
+from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FrameError
 from fgslam.core.geometry import inverse, pose, so3_exp

@@ -7,9 +7,9 @@ poses of the cameras to each other and their intrinsics come with one covariance
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -19,16 +19,9 @@ from scipy.spatial.transform import Rotation
 from fgslam.cameras.boards import Board, Corners
 from fgslam.cameras.lenses import RawCamera, checked_camera
 from fgslam.cameras.trees import intrinsic_matrix
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import (
-    inverse,
-    pose,
-    so3_exp,
-    so3_log,
-    transform_to_camera,
-    transform_to_world,
-)
+from fgslam.core.geometry import inverse, pose, so3_exp, so3_log, transform_to_world
 
 NAMES = ("left", "right", "top")
 INTRINSICS = ("fx", "fy", "cx", "cy")
@@ -42,7 +35,6 @@ LEAST_VIEWS = 5
 MOST_STEPS = 300
 """Of the fit; twenty are usual."""
 _FIRST_STEPS = 30  # with fixed distortion: from a rough start it becomes non-monotonic
-_TURN = 6  # numbers of a pose: rotation vector and translation
 _STEP = 1e-6  # of the central differences: pixels, radians, metres, and parts of a lens of order 1
 _OUTLIER_SIGMAS = 5.0  # of one coordinate: a right corner is farther off once in 270,000
 _MEDIAN_OF_RAYLEIGH = 1.1774  # median distance in the plane over the deviation of a coordinate
@@ -56,7 +48,7 @@ _UNDETERMINED = (
     "directions, some in each corner of the image"
 )
 
-View = tuple[Corners | None, ...]
+View: TypeAlias = tuple[Corners | None, ...]
 """What the cameras see of the board at one moment, in their order; None where it was not found."""
 
 
@@ -66,37 +58,26 @@ class BoardCalibration:
 
     Attributes:
         cameras: in their order; the first one is the body.
+        turns: (cameras, 6) rotation vectors and translations that take the first camera's
+            coordinates to each camera's.
         sigmas: (cameras, p) standard deviations of fx, fy, cx, cy and the model's parameters.
-        turn_sigmas: (cameras, 6) of the rotation vectors and translations that take the first
-            camera's coordinates to each camera's, radians and metres; zero for the first.
-        boards: (views, 6) pose of the board in the first camera.
-        off: of each view and camera, how far off each corner (n,) is, pixels; empty where the board
-            was not found, or did not fit.
+        turn_sigmas: (cameras, 6) of the turns, radians and metres; zero for the first.
+        boards: (views, 6) pose of the board in the first camera; NaN where it was not used.
         kept: the corners of each view that were used; None where none were.
+        errors: (views, cameras) root mean square distance in each image, pixels; NaN where unused.
+        rms: the same of all corners that were used.
         left_out: corners that do not fit the others.
     """
 
     cameras: tuple[RawCamera, ...]
+    turns: FloatArray
     sigmas: FloatArray
     turn_sigmas: FloatArray
     boards: FloatArray
-    off: tuple[tuple[FloatArray, ...], ...]
     kept: tuple[View, ...]
+    errors: FloatArray
+    rms: float
     left_out: int
-
-    def turn(self, camera: int) -> FloatArray:
-        """(6,) rotation vector and translation from the first camera's coordinates to another's."""
-        return _turn_of(inverse(self.cameras[camera].bTc) @ self.cameras[0].bTc)
-
-    @property
-    def errors(self) -> FloatArray:
-        """(views, cameras) root mean square distance in each image, pixels; NaN where unseen."""
-        return np.array([[_rms(distances) for distances in view] for view in self.off])
-
-    @property
-    def rms(self) -> float:
-        """Root mean square distance of all corners that were used, pixels."""
-        return _rms(np.concatenate([distances for view in self.off for distances in view]))
 
 
 def calibrate(
@@ -114,20 +95,123 @@ def calibrate(
         CalibrationError: too few views, they do not determine the cameras, or no such cameras show
             a board like that.
     """
-    problem, start = _first(board, views, model, size)
-    found = _fit(problem, start)
-    for _ in range(_TRIMMINGS - 1):
-        trimmed = _trimmed(views, _distances(found, board, views))
-        if _count(trimmed) == _count(found.kept):
+    seen = _sightings(board, views)
+    used = np.ones(len(seen), np.bool_)
+    _require_views(seen, used)
+    values, posed = _start(seen, size, model, len(views))
+    used = posed[seen.image]
+    if model != "radtan":
+        bends = len(INTRINSICS) + (1 if model == "omni" else 0)
+        values = _Fit(seen.select(used), values, size, model).least(_FIRST_STEPS, bends)
+    for trimming in range(_TRIMMINGS):
+        _require_views(seen, used)
+        fit = _Fit(seen.select(used), values, size, model)
+        values, sigmas = fit.solution()
+        away = np.linalg.norm(_predicted(seen, values, size, model) - seen.pixels, axis=1)
+        trimmed = _fitting(seen, away)
+        if trimming == _TRIMMINGS - 1 or trimmed.sum() == used.sum():
             break
-        problem = _Problem(board, trimmed, model, size)
-        found = _fit(problem, problem.start_of(found))
-    if found.rms > _MOST_OFF * float(np.hypot(*size)):
+        used = trimmed
+    rms = _rms(away[used])
+    if rms > _MOST_OFF * float(np.hypot(*size)):
         raise CalibrationError(
-            f"the corners lie {found.rms:.1f} px (rms) off what {model} cameras show of a flat "
+            f"the corners lie {rms:.1f} px (rms) off what {model} cameras show of a flat "
             "board; is --lens that of the camera, its focus fixed, and the board flat?"
         )
-    return replace(found, left_out=_count(views) - _count(found.kept))
+    errors = np.full((len(views), len(views[0])), np.nan)
+    kept: list[list[Corners | None]] = [[None] * len(views[0]) for _ in views]
+    for image, (v, c) in enumerate(seen.images):
+        own = used & (seen.image == image)
+        if own.any():
+            errors[v, c] = _rms(away[own])
+            kept[v][c] = Corners(seen.ids[own], seen.pixels[own])
+    cameras = tuple(
+        replace(camera_of(model, size, numbers, f"cam{c}"), bTc=inverse(_matrix_of(turn)))
+        for c, (numbers, turn) in enumerate(zip(values.intrinsics, values.turns, strict=True))
+    )
+    return BoardCalibration(
+        cameras,
+        values.turns,
+        sigmas.intrinsics,
+        sigmas.turns,
+        values.boards,
+        tuple(map(tuple, kept)),
+        errors,
+        rms,
+        int((~used).sum()),
+    )
+
+
+# --------------------------------------------------------------------------------------------
+# Corners and parameters as arrays
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sightings(Rows):
+    """All corners, a row each: view, camera, image and number, point on the board, and pixel.
+
+    ``images`` holds view and camera of each image.
+    """
+
+    SHARED = frozenset({"images"})
+
+    view: IntArray
+    camera: IntArray
+    image: IntArray
+    ids: IntArray
+    points: FloatArray
+    pixels: FloatArray
+    images: tuple[tuple[int, int], ...]
+
+
+class _Values(NamedTuple):
+    """Intrinsics (cameras, p), turns (cameras, 6), boards (views, 6); NaN for a view unused."""
+
+    intrinsics: FloatArray
+    turns: FloatArray
+    boards: FloatArray
+
+
+def _sightings(board: Board, views: Sequence[View]) -> _Sightings:
+    found = [(v, c, one) for v, view in enumerate(views) for c, one in enumerate(view) if one]
+    counts = [len(corners) for _, _, corners in found]
+    view, camera = (np.repeat([one[k] for one in found], counts).astype(int) for k in (0, 1))
+    ids = np.concatenate([corners.ids for _, _, corners in found])
+    return _Sightings(
+        view,
+        camera,
+        np.repeat(np.arange(len(found)), counts),
+        ids,
+        board.points[ids],
+        np.concatenate([corners.pixels for _, _, corners in found]),
+        tuple((v, c) for v, c, _ in found),
+    )
+
+
+def _require_views(seen: _Sightings, used: BoolArray) -> None:
+    """Raises CalibrationError where a camera shows the board too seldom."""
+    cameras = 1 + max(c for _, c in seen.images)
+    for camera in range(cameras):
+        count = len(np.unique(seen.image[used & (seen.camera == camera)]))
+        if count < LEAST_VIEWS:
+            which = f"{NAMES[camera]} camera" if cameras > 1 else "camera"
+            raise CalibrationError(
+                f"the {which} shows the board in {count} images that can be "
+                f"used; {LEAST_VIEWS} are needed at least, twenty are good"
+            )
+
+
+def _fitting(seen: _Sightings, away: FloatArray) -> BoolArray:
+    """Which corners (n,) fit: distances beyond five robust deviations of all are left out.
+
+    What an earlier, worse fit left out comes back where it fits now.
+    """
+    known = away[np.isfinite(away)]
+    if not len(known):
+        raise CalibrationError(_UNDETERMINED)
+    kept = away <= _OUTLIER_SIGMAS * float(np.median(known)) / _MEDIAN_OF_RAYLEIGH
+    counts = np.bincount(seen.image[kept], minlength=len(seen.images))
+    return np.asarray(kept & (counts >= _LEAST_CORNERS)[seen.image])
 
 
 def _rms(distances: FloatArray) -> float:
@@ -144,171 +228,66 @@ def _turn_of(matrix: FloatArray) -> FloatArray:
     return np.concatenate([so3_log(matrix[:3, :3]), matrix[:3, 3]])
 
 
-def _count(views: Sequence[View]) -> int:
-    return sum(len(corners) for view in views for corners in view if corners is not None)
-
-
-# --------------------------------------------------------------------------------------------
-# What fits
-
-
-def _trimmed(views: Sequence[View], off: Sequence[Sequence[FloatArray]]) -> tuple[View, ...]:
-    """What fits: distances (n,) beyond five robust deviations of all corners are left out.
-
-    What an earlier, worse fit left out comes back where it fits now.
-    """
-    everything = np.concatenate([distance for view in off for distance in view])
-    known = everything[np.isfinite(everything)]
-    if not len(known):
-        raise CalibrationError(_UNDETERMINED)
-    limit = _OUTLIER_SIGMAS * float(np.median(known)) / _MEDIAN_OF_RAYLEIGH
-    out = []
-    for view, distances in zip(views, off, strict=True):
-        kept = (
-            None if corners is None else corners.select(distance <= limit)
-            for corners, distance in zip(view, distances, strict=True)
-        )
-        out.append(tuple(c if c is not None and len(c) >= _LEAST_CORNERS else None for c in kept))
-    return tuple(out)
-
-
-def _distances(
-    found: BoardCalibration, board: Board, views: Sequence[View]
-) -> tuple[tuple[FloatArray, ...], ...]:
-    """Of each view and camera how far off each corner (n,) is, pixels; NaN without a board's pose.
-
-    Empty where the camera does not see the board.
-    """
-    out = []
-    for turn, view in zip(found.boards, views, strict=True):
-        known = np.isfinite(turn).all()
-        fTb = _matrix_of(turn) if known else np.full((4, 4), np.nan)
-        points = transform_to_world(fTb, board.points)
-        off = []
-        for camera, corners in zip(found.cameras, view, strict=True):
-            away = np.empty((0, 2))
-            if corners is not None:
-                shown = camera.project(transform_to_camera(camera.bTc, points[corners.ids]))
-                away = shown - corners.pixels
-            off.append(np.asarray(np.linalg.norm(away, axis=1)))
-        out.append(tuple(off))
-    return tuple(out)
-
-
 # --------------------------------------------------------------------------------------------
 # The least squares
 
 
-def _first(
-    board: Board, views: Sequence[View], model: str, size: tuple[int, int]
-) -> tuple[_Problem, FloatArray]:
-    """The problem and first values; images in which the board has no pose are left out."""
-    problem = _Problem(board, views, model, size)
-    images = [
-        (v, c, e) for v, view in enumerate(views) for c, e in enumerate(view) if e is not None
-    ]
-    cameras = []
-    for camera in range(problem.cameras):
-        own = [corners for _, c, corners in images if c == camera]
-        points = [board.points[corners.ids] for corners in own]
-        numbers = first_guess(model, points, [corners.pixels for corners in own], size)
-        cameras.append(camera_of(model, size, numbers))
-    cTb = {
-        (v, c): found
-        for v, c, corners in images
-        if (found := board_pose(cameras[c], board.points[corners.ids], corners.pixels)) is not None
-    }
-    if len(cTb) < len(images):
-        posed = [
-            tuple(corners if (v, c) in cTb else None for c, corners in enumerate(view))
-            for v, view in enumerate(views)
-        ]
-        problem = _Problem(board, posed, model, size)
-    start = problem.start(cameras, cTb)
-    if not np.isfinite(start).all():
-        raise CalibrationError(_UNDETERMINED)
-    if model != "radtan":
-        start = problem.least(start, _FIRST_STEPS, with_lens=False).x
-    return problem, start
+def _predicted(seen: _Sightings, values: _Values, size: tuple[int, int], model: str) -> FloatArray:
+    """(n, 2) pixels of all corners; NaN where the lens does not show them."""
+    points = seen.points
+    for turns, which in ((values.boards, seen.view), (values.turns, seen.camera)):
+        rotations = np.full((len(turns), 3, 3), np.nan)
+        known = np.isfinite(turns).all(axis=1)
+        rotations[known] = Rotation.from_rotvec(turns[known, :3]).as_matrix()
+        points = np.einsum("nij,nj->ni", rotations[which], points) + turns[which, 3:]
+    out = np.empty((len(points), 2))
+    for camera, numbers in enumerate(values.intrinsics):
+        own = seen.camera == camera
+        out[own] = camera_of(model, size, numbers).project(points[own])
+    return out
 
 
-def _fit(problem: _Problem, start: FloatArray) -> BoardCalibration:
-    """The cameras of the least residuals from a start on."""
-    fit = problem.least(start, MOST_STEPS)
-    jacobian = problem.jacobian(fit.x)
-    rows = len(fit.fun)
-    scale = np.linalg.norm(jacobian, axis=0)
-    if not (np.isfinite(scale).all() and scale.all()):
-        raise CalibrationError(_UNDETERMINED)
-    information = (jacobian / scale).T @ (jacobian / scale)
-    if rows <= len(fit.x) or not np.linalg.cond(information) <= 1e14:
-        raise CalibrationError(_UNDETERMINED)
-    variance = 2.0 * fit.cost / (rows - len(fit.x))
-    covariance = variance * np.linalg.inv(information) / np.outer(scale, scale)
-    problem.require_determined(fit.x, covariance)
-    if not fit.success:
-        raise CalibrationError(
-            f"the fit of the {problem.model} cameras does not converge in {MOST_STEPS} steps; try "
-            "another --lens, or leave out images in which corners were found wrongly"
-        )
-    found = problem.result(fit.x, np.sqrt(np.diag(covariance)))
-    return replace(found, off=_distances(found, problem.board, problem.views))
-
-
-class _Problem:
-    """Residuals of all corners over (intrinsics, turns of the other cameras, boards)."""
+class _Fit:
+    """Residuals of all corners over one vector: intrinsics, turns of the others, boards."""
 
     def __init__(
-        self, board: Board, views: Sequence[View], model: str, size: tuple[int, int]
+        self, seen: _Sightings, values: _Values, size: tuple[int, int], model: str
     ) -> None:
-        self.board, self.views, self.model, self.size = board, tuple(views), model, size
-        self.cameras = len(views[0])
-        for camera in range(self.cameras):
-            count = sum(view[camera] is not None for view in views)
-            if count < LEAST_VIEWS:
-                which = f"{NAMES[camera]} camera" if self.cameras > 1 else "camera"
-                raise CalibrationError(
-                    f"the {which} shows the board in {count} images that can be "
-                    f"used; {LEAST_VIEWS} are needed at least, twenty are good"
-                )
-        self._shown = [v for v, view in enumerate(views) if any(c is not None for c in view)]
-        images = [
-            (row, camera, corners)
-            for row, v in enumerate(self._shown)
-            for camera, corners in enumerate(views[v])
-            if corners is not None
-        ]
-        counts = [len(corners) for _, _, corners in images]
-        self._row, self._camera = (np.repeat([one[k] for one in images], counts) for k in (0, 1))
-        self._points = board.points[np.concatenate([corners.ids for _, _, corners in images])]
-        self._pixels = np.concatenate([corners.pixels for _, _, corners in images])
-        self._own = len(INTRINSICS) + len(PARAMETERS[model])
-        self._turns_at = self.cameras * self._own
-        self._boards_at = self._turns_at + _TURN * (self.cameras - 1)
+        self.seen, self.values, self.size, self.model = seen, values, size, model
+        self.shown, row = np.unique(seen.view, return_inverse=True)
+        own, turns = values.intrinsics.shape[1], values.intrinsics.size
+        boards = turns + 6 * (len(values.turns) - 1)
+        # Which of the parameters each corner depends on (n, own + 12); -1: on none.
+        six = np.arange(6)
+        of_turn = np.where(
+            seen.camera[:, None] > 0, turns + 6 * (seen.camera[:, None] - 1) + six, -1
+        )
+        self.columns = np.hstack(
+            [own * seen.camera[:, None] + np.arange(own), of_turn, boards + 6 * row[:, None] + six]
+        )
+        self.splits = turns, boards
 
-    def _parts(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Intrinsics (cameras, p), turns (cameras, 6) and boards (views, 6)."""
-        turns = np.concatenate([np.zeros(_TURN), x[self._turns_at : self._boards_at]])
-        intrinsics, boards = x[: self._turns_at], x[self._boards_at :]
-        return (
-            intrinsics.reshape(-1, self._own),
-            turns.reshape(-1, _TURN),
-            boards.reshape(-1, _TURN),
+    def vector(self, values: _Values) -> FloatArray:
+        """All parameters (p,)."""
+        return np.concatenate(
+            [values.intrinsics.ravel(), values.turns[1:].ravel(), values.boards[self.shown].ravel()]
         )
 
+    def parts(self, x: FloatArray) -> _Values:
+        """The parameters of a vector."""
+        intrinsics, turns, boards = np.split(x, self.splits)
+        every = np.full_like(self.values.boards, np.nan)
+        every[self.shown] = boards.reshape(-1, 6)
+        turns = np.concatenate([np.zeros(6), turns]).reshape(-1, 6)
+        return _Values(intrinsics.reshape(self.values.intrinsics.shape), turns, every)
+
     def predicted(self, x: FloatArray) -> FloatArray:
-        """(n, 2) pixels of all corners; NaN where the lens does not show them."""
-        intrinsics, turns, boards = self._parts(x)
-        points = _moved(turns, _moved(boards, self._points, self._row), self._camera)
-        out = np.empty((len(points), 2))
-        for camera, numbers in enumerate(intrinsics):
-            own = self._camera == camera
-            out[own] = camera_of(self.model, self.size, numbers).project(points[own])
-        return out
+        """(n, 2) pixels."""
+        return _predicted(self.seen, self.parts(x), self.size, self.model)
 
     def residuals(self, x: FloatArray) -> FloatArray:
         """(2n,) pixels, predicted minus found; the image's diagonal where the lens shows none."""
-        off = self.predicted(x) - self._pixels
+        off = self.predicted(x) - self.seen.pixels
         return np.asarray(np.where(np.isfinite(off), off, np.hypot(*self.size))).ravel()
 
     def jacobian(self, x: FloatArray) -> FloatArray:
@@ -317,9 +296,9 @@ class _Problem:
         A corner depends on one camera, its turn and one board: the k-th parameter of all cameras,
         or of all boards, is moved at once.
         """
-        n, step = len(self._pixels), _STEP * np.maximum(1.0, np.abs(x))
+        n, step = len(self.seen.pixels), _STEP * np.maximum(1.0, np.abs(x))
         out = np.zeros((n, 2, len(x)))
-        for column in self._columns():
+        for column in self.columns.T:
             of = np.flatnonzero(column >= 0)
             change = np.zeros(len(x))
             change[column[of]] = step[column[of]]
@@ -328,104 +307,60 @@ class _Problem:
             out[of, :, column[of]] = np.where(np.isfinite(slope), slope, 0.0)
         return out.reshape(2 * n, len(x))
 
-    def _columns(self) -> Iterator[IntArray]:
-        """(n,) which of the parameters each corner depends on, one after another; -1: on none."""
-        for k in range(self._own):
-            yield self._camera * self._own + k
-        for k in range(_TURN if self.cameras > 1 else 0):
-            of_turn = self._turns_at + _TURN * (self._camera - 1) + k
-            yield np.where(self._camera > 0, of_turn, -1)
-        for k in range(_TURN):
-            yield self._boards_at + _TURN * self._row + k
+    def least(self, steps: int, fixed_from: int | None = None) -> _Values:
+        """The values of the least residuals; each camera's parameters from one on may be fixed."""
+        return self.parts(self._solve(steps, fixed_from).x)
 
-    def least(self, start: FloatArray, steps: int, with_lens: bool = True) -> Any:
-        """The fit from a start on; the lenses' distortion may stay as it is."""
-        fixed = np.zeros(0, np.int64)
-        if not with_lens:
-            kept = len(INTRINSICS) + (1 if self.model == "omni" else 0)
-            own = np.arange(self._turns_at)
-            fixed = own[own % self._own >= kept]
+    def _solve(self, steps: int, fixed_from: int | None) -> Any:
+        own = np.arange(self.splits[0])
+        each = self.values.intrinsics.shape[1]
+        fixed = own[own % each >= (each if fixed_from is None else fixed_from)]
 
         def jacobian(x: FloatArray) -> FloatArray:
             out = self.jacobian(x)
             out[:, fixed] = 0.0
             return out
 
+        start = self.vector(self.values)
         return least_squares(
             self.residuals, start, jacobian, method="lm", x_scale="jac", max_nfev=steps
         )
 
-    def start_of(self, found: BoardCalibration) -> FloatArray:
-        """First values: those of a fit to more or fewer corners of the same views."""
-        turns = [found.turn(camera) for camera in range(1, self.cameras)]
-        boards = [found.boards[v] for v in self._shown]
-        return np.concatenate([*map(_numbers_of, found.cameras), *turns, *boards])
+    def solution(self) -> tuple[_Values, _Values]:
+        """The values of the least residuals, and their standard deviations.
 
-    def start(
-        self, cameras: Sequence[RawCamera], cTb: Mapping[tuple[int, int], FloatArray]
-    ) -> FloatArray:
-        """First values: the cameras' poses to the first where both see the board."""
-        turns = [np.eye(4), *(self._relative(cTb, camera) for camera in range(1, self.cameras))]
-        boards = []
-        for v in self._shown:
-            camera = next(c for c in range(self.cameras) if (v, c) in cTb)
-            boards.append(inverse(turns[camera]) @ cTb[v, camera] if camera else cTb[v, 0])
-        intrinsics = map(_numbers_of, cameras)
-        return np.concatenate([*intrinsics, *map(_turn_of, turns[1:]), *map(_turn_of, boards)])
-
-    def _relative(self, cTb: Mapping[tuple[int, int], FloatArray], camera: int) -> FloatArray:
-        """Of the poses that single views give the one nearest to all others."""
-        both = [
-            cTb[v, camera] @ inverse(cTb[v, 0])
-            for v in self._shown
-            if (v, camera) in cTb and (v, 0) in cTb
-        ]
-        if not both:
-            raise CalibrationError(
-                f"cameras 0 and {camera} never see the board at the same time; are the images "
-                "paired rightly?"
-            )
-        apart = [[np.linalg.norm(a - b) for b in both] for a in both]
-        return both[int(np.argmin(np.sum(apart, axis=1)))]
-
-    def require_determined(self, x: FloatArray, covariance: FloatArray) -> None:
-        """Raises CalibrationError for impossible intrinsics, or an uncertain focal length.
-
-        The unified model's is ``f / (1 + xi)``, that around the axis: the two are nearly one.
+        Raises:
+            CalibrationError: the corners do not determine them, or the fit does not converge.
         """
-        for camera, numbers in enumerate(self._parts(x)[0]):
-            own = slice(camera * self._own, (camera + 1) * self._own)
-            by = np.zeros(self._own)
+        fit = self._solve(MOST_STEPS, None)
+        jacobian = self.jacobian(fit.x)
+        scale = np.linalg.norm(jacobian, axis=0)
+        if not (np.isfinite(scale).all() and scale.all()):
+            raise CalibrationError(_UNDETERMINED)
+        information = (jacobian / scale).T @ (jacobian / scale)
+        left = len(fit.fun) - len(fit.x)
+        if left <= 0 or not np.linalg.cond(information) <= 1e14:
+            raise CalibrationError(_UNDETERMINED)
+        covariance = 2.0 * fit.cost / left * np.linalg.inv(information) / np.outer(scale, scale)
+        values, own = self.parts(fit.x), self.values.intrinsics.shape[1]
+        for camera, numbers in enumerate(values.intrinsics):
+            at = slice(camera * own, (camera + 1) * own)
+            by = np.zeros(own)
             by[0] = 1.0 / numbers[0]
-            if self.model == "omni":
+            if self.model == "omni":  # f / (1 + xi), that around the axis: the two are nearly one
                 by[len(INTRINSICS)] = -1.0 / (1.0 + numbers[len(INTRINSICS)])
-            known = bool(by @ covariance[own, own] @ by <= _UNCERTAIN**2)
             try:
                 checked_camera(camera_of(self.model, self.size, numbers))
             except CalibrationError:
-                known = False
-            if not known:
+                raise CalibrationError(_UNDETERMINED) from None
+            if not by @ covariance[at, at] @ by <= _UNCERTAIN**2:
                 raise CalibrationError(_UNDETERMINED)
-
-    def result(self, x: FloatArray, sigmas: FloatArray) -> BoardCalibration:
-        """The solution in words of cameras."""
-        intrinsics, turns, found = self._parts(x)
-        boards = np.full((len(self.views), _TURN), np.nan)
-        boards[self._shown] = found
-        cameras = tuple(
-            replace(
-                camera_of(self.model, self.size, numbers, f"cam{c}"), bTc=inverse(_matrix_of(turn))
+        if not fit.success:
+            raise CalibrationError(
+                f"the fit of the {self.model} cameras does not converge in {MOST_STEPS} steps; try "
+                "another --lens, or leave out images in which corners were found wrongly"
             )
-            for c, (numbers, turn) in enumerate(zip(intrinsics, turns, strict=True))
-        )
-        of_intrinsics, of_turns, _ = self._parts(sigmas)
-        return BoardCalibration(cameras, of_intrinsics, of_turns, boards, (), self.views, 0)
-
-
-def _moved(turns: FloatArray, points: FloatArray, which: IntArray) -> FloatArray:
-    """Points (n, 3), each by one of the turns (k, 6)."""
-    rotations = np.asarray(Rotation.from_rotvec(turns[:, :3]).as_matrix())
-    return np.asarray(np.einsum("nij,nj->ni", rotations[which], points) + turns[which, 3:])
+        return values, self.parts(np.sqrt(np.diag(covariance)))
 
 
 # --------------------------------------------------------------------------------------------
@@ -437,6 +372,44 @@ _HALF_VIEWS = np.radians([20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 90.0, 105.0, 120.0
 _XIS = (0.7, 1.0, 1.5)  # of lenses, parabolic mirrors, and spheres seen from farther away
 _AHEAD = 0.1  # least depth over distance, seen along the board's middle, to take a pose from
 _LEAST = 4  # points from which a pose follows
+
+
+def _start(
+    seen: _Sightings, size: tuple[int, int], model: str, views: int
+) -> tuple[_Values, BoolArray]:
+    """First values, and in which images (k,) the board has a pose."""
+    images = [seen.image == k for k in range(len(seen.images))]
+    count = 1 + max(c for _, c in seen.images)
+    intrinsics = []
+    for camera in range(count):
+        own = [at for at, (_, c) in zip(images, seen.images, strict=True) if c == camera]
+        flat, pixels = ([each[at] for at in own] for each in (seen.points, seen.pixels))
+        intrinsics.append(first_guess(model, flat, pixels, size))
+    cameras = [camera_of(model, size, numbers) for numbers in intrinsics]
+    cTb = {
+        (v, c): found
+        for at, (v, c) in zip(images, seen.images, strict=True)
+        if (found := board_pose(cameras[c], seen.points[at], seen.pixels[at])) is not None
+    }
+    turns = [np.eye(4)]
+    for camera in range(1, count):
+        # Of the poses that single views give the one nearest to all others.
+        shown = [v for v, c in cTb if c == camera and (v, 0) in cTb]
+        both = [cTb[v, camera] @ inverse(cTb[v, 0]) for v in shown]
+        if not both:
+            raise CalibrationError(
+                f"cameras 0 and {camera} never see the board at the same time; are the images "
+                "paired rightly?"
+            )
+        apart = [[np.linalg.norm(a - b) for b in both] for a in both]
+        turns.append(both[int(np.argmin(np.sum(apart, axis=1)))])
+    boards = np.full((views, 6), np.nan)
+    for (v, c), found in reversed(cTb.items()):  # by the first camera that sees it
+        boards[v] = _turn_of(inverse(turns[c]) @ found if c else found)
+    values = _Values(np.array(intrinsics), np.array([_turn_of(turn) for turn in turns]), boards)
+    if not all(np.isfinite(one).all() for one in (*values[:2], boards[[v for v, _ in cTb]])):
+        raise CalibrationError(_UNDETERMINED)
+    return values, np.array([image in cTb for image in seen.images])
 
 
 def first_guess(
@@ -510,10 +483,6 @@ def camera_of(
     return RawCamera(*size, matrix, numbers[4:], np.eye(4), name, model)
 
 
-def _numbers_of(camera: RawCamera) -> FloatArray:
-    return np.concatenate([camera.intrinsics, camera.distortion])
-
-
 def board_pose(camera: RawCamera, points: FloatArray, pixels: FloatArray) -> FloatArray | None:
     """Pose (4, 4) of a board in the camera; None where too few of its corners have rays.
 
@@ -548,7 +517,6 @@ def board_pose(camera: RawCamera, points: FloatArray, pixels: FloatArray) -> Flo
 
 _CELLS = 10  # of the image, along each side, that corners may cover
 _MEDIAN_TO_SIGMA = 1.4826  # of a normal distribution
-_HUBER_PX = 0.5  # beyond which a corner counts less in the board's place
 _FAR = 1e-6  # radians of parallax: below it a point has no depth
 DEPTH_SHARE = 0.05
 """Of the depth: where a point lies deeper than this error, it is of no use as a place."""
@@ -663,37 +631,27 @@ def held_out_alone(
 
     None where half of the views are not enough to calibrate with.
     """
-    own = np.array([k for k, view in enumerate(views) if view[0] is not None], np.int64)
+    own = [k for k, view in enumerate(views) if view[0] is not None]
     try:
         camera = calibrate(board, [views[k] for k in own[::2]], size, model).cameras[0]
     except CalibrationError:
         return None
-    kept, off = [], []
-    for k in own[1::2].tolist():
-        corners = views[k][0]
-        distances = None if corners is None else _off_when_placed(board, camera, corners)
-        if distances is not None:
-            kept.append(k)
-            off.append(distances)
-    if not kept:
+    seen = _sightings(board, [views[k] for k in own[1::2]])
+    images = [seen.image == k for k in range(len(seen.images))]
+    poses = [board_pose(camera, seen.points[at], seen.pixels[at]) for at in images]
+    if all(cTb is None for cTb in poses):
         return None
-    off_px = float(np.median(np.concatenate(off))) / _MEDIAN_OF_RAYLEIGH * np.sqrt(2.0)
-    return HeldOutAlone(np.array(kept), float(off_px), np.array([_rms(one) for one in off]))
-
-
-def _off_when_placed(board: Board, camera: RawCamera, corners: Corners) -> FloatArray | None:
-    """Distances (n,) in pixels with the board where they are least; None where it has no place."""
-    points = board.points[corners.ids]
-    cTb = board_pose(camera, points, corners.pixels)
-    if cTb is None:
-        return None
-
-    def off(turn: FloatArray) -> FloatArray:
-        away = camera.project(transform_to_world(_matrix_of(turn), points)) - corners.pixels
-        return np.asarray(np.where(np.isfinite(away), away, np.hypot(*camera.size))).ravel()
-
-    fit = least_squares(off, _turn_of(cTb), "3-point", loss="huber", f_scale=_HUBER_PX)
-    return np.asarray(np.linalg.norm(off(fit.x).reshape(-1, 2), axis=1))
+    boards = np.array([np.full(6, np.nan) if cTb is None else _turn_of(cTb) for cTb in poses])
+    numbers = np.concatenate([camera.intrinsics, camera.distortion])[None]
+    placed = seen.select(np.isfinite(boards).all(axis=1)[seen.image])
+    values = _Fit(placed, _Values(numbers, np.zeros((1, 6)), boards), size, model).least(
+        _FIRST_STEPS, fixed_from=0
+    )
+    away = np.linalg.norm(_predicted(placed, values, size, model) - placed.pixels, axis=1)
+    kept = np.unique(placed.image)
+    off_px = float(np.median(away)) / _MEDIAN_OF_RAYLEIGH * np.sqrt(2.0)
+    each = np.array([_rms(away[placed.image == k]) for k in kept])
+    return HeldOutAlone(np.array(own[1::2])[kept], float(off_px), each)
 
 
 def _pixels_of(views: Sequence[View], camera: int) -> FloatArray:

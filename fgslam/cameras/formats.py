@@ -7,19 +7,17 @@ the end (:func:`calibration_of_tree`, :func:`calibration_of_text`).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from configparser import ConfigParser
 from configparser import Error as ConfigParserError
 from dataclasses import replace
-from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from fgslam.cameras.calib_json import OF_RECTIFIED, is_own, is_rectified, read_own
 from fgslam.cameras.lenses import (
-    LENSES,
     Calibration,
     RawCamera,
     StatedView,
@@ -27,17 +25,6 @@ from fgslam.cameras.lenses import (
     checked_view,
 )
 from fgslam.cameras.omni import read_ocamcalib
-from fgslam.cameras.stereo_formats import (
-    has_intrinsics,
-    has_step,
-    is_camera_info,
-    is_opencv_one,
-    is_opencv_pair,
-    read_camera_info,
-    read_kitti,
-    read_opencv_one,
-    read_opencv_pair,
-)
 from fgslam.cameras.trees import (
     BROWN,
     FOCAL,
@@ -48,188 +35,392 @@ from fgslam.cameras.trees import (
     Tree,
     Values,
     camera_of,
-    flat_numbers,
     intrinsic_matrix,
     kind_of,
-    read_json,
     read_tree,
 )
 from fgslam.core.arrays import FloatArray
-from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_text
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,
     inverse,
-    is_rigid,
     pose,
+    reorthonormalise,
     rotation_from_quaternion,
 )
-from fgslam.core.sensors import CameraRig
 
 # --------------------------------------------------------------------------------------------
-# fgslam's own calib.json, of cameras as calibrated
+# OpenCV's FileStorage: stereo_calib's intrinsics and extrinsics, cv2.fisheye, cv2.omnidir
 
 
-OWN_FORMAT = "calib.json of fgslam"
-CORRECTIONS = "corrections"
-OF_RECTIFIED = {"baseline_m", "baseline", "rectified", "fx"}
-_OWN = Row(
-    size=("width", "height"),
-    matrix="matrix",
-    kind=("model",),
-    lenses={model: (model, ("parameters",)) for model in LENSES},
+_SIDES = (("1", "2"), ("left", "right"), ("l", "r"), ("0", "1"))
+_MATRICES = ("m", "k", "kk", "mtx", "cameramatrix", "cammatrix", "intrinsicmatrix", "intrinsics")
+_DISTORTIONS = (
+    *("d", "kc", "dist", "distcoeffs", "distcoefs", "distortion", "distortions"),
+    *("distortioncoefficients", "distortioncoeffs"),
+)
+"""What people call them, in small letters without marks; next to that a side, on either end."""
+_STEPS = (
+    *(("R", "T"), ("rot", "trans"), ("Rot", "Trans")),
+    *(("rotation_matrix", "translation_vector"), ("rotationMatrix", "translationVector")),
+)
+_PARTS_OF_SIDES = {
+    *("left", "right", "cameraleft", "cameraright", "l", "r", "cameral", "camerar"),
+    *(f"{word}{number}" for word in ("cam", "camera") for number in "012"),
+}
+_ONE = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M")
+_OF_ONE = (
+    *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "dist_coeffs"),
+)
+_FISHEYE = ("fisheye", "equidistant", "kannala_brandt")
+
+
+def is_opencv_pair(tree: Tree) -> bool:
+    """Whether it holds intrinsics or extrinsics of two cameras by OpenCV's usual names."""
+    return has_intrinsics(tree) or (has_step(tree) and "distortion_model" not in tree)
+
+
+def has_intrinsics(tree: Tree) -> bool:
+    """Whether it holds the intrinsics of two cameras."""
+    return _pair(_flat(tree), _MATRICES) is not None
+
+
+def has_step(tree: Tree) -> bool:
+    """Whether it holds the pose of one camera to another."""
+    return _step(_flat(tree)) is not None
+
+
+def is_opencv_one(tree: Tree) -> bool:
+    """Whether it holds one camera."""
+    return any(isinstance(tree.get(key), np.ndarray) for key in _ONE)
+
+
+def _flat(tree: Tree) -> Tree:
+    """The same with what two parts ``left`` and ``right`` hold under names with these words."""
+    inner = [
+        k for k, v in tree.items() if isinstance(v, Mapping) and _letters(k) in _PARTS_OF_SIDES
+    ]
+    deeper = {f"{key} {name}": value for key in inner for name, value in tree[key].items()}
+    return {**tree, **deeper} if len(inner) == 2 else tree
+
+
+def _letters(key: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", key.lower())
+
+
+def _pair(tree: Tree, stems: Sequence[str]) -> tuple[str, str] | None:
+    """The keys of two cameras' rows or matrices whose names are a stem next to the side."""
+    known = {
+        _letters(key): key
+        for key, value in tree.items()
+        if isinstance(value, np.ndarray | list) and np.size(np.asarray(value, object)) > 0
+    }
+    for a, b in _SIDES:
+        for stem in stems:
+            for word in ("",) if stem.startswith("cam") else ("", "cam", "camera"):
+                for form in (f"{stem}{word}{{}}", f"{word}{{}}{stem}"):
+                    if form.format(a) in known and form.format(b) in known:
+                        return known[form.format(a)], known[form.format(b)]
+    return None
+
+
+def _step(tree: Tree) -> tuple[str, str] | None:
+    """The keys of rotation and translation from the first camera's axes to the second's."""
+    return next((names for names in _STEPS if set(names) <= tree.keys()), None)
+
+
+def _read_opencv_one(path: Path, tree: Tree, size: Size | None) -> Calibration:
+    """One camera, as OpenCV's sample program calibration or cv2.omnidir writes it."""
+    part = Values(path, tree)
+    matrix = part.matrix(next(key for key in _ONE if key in part), 3, 3)
+    name = next((key for key in _OF_ONE if key in part), "")
+    coefficients = part.numbers(name) if name else np.zeros(4)
+    model = "radtan"
+    if "xi" in part:
+        model, coefficients = "omni", np.append(part.number("xi"), coefficients)
+    elif part.number("fisheye_model", 0.0) or part.text("model") in _FISHEYE:
+        model = "equidistant"
+    size = size or _opencv_size(part)
+    camera = checked_camera(RawCamera(*size, matrix, coefficients, np.eye(4), path.name, model))
+    return Calibration(str(path), "OpenCV calibration", (camera,))
+
+
+def read_opencv_pair(path: Path, tree: Tree, size: Size | None) -> Calibration:
+    """The two cameras, left first; the body is the first one.
+
+    ``R`` and ``T`` take points from the first camera's axes to the second's, in the unit of the
+    calibration target: metres, if its squares were given in metres.
+
+    Args:
+        path: a file of OpenCV's FileStorage.
+        tree: its keys, with those of a second file that holds the rest.
+        size: width and height of the images, where the file does not state them.
+
+    Raises:
+        CalibrationError: a matrix or the size is missing, or not what it should be.
+    """
+    flat = _flat(tree)
+    part, step = Values(path, flat), _step(flat)
+    matrices, distortions = _pair(flat, _MATRICES), _pair(flat, _DISTORTIONS)
+    if matrices is None or distortions is None or step is None:
+        lacking = "R and T" if matrices and distortions else "matrices of two cameras"
+        raise CalibrationError(
+            f"{path} has no {lacking}; a stereo pair needs M1, D1, M2, D2, R and T "
+            "(intrinsics.yml and extrinsics.yml next to each other will do)"
+        )
+    size = size or _opencv_size(part)
+    turned, moved = step
+    turn = part.numbers(turned)
+    rotation = cv2.Rodrigues(turn)[0] if len(turn) == 3 else part.matrix(turned, 3, 3)
+    motion = pose(np.asarray(rotation, np.float64), part.numbers(moved, 3))
+    sTf = Values(path, {f"{turned} and {moved}": motion}).motion(f"{turned} and {moved}")
+    cameras = []
+    for k, bTc in enumerate((np.eye(4), inverse(sTf))):
+        model, parameters = _opencv_lens(part, distortions[k], matrices[k], k)
+        matrix, name = part.matrix(matrices[k], 3, 3), f"{path.name}: {matrices[k]}"
+        cameras.append(checked_camera(RawCamera(*size, matrix, parameters, bTc, name, model)))
+    notes: tuple[str, ...] = ()
+    if cameras[0].model == "equidistant" and "distortion_model" not in part:
+        notes = (f"four coefficients beside {matrices[0]}: taken as those of cv2.fisheye",)
+    return Calibration(str(path), "OpenCV stereo calibration", tuple(cameras), True, None, notes)
+
+
+def _opencv_lens(part: Values, distortion: str, matrix: str, k: int) -> tuple[str, FloatArray]:
+    """Model and parameters. cv2.fisheye's files name matrices K and have four coefficients."""
+    coefficients = part.numbers(distortion)
+    if f"xi{k + 1}" in part:
+        return "omni", np.append(part.number(f"xi{k + 1}"), coefficients)
+    stated = part.text("distortion_model")
+    fisheye = matrix.rpartition(" ")[2][0] == "K" and len(coefficients) == 4
+    if stated in _FISHEYE or (not stated and fisheye):
+        return "equidistant", coefficients
+    return "radtan", coefficients
+
+
+def _opencv_size(part: Values) -> Size:
+    """Width and height; (0, 0) where none are stated."""
+    for pair in (("image_width", "image_height"), ("width", "height")):
+        if pair[0] in part and pair[1] in part:
+            return part.size(*pair)
+    for key in ("image_size", "imageSize", "size", "img_size"):
+        if key in part:
+            text = part.tree[key]
+            words = text.split() if isinstance(text, str) else text
+            return Values(part.path, {key: words}).size(key)
+    return 0, 0
+
+
+# --------------------------------------------------------------------------------------------
+# ROS camera_info: one file a camera, each with its own rectification and projection
+
+
+_COEFFICIENTS = "distortion_coefficients"
+_ROS_NAMES = (
+    *(_COEFFICIENTS, "camera_matrix"),
+    *("rectification_matrix", "projection_matrix"),
+)
+_ROS = Row(
+    size=("image_width", "image_height"),
+    matrix="camera_matrix",
+    kind=("distortion_model",),
+    lenses={
+        "plumb_bob": ("radtan", (_COEFFICIENTS,)),
+        "rational_polynomial": ("radtan", (_COEFFICIENTS,)),
+        "thin_prism": ("radtan", (_COEFFICIENTS,)),
+        "equidistant": ("equidistant", (_COEFFICIENTS,)),
+        "fisheye": ("equidistant", (_COEFFICIENTS,)),
+        "kannala_brandt": ("equidistant", (_COEFFICIENTS,)),
+        "none": ("radtan", (_COEFFICIENTS,)),
+    },
 )
 
 
-def is_rectified(tree: Tree) -> bool:
-    """Whether it is a ``calib.json`` of rectified cameras."""
-    return not _is_own(tree) and bool(OF_RECTIFIED & tree.keys())
+def is_camera_info(tree: Tree) -> bool:
+    """Whether it is a camera_info, as camera_calibration or an echo of the topic writes it."""
+    return {"camera_matrix", "distortion_model", "image_width"} <= _as_ros_file(tree).keys()
 
 
-def _is_own(tree: Tree) -> bool:
-    cameras = tree.get("cameras")
-    first = cameras[0] if isinstance(cameras, list) and cameras else None
-    return isinstance(first, dict) and {"model", "matrix"} <= first.keys()
+def _as_ros_file(tree: Tree) -> Tree:
+    """The message as ``rostopic echo`` and ``ros2 topic echo`` write it, with a file's keys."""
+    for letters in ("DKRP", "dkrp"):
+        if tree.keys() >= {*letters, "distortion_model", "width", "height"}:
+            named = {name: tree[letter] for name, letter in zip(_ROS_NAMES, letters, strict=True)}
+            return {**tree, **named, "image_width": tree["width"], "image_height": tree["height"]}
+    return tree
 
 
-def _read_own(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    parts = [Values(path, values, f"cameras[{k}].") for k, values in enumerate(tree["cameras"])]
-    corrections = stated_corrections(path, tree)
-    if corrections is not None and "rectified_view" not in tree:
+def read_camera_info(path: Path, tree: Tree) -> Calibration:
+    """The calibration of one camera alone."""
+    camera, _, _ = _ros_camera(path, tree)
+    return Calibration(str(path), "ROS camera_info", (camera,))
+
+
+def read_camera_info_pair(files: tuple[Path, Path], trees: tuple[Tree, Tree]) -> Calibration:
+    """Left and right camera; the body is the rectified right one.
+
+    The baseline is in the projection matrix of one of the two: its fourth number over fx.
+
+    Raises:
+        CalibrationError: a value is missing or malformed, a distortion model is not known, or the
+            files are not of one rectified pair.
+    """
+    (left, r_left, p_left), (right, r_right, p_right) = map(_ros_camera, files, trees)
+    if left.size != right.size:
         raise CalibrationError(
-            f"{path}: {CORRECTIONS} are of rectified images, but rectified_view is missing; "
-            f"restore it, or remove {CORRECTIONS}"
+            f"{files[0]} is {left.width}x{left.height} but {files[1].name} is "
+            f"{right.width}x{right.height}; both must have one resolution"
         )
-    return Calibration(
-        str(path),
-        OWN_FORMAT,
-        tuple(
-            camera_of(part, _OWN, part.motion("bTc"), str(part.tree.get("name", part.where[:-1])))
-            for part in parts
-        ),
-        sided=tree.get("sided") is True,
-        view=_own_view(Values(path, tree).inside("rectified_view"), len(parts)),
-        corrections=corrections,
+    # The principal columns may differ: then far points have a disparity. One is taken for both.
+    if not np.allclose(np.delete(p_left, 2, 1)[:, :2], np.delete(p_right, 2, 1)[:, :2]) or (
+        not np.isclose(p_left[1, 2], p_right[1, 2])
+    ):
+        raise CalibrationError(
+            f"{files[0]}: its projection_matrix differs from that of {files[1].name}, so the two "
+            "are not of one rectified pair; calibrate them as a stereo pair"
+        )
+    offset = -(p_right[0, 3] - p_left[0, 3]) / (p_right[0, 0] or np.inf)
+    if p_right[0, 0] <= 0.0 or offset == 0.0:
+        raise CalibrationError(
+            f"{files[1]}: projection_matrix states no baseline (its fourth number is "
+            f"{p_right[0, 3]:g}, must be negative); calibrate a stereo pair, or swap the files"
+        )
+    cameras = (
+        replace(left, bTc=pose(r_left, np.array([-offset, 0.0, 0.0]))),
+        replace(right, bTc=pose(r_right, np.zeros(3))),
     )
+    source = f"{files[0]} and {files[1].name}"
+    view = checked_view(StatedView((r_left, r_right), p_right[:, :3], left.size), source)
+    return Calibration(source, "ROS camera_info, a pair", cameras, True, view)
 
 
-def stated_corrections(path: Path, tree: Tree) -> Mapping[str, float] | None:
-    """Its corrections by name; None where it has none. Raises CalibrationError: no object."""
-    values = tree.get(CORRECTIONS)
-    if values is not None and not isinstance(values, dict):
-        raise CalibrationError(
-            f"{path}: {CORRECTIONS} must be an object with a number for each term; correct or "
-            "remove it"
-        )
-    return values
-
-
-def _own_view(part: Values, cameras: int) -> StatedView | None:
-    if not part.tree:
-        return None
-    kind = part.text("kind", "perspective")
-    if kind != "perspective":
-        raise part.refuse(f"kind is {kind!r}, but a view is perspective; rectify anew")
-    rotations = part.numbers("rotations", 9 * cameras).reshape(cameras, 3, 3)
-    if not all(is_rigid(pose(rotation, np.zeros(3))) for rotation in rotations):
-        raise part.refuse("rotations has one that is no rotation; correct the file")
-    size = part.size("width", "height")
-    if min(size) <= 0:
-        raise part.refuse(f"width and height are {size[0]} and {size[1]}; correct the file")
-    view = StatedView(tuple(rotations), part.matrix("matrix", 3, 3), size)
-    return checked_view(view, str(part.path))
+def _ros_camera(path: Path, tree: Tree) -> tuple[RawCamera, FloatArray, FloatArray]:
+    """The camera, its rectifying rotation (3, 3) and its projection (3, 4)."""
+    tree = _as_ros_file(tree)
+    kind = Values(path, tree).text("distortion_model") or "none"
+    given = tree.get(_COEFFICIENTS)
+    data = given.get("data") if isinstance(given, dict) else given
+    if isinstance(data, np.ndarray | list) and not np.size(data):  # CameraInfo.msg: none
+        fisheye = _ROS.lenses.get(kind, ("", ()))[0] == "equidistant"
+        given = [0.0] * (4 if fisheye else 5)
+    part = Values(path, {**tree, "distortion_model": kind, _COEFFICIENTS: given})
+    raw = camera_of(part, _ROS)
+    rotation, projection = np.eye(3), np.column_stack([raw.matrix, np.zeros(3)])
+    if "rectification_matrix" in part:
+        turn = pose(part.matrix("rectification_matrix", 3, 3), np.zeros(3))
+        rotation = reorthonormalise(turn)[:3, :3]
+        if not np.allclose(rotation, turn[:3, :3], atol=1e-3):
+            raise part.refuse("rectification_matrix is not a rotation; calibrate again")
+    if "projection_matrix" in part:
+        projection = part.matrix("projection_matrix", 3, 4)
+    return raw, rotation, projection
 
 
 # --------------------------------------------------------------------------------------------
-# The same, of rectified cameras
-
-# 'baseline' is close to 'baseline_m' (0.89); 'fy' to 'fx' (0.5) and 'baseline_m' to
-# 'vertical_baseline_m' (0.69), which are keys of their own, are not.
-_CLOSE_NAMES = 0.8
+# KITTI: projections of a rectified pair, grey (cameras 0 and 1) or colour (2 and 3)
 
 
-def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
-    """The rig of a ``calib.json``; ``three_cameras`` asks for its vertical baseline as well.
+_KITTI_PAIRS = ((0, 1), (2, 3))  # of the odometry data: left and right camera, grey, else colour
+_P_RECT = "P_rect_"
+KITTI_RAW = ("P_rect_00", "P_rect_01")
+KITTI_RAW_COLOUR = ("P_rect_02", "P_rect_03")
+
+
+def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = None) -> Calibration:
+    """A rectified pair; the body is the left camera, looking ahead.
+
+    ``keys`` are the lines of left and right camera; None: of the grey pair, or of the colour one
+    where only that has images beside the file.
 
     Raises:
-        CalibrationError: a value is missing, not finite or impossible.
+        CalibrationError: a line is missing or malformed, or the pair is not rectified.
     """
-    values = read_json_object(path)
-    if values.get("rectified") is False:
+    lines = _lines(path)
+    raw = sorted(name for name in lines.tree if name.startswith(_P_RECT))
+    stated = (raw[0], raw[1]) if len(raw) == 2 else KITTI_RAW  # DrivingStereo: 101, 103
+    keys = keys or (stated if raw else _kitti_keys(path))
+    left, right = (lines.matrix(key, 3, 4) for key in keys)
+    if not np.allclose(left[:, :3], right[:, :3]):
         raise CalibrationError(
-            f"{path} says that the images are not rectified; rectify them first (rows of the left "
-            "and right image must agree), or give the raw cameras' calibration by --camera FILE"
+            f"{path}: {keys[0]} and {keys[1]} differ in their intrinsics, so the pair is not "
+            "rectified; use the calibration that came with the sequence"
         )
-    if values.get("view", "perspective") != "perspective":
+    fx, fy = float(right[0, 0]), float(right[1, 1])
+    if fx <= 0.0 or fy <= 0.0:
+        raise CalibrationError(f"{path}: focal lengths {fx:g}, {fy:g} must be positive")
+    baseline = float(left[0, 3] - right[0, 3]) / fx
+    if baseline <= 0.0:
         raise CalibrationError(
-            f"{path}: view is {values['view']!r}, but rectified images are perspective ones; "
-            "rectify the raw images anew"
+            f"{path}: the baseline is {baseline:g} m, must be positive; {keys[0]} belongs to the "
+            f"left camera (image_0), {keys[1]} to the right one (image_1): are they swapped?"
         )
-    bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
-    if "bTc" in values:
-        found = flat_numbers(values["bTc"])
-        bTc = np.empty(0) if found is None or len(found) != 16 else found.reshape(4, 4)
-        if not is_rigid(bTc):
-            raise CalibrationError(
-                f"{path}: bTc must be a rigid 4x4 matrix (the pose of the right camera in the "
-                "body); correct or remove it"
+    sized = f"S_rect_{keys[0].removeprefix(_P_RECT)}"
+    if raw and sized in lines:
+        size = lines.size(sized)
+    cameras = tuple(
+        checked_camera(
+            RawCamera(
+                *(size or (0, 0)),
+                left[:, :3],
+                np.zeros(4),
+                BODY_FORWARD_LEFT_UP_FROM_CAMERA @ pose(np.eye(3), np.array([x, 0.0, 0.0])),
+                f"{path.name}: {key}",
             )
-    return CameraRig(
-        width=pixels(path, values, "width"),
-        height=pixels(path, values, "height"),
-        fx=positive(path, values, "fx"),
-        fy=positive(path, values, "fy"),
-        cx=number(path, values, "cx"),
-        cy=number(path, values, "cy"),
-        baseline=positive(path, values, "baseline_m"),
-        vertical_baseline=positive(path, values, "vertical_baseline_m") if three_cameras else None,
-        bTc=bTc,
+        )
+        for key, x in zip(keys, (-baseline, 0.0), strict=True)
     )
+    return Calibration(str(path), "KITTI", cameras, sided=True)
 
 
-def read_json_object(path: Path) -> Mapping[str, Any]:
-    """A JSON file's outermost object. Raises CalibrationError when there is none."""
-    remedy = "give a calibration: this file (docs/datasets/images.md has its keys), or "
-    remedy += "another one by --camera FILE"
-    values = read_json(path, read_text(path, CalibrationError, remedy))
-    if not isinstance(values, dict):
-        raise CalibrationError(f"{path} must hold one JSON object with the calibration's keys")
-    return values
+def pair_beside(path: Path) -> tuple[int, int] | None:
+    """Left and right camera whose folders of images lie beside a calib.txt; None: of no pair."""
+    for pair in _KITTI_PAIRS:
+        if all((path.parent / f"image_{number}").is_dir() for number in pair):
+            return pair
+    return None
 
 
-def number(path: Path, values: Mapping[str, Any], key: str) -> float:
-    """A finite number of the calibration. Raises CalibrationError otherwise."""
-    if key not in values:
-        remedy = "add it to the calibration"
-        for close in get_close_matches(key, values, n=1, cutoff=_CLOSE_NAMES):
-            unit = " in metres" if key.endswith("_m") else ""
-            remedy = f"if {close!r} means it, rename it to {key!r} (a number{unit})"
-        raise CalibrationError(f"{path} has no {key!r}; {remedy}")
-    value = values[key]
-    if not is_finite_number(value):
-        raise CalibrationError(f"{path}: {key} is {value!r}, not a finite number; correct it")
-    return float(value)
+def _kitti_keys(path: Path) -> tuple[str, str]:
+    """Lines of the pair whose images lie beside a calib.txt; of the grey one where none does."""
+    left, right = pair_beside(path) or _KITTI_PAIRS[0]
+    return f"P{left}", f"P{right}"
 
 
-def positive(path: Path, values: Mapping[str, Any], key: str) -> float:
-    """A positive number of the calibration. Raises CalibrationError otherwise."""
-    value = number(path, values, key)
-    if value <= 0.0:
-        hint = "correct it"
-        if "baseline" in key:
-            hint = "it is the distance between the cameras in metres; if left and right are "
-            hint += "swapped, swap the folders"
-        raise CalibrationError(f"{path}: {key} is {value:g}, must be positive: {hint}")
-    return value
+def right_of_camera_0(path: Path) -> float:
+    """How far the pair's right camera is to the right of camera 0, whose poses KITTI gives, metres.
+
+    Raises:
+        CalibrationError: a line is missing or malformed.
+    """
+    right = _lines(path).matrix(_kitti_keys(path)[1], 3, 4)
+    return -float(right[0, 3] / right[0, 0])
 
 
-def pixels(path: Path, values: Mapping[str, Any], key: str) -> int:
-    """A positive whole number of the calibration. Raises CalibrationError otherwise."""
-    value = positive(path, values, key)
-    if value != int(value):
-        raise CalibrationError(f"{path}: {key} is {value:g}, not a whole number of pixels")
-    return int(value)
+def left_on_inertial_unit(path: Path, keys: tuple[str, str]) -> FloatArray | None:
+    """Pose (4, 4) of a raw drive's rectified left camera on the inertial unit.
+
+    By calib_cam_to_cam.txt and the two files beside it that lead over the laser scanner; None
+    where those are absent.
+
+    Raises:
+        CalibrationError: a line is missing or malformed.
+    """
+    chain = [path.parent / f"calib_{name}.txt" for name in ("imu_to_velo", "velo_to_cam")]
+    if not all(file.is_file() for file in chain):
+        return None
+    steps = [(lines.matrix("R", 3, 3), lines.numbers("T", 3)) for lines in map(_lines, chain)]
+    to_scanner, to_camera = (pose(*step) for step in steps)
+    lines = _lines(path)
+    upright = pose(lines.matrix("R_rect_00", 3, 3), np.zeros(3))
+    left = lines.matrix(keys[0], 3, 4)
+    beside = pose(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
+    return np.asarray(inverse(reorthonormalise(upright @ to_camera @ to_scanner)) @ beside)
+
+
+def _lines(path: Path) -> Values:
+    """Words of each line ``name: words`` of a file."""
+    parted = [text.partition(":") for _, text in read_lines(path, CalibrationError)]
+    return Values(path, {name.strip(): words.split() for name, _, words in reversed(parted)})
 
 
 # --------------------------------------------------------------------------------------------
@@ -248,8 +439,7 @@ _KALIBR = {
     "eucm-none": ("eucm", 2),
 }
 """Our model, and how many of the intrinsics are the model's own; fx, fy, cx and cy follow."""
-_CONTRADICTION_M = 0.005  # what two calibrations of one rig agree to, and the angle next to it
-_CONTRADICTION = np.cos(np.radians(1.0))
+_CONTRADICTION_M, _CONTRADICTION_DEG = 0.005, 1.0  # what two calibrations of one rig agree to
 
 
 def is_camchain(tree: Tree) -> bool:
@@ -278,9 +468,10 @@ def _read_camchain(path: Path, tree: Tree, _: Size | None) -> Calibration:
         else:
             bTc = inverse(part.motion("T_cam_imu"))
         cameras.append(_kalibr_camera(part, bTc))
-    notes = tuple(_contradiction(part, k, parts, cameras) for k, part in enumerate(parts) if k)
-    told = tuple(filter(None, notes))
-    return Calibration(str(path), "Kalibr camchain", tuple(cameras), notes=told)
+    notes = (_contradiction(part, k, parts, cameras) for k, part in enumerate(parts) if k)
+    return Calibration(
+        str(path), "Kalibr camchain", tuple(cameras), notes=tuple(filter(None, notes))
+    )
 
 
 def _kalibr_camera(part: Values, bTc: FloatArray) -> RawCamera:
@@ -304,20 +495,24 @@ def _kalibr_camera(part: Values, bTc: FloatArray) -> RawCamera:
 
 
 def _contradiction(part: Values, k: int, parts: list[Values], cameras: list[RawCamera]) -> str:
-    """What to tell where the step to a camera and the places on the IMU say different things."""
+    """A note where the step to a camera and the places on the IMU contradict each other."""
     if not all("T_cam_imu" in p for p in (part, parts[k - 1])) or "T_cn_cnm1" not in part:
         return ""
     by_imu = parts[k - 1].motion("T_cam_imu") @ inverse(part.motion("T_cam_imu"))
-    by_step = inverse(cameras[k - 1].bTc) @ cameras[k].bTc
-    apart = float(np.linalg.norm(by_imu[:3, 3] - by_step[:3, 3]))
-    cosine = 0.5 * (float(np.trace(by_imu[:3, :3].T @ by_step[:3, :3])) - 1.0)
-    if apart < _CONTRADICTION_M and cosine > _CONTRADICTION:
+    away, turn = pose_difference(by_imu, inverse(cameras[k - 1].bTc) @ cameras[k].bTc)
+    if away < _CONTRADICTION_M and turn < _CONTRADICTION_DEG:
         return ""
     return (
         f"{part.path.name}: {part.where}T_cn_cnm1 and T_cam_imu contradict each other by "
-        f"{apart:.3f} m and {np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.1f} degrees; "
-        "T_cn_cnm1 is taken"
+        f"{away:.3f} m and {turn:.1f} degrees; T_cn_cnm1 is taken"
     )
+
+
+def pose_difference(a: FloatArray, b: FloatArray) -> tuple[float, float]:
+    """Distance, and angle in degrees, between two poses (4, 4)."""
+    cosine = 0.5 * (float(np.trace(a[:3, :3].T @ b[:3, :3])) - 1.0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return float(np.linalg.norm(a[:3, 3] - b[:3, 3])), float(angle)
 
 
 # --------------------------------------------------------------------------------------------
@@ -338,7 +533,6 @@ _ASL = Row(
         "equidistant": ("equidistant", _LISTED),
         "fisheye": ("equidistant", _LISTED),
         "fov": ("fov", _LISTED),
-        "omni": ("ocam", _LISTED),
     },
 )
 
@@ -358,17 +552,7 @@ def read_asl_camera(path: Path, tree: Tree) -> RawCamera:
     part = Values(path, tree)
     name = str(path.parent) if path.name == "sensor.yaml" else path.name
     bTc = part.motion("T_BS") if "T_BS" in part else np.eye(4)
-    if part.text("distortion_model") != "omni":
-        return camera_of(part, _ASL, bTc, name)
-    # Kimera's omnidirectional camera: the polynomial's depth grows forward.
-    centre, (e, d, c) = part.numbers("omni_distortion_center", 2), part.numbers("omni_affine", 3)
-    depth = -part.numbers(*_LISTED)
-    matrix = ocam_matrix((c, d, e), centre)
-    return checked_camera(RawCamera(*part.size("resolution"), matrix, depth, bTc, name, "ocam"))
-
-
-def _read_asl(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    return Calibration(str(path), "ASL sensor.yaml", (read_asl_camera(path, tree),))
+    return camera_of(part, _ASL, bTc, name)
 
 
 def read_asl_mounting(path: Path) -> FloatArray:
@@ -376,14 +560,8 @@ def read_asl_mounting(path: Path) -> FloatArray:
     return Values(path, read_tree(path)).motion("T_BS")
 
 
-def ocam_matrix(affine: Iterable[float], centre: Sequence[float] | FloatArray) -> FloatArray:
-    """(3, 3) of OCamCalib's affine parameters (c, d, e) and its centre (column, row)."""
-    c, d, e = affine
-    return np.array([[1.0, e, centre[0]], [d, c, centre[1]], [0.0, 0.0, 1.0]])
-
-
 # --------------------------------------------------------------------------------------------
-# Settings of SLAM programs: ORB-SLAM 2 and 3, stella_vslam, camodocal, VINS-Fusion, MultiCol-SLAM
+# Settings of SLAM programs: ORB-SLAM 2 and 3, camodocal, VINS-Fusion
 
 
 _ORB = {"pinhole": "radtan", "kannalabrandt8": "equidistant", "rectified": "radtan"}
@@ -391,13 +569,26 @@ _ORB = {"pinhole": "radtan", "kannalabrandt8": "equidistant", "rectified": "radt
 
 def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
     """The pair of a stereo file, or the one camera of another; the body is the left one."""
-    part = Values(path, {"Camera.type": "pinhole", **tree})
+    part, view = Values(path, {"Camera.type": "pinhole", **tree}), None
     model = _ORB[kind_of(part, ("Camera.type",), _ORB)]
     if "Camera.width" in part or size is None:
         size = part.size("Camera.width", "Camera.height")
-    if "LEFT.K" in part and "RIGHT.K" in part:
-        return _rectified_pair(part, size, ("LEFT.{}", "RIGHT.{}"), "ORB-SLAM settings", "radtan")
-    sized = Values(path, {**part.tree, "size": list(size)})
+    part = Values(path, {**part.tree, "size": list(size)})
+    if "LEFT.K" in part and "RIGHT.K" in part:  # with the rectification of both
+        projection = part.matrix("RIGHT.P", 3, 4)
+        turns = part.matrix("LEFT.R", 3, 3), part.matrix("RIGHT.R", 3, 3)
+        view = checked_view(StatedView(turns, projection[:, :3], size), str(path))
+        places = projection[0, 3] / projection[0, 0], 0.0
+        cameras = [
+            camera_of(
+                part,
+                Row(("size",), {"": ("radtan", (f"{side}.D",))}, matrix=f"{side}.K"),
+                pose(turn, np.array([x, 0.0, 0.0])),
+                f"{path.name}: {side}.K",
+            )
+            for side, turn, x in zip(("LEFT", "RIGHT"), turns, places, strict=True)
+        ]
+        return Calibration(str(path), "ORB-SLAM settings", tuple(cameras), True, view)
 
     def camera(prefix: str, bTc: FloatArray) -> RawCamera:
         terms = KANNALA if model == "equidistant" else BROWN
@@ -405,8 +596,8 @@ def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
         if model == "radtan" and prefix + "k3" in part:
             keys = (*keys, prefix + "k3")
         focal = tuple(prefix + name for name in FOCAL)
-        row = Row(size=("size",), focal=focal, lenses={"": (model, keys)})
-        return camera_of(sized, row, bTc, f"{path.name}: {prefix[:-1]}")
+        row = Row(("size",), {"": (model, keys)}, focal=focal)
+        return camera_of(part, row, bTc, f"{path.name}: {prefix[:-1]}")
 
     first = "Camera1." if "Camera1.fx" in part else "Camera."
     cameras = [camera(first, np.eye(4))]
@@ -421,89 +612,23 @@ def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
     return Calibration(str(path), "ORB-SLAM settings", tuple(cameras), sided=True)
 
 
-def _rectified_pair(
-    part: Values, size: Size, names: tuple[str, str], form: str, model: str
-) -> Calibration:
-    """A pair with matrices K, D and R of each camera, beside the rectified intrinsics."""
-    rotations = tuple(part.matrix(name.format("R"), 3, 3) for name in names)
-    if names[1].format("P") in part:
-        projection = part.matrix(names[1].format("P"), 3, 4)
-        matrix, offset = projection[:, :3], -projection[0, 3] / projection[0, 0]
-    else:
-        matrix = part.intrinsics(FOCAL)
-        offset = part.number("focal_x_baseline") / matrix[0, 0]
-    cameras = tuple(
-        checked_camera(
-            RawCamera(
-                *size,
-                part.matrix(name.format("K"), 3, 3),
-                part.numbers(name.format("D")),
-                pose(rotation, np.array([x, 0.0, 0.0])),
-                f"{part.path.name}: {name.format('K')}",
-                model,
-            )
-        )
-        for name, rotation, x in zip(names, rotations, (-offset, 0.0), strict=True)
-    )
-    view = checked_view(StatedView((rotations[0], rotations[1]), matrix, size), str(part.path))
-    return Calibration(str(part.path), form, cameras, True, view)
-
-
-_STELLA = Row(
-    size=("cols", "rows"),
-    kind=("model",),
-    lenses={
-        "perspective": ("radtan", ("k1?", "k2?", "p1?", "p2?", "k3?")),
-        "fisheye": ("equidistant", ("k1?", "k2?", "k3?", "k4?")),
-    },
-)
-
-
-def _is_stella(tree: Tree) -> bool:
-    camera = tree.get("Camera")
-    return isinstance(camera, dict) and "model" in camera
-
-
-def _read_stella(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    """The pair of a stereo configuration, or the one camera of another."""
-    part, form = Values(path, tree["Camera"], "Camera."), "stella_vslam configuration"
-    stated = tree.get("StereoRectifier")
-    if isinstance(stated, dict):
-        lens = str(stated.get("model", "perspective")).lower()
-        merged = Values(path, {**part.tree, **stated}, "StereoRectifier.")
-        model = _STELLA.lenses.get(lens, ("radtan", ()))[0]
-        return _rectified_pair(
-            merged, part.size(*_STELLA.size), ("{}_left", "{}_right"), form, model
-        )
-    cameras = [camera_of(part, _STELLA, name=path.name)]
-    if part.text("setup") == "stereo":
-        offset = part.number("focal_x_baseline") / cameras[0].matrix[0, 0]
-        cameras.append(replace(cameras[0], bTc=pose(np.eye(3), np.array([offset, 0.0, 0.0]))))
-    return Calibration(str(path), form, tuple(cameras), sided=True)
-
-
-_OF_IMAGES = ("image_width", "image_height")
+_PROJECTION, _DISTORTION = "projection_parameters.{}", "distortion_parameters.{}"
+_BROWN = tuple(map(_DISTORTION.format, BROWN))
 _CAMODOCAL = {
-    "pinhole": Row(
-        size=_OF_IMAGES,
-        focal=tuple(f"projection_parameters.{name}" for name in FOCAL),
-        lenses={"": ("radtan", tuple(f"distortion_parameters.{name}" for name in BROWN))},
-    ),
-    "mei": Row(
-        size=_OF_IMAGES,
-        focal=tuple(f"projection_parameters.{name}" for name in ("gamma1", "gamma2", "u0", "v0")),
-        lenses={
-            "": (
-                "omni",
-                ("mirror_parameters.xi", *(f"distortion_parameters.{name}" for name in BROWN)),
-            )
-        },
-    ),
-    "kannala_brandt": Row(
-        size=_OF_IMAGES,
-        focal=tuple(f"projection_parameters.{name}" for name in ("mu", "mv", "u0", "v0")),
-        lenses={"": ("equidistant", tuple(f"projection_parameters.k{k}" for k in (2, 3, 4, 5)))},
-    ),
+    kind: Row(
+        size=("image_width", "image_height"),
+        focal=tuple(map(_PROJECTION.format, focal)),
+        lenses={"": lens},
+    )
+    for kind, focal, lens in (
+        ("pinhole", FOCAL, ("radtan", _BROWN)),
+        ("mei", ("gamma1", "gamma2", "u0", "v0"), ("omni", ("mirror_parameters.xi", *_BROWN))),
+        (
+            "kannala_brandt",
+            ("mu", "mv", "u0", "v0"),
+            ("equidistant", tuple(map(_PROJECTION.format, ("k2", "k3", "k4", "k5")))),
+        ),
+    )
 }
 
 
@@ -515,10 +640,6 @@ def is_camodocal(tree: Tree) -> bool:
 def _camodocal(path: Path, tree: Tree, bTc: FloatArray = ORIGIN) -> RawCamera:
     part = Values(path, tree)
     return camera_of(part, _CAMODOCAL[kind_of(part, ("model_type",), _CAMODOCAL)], bTc)
-
-
-def _read_camodocal(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    return Calibration(str(path), "camodocal camera", (_camodocal(path, tree),))
 
 
 def _read_vins(path: Path, tree: Tree, _: Size | None) -> Calibration:
@@ -534,18 +655,6 @@ def _read_vins(path: Path, tree: Tree, _: Size | None) -> Calibration:
             raise part.refuse(f"cam{k}_calib names {beside}, which is no camera of camodocal")
         cameras.append(_camodocal(beside, own, part.motion(f"body_T_cam{k}")))
     return Calibration(str(path), "VINS-Fusion configuration", tuple(cameras))
-
-
-def _read_multicol(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    """One camera: OCamCalib's model under keys such as Camera.a0."""
-    part = Values(path, tree)
-    count = round(part.number("Camera.nrpol", 5.0))
-    depth = part.values([f"Camera.a{k}" for k in range(count)])
-    affine = part.values(("Camera.c", "Camera.d", "Camera.e"))
-    matrix = ocam_matrix(affine, part.values(("Camera.u0", "Camera.v0")))
-    size = part.size("Camera.Iw", "Camera.Ih")
-    camera = checked_camera(RawCamera(*size, matrix, depth, np.eye(4), path.name, "ocam"))
-    return Calibration(str(path), "MultiCol-SLAM camera", (camera,))
 
 
 # --------------------------------------------------------------------------------------------
@@ -579,11 +688,11 @@ def _is_basalt(tree: Tree) -> bool:
 def _read_basalt(path: Path, tree: Tree, _: Size | None) -> Calibration:
     """The cameras; the body is the IMU."""
     part = Values(path, tree["value0"], "value0.")
-    places, lenses, sizes = (part.listed(key) for key in ("T_imu_cam", "intrinsics", "resolution"))
-    if not len(places) == len(lenses) == len(sizes):
+    lists = [part.tree.get(key) for key in ("T_imu_cam", "intrinsics", "resolution")]
+    if not all(isinstance(one, list) for one in lists) or len({len(one) for one in lists}) > 1:  # type: ignore[arg-type]
         raise part.refuse("T_imu_cam, intrinsics and resolution must be lists of one length")
     cameras = []
-    for k, (place, inner, size) in enumerate(zip(places, lenses, sizes, strict=True)):
+    for k, (place, inner, size) in enumerate(zip(*lists, strict=True)):
         at = Values(path, place, f"T_imu_cam {k}: ")
         quaternion = at.values(("qx", "qy", "qz", "qw"))
         turn = rotation_from_quaternion(quaternion / np.linalg.norm(quaternion))
@@ -624,14 +733,19 @@ def _read_oak(path: Path, tree: Tree, _: Size | None) -> Calibration:
     return Calibration(str(path), "OAK calibration", cameras, sided=True)
 
 
+_OAK = Row(
+    size=("width", "height"),
+    matrix="intrinsicMatrix",
+    kind=("cameraType",),  # CameraModel of DepthAI
+    lenses={"0": ("radtan", ("distortionCoeff",)), "1": ("equidistant", ("distortionCoeff",))},
+)
+
+
 def _oak_camera(part: Values, bTc: FloatArray) -> RawCamera:
-    kind = round(part.number("cameraType", 0.0))  # CameraModel of DepthAI
-    if kind not in (0, 1):
-        raise part.refuse("cameraType is not known; known: 0 (perspective), 1 (fisheye)")
-    coefficients = part.numbers("distortionCoeff")
-    model, lens = ("equidistant", coefficients[:4]) if kind else ("radtan", coefficients)
-    size, matrix = part.size("width", "height"), part.matrix("intrinsicMatrix", 3, 3)
-    return checked_camera(RawCamera(*size, matrix, lens, bTc, part.name, model))
+    kind, lens = round(part.number("cameraType", 0.0)), part.numbers("distortionCoeff")
+    lens = lens[:4] if kind == 1 else lens  # of a fisheye padded
+    values = {**part.tree, "cameraType": kind, "distortionCoeff": lens}
+    return camera_of(Values(part.path, values, part.where), _OAK, bTc)
 
 
 # --------------------------------------------------------------------------------------------
@@ -691,9 +805,12 @@ def _read_zed(path: Path, text: str, size: Size | None) -> Calibration:
 
 
 _PRINCIPAL = ("fx", "fy", "ppx", "ppy")  # rs2_intrinsics
-_RS2_BROWN = ("", "brownconrady", "modifiedbrownconrady", "plumbbob", "radtan", "pinhole", "opencv")
-_RS2_KANNALA = ("kannalabrandt4", "kannalabrandt", "equidistant", "fisheye", "opencvfisheye")
-_RS2_MODELS = {"1": "modifiedbrownconrady", "4": "brownconrady", "5": "kannalabrandt4"}
+_RS2_MODELS = {  # by rs2_distortion's name or number, else OpenCV's
+    **dict.fromkeys(("", "brownconrady", "modifiedbrownconrady", "1", "4"), "radtan"),
+    **dict.fromkeys(("plumbbob", "radtan", "pinhole", "opencv"), "radtan"),
+    **dict.fromkeys(("kannalabrandt4", "kannalabrandt", "5"), "equidistant"),
+    **dict.fromkeys(("equidistant", "fisheye", "opencvfisheye"), "equidistant"),
+}
 _LISTS = ("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "dist", "D")
 
 
@@ -704,7 +821,7 @@ def is_realsense(tree: Tree) -> bool:
     return alone or "intrinsic_matrix" in tree or tree.keys() >= set(_PRINCIPAL)
 
 
-def _read_realsense(path: Path, tree: Tree, _: Size | None) -> Calibration:
+def _realsense(path: Path, tree: Tree) -> RawCamera:
     """One camera; Open3D's matrix goes column by column, other people's row by row."""
     part = Values(path, tree)
     if "intrinsic_matrix" in part:
@@ -716,27 +833,26 @@ def _read_realsense(path: Path, tree: Tree, _: Size | None) -> Calibration:
         matrix = part.intrinsics(_PRINCIPAL if "ppx" in part else FOCAL)
     model, lens = _realsense_lens(part)
     size = part.size("width", "height")
-    camera = checked_camera(RawCamera(*size, matrix, lens, np.eye(4), path.name, model))
-    return Calibration(str(path), "RealSense intrinsics", (camera,))
+    return checked_camera(RawCamera(*size, matrix, lens, np.eye(4), path.name, model))
 
 
 def _realsense_lens(part: Values) -> tuple[str, FloatArray]:
     """Model and parameters, by rs2_distortion where that is stated, else OpenCV's."""
     key = next((k for k in ("model", "distortion_model", "camera_model") if k in part), "model")
     stated = re.sub(r"[^a-z0-9]|^(rs2_)?distortion[._]", "", part.text(key))
-    name = _RS2_MODELS.get(stated, stated)
-    fisheye = name in _RS2_KANNALA
+    model = _RS2_MODELS.get(stated, "")
     listed = next((k for k in _LISTS if k in part), None)
     if listed is not None:
         found = part.numbers(listed)
     else:
-        terms = KANNALA if fisheye else _LONG_BROWN if "k4" in part else _LONG_BROWN[:5]
+        terms: tuple[str, ...] = _LONG_BROWN if "k4" in part else _LONG_BROWN[:5]
+        terms = KANNALA if model == "equidistant" else terms
         found = part.values([f"{term}?" for term in terms])
         if found[5:].any() and "p1" not in part:
             raise part.refuse('k1 to k4 without p1, p2 need "model": fisheye or brown_conrady')
-    if fisheye:
-        return "equidistant", found[:4]
-    if found.any() and name not in _RS2_BROWN:
+    if model == "equidistant":
+        return model, found[:4]
+    if found.any() and not model:
         raise part.refuse(
             f"{key} {part.text(key)} is not known with coefficients other than 0; known: "
             "brown_conrady, kannala_brandt4"
@@ -746,7 +862,7 @@ def _realsense_lens(part: Values) -> tuple[str, FloatArray]:
 
 # --------------------------------------------------------------------------------------------
 # One colour camera, next to its depth: Replica's cam_params.json, NICE-SLAM's and SplaTAM's
-# configurations. COLMAP's cameras.txt and nerfstudio's transforms.json
+# configurations
 
 
 _PARTS = ("camera", "cam", "camera_params")
@@ -760,52 +876,10 @@ def rgbd_part(tree: Tree) -> Tree:
     return next((part for keys in needed for part in found if keys <= part.keys()), {})
 
 
-def _read_rgbd(path: Path, tree: Tree, _: Size | None) -> Calibration:
+def _rgbd(path: Path, tree: Tree) -> RawCamera:
     part = Values(path, rgbd_part(tree), "camera: ")
     size = next(keys for keys in _SIZES if keys[0] in part)
-    camera = camera_of(part, Row(size, {"": ("radtan", ())}), name="camera")
-    return Calibration(str(path), "camera of colour and depth", (camera,))
-
-
-_COLMAP = {
-    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
-    "PINHOLE": FOCAL,
-    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
-    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
-    "OPENCV": (*FOCAL, *BROWN),
-    "OPENCV_FISHEYE": (*FOCAL, *KANNALA),
-}
-"""Parameters of its models, in their order."""
-_COLMAP_LINE = re.compile(rf"^\d+\s+({'|'.join(_COLMAP)})\s+(\d+)\s+(\d+)\s+(.*)$", re.M)
-
-
-def _read_colmap(path: Path, text: str, _: Size | None) -> Calibration:
-    ((model, width, height, numbers),) = _COLMAP_LINE.findall(text)
-    names, words = _COLMAP[model], numbers.split()
-    if len(words) != len(names):
-        raise CalibrationError(f"{path}: {model} takes {' '.join(names)}; correct the file")
-    tree = dict(zip(names, words, strict=True)) | {"w": width, "h": height}
-    camera = _from_corner(Values(path, tree, f"{model}: "), model)
-    return Calibration(str(path), "COLMAP cameras", (camera,))
-
-
-def _read_nerfstudio(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    part = Values(path, {"fx": tree["fl_x"], "fy": tree.get("fl_y", tree["fl_x"]), **tree})
-    camera = _from_corner(part, str(tree.get("camera_model", "OPENCV")))
-    return Calibration(str(path), "nerfstudio transforms", (camera,))
-
-
-def _from_corner(part: Values, model: str) -> RawCamera:
-    """The camera of numbers whose pixels begin at the corner of the first one."""
-    if model not in _COLMAP:
-        raise part.refuse(f"camera_model {model} is not known; known: {', '.join(_COLMAP)}")
-    if model != "OPENCV_FISHEYE" and part.number("k4", 0.0):
-        raise part.refuse(f"k4 of {model} is not known; calibrate without it")
-    focal = ("f", "f", "cx", "cy") if "f" in part else FOCAL
-    fisheye = ("equidistant", ("k1?", "k2?", "k3?", "k4?"))
-    lens = fisheye if model == "OPENCV_FISHEYE" else ("radtan", ("k1?", "k2?", "p1?", "p2?", "k3?"))
-    camera = camera_of(part, Row(("w", "h"), {"": lens}, focal=focal), name=part.path.name)
-    return replace(camera, matrix=camera.matrix - [[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0] * 3])
+    return camera_of(part, Row(size, {"": ("radtan", ())}), name="camera")
 
 
 # --------------------------------------------------------------------------------------------
@@ -821,8 +895,9 @@ def _is_ocamcalib(text: str) -> bool:
 def _read_ocamcalib(path: Path, *_: object) -> Calibration:
     """One camera, forward along its axis."""
     found = read_ocamcalib(path)
-    matrix, depth = ocam_matrix(found.affine, found.centre[::-1]), np.array(found.direct)
-    size = found.width, found.height
+    (c, d, e), (row, column) = found.affine, found.centre
+    matrix = np.array([[1.0, e, column], [d, c, row], [0.0, 0.0, 1.0]])
+    size, depth = (found.width, found.height), np.array(found.direct)
     camera = checked_camera(RawCamera(*size, matrix, depth, np.eye(4), path.name, "ocam"))
     return Calibration(str(path), "OCamCalib", (camera,))
 
@@ -834,28 +909,30 @@ def _read_ocamcalib(path: Path, *_: object) -> Calibration:
 KNOWN = (
     "known: calib.json of fgslam, Kalibr's camchain, OpenCV's stereo files (M1, D1, M2, D2, R, T), "
     "left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, EuRoC's sensor.yaml, settings "
-    "of ORB-SLAM, stella_vslam and VINS, files of Basalt, OAK, ZED, RealSense and OCamCalib"
+    "of ORB-SLAM and VINS, files of Basalt, OAK, ZED, RealSense and OCamCalib"
 )
+Reader = Callable[[Path, Tree, Size | None], Calibration]
 
-_READERS: tuple[
-    tuple[Callable[[Tree], bool], Callable[[Path, Tree, Size | None], Calibration]], ...
-] = (
-    (is_realsense, _read_realsense),
-    (_is_own, _read_own),
+
+def _one(form: str, camera: Callable[[Path, Tree], RawCamera]) -> Reader:
+    """The reader of a format of one camera."""
+    return lambda path, tree, _: Calibration(str(path), form, (camera(path, tree),))
+
+
+_READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
+    (is_realsense, _one("RealSense intrinsics", _realsense)),
+    (is_own, read_own),
     (_is_basalt, _read_basalt),
     (lambda tree: {"cameraData", "boardName"} <= tree.keys(), _read_oak),
     (is_camchain, _read_camchain),
-    (is_asl, _read_asl),
+    (is_asl, _one("ASL sensor.yaml", read_asl_camera)),
     (is_camera_info, lambda path, tree, _: read_camera_info(path, tree)),
     (lambda tree: "cam0_calib" in tree, _read_vins),
-    (is_camodocal, _read_camodocal),
+    (is_camodocal, _one("camodocal camera", _camodocal)),
     (lambda tree: "Camera.fx" in tree or "Camera1.fx" in tree, _read_orb_slam),
-    (_is_stella, _read_stella),
-    (lambda tree: "Camera.a0" in tree, _read_multicol),
-    (lambda tree: bool(rgbd_part(tree)), _read_rgbd),
-    (lambda tree: {"fl_x", "cx", "cy", "w", "h"} <= tree.keys(), _read_nerfstudio),
+    (lambda tree: bool(rgbd_part(tree)), _one("camera of colour and depth", _rgbd)),
     (is_opencv_pair, read_opencv_pair),
-    (is_opencv_one, read_opencv_one),
+    (is_opencv_one, _read_opencv_one),
 )
 """What recognises a format by its keys, and reads it; the first that fits counts."""
 
@@ -867,7 +944,6 @@ _TEXTS: tuple[
         lambda path, _, size: read_kitti(path, size),
     ),
     (lambda text: "[LEFT_CAM_" in text and "[STEREO]" in text, _read_zed),
-    (lambda text: len(_COLMAP_LINE.findall(text)) == 1, _read_colmap),
     (_is_ocamcalib, _read_ocamcalib),
 )
 """The same of files that are no keys and values."""

@@ -271,3 +271,13 @@ def displaced_grid(rig: CameraRig, camera: int, correction: FloatArray | None) -
     if correction is None:
         return exact
     return np.asarray(exact + camera_displacements(rig, camera, exact) @ correction)
+
+
+def rectifier_of(rig: CameraRig, correction: FloatArray) -> Rectifier:
+    """What undoes displacements (p,) of the rig's images."""
+    maps = []
+    for camera in range(rig.cameras):
+        seen = displaced_grid(rig, camera, correction)
+        columns, rows = seen.T.reshape(2, rig.height, rig.width).astype(np.float32)
+        maps.append((columns, rows))
+    return Rectifier(rig, tuple(maps), correction=correction)

@@ -1,48 +1,46 @@
-"""The rectified stereo rig: as users describe it, or from a calibration file, and back into one.
+"""The rectified stereo rig: as users describe it, or from a calibration file.
 
-From a file to a rig: what the file says (:func:`read_calibration_file`), which of its cameras is
-which, and their common view (:func:`assembled`).
+From a file to a rig (:func:`load_rig`): what the file says (:func:`read_calibration_file`), which
+of its cameras is which, and their common view (:func:`rig_of`).
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras import formats
-from fgslam.cameras.formats import CORRECTIONS, KNOWN
+from fgslam.cameras.calib_json import (
+    OF_RECTIFIED,
+    as_calibrated,
+    correction_values,
+    is_rectified,
+    read_json_object,
+    read_rectified,
+    stated_corrections,
+)
+from fgslam.cameras.formats import KNOWN
 from fgslam.cameras.lenses import Calibration, RawCamera, StatedView, checked_camera
 from fgslam.cameras.rectify import (
     Rectifier,
     View,
     chosen_view,
-    displaced_grid,
     orientation,
     rectifier,
+    rectifier_of,
 )
-from fgslam.cameras.stereo_formats import (
-    has_intrinsics,
-    is_camera_info,
-    is_opencv_pair,
-    read_camera_info_pair,
-    read_opencv_pair,
-)
-from fgslam.cameras.trees import Size, Tree, intrinsic_matrix, is_camera_text, read_tree
-from fgslam.cameras.write_formats import raw_values
+from fgslam.cameras.trees import Size, Tree, is_camera_text, read_tree
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.checks import is_finite_number
-from fgslam.core.correction import RigCorrection, term_names
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import as_path, read_text, shown_in, write_text
-from fgslam.core.geometry import inverse, pose
+from fgslam.core.files import as_path, read_text, shown_in
+from fgslam.core.geometry import pose
 from fgslam.core.log import rig_fault
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.sides import camera_pairs
@@ -112,9 +110,7 @@ class StereoRig(CameraRig):
 
         The images themselves where the rig has nothing to rectify.
         """
-        if self.rectifier is None:
-            return images
-        return self.rectifier.images(images)
+        return images if self.rectifier is None else self.rectifier.images(images)
 
 
 def require_rig(rig: CameraRig) -> None:
@@ -126,10 +122,6 @@ def require_rig(rig: CameraRig) -> None:
         )
     if fault := rig_fault(rig):
         raise CalibrationError(f"rig: {fault}")
-
-
-# --------------------------------------------------------------------------------------------
-# Calibration files
 
 
 def load_rig(
@@ -147,8 +139,8 @@ def load_rig(
     Where the cameras are not rectified, the rig holds the maps that rectify them, and a session
     applies them to the raw images that it is given. ``remarks`` of the rig say what was noticed.
     docs/howto/your_camera.md lists the formats. Pictures ``mask_left.png``, ``mask_right.png`` and
-    ``mask_top.png`` beside the file (of EuRoC ``mask.png`` in a camera's folder) hide what is black
-    in them: one's own robot, the rim of a lens.
+    ``mask_top.png`` next to the file (of EuRoC ``mask.png`` in a camera's folder) hide what is
+    black in them: one's own robot, the rim of a lens.
 
     Args:
         path: the file, or a folder that holds one.
@@ -166,131 +158,19 @@ def load_rig(
         CalibrationError: the format or a camera model is not known, a value is missing or
             impossible, the size is another one, or the cameras are no stereo rig.
     """
-    require_options(size, unit_m, fov_deg)
-    _require_cameras(cameras)
+    require_options(size, unit_m, fov_deg, cameras)
     file = as_path(path, CalibrationError)
     file2 = None if path2 is None else as_path(path2, CalibrationError, "path2")
     own = _own_rectified(file, cameras, unit_m) if file2 is None else None
-    same_size = own is not None and size in (None, (own.width, own.height))
-    if own is not None and same_size and fov_deg is None:
+    if own is not None and size in (None, (own.width, own.height)) and fov_deg is None:
         return with_masks(own, file)
     found = read_calibration_file(file, file2, size)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
     return with_masks(rig_of(found, fov_deg), file)
 
 
-def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
-    """The rig of a calibration that is read; see :func:`load_rig`."""
-    made = assembled(calibration, fov_deg)
-    return _stereo_rig(made.rig, made.rectifier, made.sources, made.remarks)
-
-
-def with_masks(rig: StereoRig, path: Path) -> StereoRig:
-    """The rig with the masks that lie beside a calibration, of the raw images' size.
-
-    Raises:
-        CalibrationError: a mask is no picture, or has another size.
-    """
-    folder = path if path.is_dir() else path.parent
-    order = range(rig.cameras) if rig.rectifier is None else rig.rectifier.order[: rig.cameras]
-    shown = []
-    for given, source in zip(order, rig.sources, strict=False):
-        beside = folder / f"mask_{('right', 'left', 'top')[given]}.png"
-        of_euroc = folder.parent / f"cam{source}" / "mask.png"
-        if path.is_dir():
-            of_euroc = folder / f"cam{source}" / "mask.png"
-        shown.append(_mask(beside, rig) if beside.is_file() else _mask(of_euroc, rig))
-    if all(one is None for one in shown):
-        return rig
-    plain = Rectifier(rig.plain(), ())
-    raw = replace(rig.rectifier or plain, shown=tuple(shown))
-    return replace(rig, rectifier=raw, remarks=(*rig.remarks, _hidden(raw)))
-
-
-def _mask(path: Path, rig: StereoRig) -> Image | None:
-    if not path.is_file():
-        return None
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    width, height = rig.image_size
-    if mask is None or mask.shape != (height, width):
-        found = "no picture" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
-        raise CalibrationError(
-            f"{path}: is {found}, but a mask has the size of the images, {width}x{height}; black "
-            "is hidden"
-        )
-    return np.where(mask > _WHITE, 255, 0).astype(np.uint8)
-
-
-def _hidden(rectifier: Rectifier) -> str:
-    parts = [
-        f"{100.0 * float(np.mean(one == 0)):.0f} % of the {CAMERA_NAMES[k]} images"
-        for k, one in enumerate(rectifier.shown)
-        if one is not None
-    ]
-    return f"masks hide {', '.join(parts)}"
-
-
-def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> StereoRig | None:
-    """The rig of a ``calib.json`` of rectified cameras, number by number; None for other files."""
-    path = path / "calib.json" if path.is_dir() else path
-    if not path.is_file() or path.suffix.lower() != ".json":
-        return None
-    values = formats.read_json_object(path)
-    # A file of that name is ours, if it is nobody else's: what it lacks is then named.
-    if not formats.is_rectified(values) and not (path.name == "calib.json" and "width" in values):
-        return None
-    three = "vertical_baseline_m" in values if cameras is None else len(cameras) == 3
-    stated = formats.read_rectified(path, three)
-    corrections = formats.stated_corrections(path, values)
-    rig, raw = _rig_in_metres(stated, unit_m), None
-    if corrections is not None:
-        raw = replace(
-            rectifier_of(stated, _correction_values(str(path), corrections, stated)), rig=rig
-        )
-    if unit_m != 1.0:
-        assembled(_calibration_of(rig, path))  # refuses a unit that makes one camera of two
-    return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
-
-
-def _rig_in_metres(rig: CameraRig, unit_m: float) -> CameraRig:
-    """The rig with its lengths in metres; what corrects its images is in pixels and stays."""
-    up = rig.vertical_baseline
-    bTc = pose(rig.bTc[:3, :3], unit_m * rig.bTc[:3, 3])
-    vertical = None if up is None else unit_m * up
-    return replace(rig, baseline=unit_m * rig.baseline, vertical_baseline=vertical, bTc=bTc)
-
-
-def _stereo_rig(
-    rig: CameraRig, raw: Rectifier | None, sources: tuple[int, ...], remarks: tuple[str, ...]
-) -> StereoRig:
-    values = {name: getattr(rig, name) for name in CameraRig.__dataclass_fields__}
-    return StereoRig(**values, rectifier=raw, sources=sources, remarks=remarks)
-
-
-def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> Calibration:
-    """The calibration of these of its cameras; None: all. Raises CalibrationError."""
-    if cameras is None:
-        return calibration
-    count = len(calibration.cameras)
-    good = len(set(cameras)) == len(cameras) in (2, 3)
-    if not good or not all(isinstance(k, int) and 0 <= k < count for k in cameras):
-        raise CalibrationError(
-            f"{calibration.source}: cameras is {cameras!r}; give two or three of 0 to {count - 1}"
-        )
-    calibration.require_uncorrected("some of its cameras are chosen")
-    chosen = tuple(calibration.cameras[k] for k in cameras)
-    return replace(calibration, cameras=chosen, view=None)
-
-
-def _require_cameras(cameras: object) -> None:
-    if cameras is not None and not isinstance(cameras, list | tuple | range):
-        raise CalibrationError(
-            f"cameras is a {type(cameras).__name__}; give a list of two or three numbers, or None"
-        )
-
-
-def require_options(size: object, unit_m: object, fov_deg: object) -> None:
-    """Raises CalibrationError where what is said beside a file cannot be meant."""
+def require_options(size: object, unit_m: object, fov_deg: object, cameras: object = None) -> None:
+    """Raises CalibrationError where an option of a file cannot be meant."""
     pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
     whole = pair and all(isinstance(n, int | np.integer) and n > 0 for n in pair)
     if size is not None and not whole:
@@ -302,6 +182,80 @@ def require_options(size: object, unit_m: object, fov_deg: object) -> None:
         raise CalibrationError(
             f"fov_deg is {fov_deg!r}; a perspective view takes 0 to {_WIDEST_DEG:.0f} degrees"
         )
+    if cameras is not None and not isinstance(cameras, list | tuple | range):
+        raise CalibrationError(
+            f"cameras is a {type(cameras).__name__}; give a list of two or three numbers, or None"
+        )
+
+
+def _own_rectified(path: Path, cameras: Sequence[int] | None, unit_m: float) -> StereoRig | None:
+    """The rig of a ``calib.json`` of rectified cameras, number by number; None for other files."""
+    path = path / "calib.json" if path.is_dir() else path
+    if not path.is_file() or path.suffix.lower() != ".json":
+        return None
+    values = read_json_object(path)
+    # A file of that name that is in no other format is ours: what it lacks is then named.
+    if not is_rectified(values) and not (path.name == "calib.json" and "width" in values):
+        return None
+    three = "vertical_baseline_m" in values if cameras is None else len(cameras) == 3
+    stated = read_rectified(path, three)
+    up = stated.vertical_baseline
+    rig = replace(  # what corrects its images is in pixels and stays
+        stated,
+        baseline=unit_m * stated.baseline,
+        vertical_baseline=None if up is None else unit_m * up,
+        bTc=pose(stated.bTc[:3, :3], unit_m * stated.bTc[:3, 3]),
+    )
+    raw = None
+    if (corrections := stated_corrections(path, values)) is not None:
+        found = correction_values(str(path), corrections, stated)
+        raw = replace(rectifier_of(stated, found), rig=rig)
+    if unit_m != 1.0:
+        rig_of(as_calibrated(rig, path))  # refuses a unit that makes one camera of two
+    return _stereo_rig(rig, raw, (1, 0, 2)[: rig.cameras], implausible(str(path), rig))
+
+
+def _stereo_rig(
+    rig: CameraRig, raw: Rectifier | None, sources: tuple[int, ...], remarks: tuple[str, ...]
+) -> StereoRig:
+    values = {name: getattr(rig, name) for name in CameraRig.__dataclass_fields__}
+    return StereoRig(**values, rectifier=raw, sources=sources, remarks=remarks)
+
+
+def with_masks(rig: StereoRig, path: Path) -> StereoRig:
+    """The rig with the masks that lie next to a calibration, of the raw images' size.
+
+    Raises:
+        CalibrationError: a mask is no picture, or has another size.
+    """
+    folder = path if path.is_dir() else path.parent
+    of_euroc = path if path.is_dir() else folder.parent
+    order = range(rig.cameras) if rig.rectifier is None else rig.rectifier.order[: rig.cameras]
+    width, height = rig.image_size
+    shown: list[Image | None] = []
+    for given, source in zip(order, rig.sources, strict=False):
+        names = folder / f"mask_{('right', 'left', 'top')[given]}.png", of_euroc / f"cam{source}"
+        file = names[0] if names[0].is_file() else names[1] / "mask.png"
+        if not file.is_file():
+            shown.append(None)
+            continue
+        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        if mask is None or mask.shape != (height, width):
+            found = "no picture" if mask is None else f"{mask.shape[1]}x{mask.shape[0]}"
+            raise CalibrationError(
+                f"{file}: is {found}, but a mask has the size of the images, {width}x{height}; "
+                "black is hidden"
+            )
+        shown.append(np.where(mask > _WHITE, 255, 0).astype(np.uint8))
+    if all(one is None for one in shown):
+        return rig
+    hidden = [
+        f"{100.0 * float(np.mean(one == 0)):.0f} % of the {CAMERA_NAMES[k]} images"
+        for k, one in enumerate(shown)
+        if one is not None
+    ]
+    raw = replace(rig.rectifier or Rectifier(rig.plain(), ()), shown=tuple(shown))
+    return replace(rig, rectifier=raw, remarks=(*rig.remarks, f"masks hide {', '.join(hidden)}"))
 
 
 # --------------------------------------------------------------------------------------------
@@ -329,509 +283,154 @@ def read_calibration_file(
         return _of_folder(path, size)
     if remedy := _REMEDIES.get(path.suffix.lower()):
         raise CalibrationError(f"{path} is not read: {remedy}")
-    archive = path.suffix.lower() == ".npz"
-    text = "" if archive else read_text(path, CalibrationError, f"restore the file; {KNOWN}")
+    text = read_text(path, CalibrationError, f"restore the file; {KNOWN}")
     if found := formats.calibration_of_text(path, text, size):
         return found
-    tree = read_tree(path)
-    if tree is None:
-        raise CalibrationError(f"{path} holds no keys and values of a calibration; {KNOWN}")
-    beside = _partner(path, tree)
-    return _of_tree(path, tree, size) if beside is None else _of_two(*beside, size)
+    tree = _tree_of(path)
+    partner = _partner(path, tree)
+    return _of_tree(path, tree, size) if partner is None else _of_two(*partner, size)
 
 
+_AS_JSON = "a .json of M1, D1, M2, D2, R, T and image_size"
 _REMEDIES = {
-    ".mat": "in MATLAB, [K1,D1,K2,D2,R,T] = stereoParametersToOpenCV(stereoParams), then write "
-    "jsonencode of a struct with M1, D1, M2, D2, R, T and image_size to a .json (--unit 0.001 "
-    "where the squares were in millimetres)",
-    ".pkl": "a pickle may run programs; save its arrays by numpy.savez as M1, D1, M2, D2, R, T",
+    ".mat": "in MATLAB, [K1,D1,K2,D2,R,T] = stereoParametersToOpenCV(stereoParams), then write by "
+    f"jsonencode {_AS_JSON} (--unit 0.001 where the squares were in millimetres)",
+    ".pkl": f"a pickle may run programs; write {_AS_JSON}",
+    ".npz": f"write its arrays to {_AS_JSON}",
 }
-"""What to do with files that hold calibrations in a form that nobody else can read."""
-
-
-def _of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration:
-    if formats.is_realsense(tree) or not formats.is_rectified(tree):
-        return formats.calibration_of_tree(path, tree, size)
-    if path.suffix.lower() != ".json":
-        raise CalibrationError(
-            f"{path}: {', '.join(sorted(formats.OF_RECTIFIED & tree.keys()))} are keys of fgslam's "
-            "calib.json; write it so (docs/datasets/images.md has its keys)"
-        )
-    rig = formats.read_rectified(path, "vertical_baseline_m" in tree)
-    return _calibration_of(rig, path, formats.stated_corrections(path, tree))
-
-
-def _calibration_of(
-    rig: CameraRig, path: Path, corrections: Mapping[str, float] | None = None
-) -> Calibration:
-    """Rectified cameras as calibrated ones without distortion: left, right[, top]."""
-    offsets = [("left", [-rig.baseline, 0.0, 0.0]), ("right", [0.0, 0.0, 0.0])]
-    if rig.vertical_baseline is not None:
-        offsets.append(("top", [0.0, -rig.vertical_baseline, 0.0]))
-    size, matrix = (rig.width, rig.height), intrinsic_matrix(rig.fx, rig.fy, rig.cx, rig.cy)
-    cameras = tuple(
-        RawCamera(*size, matrix, np.zeros(4), rig.bTc @ pose(np.eye(3), np.array(at)), name)
-        for name, at in offsets
-    )
-    view = None
-    if corrections is not None:
-        view = StatedView((np.eye(3),) * len(cameras), matrix, size)
-    return Calibration(str(path), formats.OWN_FORMAT, cameras, True, view, corrections=corrections)
-
-
+"""What to do with files that hold calibrations in a form of one program."""
 _PARTNERS = (
     ("left.yaml", "right.yaml"),
     ("intrinsics.yml", "extrinsics.yml"),
     ("LeftCameraParams.yaml", "RightCameraParams.yaml"),
 )
 """Names of files that belong together, as the tools that write them give."""
+_TREES = (".yaml", ".yml", ".json", ".xml")
+_SUFFIXES = (*_TREES, ".txt", ".conf")
 
 
-def _partner(path: Path, tree: Tree) -> tuple[Path, Path] | None:
-    """The two files of a pair, where this is one of them and the other lies beside it."""
-    if not _is_alone(tree):
-        return None
-    for names in _PARTNERS:
-        first, second = (path.with_name(name) for name in names)
-        if path.name in names and first.is_file() and second.is_file():
-            return first, second
-    pairs = [pair for pair in _pairs_beside(path.parent) if path in pair]
-    return pairs[0] if len(pairs) == 1 else None
+def _tree_of(path: Path) -> Tree:
+    tree = read_tree(path)
+    if tree is None:
+        raise CalibrationError(f"{path} holds no keys and values of a calibration; {KNOWN}")
+    return tree
 
 
-def _is_alone(tree: Tree) -> bool:
-    """Whether it is one file of two that belong together."""
-    return formats.is_asl(tree) or is_camera_info(tree) or formats.is_opencv_half(tree)
-
-
-def _pairs_beside(folder: Path) -> list[tuple[Path, Path]]:
-    """Files of a folder that belong together: by the side in their names, or OpenCV's halves."""
-    trees = {path: tree for path in shown_in(folder) if (tree := _tree_or_none(path)) is not None}
-    halves = [path for path, tree in trees.items() if formats.is_opencv_half(tree)]
-    inner = [path for path in halves if has_intrinsics(trees[path])]
-    if len(halves) == 2 and len(inner) == 1:
-        return [(inner[0], next(path for path in halves if path != inner[0]))]
-    sided = {path.name: path for path in trees if path not in halves and _is_alone(trees[path])}
-    return [(sided[left], sided[right]) for left, right in camera_pairs(sided)]
-
-
-def _tree_or_none(path: Path) -> Tree | None:
-    if path.suffix.lower() not in (*_TREES, ".txt") or not path.is_file():
-        return None
-    try:
-        if path.suffix.lower() == ".txt" and not is_camera_text(read_text(path, CalibrationError)):
-            return None
-        return read_tree(path)
-    except CalibrationError:
-        return None
-
-
-_TREES = (".yaml", ".yml", ".json", ".xml", ".npz")
-
-
-# --------------------------------------------------------------------------------------------
-# Two files
+def _of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration:
+    if formats.is_realsense(tree) or not is_rectified(tree):
+        return formats.calibration_of_tree(path, tree, size)
+    if path.suffix.lower() != ".json":
+        raise CalibrationError(
+            f"{path}: {', '.join(sorted(OF_RECTIFIED & tree.keys()))} are keys of fgslam's "
+            "calib.json; write it so (docs/datasets/images.md has its keys)"
+        )
+    rig = read_rectified(path, "vertical_baseline_m" in tree)
+    return as_calibrated(rig, path, stated_corrections(path, tree))
 
 
 def _of_two(first: Path, second: Path, size: Size | None) -> Calibration:
-    trees = tuple(read_tree(path) for path in (first, second))
-    if trees[0] is None or trees[1] is None:
-        wrong = first if trees[0] is None else second
-        raise CalibrationError(f"{wrong} holds no keys and values of a calibration; {KNOWN}")
-    both = (trees[0], trees[1])
-    if all(map(is_camera_info, both)):
-        return read_camera_info_pair((first, second), both)
-    if all(map(formats.is_asl, both)):
-        cameras = tuple(
-            formats.read_asl_camera(path, tree)
-            for path, tree in zip((first, second), both, strict=True)
-        )
+    files, trees = (first, second), (_tree_of(first), _tree_of(second))
+    if all(map(formats.is_camera_info, trees)):
+        return formats.read_camera_info_pair(files, trees)
+    if all(map(formats.is_asl, trees)):
+        cameras = tuple(map(formats.read_asl_camera, files, trees))
         return Calibration(f"{first} and {second}", "ASL sensor.yaml, a pair", cameras)
-    merged = {**trees[1], **trees[0]}
-    if any(map(is_opencv_pair, both)):
-        inner = second if has_intrinsics(trees[1]) else first
-        return read_opencv_pair(inner, merged, size)
-    one = [_of_tree(path, tree, size) for path, tree in zip((first, second), both, strict=True)]
+    if any(map(formats.is_opencv_pair, trees)):
+        inner = second if formats.has_intrinsics(trees[1]) else first
+        return formats.read_opencv_pair(inner, {**trees[1], **trees[0]}, size)
+    one = [_of_tree(path, tree, size) for path, tree in zip(files, trees, strict=True)]
     raise CalibrationError(
         f"{first} ({one[0].format}) and {second} ({one[1].format}) do not say how the cameras "
         "stand to each other; give a calibration of the pair"
     )
 
 
-# --------------------------------------------------------------------------------------------
-# A folder
+def _is_half(tree: Tree) -> bool:
+    """Whether it is one file of two that belong together."""
+    return formats.is_asl(tree) or formats.is_camera_info(tree) or formats.is_opencv_half(tree)
 
 
-_SUFFIXES = (*_TREES, ".txt", ".conf")
+def _partner(path: Path, tree: Tree) -> tuple[Path, Path] | None:
+    """The two files of a pair, where this is one of them and the other lies next to it.
+
+    By the names of a tool, by the side in their names, or as OpenCV's halves.
+    """
+    if not _is_half(tree):
+        return None
+    for names in _PARTNERS:
+        first, second = (path.with_name(name) for name in names)
+        if path.name in names and first.is_file() and second.is_file():
+            return first, second
+    trees = {}
+    for file in shown_in(path.parent):
+        try:
+            if file.suffix.lower() in _TREES or (
+                file.suffix.lower() == ".txt" and is_camera_text(read_text(file, CalibrationError))
+            ):
+                trees[file] = read_tree(file) or {}
+        except CalibrationError:
+            continue
+    halves = [file for file, one in trees.items() if formats.is_opencv_half(one)]
+    inner = [file for file in halves if formats.has_intrinsics(trees[file])]
+    if len(halves) == 2 and len(inner) == 1:
+        pairs = [(inner[0], next(file for file in halves if file != inner[0]))]
+    else:
+        alone = [file for file, one in trees.items() if _is_half(one) and file not in halves]
+        sided = {file.name: file for file in alone}
+        pairs = [(sided[left], sided[right]) for left, right in camera_pairs(sided)]
+    pairs = [pair for pair in pairs if path in pair]
+    return pairs[0] if len(pairs) == 1 else None
 
 
 def _of_folder(folder: Path, size: Size | None) -> Calibration:
+    """The only calibration of two cameras or more in a folder; two files of a pair are one."""
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     if (root / "cam0" / "sensor.yaml").is_file():
         return _of_two(root / "cam0" / "sensor.yaml", root / "cam1" / "sensor.yaml", size)
     for name in ("calib.json", *(pair[0] for pair in _PARTNERS)):
         if (folder / name).is_file():
             return read_calibration_file(folder / name, size=size)
-    if (folder / "right.yaml").is_file():
-        raise CalibrationError(f"{folder}: has right.yaml but no left.yaml; a pair needs both")
-    found = tuple(_rigs(shown_in(folder), size))
-    by_name = tuple(one for one in found if one.source.endswith("camchain.yaml"))
-    kalibr_alone = all(one.format == by_name[0].format for one in found) if by_name else False
-    found = by_name if len(by_name) == 1 and kalibr_alone else found
-    if len(found) == 1:
-        return found[0]
-    if found:
-        names = ", ".join(Path(one.source).name for one in found)
-        raise CalibrationError(f"{folder}: holds several calibrations ({names}); name one")
-    own = [path for path in shown_in(folder) if path.suffix.lower() in _TREES]
-    if len(own) == 1 and own[0].is_file():
-        read_calibration_file(own[0], size=size)  # the only one that may be meant is at fault
-    raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {KNOWN}")
-
-
-def _rigs(files: Iterable[Path], size: Size | None) -> Iterable[Calibration]:
-    """Of the files those that describe two cameras or more; two that belong together once."""
-    sources = set()
+    found: dict[str, Calibration] = {}
+    fault = None
+    files = [one for one in shown_in(folder) if one.suffix.lower() in _SUFFIXES and one.is_file()]
     for path in files:
-        if path.suffix.lower() not in _SUFFIXES or not path.is_file():
-            continue
         try:
-            found = read_calibration_file(path, size=size)
-        except CalibrationError:
+            one = read_calibration_file(path, size=size)
+        except CalibrationError as error:
+            fault = error
             continue
-        if len(found.cameras) > 1 and found.source not in sources:
-            sources.add(found.source)
-            yield found
-
-
-# --------------------------------------------------------------------------------------------
-# From a calibration to a rig
-
-
-_LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
-# Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.
-_LONGEST_BASELINE_M = 3.0
-# Cosine of 45 degrees: beyond, a common image plane would stretch the views out of use.
-_LEAST_COMMON_VIEW = 0.707
-# A stated view with less of the raw resolution than this has collapsed.
-_LEAST_STATED = 0.5
-_SAME_PX = 1e-3  # cameras that differ by less are rectified already
-_TOLD_SHARE = 0.8  # of the angle of view; less is said to be cut off
-_TOLD_SKEW_DEG = 0.5  # from a right angle between the baselines, of three cameras
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Assembly:
-    """A rectified rig.
-
-    Attributes:
-        rig: reference = right camera.
-        rectifier: what rectifies its raw images; None where they are rectified already.
-        sources: which of the file's cameras are right, left[, top].
-        remarks: what a user should know, a line each.
-    """
-
-    rig: CameraRig
-    rectifier: Rectifier | None
-    sources: tuple[int, ...]
-    remarks: tuple[str, ...]
-
-
-def assembled(calibration: Calibration, fov_deg: float | None = None) -> Assembly:
-    """The rig of a calibration.
-
-    Args:
-        calibration: of two or three cameras.
-        fov_deg: horizontal angle of the rectified view; None: as much as all cameras fill.
-
-    Raises:
-        CalibrationError: it is of one camera only or of more than three, their images differ in
-            size, or they are no stereo pair.
-    """
-    cameras = _usable(calibration)
-    sources, turn, told = _pair(cameras) if len(cameras) == 2 else _three(cameras)
-    chosen = tuple(cameras[k] for k in sources)
-    _require_side_by_side(chosen, turn)
-    rotations, view, also = _view(calibration, chosen, sources, turn, fov_deg)
-    found = rectifier(chosen, rotations, view, _corrected(calibration))
-    found = replace(found, calibration=_with_view(calibration, sources, rotations, view))
-    remarks = (*calibration.notes, *told, *also)
-    if calibration.sided and len(sources) == 2:
-        found = replace(found, order=tuple(_GIVEN_AS[k] for k in sources))
-        if sources == (0, 1) and not told:
-            remarks = (*remarks, _swapped(chosen, found.rig))
-    remarks = (*remarks, *implausible(calibration.source, found.rig))
-    straight = found.order[:2] == (0, 1) and fov_deg is None and _is_rectified(chosen, turn)
-    kept = None if straight and found.correction is None else found
-    return Assembly(found.rig, kept, sources, remarks)
-
-
-_GIVEN_AS = (1, 0, 2)
-"""Where the images of a sided file's left, right and third camera are among right, left, top."""
-
-
-def _corrected(calibration: Calibration) -> Callable[[CameraRig], FloatArray] | None:
-    values = calibration.corrections
-    if values is None:
-        return None
-    return lambda rig: _correction_values(calibration.source, values, rig)
-
-
-def _with_view(
-    calibration: Calibration,
-    sources: tuple[int, ...],
-    rotations: Sequence[FloatArray],
-    view: View,
-) -> Calibration:
-    """The calibration with the view that was chosen, without corrections."""
-    turns = [np.eye(3)] * len(calibration.cameras)
-    for source, rotation in zip(sources, rotations, strict=True):
-        turns[source] = rotation
-    stated = StatedView(tuple(turns), view.matrix, view.size)
-    return replace(calibration, view=stated, corrections=None)
-
-
-def _usable(calibration: Calibration) -> tuple[RawCamera, ...]:
-    cameras = calibration.cameras
-    if len(cameras) == 1:
-        raise CalibrationError(
-            f"{calibration.source}: one camera alone ({calibration.format}) knows no baseline; "
-            "give the calibration of the pair, or both cameras' files"
-        )
-    if len(cameras) > 3:
-        raise CalibrationError(
-            f"{calibration.source}: holds {len(cameras)} cameras; say which two or three form the "
-            "rig: cameras=(0, 1)"
-        )
-    for camera in cameras:
-        if camera.width == 0:
-            raise CalibrationError(
-                f"{calibration.source} does not state the images' size; give size=(width, "
-                "height), on the command line --size WxH"
-            )
-    _require_one_size(cameras)
-    return cameras
-
-
-def _require_one_size(cameras: Sequence[RawCamera]) -> None:
-    first = cameras[0]
-    for camera in cameras:
-        if camera.size != first.size:
-            raise CalibrationError(
-                f"{first.name} is {first.width}x{first.height} but {camera.name} is "
-                f"{camera.width}x{camera.height}; both must have one resolution"
-            )
-
-
-# --------------------------------------------------------------------------------------------
-# Which camera is which
-
-
-Placed: TypeAlias = tuple[tuple[int, ...], FloatArray, tuple[str, ...]]
-"""The cameras that are right, left[, top], how the view is turned, and what to tell."""
-
-
-def _offset(camera: RawCamera, reference: RawCamera) -> FloatArray:
-    """Position (3,) of a camera in another's axes."""
-    turned = reference.bTc[:3, :3]
-    return np.asarray((camera.bTc[:3, 3] - reference.bTc[:3, 3]) @ turned)
-
-
-def _pair(cameras: Sequence[RawCamera]) -> Placed:
-    """Right and left: the left one sees the other at +x. Of two above each other, the upper one."""
-    x, y, _ = _offset(cameras[1], cameras[0])
-    if abs(x) >= abs(y):
-        return ((1, 0) if x > 0.0 else (0, 1)), np.eye(3), ()
-    lower, upper = (1, 0) if y > 0.0 else (0, 1)
-    text = (
-        f"{cameras[upper].name} is above {cameras[lower].name}: the view is turned by a quarter "
-        "turn, in which the upper camera is the left one"
-    )
-    return (lower, upper), _quarter_turn(upper_side=True), (text,)
-
-
-def is_stereo_pair(cameras: Sequence[RawCamera]) -> bool:
-    """Whether two cameras see the same from beside each other, or above."""
-    sources, turn, _ = _pair(cameras)
-    try:
-        _require_side_by_side([cameras[k] for k in sources], turn)
-    except CalibrationError:
-        return False
-    return True
-
-
-def _quarter_turn(upper_side: bool) -> FloatArray:
-    """Turn (3, 3) of the view after which the camera above, or the one below, is the left one."""
-    sign = 1.0 if upper_side else -1.0
-    return np.array([[0.0, sign, 0.0], [-sign, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _three(cameras: Sequence[RawCamera]) -> Placed:
-    """Right, left[, top], how the view is turned about its axis, and what to tell.
-
-    Of cameras in a line the outer two are used. The corner of an L becomes the right one; the view
-    is turned by a multiple of 90 degrees where its neighbours are not to the left and above.
-    """
-    across = [k for k in range(3) if not _in_line(cameras, k)]
-    if not across:
-        x = [_offset(camera, cameras[0])[0] for camera in cameras]
-        right, left = int(np.argmax(x)), int(np.argmin(x))
-        third = 3 - right - left
-        text = f"three cameras in a line: {cameras[third].name}, between the others, is not used"
-        return (right, left), np.eye(3), (text,)
-    corner = min(range(3), key=lambda k: abs(_cosine(cameras, k)))
-    away = [_offset(camera, cameras[corner])[:2] for camera in cameras]
-    others = [k for k in range(3) if k != corner]
-    beside = max(others, key=lambda k: abs(away[k][0]) - abs(away[k][1]))
-    above = next(k for k in others if k != beside)
-    left_side, upper_side = away[beside][0] < 0.0, away[above][1] < 0.0
-    skew = 90.0 - np.degrees(np.arccos(np.clip(_cosine(cameras, corner), -1.0, 1.0)))
-    told: tuple[str, ...] = ()
-    if abs(skew) > _TOLD_SKEW_DEG:
-        told = (
-            f"the two baselines are {abs(skew):.1f} degrees off a right angle: columns of the top "
-            f"image differ by {np.sin(np.radians(abs(skew))):.3f} of the vertical disparity",
-        )
-    if left_side == upper_side:
-        turn = np.eye(3) if left_side else np.diag([-1.0, -1.0, 1.0])
-        return (corner, beside, above), turn, told
-    return (corner, above, beside), _quarter_turn(upper_side), told
-
-
-def _sides(cameras: Sequence[RawCamera], corner: int) -> tuple[FloatArray, FloatArray]:
-    first, second = (
-        camera.bTc[:3, 3] - cameras[corner].bTc[:3, 3]
-        for k, camera in enumerate(cameras)
-        if k != corner
-    )
-    return first, second
-
-
-def _cosine(cameras: Sequence[RawCamera], corner: int) -> float:
-    a, b = _sides(cameras, corner)
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
-
-
-def _in_line(cameras: Sequence[RawCamera], corner: int) -> bool:
-    return bool(abs(_cosine(cameras, corner)) > np.cos(np.radians(15.0)))
-
-
-def _require_side_by_side(chosen: Sequence[RawCamera], turn: FloatArray) -> None:
-    """Raises CalibrationError unless the cameras form a stereo rig."""
-    right, left = chosen[:2]
-    offset = turn @ _offset(right, left)
-    if np.linalg.norm(offset) < _LEAST_BASELINE_M:
-        raise CalibrationError(
-            f"{left.name} and {right.name} are {1e3 * np.linalg.norm(offset):.3g} mm apart, as one "
-            "camera; check T_BS (or T) in the calibration, and the unit of its lengths (--unit)"
-        )
-    if np.abs(offset[0]) < 2.0 * np.hypot(offset[1], offset[2]):
-        x, y, z = offset
-        raise CalibrationError(
-            f"{left.name} and {right.name} are not side by side (offset {x:.3f}, {y:.3f}, {z:.3f} "
-            "m along x, y, z); check T_BS (or R and T) in the calibration"
-        )
-    for other in chosen[1:]:
-        if right.bTc[:3, 2] @ other.bTc[:3, 2] < _LEAST_COMMON_VIEW:
-            raise CalibrationError(
-                f"{other.name} and {right.name} look more than 45 degrees apart; check T_BS (or R "
-                "and T) in the calibration"
-            )
-
-
-# --------------------------------------------------------------------------------------------
-# The view
-
-
-def _view(
-    calibration: Calibration,
-    chosen: Sequence[RawCamera],
-    sources: tuple[int, ...],
-    turn: FloatArray,
-    fov_deg: float | None,
-) -> tuple[tuple[FloatArray, ...], View, tuple[str, ...]]:
-    """Rotation of each camera into the view, the view, and what to tell."""
-    stated = calibration.view
-    if stated is not None and fov_deg is None and calibration.corrections is not None:
-        rotations = tuple(stated.rotations[k] for k in sources)
-        return rotations, View(stated.matrix, stated.size), ()
-    calibration.require_uncorrected("another view (fov_deg) is asked for")
-    if fov_deg is None and _is_rectified(chosen, turn):
-        return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
-    told: tuple[str, ...] = ()
-    natural = float(np.mean([camera.focal_px for camera in chosen]))
-    if stated is not None and fov_deg is None:
-        if stated.matrix[0, 0] > _LEAST_STATED * natural:
-            rotations = tuple(stated.rotations[k] for k in sources)
-            return rotations, View(stated.matrix, stated.size), ()
-        told = (
-            f"the rectified focal length that the file states, {stated.matrix[0, 0]:.0f} px, would "
-            f"shrink the images ({natural:.0f} px); another view is chosen",
-        )
-    width, height = chosen[0].size
-    size = (width, height) if abs(turn[0, 0]) > 0.5 else (height, width)
-    axes = np.array([camera.bTc[:3, 2] for camera in chosen])
-    body_to_view = orientation([camera.bTc[:3, 3] for camera in chosen], axes)
-    rotations = tuple(body_to_view @ camera.bTc[:3, :3] for camera in chosen)
-    view = chosen_view(chosen, rotations, size, fov_deg)
-    seen = np.degrees(chosen[0].field_of_view()[:2])
-    seen = seen if size == chosen[0].size else seen[::-1]
-    return rotations, view, (*told, *_cut_off(seen, view))
-
-
-def _cut_off(seen: FloatArray, view: View) -> tuple[str, ...]:
-    """What the view does not show of the angles (2,) across and down that a camera sees."""
-    kept = np.degrees(view.angles)
-    if kept[0] > _TOLD_SHARE * seen[0]:
-        return ()
-    return (
-        f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
-        f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
-    )
-
-
-def _is_rectified(chosen: Sequence[RawCamera], turn: FloatArray) -> bool:
-    """Whether the images are rectified as they are: equal cameras, to the left and above."""
-    right = chosen[0]
-    if not np.array_equal(turn, np.eye(3)):
-        return False
-    for k, camera in enumerate(chosen):
-        turned = right.bTc[:3, :3].T @ camera.bTc[:3, :3]
-        away = np.delete(_offset(camera, right), 0 if k == 1 else 1)
-        if (
-            camera.model != "radtan"
-            or camera.distortion.any()
-            or not np.allclose(camera.matrix, right.matrix, rtol=0.0, atol=_SAME_PX)
-            or not np.allclose(turned, np.eye(3), rtol=0.0, atol=1e-6)
-            or np.abs(away).max() > 1e-6
-        ):
-            return False
-    return True
-
-
-# --------------------------------------------------------------------------------------------
-# What to tell
-
-
-def _swapped(chosen: Sequence[RawCamera], rig: CameraRig) -> str:
-    return (
-        f"left and right are swapped: {chosen[0].name}, the left one by its name, is "
-        f"{rig.baseline:.3f} m to the right of the other; its images are taken as the right ones"
-    )
-
-
-def implausible(source: str, rig: CameraRig) -> tuple[str, ...]:
-    """A remark where no vehicle carries cameras so far apart."""
-    if rig.baseline <= _LONGEST_BASELINE_M:
-        return ()
-    return (
-        f"{source}: the baseline is {rig.baseline:.4g} m; if its unit is not the metre, give it: "
-        "--unit 0.001 for millimetres, or the side of a square in metres (unit_m of load_rig)",
-    )
+        if len(one.cameras) > 1:
+            found.setdefault(one.source, one)
+    chains = [one for source, one in found.items() if source.endswith("camchain.yaml")]
+    if len(chains) == 1 and all(one.format == chains[0].format for one in found.values()):
+        return chains[0]  # Kalibr writes its results next to it
+    if len(found) > 1:
+        names = ", ".join(Path(source).name for source in found)
+        raise CalibrationError(f"{folder}: holds several calibrations ({names}); name one")
+    if found:
+        return next(iter(found.values()))
+    if fault is not None and len(files) == 1 and files[0].suffix.lower() in _TREES:
+        raise fault  # of the only file that may be meant
+    raise CalibrationError(f"{folder}: holds no calibration of a stereo rig; {KNOWN}")
 
 
 # --------------------------------------------------------------------------------------------
 # Changes before that are asked for
+
+
+def chosen_cameras(calibration: Calibration, cameras: Sequence[int] | None) -> Calibration:
+    """The calibration of these of its cameras; None: all. Raises CalibrationError."""
+    if cameras is None:
+        return calibration
+    count = len(calibration.cameras)
+    good = len(set(cameras)) == len(cameras) in (2, 3)
+    if not good or not all(isinstance(k, int) and 0 <= k < count for k in cameras):
+        raise CalibrationError(
+            f"{calibration.source}: cameras is {cameras!r}; give two or three of 0 to {count - 1}"
+        )
+    calibration.require_uncorrected("some of its cameras are chosen")
+    chosen = tuple(calibration.cameras[k] for k in cameras)
+    return replace(calibration, cameras=chosen, view=None)
 
 
 def in_metres(calibration: Calibration, unit_m: float) -> Calibration:
@@ -874,89 +473,273 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
         c.scaled(size) if c.width else checked_camera(replace(c, width=size[0], height=size[1]))
         for c in calibration.cameras
     )
-    view = calibration.view if not other else None
-    return replace(calibration, cameras=cameras, view=view)
+    return replace(calibration, cameras=cameras, view=None if other else calibration.view)
 
 
 # --------------------------------------------------------------------------------------------
-# What a drive found wrong in a calibration, written: displacements of each image's pixels
-# (:mod:`fgslam.core.correction`), which are undone where an image is read
+# From a calibration to a rig
 
 
-_NUMBERS = ("width", "height", "fx", "fy", "cx", "cy")
+_LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
+# Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.
+_LONGEST_BASELINE_M = 3.0
+# Cosine of 45 degrees: beyond, a common image plane would stretch the views out of use.
+_LEAST_COMMON_VIEW = 0.707
+# A stated view with less of the raw resolution than this has collapsed.
+_LEAST_STATED = 0.5
+_SAME_PX = 1e-3  # cameras that differ by less are rectified already
+_KEPT_SHARE = 0.8  # of the angle of view; less is reported as cut off
+_SKEW_DEG = 0.5  # from a right angle between the baselines of three cameras: reported beyond
+_GIVEN_AS = (1, 0, 2)
+"""Where the images of a sided file's left, right and third camera are among right, left, top."""
 
 
-def write_corrected(
-    path: Path, correction: RigCorrection, rectifier: Rectifier | None = None
-) -> None:
-    """Writes a ``calib.json`` with what was found wrong in it, and standard deviations.
+def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
+    """The rig of a calibration.
 
     Args:
-        path: the file.
-        correction: found in the rectified images.
-        rectifier: what rectified them. The file then is of the raw cameras, and states the view;
-            what was corrected before is added.
+        calibration: of two or three cameras.
+        fov_deg: horizontal angle of the rectified view; None: as much as all cameras fill.
 
     Raises:
-        OutputError: the file cannot be written.
+        CalibrationError: it is of one camera only or of more than three, their images differ in
+            size, or they are no stereo pair.
     """
-    rig, found = correction.rig, correction.values
-    if rectifier is not None and rectifier.correction is not None:
-        found = found + rectifier.correction
-    raw = None if rectifier is None else rectifier.calibration
-    if rectifier is None or raw is None:
-        values = _rectified_values(rig)
-    else:
-        raw = _moved(raw, rig.bTc @ inverse(rectifier.rig.bTc))
-        values = raw_values(raw)
-    if found.any():
-        names = term_names(rig)
-        values[CORRECTIONS] = dict(zip(names, found.tolist(), strict=True))
-        values["correction_sigmas"] = dict(zip(names, correction.sigmas.tolist(), strict=True))
-    write_text(path, json.dumps(values, indent=2) + "\n")
+    cameras, source = calibration.cameras, calibration.source
+    _require_rig_cameras(calibration)
+    sources, turn, notes = _pair(cameras) if len(cameras) == 2 else _three(cameras)
+    chosen = tuple(cameras[k] for k in sources)
+    _require_side_by_side(chosen, turn)
+    rotations, view, also = _view(calibration, chosen, sources, turn, fov_deg)
+    values = calibration.corrections
+    corrected = None if values is None else lambda rig: correction_values(source, values, rig)
+    found = rectifier(chosen, rotations, view, corrected)
+    turns = [np.eye(3)] * len(cameras)
+    for k, rotation in zip(sources, rotations, strict=True):
+        turns[k] = rotation
+    stated = StatedView(tuple(turns), view.matrix, view.size)
+    found = replace(found, calibration=replace(calibration, view=stated, corrections=None))
+    remarks = (*calibration.notes, *notes, *also)
+    if calibration.sided and len(sources) == 2:
+        found = replace(found, order=tuple(_GIVEN_AS[k] for k in sources))
+        if sources == (0, 1) and not notes:
+            swapped = (
+                f"left and right are swapped: {chosen[0].name}, the left one by its name, is "
+                f"{found.rig.baseline:.3f} m to the right of the other; its images are taken as "
+                "the right ones"
+            )
+            remarks = (*remarks, swapped)
+    remarks = (*remarks, *implausible(source, found.rig))
+    straight = found.order[:2] == (0, 1) and fov_deg is None and _are_rectified(chosen, turn)
+    kept = None if straight and found.correction is None else found
+    return _stereo_rig(found.rig, kept, sources, remarks)
 
 
-def _rectified_values(rig: CameraRig) -> dict[str, Any]:
-    values: dict[str, Any] = {name: getattr(rig, name) for name in _NUMBERS}
-    values["baseline_m"] = rig.baseline
-    if rig.vertical_baseline is not None:
-        values["vertical_baseline_m"] = rig.vertical_baseline
-    values["bTc"] = rig.bTc.tolist()
-    return values
+def implausible(source: str, rig: CameraRig) -> tuple[str, ...]:
+    """A remark where no vehicle carries cameras so far apart."""
+    if rig.baseline <= _LONGEST_BASELINE_M:
+        return ()
+    return (
+        f"{source}: the baseline is {rig.baseline:.4g} m; if its unit is not the metre, give it: "
+        "--unit 0.001 for millimetres, or the side of a square in metres (unit_m of load_rig)",
+    )
 
 
-def _moved(calibration: Calibration, motion: FloatArray) -> Calibration:
-    """The same where it was mounted otherwise on the robot."""
-    if np.allclose(motion, np.eye(4), rtol=0.0, atol=1e-12):
-        return calibration
-    cameras = tuple(replace(c, bTc=motion @ c.bTc) for c in calibration.cameras)
-    return replace(calibration, cameras=cameras)
-
-
-def _correction_values(source: str, values: Mapping[str, float], rig: CameraRig) -> FloatArray:
-    """(p,) values of a rig's terms by their names.
-
-    Raises:
-        CalibrationError: one is no term of the rig, or is missing; ``source`` names the file.
-    """
-    names = term_names(rig)
-    known = {*names, *(name.replace("left.", "top.") for name in names)}
-    unknown = sorted(set(values) - known)
-    if unknown:
+def _require_rig_cameras(calibration: Calibration) -> None:
+    """Raises CalibrationError unless there are two or three cameras of one known size."""
+    cameras = calibration.cameras
+    if len(cameras) == 1:
         raise CalibrationError(
-            f"{source}: {CORRECTIONS} has {unknown[0]!r}, which is no term; known: "
-            f"{', '.join(names)}"
+            f"{calibration.source}: one camera alone ({calibration.format}) knows no baseline; "
+            "give the calibration of the pair, or both cameras' files"
         )
-    later = [name for name in names if name.startswith("all.") or name.endswith("_outer")]
-    every = {**dict.fromkeys(later, 0.0), **values}  # older files have none of these
-    return np.array([formats.number(Path(source), every, name) for name in names])
+    if len(cameras) > 3:
+        raise CalibrationError(
+            f"{calibration.source}: holds {len(cameras)} cameras; say which two or three form the "
+            "rig: cameras=(0, 1)"
+        )
+    if any(camera.width == 0 for camera in cameras):
+        raise CalibrationError(
+            f"{calibration.source} does not state the images' size; give size=(width, "
+            "height), on the command line --size WxH"
+        )
+    _require_one_size(cameras)
 
 
-def rectifier_of(rig: CameraRig, correction: FloatArray) -> Rectifier:
-    """What undoes displacements (p,) of the rig's images."""
-    maps = []
-    for camera in range(rig.cameras):
-        seen = displaced_grid(rig, camera, correction)
-        columns, rows = seen.T.reshape(2, rig.height, rig.width).astype(np.float32)
-        maps.append((columns, rows))
-    return Rectifier(rig, tuple(maps), correction=correction)
+def _require_one_size(cameras: Sequence[RawCamera]) -> None:
+    first = cameras[0]
+    for camera in cameras:
+        if camera.size != first.size:
+            raise CalibrationError(
+                f"{first.name} is {first.width}x{first.height} but {camera.name} is "
+                f"{camera.width}x{camera.height}; both must have one resolution"
+            )
+
+
+# --------------------------------------------------------------------------------------------
+# Which camera is which
+
+
+Placed = tuple[tuple[int, ...], FloatArray, tuple[str, ...]]
+"""The cameras that are right, left[, top], how the view is turned, and remarks."""
+
+
+def _offset(camera: RawCamera, reference: RawCamera) -> FloatArray:
+    """Position (3,) of a camera in another's axes."""
+    turned = reference.bTc[:3, :3]
+    return np.asarray((camera.bTc[:3, 3] - reference.bTc[:3, 3]) @ turned)
+
+
+def _pair(cameras: Sequence[RawCamera]) -> Placed:
+    """Right and left: the left one sees the other at +x. Of two above each other, the upper one."""
+    x, y, _ = _offset(cameras[1], cameras[0])
+    if abs(x) >= abs(y):
+        return ((1, 0) if x > 0.0 else (0, 1)), np.eye(3), ()
+    lower, upper = (1, 0) if y > 0.0 else (0, 1)
+    text = (
+        f"{cameras[upper].name} is above {cameras[lower].name}: the view is turned by a quarter "
+        "turn, in which the upper camera is the left one"
+    )
+    return (lower, upper), _quarter_turn(upper_side=True), (text,)
+
+
+def is_stereo_pair(cameras: Sequence[RawCamera]) -> bool:
+    """Whether two cameras see the same from next to each other, or above."""
+    sources, turn, _ = _pair(cameras)
+    try:
+        _require_side_by_side([cameras[k] for k in sources], turn)
+    except CalibrationError:
+        return False
+    return True
+
+
+def _quarter_turn(upper_side: bool) -> FloatArray:
+    """Turn (3, 3) of the view after which the camera above, or the one below, is the left one."""
+    sign = 1.0 if upper_side else -1.0
+    return np.array([[0.0, sign, 0.0], [-sign, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _three(cameras: Sequence[RawCamera]) -> Placed:
+    """Right, left[, top], how the view is turned about its axis, and remarks.
+
+    Of cameras in a line the outer two are used. The corner of an L becomes the right one; the view
+    is turned by a multiple of 90 degrees where its neighbours are not to the left and above.
+    """
+    cosines = [_cosine(cameras, k) for k in range(3)]
+    if all(abs(cosine) > np.cos(np.radians(15.0)) for cosine in cosines):
+        x = [_offset(camera, cameras[0])[0] for camera in cameras]
+        right, left = int(np.argmax(x)), int(np.argmin(x))
+        third = 3 - right - left
+        text = f"three cameras in a line: {cameras[third].name}, between the others, is not used"
+        return (right, left), np.eye(3), (text,)
+    corner = min(range(3), key=lambda k: abs(cosines[k]))
+    away = [_offset(camera, cameras[corner])[:2] for camera in cameras]
+    others = [k for k in range(3) if k != corner]
+    beside = max(others, key=lambda k: abs(away[k][0]) - abs(away[k][1]))
+    above = next(k for k in others if k != beside)
+    left_side, upper_side = away[beside][0] < 0.0, away[above][1] < 0.0
+    skew = 90.0 - np.degrees(np.arccos(np.clip(cosines[corner], -1.0, 1.0)))
+    notes: tuple[str, ...] = ()
+    if abs(skew) > _SKEW_DEG:
+        notes = (
+            f"the two baselines are {abs(skew):.1f} degrees off a right angle: columns of the top "
+            f"image differ by {np.sin(np.radians(abs(skew))):.3f} of the vertical disparity",
+        )
+    if left_side == upper_side:
+        turn = np.eye(3) if left_side else np.diag([-1.0, -1.0, 1.0])
+        return (corner, beside, above), turn, notes
+    return (corner, above, beside), _quarter_turn(upper_side), notes
+
+
+def _cosine(cameras: Sequence[RawCamera], corner: int) -> float:
+    """Cosine of the angle at one of three cameras."""
+    a, b = (c.bTc[:3, 3] - cameras[corner].bTc[:3, 3] for k, c in enumerate(cameras) if k != corner)
+    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
+
+
+def _require_side_by_side(chosen: Sequence[RawCamera], turn: FloatArray) -> None:
+    """Raises CalibrationError unless the cameras form a stereo rig."""
+    right, left = chosen[:2]
+    offset = turn @ _offset(right, left)
+    if np.linalg.norm(offset) < _LEAST_BASELINE_M:
+        raise CalibrationError(
+            f"{left.name} and {right.name} are {1e3 * np.linalg.norm(offset):.3g} mm apart, as one "
+            "camera; check T_BS (or T) in the calibration, and the unit of its lengths (--unit)"
+        )
+    if np.abs(offset[0]) < 2.0 * np.hypot(offset[1], offset[2]):
+        x, y, z = offset
+        raise CalibrationError(
+            f"{left.name} and {right.name} are not side by side (offset {x:.3f}, {y:.3f}, {z:.3f} "
+            "m along x, y, z); check T_BS (or R and T) in the calibration"
+        )
+    for other in chosen[1:]:
+        if right.bTc[:3, 2] @ other.bTc[:3, 2] < _LEAST_COMMON_VIEW:
+            raise CalibrationError(
+                f"{other.name} and {right.name} look more than 45 degrees apart; check T_BS (or R "
+                "and T) in the calibration"
+            )
+
+
+# --------------------------------------------------------------------------------------------
+# The view
+
+
+def _view(
+    calibration: Calibration,
+    chosen: Sequence[RawCamera],
+    sources: tuple[int, ...],
+    turn: FloatArray,
+    fov_deg: float | None,
+) -> tuple[tuple[FloatArray, ...], View, tuple[str, ...]]:
+    """Rotation of each camera into the view, the view, and remarks."""
+    stated = calibration.view if fov_deg is None else None
+    if stated is not None and calibration.corrections is not None:
+        rotations = tuple(stated.rotations[k] for k in sources)
+        return rotations, View(stated.matrix, stated.size), ()
+    calibration.require_uncorrected("another view (fov_deg) is asked for")
+    if fov_deg is None and _are_rectified(chosen, turn):
+        return (np.eye(3),) * len(chosen), View(chosen[0].matrix, chosen[0].size), ()
+    notes: tuple[str, ...] = ()
+    natural = float(np.mean([camera.focal_px for camera in chosen]))
+    if stated is not None:
+        if stated.matrix[0, 0] > _LEAST_STATED * natural:
+            rotations = tuple(stated.rotations[k] for k in sources)
+            return rotations, View(stated.matrix, stated.size), ()
+        notes = (
+            f"the rectified focal length that the file states, {stated.matrix[0, 0]:.0f} px, would "
+            f"shrink the images ({natural:.0f} px); another view is chosen",
+        )
+    width, height = chosen[0].size
+    upright = abs(turn[0, 0]) > 0.5 or width == height
+    axes = np.array([camera.bTc[:3, 2] for camera in chosen])
+    body_to_view = orientation([camera.bTc[:3, 3] for camera in chosen], axes)
+    rotations = tuple(body_to_view @ camera.bTc[:3, :3] for camera in chosen)
+    view = chosen_view(chosen, rotations, (width, height) if upright else (height, width), fov_deg)
+    seen = np.degrees(chosen[0].field_of_view()[:2])[:: 1 if upright else -1]
+    kept = np.degrees(view.angles)
+    if kept[0] <= _KEPT_SHARE * seen[0]:
+        notes = (
+            *notes,
+            f"of {seen[0]:.0f} x {seen[1]:.0f} degrees the rectified view shows {kept[0]:.0f} x "
+            f"{kept[1]:.0f}; what lies beyond is cut off (dataset.fov_deg chooses another angle)",
+        )
+    return rotations, view, notes
+
+
+def _are_rectified(chosen: Sequence[RawCamera], turn: FloatArray) -> bool:
+    """Whether the images are rectified as they are: equal cameras, to the left and above."""
+    right = chosen[0]
+    if not np.array_equal(turn, np.eye(3)):
+        return False
+    for k, camera in enumerate(chosen):
+        turned = right.bTc[:3, :3].T @ camera.bTc[:3, :3]
+        away = np.delete(_offset(camera, right), 0 if k == 1 else 1)
+        if (
+            camera.model != "radtan"
+            or camera.distortion.any()
+            or not np.allclose(camera.matrix, right.matrix, rtol=0.0, atol=_SAME_PX)
+            or not np.allclose(turned, np.eye(3), rtol=0.0, atol=1e-6)
+            or np.abs(away).max() > 1e-6
+        ):
+            return False
+    return True

@@ -1,13 +1,13 @@
 """Calibration files as keys and values, and the tables that say which key holds which number.
 
 A :class:`Row` of a format's table says where a camera's size, intrinsics and lens are;
-:func:`camera_of` reads them. Files are YAML, JSON, XML, with OpenCV's matrices as arrays, and
-NumPy's archives.
+:func:`camera_of` reads them. Files are YAML, JSON and XML, with OpenCV's matrices as arrays.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -19,11 +19,9 @@ import yaml
 
 from fgslam.cameras.lenses import RawCamera, checked_camera
 from fgslam.core.arrays import FloatArray
-from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_text, require_file
+from fgslam.core.files import read_text
 from fgslam.core.geometry import is_rigid
-from fgslam.core.store import UNREADABLE, require_plain
 from fgslam.core.yaml_text import PlainLoader
 
 Size: TypeAlias = tuple[int, int]
@@ -66,21 +64,20 @@ def camera_of(part: Values, row: Row, bTc: FloatArray = ORIGIN, name: str = "") 
 
 def kind_of(part: Values, keys: Sequence[str], known: Iterable[str]) -> str:
     """The texts under some keys, joined by `-`. Raises CalibrationError: they are not known."""
-    found = "-".join(part.text(key, "none") for key in keys)
-    if found not in known:
-        stated = " with ".join(f"{key} {part.text(key, 'none')}" for key in keys)
+    texts = [part.text(key, "none") for key in keys]
+    if "-".join(texts) not in known:
+        stated = " with ".join(f"{key} {text}" for key, text in zip(keys, texts, strict=True))
         raise part.refuse(f"{stated} is not known; known: {', '.join(known)}")
-    return found
+    return "-".join(texts)
 
 
 # --------------------------------------------------------------------------------------------
-# Keys and values: YAML, JSON and XML, with OpenCV's matrices as arrays, and NumPy's archives
+# Keys and values
 
 
-_TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])")
+_TIGHT = re.compile(r"^(\s*[\w.]+):(?=[^\s:/\\])", re.MULTILINE)
 _CAMERA_INFO = re.compile(r"^distortion_model:", re.MULTILINE)
 _MESSAGE_END = re.compile(r"^---[ \t]*$", re.MULTILINE)
-_LARGEST_ARCHIVE = 100_000_000  # bytes; points of a board may be in it
 _DEEPEST = 20  # levels of nesting: no calibration has ten
 
 
@@ -99,13 +96,11 @@ for _tag in ("opencv-matrix", "opencv-nd-matrix"):
 
 
 def read_tree(path: Path) -> Tree | None:
-    """Keys and values of a file; None where it is none of YAML, JSON, XML and NumPy's archive.
+    """Keys and values of a file; None where it is none of YAML, JSON and XML.
 
     Raises:
         CalibrationError: it cannot be read, or is meant to be one of them and is malformed.
     """
-    if path.suffix.lower() == ".npz":
-        return _of_archive(path)
     text = read_text(path, CalibrationError).lstrip("\ufeff \t\r\n")
     if text.startswith("<"):
         values = _of_xml(path)
@@ -113,30 +108,7 @@ def read_tree(path: Path) -> Tree | None:
         values = read_json(path, text) if text.startswith("{") else _of_yaml(path, text)
     if not isinstance(values, dict):
         return None
-    return {str(key): _arrays(path, str(key), value, 0) for key, value in values.items()}
-
-
-def _of_archive(path: Path) -> Tree:
-    """The arrays of ``numpy.savez``; what is no array of numbers is left out."""
-    require_file(path, CalibrationError, "restore the file", _LARGEST_ARCHIVE)
-    try:
-        with np.load(path, allow_pickle=False) as found:
-            require_plain(found)
-            arrays = {key: _loaded(found, key) for key in found.files}
-    except UNREADABLE as cause:
-        reason = " ".join(str(cause).split())
-        raise CalibrationError(f"{path} is no archive of NumPy ({reason}); save it again") from None
-    return {key: value for key, value in arrays.items() if value is not None}
-
-
-def _loaded(archive: Any, key: str) -> Any:
-    try:
-        value = archive[key]
-    except ValueError:  # Python's objects
-        return None
-    if value.dtype.kind not in "fiu":
-        return str(value) if value.ndim == 0 else None
-    return float(value) if value.ndim == 0 else np.asarray(value, np.float64)
+    return {str(key): _with_arrays(path, str(key), value, 0) for key, value in values.items()}
 
 
 def read_json(path: Path, text: str) -> Any:
@@ -150,16 +122,17 @@ def read_json(path: Path, text: str) -> Any:
 
 
 def _of_yaml(path: Path, text: str) -> Any:
-    lines = _first_message(text).splitlines()
     if text.startswith("%YAML"):
-        # OpenCV writes a directive that is no YAML, and reads "key:value" without a space.
-        lines = [_TIGHT.sub(r"\1: ", line) for line in lines if not line.startswith("%YAML")]
+        # OpenCV writes a head that is no YAML, and reads "key:value" without a space.
+        text = _TIGHT.sub(r"\1: ", text.partition("\n")[2])
+    elif is_camera_text(text):  # the first message of an echo of a topic
+        text = _MESSAGE_END.split(text.removeprefix("---\n"), maxsplit=1)[0]
     try:
-        return _Loader("\n".join(lines)).get_single_data()
+        return _Loader(text.rstrip().removesuffix("\n---")).get_single_data()
     except RecursionError:
         raise CalibrationError(f"{path} is nested too deeply; correct the file") from None
     except (yaml.YAMLError, ValueError) as cause:
-        if not text.startswith("%YAML") and path.suffix.lower() not in (".yaml", ".yml"):
+        if path.suffix.lower() not in (".yaml", ".yml"):
             return None
         reason = " ".join(str(cause).split())
         raise CalibrationError(f"{path} is not YAML: {reason}; correct the file") from None
@@ -168,13 +141,6 @@ def _of_yaml(path: Path, text: str) -> Any:
 def is_camera_text(text: str) -> bool:
     """Whether a text may be a ROS camera_info, as ``rostopic echo`` writes it too."""
     return _CAMERA_INFO.search(text) is not None
-
-
-def _first_message(text: str) -> str:
-    """The first message of an echo of a topic, each of which ends in a line of dashes."""
-    if text.startswith("%YAML") or not is_camera_text(text):
-        return text.rstrip().removesuffix("\n---")
-    return _MESSAGE_END.split(text.removeprefix("---\n"), maxsplit=1)[0]
 
 
 def _of_xml(path: Path) -> Any:
@@ -192,8 +158,7 @@ def _of_node(node: cv2.FileNode, depth: int) -> Any:
     if depth > _DEEPEST:
         return None
     if node.isMap():
-        names = node.keys()
-        return {name: _of_node(node.getNode(name), depth + 1) for name in names}
+        return {name: _of_node(node.getNode(name), depth + 1) for name in node.keys()}  # noqa: SIM118 - no mapping
     if node.isSeq():
         return [_of_node(node.at(k), depth + 1) for k in range(node.size())]
     if node.isString():
@@ -201,66 +166,42 @@ def _of_node(node: cv2.FileNode, depth: int) -> Any:
     return node.real() if node.isReal() or node.isInt() else None
 
 
-def _arrays(path: Path, key: str, value: Any, depth: int) -> Any:
+def _with_arrays(path: Path, key: str, value: Any, depth: int) -> Any:
     """The value with what has rows, columns and data as arrays; keys are texts."""
     if depth > _DEEPEST:
         raise CalibrationError(f"{path} is nested too deeply; correct the file")
     if isinstance(value, list):
-        return [_arrays(path, key, one, depth + 1) for one in value]
+        return [_with_arrays(path, key, one, depth + 1) for one in value]
     if not isinstance(value, dict):
         return value
-    if {"rows", "cols", "data"} <= value.keys():
-        return _array(path, key, value)
-    if {"sizes", "dt", "data"} <= value.keys():
-        return _array_of_sizes(path, key, value)
-    return {str(k): _arrays(path, str(k), v, depth + 1) for k, v in value.items()}
-
-
-def _array(path: Path, key: str, block: Mapping[str, Any]) -> FloatArray:
-    rows, columns, given = block["rows"], block["cols"], block["data"]
-    data = flat_numbers(given)
-    whole = all(is_finite_number(count) and count >= 0 for count in (rows, columns))
-    cells = round(rows * columns) if whole else 0
-    if data is None or not whole or len(data) % max(cells, 1) or bool(cells) != bool(len(data)):
+    if "data" not in value or not ("sizes" in value or {"rows", "cols"} <= value.keys()):
+        return {str(k): _with_arrays(path, str(k), v, depth + 1) for k, v in value.items()}
+    # OpenCV 5 writes a row of numbers with one axis; points have several numbers a cell.
+    sizes = flat_numbers(value.get("sizes", [value.get("rows"), value.get("cols")]))
+    data = flat_numbers(value["data"])
+    shape = tuple(np.rint(np.empty(0) if sizes is None else sizes).astype(int).tolist())
+    cells = math.prod(shape)
+    if (
+        data is None
+        or not shape
+        or min(shape) < 0
+        or len(data) % max(cells, 1)
+        or bool(cells) != bool(len(data))
+    ):
+        wanted = " x ".join(map(str, shape))
         raise CalibrationError(
-            f"{path}: {key} must be {rows} rows of {columns} finite numbers; correct the file"
+            f"{path}: {key} must be a matrix of {wanted} finite numbers; correct the file"
         )
-    shape = (round(rows), round(columns))
-    # Points have several numbers a cell.
     return data.reshape(shape if len(data) == cells else (*shape, -1))
 
 
-def _array_of_sizes(path: Path, key: str, block: Mapping[str, Any]) -> FloatArray:
-    """An array of any number of axes: OpenCV 5 writes a row of numbers with one."""
-    sizes, data = flat_numbers(block["sizes"]), flat_numbers(block["data"])
-    if sizes is None or data is None or np.prod(sizes) != len(data) or (sizes < 0.0).any():
-        raise CalibrationError(f"{path}: {key} must be finite numbers of its sizes; correct it")
-    return data.reshape(tuple(np.rint(sizes).astype(int)))
-
-
-def flat_numbers(value: Any, depth: int = 0) -> FloatArray | None:
+def flat_numbers(value: Any) -> FloatArray | None:
     """All numbers of lists in lists, or of an array, in order; None where one is no number."""
-    if isinstance(value, np.ndarray):
-        return np.asarray(value, np.float64).ravel()
-    if depth > _DEEPEST:
+    try:  # YAML 1.1 takes 1e-05 for a text
+        found = np.asarray(value, np.float64).ravel()
+    except (TypeError, ValueError, OverflowError):
         return None
-    found: list[float] = []
-    for one in value if isinstance(value, list) else [value]:
-        if isinstance(one, list | np.ndarray):
-            inner = flat_numbers(one, depth + 1)
-            if inner is None:
-                return None
-            found.extend(inner.tolist())
-            continue
-        if isinstance(one, str):  # YAML 1.1 takes 1e-05 for a text
-            try:
-                one = float(one)
-            except ValueError:
-                return None
-        if not is_finite_number(one):
-            return None
-        found.append(float(one))
-    return np.array(found, np.float64)
+    return found if np.isfinite(found).all() else None
 
 
 class Values:
@@ -294,13 +235,6 @@ class Values:
         """The value as lower-case text."""
         return str(self.tree.get(key, default)).strip().lower()
 
-    def listed(self, key: str) -> list[Any]:
-        """A list. Raises CalibrationError where there is none."""
-        value = self.tree.get(key)
-        if not isinstance(value, list):
-            raise self.refuse(f"{key} must be a list, one entry a camera; correct the file")
-        return value
-
     def numbers(self, key: str, count: int | None = None) -> FloatArray:
         """(count,) finite numbers, or as many as there are. Raises CalibrationError otherwise."""
         given = self._at(key)
@@ -309,7 +243,7 @@ class Values:
         found = None if given is None else flat_numbers(given)
         if found is None or count not in (None, len(found)):
             many = "" if count is None else f"{count} "
-            text = " ".join(repr(given).split())
+            text = "missing" if given is None else " ".join(repr(given).split())
             raise self.refuse(
                 f"{key} is {text if len(text) <= 60 else text[:57] + '...'}, expected {many}finite "
                 f"number{'' if count == 1 else 's'}; correct the file"
@@ -326,9 +260,7 @@ class Values:
         """One number for each key, 0 for a missing one that ends in `?`; of one key alone all."""
         if len(keys) == 1:
             return self.numbers(keys[0])
-        optional = [0.0 if key.endswith("?") else None for key in keys]
-        named = [key.removesuffix("?") for key in keys]
-        return np.array([self.number(*pair) for pair in zip(named, optional, strict=True)])
+        return np.array([self.number(k.rstrip("?"), 0.0 if k[-1] == "?" else None) for k in keys])
 
     def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
         """(rows, columns) numbers."""
@@ -336,8 +268,9 @@ class Values:
 
     def intrinsics(self, keys: Sequence[str]) -> FloatArray:
         """(3, 3) of fx, fy, cx, cy by their keys, or by one key of all four."""
-        four = self.numbers(keys[0], 4) if len(keys) == 1 else self.values(keys)
-        return intrinsic_matrix(*four)
+        return intrinsic_matrix(
+            *(self.numbers(keys[0], 4) if len(keys) == 1 else self.values(keys))
+        )
 
     def motion(self, key: str) -> FloatArray:
         """(4, 4) rigid motion, of 16 or of 12 numbers."""

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import yaml
 
-from fgslam.cameras.formats import CORRECTIONS
+from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
@@ -60,34 +60,6 @@ def write_calibration(
         calibration.require_uncorrected(f"{words} cannot hold them")
     write(calibration, path, view)
     return words
-
-
-def raw_values(calibration: Calibration) -> dict[str, Any]:
-    """Keys and values of fgslam's own ``calib.json``."""
-    cameras = [
-        {
-            "name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
-            "model": camera.model,
-            "matrix": camera.matrix.tolist(),
-            "parameters": camera.distortion.tolist(),
-            "bTc": camera.bTc.tolist(),
-        }
-        for camera in calibration.cameras
-    ]
-    values: dict[str, Any] = {"sided": calibration.sided, "cameras": cameras}
-    view = calibration.view
-    if view is not None:
-        values["rectified_view"] = {
-            "width": view.size[0],
-            "height": view.size[1],
-            "matrix": view.matrix.tolist(),
-            "rotations": [rotation.tolist() for rotation in view.rotations],
-        }
-    if calibration.corrections is not None:
-        values[CORRECTIONS] = dict(calibration.corrections)
-    return values
 
 
 def _write_own(calibration: Calibration, path: Path, _: StatedView | None) -> None:

@@ -19,9 +19,9 @@ from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
+from fgslam.cameras.formats import read_camera_info, read_camera_info_pair
 from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.cameras.rig import StereoRig, at_size, implausible, in_metres, read_calibration_file
-from fgslam.cameras.stereo_formats import read_camera_info, read_camera_info_pair
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
 from fgslam.core.files import shown_in

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats import read_json_object
+from fgslam.cameras.calib_json import read_json_object
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from fgslam.cameras.formats import read_asl_mounting
-from fgslam.cameras.rig import StereoRig, load_rig
-from fgslam.cameras.stereo_formats import (
+from fgslam.cameras.formats import (
     KITTI_RAW,
     KITTI_RAW_COLOUR,
     left_on_inertial_unit,
     pair_beside,
+    read_asl_mounting,
     read_kitti,
     right_of_camera_0,
 )
+from fgslam.cameras.rig import StereoRig, load_rig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.files import read_lines, read_text, shown_in

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from fgslam.cameras.boards import Board, Corners, find_corners, find_corners_of_wide, sizes_that_fit
+from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.calibrate import (
     DEPTH_SHARE,
     INTRINSICS,
@@ -35,7 +36,6 @@ from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
 from fgslam.cameras.omni import MirrorFrame
 from fgslam.cameras.rig import (
     StereoRig,
-    assembled,
     at_size,
     chosen_cameras,
     in_metres,
@@ -44,7 +44,7 @@ from fgslam.cameras.rig import (
     rig_of,
 )
 from fgslam.cameras.rings import calibrate_from_rings, find_mirror_circle
-from fgslam.cameras.write_formats import raw_values, write_calibration
+from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
 from fgslam.core.files import write_text
@@ -117,7 +117,7 @@ def calibrate_cameras(
     found = calibrate(board, views, size, model)
     checked = [held_out(board, views, size, model, k) for k in range(1, len(found.cameras))]
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
-    remarks = assembled(calibration).remarks
+    remarks = rig_of(calibration).remarks
     write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
     others = _write_beside(out, files, views, found)
     fit = _fit_lines(files, views, found)
@@ -383,14 +383,15 @@ def _write_beside(
     of_images = []
     for v, view in enumerate(views):
         for c, seen in enumerate(view):
-            count, used = 0 if seen is None else len(seen), len(found.off[v][c])
+            count, kept = 0 if seen is None else len(seen), found.kept[v][c]
+            used = 0 if kept is None else len(kept)
             rms = float(found.errors[v, c])
             of_images.append((files[v][c].name, names[c], count, count - used, rms))
     write_csv(images, ("image", "camera", "corners", "left_out", "rms_px"), of_images)
     rows: list[tuple[str, str, float, float]] = []
     for k, camera in enumerate(found.cameras):
         named = (*INTRINSICS, *PARAMETERS[camera.model], *(_TURNS if k else ()))
-        values = [*camera.intrinsics, *camera.distortion, *(found.turn(k) if k else ())]
+        values = [*camera.intrinsics, *camera.distortion, *(found.turns[k] if k else ())]
         sigmas = [*found.sigmas[k], *(found.turn_sigmas[k] if k else ())]
         for name, value, sigma in zip(named, values, sigmas, strict=True):
             rows.append((names[k], name, float(value), float(sigma)))
@@ -514,13 +515,13 @@ def _view(found: Calibration, fov_deg: float | None) -> StatedView:
     """The rectification of a pair, left camera first."""
     if found.view is not None and fov_deg is None:
         return found.view
-    made = assembled(found, fov_deg)
+    made = rig_of(found, fov_deg)
     if made.sources != (1, 0):
         raise CalibrationError(
             f"{found.source}: its first camera is the right one, and ROS wants the left one first; "
             "choose them in that order: --cameras 1,0"
         )
-    rig = made.rig
+    rig = made
     axes = rig.bTc[:3, :3].T
     rotations = tuple(axes @ camera.bTc[:3, :3] for camera in found.cameras)
     matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])

@@ -29,7 +29,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fgslam.cameras.formats import pixels, read_json_object
+from fgslam.cameras.calib_json import pixels, read_json_object
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import read_lines, write_bytes, write_text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -153,19 +153,3 @@ BEARINGS = Archive(".npz", _bearing_log, BearingLog.load, lambda log: dict(log.t
 MAP = Archive(".fgmap", _map, fg.Map.load, _saved)
 ROUTE = Archive(".fgpath", _route, fg.PathMemory.load, _saved)
 ROUTE_MAP = Archive(".fgmap", _route_map, fg.RouteMap.load, _saved)
-
-
-@cache
-def _calibration_arrays() -> Arrays:
-    camera = np.array([[200.0, 0.0, 159.5], [0.0, 200.0, 119.5], [0.0, 0.0, 1.0]])
-    beside = np.array([-0.1, 0.0, 0.0])
-    return {"K1": camera, "D1": np.zeros(5), "K2": camera, "D2": np.zeros(5), "R": np.eye(3),
-            "T": beside, "size": np.array([320, 240])}  # fmt: skip
-
-
-def calibration_archive(rng: Rng, folder: Path) -> Path:
-    """A rig's matrices as ``numpy.savez`` writes them, damaged in values or bytes."""
-    path = folder / "stereo.npz"
-    arrays: Any = _calibration_arrays()
-    np.savez_compressed(path, **(damaged_arrays(rng, arrays) if rng.random() < 0.5 else arrays))
-    return path if rng.random() < 0.3 else written(path, damaged_bytes(rng, path.read_bytes()))

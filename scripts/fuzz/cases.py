@@ -28,7 +28,6 @@ from scripts.fuzz.archives import (
     MEASUREMENTS,
     ROUTE,
     ROUTE_MAP,
-    calibration_archive,
 )
 from scripts.fuzz.damage import Rng, require_one_line
 
@@ -80,7 +79,6 @@ KINDS = (
     Kind("route_values", ROUTE.of_odd_values, ROUTE.load),
     Kind("joined_bytes", ROUTE_MAP.of_damaged_bytes, ROUTE_MAP.load, ROUTE_MAP.is_same),
     Kind("joined_values", ROUTE_MAP.of_odd_values, ROUTE_MAP.load),
-    Kind("calibration_archive", calibration_archive, lambda path: fg.load_rig(path)),
     Kind("calibration_digit", values.calibration, values.read_calibration, values.is_as_written),
     Kind(
         "configuration_digit",

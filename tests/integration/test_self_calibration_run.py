@@ -11,7 +11,7 @@ from recordings import BASELINE, FOCAL, HEIGHT, WIDTH, experiment, write_recordi
 from running import bytes_of, main, metrics_of, run_values, stop_after
 
 import fgslam
-from fgslam.cameras.rig import rectifier_of
+from fgslam.cameras.rectify import rectifier_of
 from fgslam.core.correction import term_names
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig

@@ -12,8 +12,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from fgslam.backend.self_calibration import SelfCalibration
+from fgslam.cameras.calib_json import write_corrected
 from fgslam.cameras.rectify import Rectifier
-from fgslam.cameras.rig import write_corrected
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.correction import IMPLAUSIBLE_PX, RigCorrection, term_names
 from fgslam.core.errors import ConfigError, FgslamError, OutputError

@@ -11,15 +11,15 @@ import cv2
 import numpy as np
 import pytest
 
+from fgslam.cameras.calib_json import raw_values, write_corrected
 from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.rectify import rectifier_of
 from fgslam.cameras.rig import (
     StereoRig,
     load_rig,
     read_calibration_file,
-    rectifier_of,
-    write_corrected,
 )
-from fgslam.cameras.write_formats import raw_values, write_calibration
+from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.correction import (
     SHARED,
@@ -234,7 +234,6 @@ def test_what_would_lose_a_correction_is_refused(
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"kind": "cylindrical"}, "kind is 'cylindrical', but a view is perspective"),
         ({"rotations": [np.ones((3, 3)).tolist()] * 2}, "no rotation"),
         ({"rotations": [np.eye(3).tolist()]}, "expected 18 finite numbers"),
         ({"width": 0}, "width and height are 0"),
@@ -254,11 +253,3 @@ def test_a_stated_view_that_is_none_is_refused(
     path.write_text(json.dumps(values))
     with pytest.raises(CalibrationError, match="rectified_view is missing"):
         load_rig(path)
-
-
-def test_a_file_of_images_in_another_view_is_refused(tmp_path: Path) -> None:
-    write_corrected(tmp_path / "rolled.json", RigCorrection.none(PAIR))
-    values = json.loads((tmp_path / "rolled.json").read_text())
-    (tmp_path / "rolled.json").write_text(json.dumps(values | {"view": "cylindrical"}))
-    with pytest.raises(CalibrationError, match=r"view is 'cylindrical', but .* perspective ones"):
-        load_rig(tmp_path / "rolled.json")

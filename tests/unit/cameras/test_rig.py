@@ -205,7 +205,7 @@ def test_rows_of_numbers_as_opencv_5_writes_them(tmp_path: Path) -> None:
     assert rig.baseline == pytest.approx(0.2, abs=1e-12)
     assert any("taken as those of cv2.fisheye" in remark for remark in rig.remarks)
     path.write_text(OF_OPENCV_5.replace("sizes: [ 3 ]", "sizes: [ 4 ]"), encoding="utf-8")
-    with pytest.raises(CalibrationError, match=r"rig_of_tuesday\.yml: T must be finite numbers of"):
+    with pytest.raises(CalibrationError, match=r"_of_tuesday\.yml: T must be a matrix of 4 "):
         StereoRig.load(tmp_path, (WIDTH, HEIGHT))
 
 
@@ -232,9 +232,11 @@ def test_numbers_that_no_camera_has_are_refused(
     """A transposed matrix, lost points of numbers, millimetres of a wrong power."""
     plain = np.array([[30.0, 0.0, 80.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]])
     whole = {"K1": plain, "K2": plain, "D1": np.zeros(5), "D2": np.zeros(5), "R": np.eye(3)}
-    np.savez(tmp_path / "rig.npz", **whole | {"T": [-0.1, 0.0, 0.0], "size": [160, 120]} | wrong)
+    values = whole | {"T": [-0.1, 0.0, 0.0], "size": [160, 120]} | wrong
+    text = json.dumps(values, default=lambda array: array.tolist())
+    (tmp_path / "rig.json").write_text(text, encoding="utf-8")
     with pytest.raises(CalibrationError, match=words):
-        StereoRig.load(tmp_path / "rig.npz")
+        StereoRig.load(tmp_path / "rig.json")
 
 
 def test_camera_info_is_rectified_as_it_says(tmp_path: Path) -> None:
@@ -288,7 +290,7 @@ def test_our_own_and_kittis_files_need_no_rectification(tmp_path: Path) -> None:
         ({"distortion_model": "kb9"}, "cam1.camera_model pinhole with distortion_model kb9 is not"),
         ({"camera_model": "omni"}, "cam1.intrinsics is .*, expected 5 finite numbers"),
         ({"T_cn_cnm1": None}, "T_cn_cnm1"),
-        ({"T_cn_cnm1": [[1.0, 0.0], [0.0]]}, "expected 16 finite numbers"),
+        ({"T_cn_cnm1": [[1.0, 0.0], [0.0]]}, "expected finite numbers"),
         ({"T_cn_cnm1": np.diag([2.0, 1, 1, 1]).tolist()}, "not a rigid motion"),
         ({"intrinsics": [1.0, 2.0]}, "intrinsics"),
         ({"resolution": [80, 60]}, "one resolution"),

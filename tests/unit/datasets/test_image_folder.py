@@ -17,8 +17,8 @@ from dataset_builders import (
     write_tum,
 )
 
+from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.lenses import Calibration, RawCamera
-from fgslam.cameras.write_formats import raw_values
 from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, right_from_left_camera
 from fgslam.core.log import ImageSequence

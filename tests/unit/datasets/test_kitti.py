@@ -109,8 +109,8 @@ BAD = [
     (mono, DatasetError, ["no image_1/", "both grey cameras", "unpack"]),
     (other_size, DatasetError, ["differ in size", "right 16x12", "left 32x24"]),
     (no_calibration, CalibrationError, ["calib.txt", "No such file", "restore"]),
-    (replaced("calib.txt", "P1:", "P9:"), CalibrationError, ["calib.txt", "no line 'P1'"]),
-    (replaced("calib.txt", "-12.0", "nan"), CalibrationError, ["line 2", "P1", "12 finite"]),
+    (replaced("calib.txt", "P1:", "P9:"), CalibrationError, ["calib.txt", "P1 is missing"]),
+    (replaced("calib.txt", "-12.0", "nan"), CalibrationError, ["calib.txt: P1 is", "12 finite"]),
     (replaced("calib.txt", "-12.0", "12.0"), CalibrationError, ["baseline is -0.4", "swapped"]),
     (replaced("calib.txt", "-12.0", "0.0"), CalibrationError, ["baseline is 0", "positive"]),
     (

@@ -14,9 +14,9 @@ import pytest
 from dataset_builders import write_calibration
 
 import fgslam as fg
+from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.lenses import Calibration, RawCamera
 from fgslam.cameras.settings import EquirectangularSettings
-from fgslam.cameras.write_formats import raw_values
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import pose

@@ -1,0 +1,286 @@
+"""fgslam's own ``calib.json``: cameras as calibrated, or a rectified rig in a few numbers.
+
+Both may state corrections: what a drive found wrong, as displacements of the rectified images'
+pixels (:mod:`fgslam.core.correction`), which are undone where an image is read.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fgslam.cameras.lenses import LENSES, Calibration, RawCamera, StatedView, checked_view
+from fgslam.cameras.rectify import Rectifier
+from fgslam.cameras.trees import (
+    Row,
+    Size,
+    Tree,
+    Values,
+    camera_of,
+    flat_numbers,
+    intrinsic_matrix,
+    read_json,
+)
+from fgslam.core.arrays import FloatArray
+from fgslam.core.checks import is_finite_number
+from fgslam.core.correction import RigCorrection, term_names
+from fgslam.core.errors import CalibrationError
+from fgslam.core.files import read_text, write_text
+from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse, is_rigid, pose
+from fgslam.core.sensors import CameraRig
+
+OWN_FORMAT = "calib.json of fgslam"
+CORRECTIONS = "corrections"
+OF_RECTIFIED = {"baseline_m", "baseline", "rectified", "fx"}
+_OWN = Row(
+    size=("width", "height"),
+    matrix="matrix",
+    kind=("model",),
+    lenses={model: (model, ("parameters",)) for model in LENSES},
+)
+
+# --------------------------------------------------------------------------------------------
+# Of cameras as calibrated
+
+
+def is_own(tree: Tree) -> bool:
+    """Whether it is a ``calib.json`` of cameras as calibrated."""
+    cameras = tree.get("cameras")
+    first = cameras[0] if isinstance(cameras, list) and cameras else None
+    return isinstance(first, dict) and {"model", "matrix"} <= first.keys()
+
+
+def read_own(path: Path, tree: Tree, _: Size | None) -> Calibration:
+    """The cameras, and the view that is stated. Raises CalibrationError."""
+    corrections = stated_corrections(path, tree)
+    if corrections is not None and "rectified_view" not in tree:
+        raise CalibrationError(
+            f"{path}: {CORRECTIONS} are of rectified images, but rectified_view is missing; "
+            f"restore it, or remove {CORRECTIONS}"
+        )
+    cameras = []
+    for k, values in enumerate(tree["cameras"]):
+        part = Values(path, values, f"cameras[{k}].")
+        name = str(part.tree.get("name", part.where[:-1]))
+        cameras.append(camera_of(part, _OWN, part.motion("bTc"), name))
+    view, stated = None, Values(path, tree).inside("rectified_view")
+    if stated.tree:
+        rotations = stated.numbers("rotations", 9 * len(cameras)).reshape(-1, 3, 3)
+        if not all(is_rigid(pose(rotation, np.zeros(3))) for rotation in rotations):
+            raise stated.refuse("rotations has one that is no rotation; correct the file")
+        size = stated.size("width", "height")
+        if min(size) <= 0:
+            raise stated.refuse(f"width and height are {size[0]} and {size[1]}; correct the file")
+        view = StatedView(tuple(rotations), stated.matrix("matrix", 3, 3), size)
+        view = checked_view(view, str(path))
+    sided = tree.get("sided") is True
+    return Calibration(str(path), OWN_FORMAT, tuple(cameras), sided, view, corrections=corrections)
+
+
+def raw_values(calibration: Calibration) -> dict[str, Any]:
+    """Keys and values of fgslam's own ``calib.json``."""
+    cameras = [
+        {
+            "name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "model": camera.model,
+            "matrix": camera.matrix.tolist(),
+            "parameters": camera.distortion.tolist(),
+            "bTc": camera.bTc.tolist(),
+        }
+        for camera in calibration.cameras
+    ]
+    values: dict[str, Any] = {"sided": calibration.sided, "cameras": cameras}
+    view = calibration.view
+    if view is not None:
+        values["rectified_view"] = {
+            "width": view.size[0],
+            "height": view.size[1],
+            "matrix": view.matrix.tolist(),
+            "rotations": [rotation.tolist() for rotation in view.rotations],
+        }
+    if calibration.corrections is not None:
+        values[CORRECTIONS] = dict(calibration.corrections)
+    return values
+
+
+# --------------------------------------------------------------------------------------------
+# Of rectified cameras
+
+# 'baseline' is close to 'baseline_m' (0.89); 'fy' to 'fx' (0.5) and 'baseline_m' to
+# 'vertical_baseline_m' (0.69), which are keys of their own, are not.
+_CLOSE_NAMES = 0.8
+
+
+def is_rectified(tree: Tree) -> bool:
+    """Whether it is a ``calib.json`` of rectified cameras."""
+    return not is_own(tree) and bool(OF_RECTIFIED & tree.keys())
+
+
+def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
+    """The rig of a ``calib.json``; ``three_cameras`` asks for its vertical baseline as well.
+
+    Raises:
+        CalibrationError: a value is missing, not finite or impossible.
+    """
+    values = read_json_object(path)
+    if values.get("rectified") is False:
+        raise CalibrationError(
+            f"{path} says that the images are not rectified; rectify them first (rows of the left "
+            "and right image must agree), or give the raw cameras' calibration by --camera FILE"
+        )
+    bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
+    if "bTc" in values:
+        found = flat_numbers(values["bTc"])
+        if found is None or len(found) != 16 or not is_rigid(found.reshape(4, 4)):
+            raise CalibrationError(
+                f"{path}: bTc must be a rigid 4x4 matrix (the pose of the right camera in the "
+                "body); correct or remove it"
+            )
+        bTc = found.reshape(4, 4)
+    return CameraRig(
+        width=pixels(path, values, "width"),
+        height=pixels(path, values, "height"),
+        fx=number(path, values, "fx", positive=True),
+        fy=number(path, values, "fy", positive=True),
+        cx=number(path, values, "cx"),
+        cy=number(path, values, "cy"),
+        baseline=number(path, values, "baseline_m", positive=True),
+        vertical_baseline=(
+            number(path, values, "vertical_baseline_m", positive=True) if three_cameras else None
+        ),
+        bTc=bTc,
+    )
+
+
+def as_calibrated(
+    rig: CameraRig, path: Path, corrections: Mapping[str, float] | None = None
+) -> Calibration:
+    """A rectified rig as cameras without distortion: left, right[, top]."""
+    offsets = [("left", [-rig.baseline, 0.0, 0.0]), ("right", [0.0, 0.0, 0.0])]
+    if rig.vertical_baseline is not None:
+        offsets.append(("top", [0.0, -rig.vertical_baseline, 0.0]))
+    size, matrix = (rig.width, rig.height), intrinsic_matrix(rig.fx, rig.fy, rig.cx, rig.cy)
+    cameras = tuple(
+        RawCamera(*size, matrix, np.zeros(4), rig.bTc @ pose(np.eye(3), np.array(at)), name)
+        for name, at in offsets
+    )
+    view = None if corrections is None else StatedView((np.eye(3),) * len(cameras), matrix, size)
+    return Calibration(str(path), OWN_FORMAT, cameras, True, view, corrections=corrections)
+
+
+def read_json_object(path: Path) -> Mapping[str, Any]:
+    """A JSON file's outermost object. Raises CalibrationError when there is none."""
+    remedy = "give a calibration: this file (docs/datasets/images.md has its keys), or "
+    remedy += "another one by --camera FILE"
+    values = read_json(path, read_text(path, CalibrationError, remedy))
+    if not isinstance(values, dict):
+        raise CalibrationError(f"{path} must hold one JSON object with the calibration's keys")
+    return values
+
+
+def number(path: Path, values: Mapping[str, Any], key: str, positive: bool = False) -> float:
+    """A finite number of the calibration. Raises CalibrationError otherwise."""
+    if key not in values:
+        remedy = "add it to the calibration"
+        for close in get_close_matches(key, values, n=1, cutoff=_CLOSE_NAMES):
+            unit = " in metres" if key.endswith("_m") else ""
+            remedy = f"if {close!r} means it, rename it to {key!r} (a number{unit})"
+        raise CalibrationError(f"{path} has no {key!r}; {remedy}")
+    value = values[key]
+    if not is_finite_number(value):
+        raise CalibrationError(f"{path}: {key} is {value!r}, not a finite number; correct it")
+    if positive and value <= 0.0:
+        hint = "correct it"
+        if "baseline" in key:
+            hint = "it is the distance between the cameras in metres; if left and right are "
+            hint += "swapped, swap the folders"
+        raise CalibrationError(f"{path}: {key} is {value:g}, must be positive: {hint}")
+    return float(value)
+
+
+def pixels(path: Path, values: Mapping[str, Any], key: str) -> int:
+    """A positive whole number of the calibration. Raises CalibrationError otherwise."""
+    value = number(path, values, key, positive=True)
+    if value != int(value):
+        raise CalibrationError(f"{path}: {key} is {value:g}, not a whole number of pixels")
+    return int(value)
+
+
+# --------------------------------------------------------------------------------------------
+# Corrections
+
+
+def stated_corrections(path: Path, tree: Tree) -> Mapping[str, float] | None:
+    """Its corrections by name; None where it has none. Raises CalibrationError: no object."""
+    values = tree.get(CORRECTIONS)
+    if values is not None and not isinstance(values, dict):
+        raise CalibrationError(
+            f"{path}: {CORRECTIONS} must be an object with a number for each term; correct or "
+            "remove it"
+        )
+    return values
+
+
+def correction_values(source: str, values: Mapping[str, float], rig: CameraRig) -> FloatArray:
+    """(p,) values of a rig's terms by their names.
+
+    Raises:
+        CalibrationError: one is no term of the rig, or is missing; ``source`` names the file.
+    """
+    names = term_names(rig)
+    known = {*names, *(name.replace("left.", "top.") for name in names)}
+    unknown = sorted(set(values) - known)
+    if unknown:
+        raise CalibrationError(
+            f"{source}: {CORRECTIONS} has {unknown[0]!r}, which is no term; known: "
+            f"{', '.join(names)}"
+        )
+    later = [name for name in names if name.startswith("all.") or name.endswith("_outer")]
+    every = {**dict.fromkeys(later, 0.0), **values}  # older files have none of these
+    return np.array([number(Path(source), every, name) for name in names])
+
+
+def write_corrected(
+    path: Path, correction: RigCorrection, rectifier: Rectifier | None = None
+) -> None:
+    """Writes a ``calib.json`` with what was found wrong in it, and standard deviations.
+
+    Args:
+        path: the file.
+        correction: found in the rectified images.
+        rectifier: what rectified them. The file then is of the raw cameras, and states the view;
+            what was corrected before is added.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    rig, found = correction.rig, correction.values
+    if rectifier is not None and rectifier.correction is not None:
+        found = found + rectifier.correction
+    raw = None if rectifier is None else rectifier.calibration
+    if rectifier is None or raw is None:
+        names = ("width", "height", "fx", "fy", "cx", "cy")
+        values: dict[str, Any] = {name: getattr(rig, name) for name in names}
+        values["baseline_m"] = rig.baseline
+        if rig.vertical_baseline is not None:
+            values["vertical_baseline_m"] = rig.vertical_baseline
+        values["bTc"] = rig.bTc.tolist()
+    else:
+        motion = rig.bTc @ inverse(rectifier.rig.bTc)  # mounted otherwise on the robot
+        if not np.allclose(motion, np.eye(4), rtol=0.0, atol=1e-12):
+            cameras = tuple(replace(c, bTc=motion @ c.bTc) for c in raw.cameras)
+            raw = replace(raw, cameras=cameras)
+        values = raw_values(raw)
+    if found.any():
+        terms = term_names(rig)
+        values[CORRECTIONS] = dict(zip(terms, found.tolist(), strict=True))
+        values["correction_sigmas"] = dict(zip(terms, correction.sigmas.tolist(), strict=True))
+    write_text(path, json.dumps(values, indent=2) + "\n")
