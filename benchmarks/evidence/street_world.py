@@ -20,7 +20,7 @@ from fgslam.core.correction import camera_displacements
 from fgslam.core.geometry import pose
 from fgslam.core.sensors import CameraRig
 from fgslam.worlds.patches import Patch, RayCaster, Surface, Thing, rectangle, stack
-from fgslam.worlds.renderer import Layer, LightMaps, PixelRays, Renderer, pinhole_view
+from fgslam.worlds.renderer import Layer, LightMaps, Renderer, pinhole_view
 from fgslam.worlds.textures import GreyBank
 
 Float32 = npt.NDArray[np.float32]
@@ -82,7 +82,9 @@ class Street:
         exact = pixels
         for _ in range(3):
             exact = pixels - camera_displacements(RIG, number, exact) @ correction
-        rays = PixelRays((_SCALE * exact + 0.5).astype(np.float32), view.matrix)
+        columns, rows = (_SCALE * exact + 0.5).astype(np.float32).T
+        direction = np.stack([columns, rows, np.ones_like(rows)])
+        rays = dataclasses.replace(view.rays, direction=direction)
         cTk = pose(np.eye(3), np.array([-number * RIG.baseline, 0.0, 0.0]))
         return Renderer(dataclasses.replace(view, rays=rays), self._bank), cTk
 

@@ -17,8 +17,8 @@ from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.runs.engine import run_task
 from fgslam.runs.tasks.slam import SlamResult, first_config, open_slam
 from fgslam.runs.tasks.slam_map_entry import MAP_FILE
-from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.patches import Thing
+from fgslam.worlds.places import build_lab
 
 EXPERIMENT = "two_visits"
 UNCHANGED = "nothing moved"
@@ -151,7 +151,8 @@ def _things(result: SlamResult, saved: SavedMap) -> npt.NDArray[np.str_]:
 def _moved_things(visit: int) -> list[str]:
     """Names of the things that stand elsewhere at this visit than at the first."""
     before, after = (
-        {thing.name: thing for thing in build_lab(np.random.default_rng(0), v)} for v in (1, visit)
+        {thing.name: thing for thing in build_lab(np.random.default_rng(0), v).things}
+        for v in (1, visit)
     )
     return [name for name, thing in before.items() if not _same_place(thing, after[name])]
 

@@ -390,6 +390,3 @@ def _simulation_notes(
         yield f"odometry off by a factor of {fault.scale:g} for {fault.frames} frames"
     if settings.blackout is not None:
         yield f"cameras blocked for {settings.blackout.frames} frames"
-    if settings.moved is not None:
-        share = 100.0 * settings.moved.fraction
-        yield f"{share:g} % of the landmarks move at frame {settings.moved.frame}"

@@ -19,7 +19,7 @@ from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.types import Trajectory
-from fgslam.worlds.driving import PosesInTime, simulate_wheels
+from fgslam.worlds.driving import Drive, simulate_wheels
 from fgslam.worlds.lab import (
     PlaceChoice,
     World,
@@ -30,15 +30,8 @@ from fgslam.worlds.lab import (
     open_room,
     plan_in_place,
 )
-from fgslam.worlds.people import Stance, make_walk
-from fgslam.worlds.renderer import (
-    BLUR_RENDERS,
-    Body,
-    RenderCache,
-    apply_effects,
-    content_hash,
-    is_blocked,
-)
+from fgslam.worlds.people import make_walk
+from fgslam.worlds.renderer import Body, RenderCache, apply_effects, content_hash, is_blocked
 from fgslam.worlds.settings import LabSettings, RenderedLabSettings
 
 RENDER_VERSION = 7
@@ -137,12 +130,10 @@ class RenderedLabSequence:
         return tuple(
             f"effect: {name}"
             for name, value in (
-                ("exposure", effects.exposure),
-                ("motion blur", effects.motion_blur_s),
                 ("person", effects.person),
                 ("blocked frames", effects.blocked_frames),
             )
-            if value not in (None, False)
+            if value is not None
         )
 
     def __len__(self) -> int:
@@ -263,28 +254,14 @@ class RenderedLabSequence:
     def _render(self, index: int) -> Image:
         """Clean images (cameras, height, width) of one of the drive's frames."""
         world = self._open_world()
-        instants = self._instants(index)
-        total = np.zeros((self._rig.cameras, self._rig.height, self._rig.width))
-        for seconds, pose in zip(instants, self.room_from_camera(instants), strict=True):
-            bodies = world.bodies(self._stance(seconds))
-            for k, offset in enumerate(camera_offsets(self._rig)):
-                total[k] += world.image(pose @ offset, bodies)
-        return np.clip(np.rint(total / len(instants)), 0, 255).astype(np.uint8)
+        pose = self._body[index] @ self._rig.bTc
+        bodies = self._bodies(world, index)
+        images = [world.image(pose @ offset, bodies) for offset in camera_offsets(self._rig)]
+        return np.clip(np.rint(images), 0, 255).astype(np.uint8)
 
     def _bodies(self, world: World, index: int) -> list[Body]:
-        return world.bodies(self._stance(float(self._drive.timestamps[index])))
-
-    def _stance(self, seconds: float) -> Stance | None:
-        return None if self._walk is None else self._walk.stance(seconds)
-
-    def _instants(self, index: int) -> FloatArray:
-        """Times at which a frame is rendered: spread over the exposure, centred on its stamp."""
-        stamp = self._drive.timestamps[index]
-        exposure_s = self._settings.effects.motion_blur_s
-        if exposure_s is None:
-            return np.array([stamp])
-        spread = (np.arange(BLUR_RENDERS) + 0.5) / BLUR_RENDERS - 0.5
-        return np.asarray(stamp + exposure_s * spread)
+        seconds = float(self._drive.timestamps[index])
+        return world.bodies(None if self._walk is None else self._walk.stance(seconds))
 
 
 def first_camera_pose(settings: RenderedLabSettings) -> FloatArray:
@@ -326,7 +303,7 @@ def _render_description(settings: LabSettings) -> dict[str, Any]:
     }
 
 
-def _check_clearance(drive: PosesInTime, world: World, rig: CameraRig) -> None:
+def _check_clearance(drive: Drive, world: World, rig: CameraRig) -> None:
     """Refuses a drive whose cameras come too near to a surface."""
     cameras = drive.body_poses(drive.timestamps) @ rig.bTc
     distance, xy = world.room.caster.distance(cameras[:, :3, 3]), cameras[:, :2, 3]

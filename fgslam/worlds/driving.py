@@ -7,10 +7,8 @@ centre; the heading is counter-clockwise from x, in radians.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from collections.abc import Sequence as Seq
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
@@ -58,65 +56,24 @@ class PlanarPath:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TimeLaw:
-    """Arc length as a function of time: the pairs (seconds, metres), both increasing."""
-
-    seconds: FloatArray
-    arc: FloatArray
-
-    @property
-    def duration(self) -> float:
-        """Seconds."""
-        return float(self.seconds[-1])
-
-
-class PosesInTime(Protocol):
-    """Where a robot is when: a drive, or poses without one.
+class Drive:
+    """Where a robot is when, on a path or without one.
 
     Attributes:
         timestamps: (n,) seconds of the frames, from 0.
+        planar: (k, 3) x, y, heading at times (k,); outside the drive the robot stands still.
+        driven: (n - 1,) whether the robot drove from a frame to the next, or was carried.
+        path: the curve; None where there is none.
     """
 
     timestamps: FloatArray
-
-    @property
-    def driven(self) -> BoolArray:
-        """(n - 1,) whether the robot drove from a frame to the next."""
-        ...
+    planar: Callable[[FloatArray], FloatArray]
+    driven: BoolArray
+    path: PlanarPath | None = None
 
     def body_poses(self, seconds: FloatArray) -> FloatArray:
-        """(n, 4, 4) ``wTb`` in the room's frame: body x forward, y left, z up, on the floor."""
-        ...
-
-
-class Drive:
-    """A path driven by a time law, asked for poses at any time."""
-
-    def __init__(self, path: PlanarPath, law: TimeLaw, timestamps: FloatArray) -> None:
-        self.path = path
-        self.law = law
-        self.timestamps = timestamps
-        tangent = np.column_stack([np.cos(path.heading), np.sin(path.heading)])
-        self._xy = CubicHermiteSpline(path.arc, path.xy, tangent)
-        self._heading = CubicHermiteSpline(path.arc, path.heading, path.curvature)
-
-    def planar(self, seconds: FloatArray) -> FloatArray:
-        """(n, 3) x, y, heading at the given times; outside the drive the robot stands still."""
-        arc = np.interp(seconds, self.law.seconds, self.law.arc)
-        out = np.column_stack([self._xy(arc), self._heading(arc)])
-        if self.path.closed:
-            at_end = arc >= self.path.length
-            out[at_end] = [*self.path.xy[0], self.path.heading[0]]
-        return out
-
-    def body_poses(self, seconds: FloatArray) -> FloatArray:
-        """(n, 4, 4) ``wTb`` in the room's frame: body x forward, y left, z up, on the floor."""
+        """(k, 4, 4) ``wTb`` in the room's frame: body x forward, y left, z up, on the floor."""
         return planar_poses(self.planar(seconds))
-
-    @property
-    def driven(self) -> BoolArray:
-        """(n - 1,) whether the robot drove from a frame to the next: always."""
-        return np.ones(len(self.timestamps) - 1, np.bool_)
 
 
 def planar_poses(planar: FloatArray) -> FloatArray:
@@ -135,7 +92,7 @@ def planar_poses(planar: FloatArray) -> FloatArray:
 
 
 def straights_and_turns(
-    start: tuple[float, float, float], segments: Seq[tuple[float, float]], closed: bool
+    start: tuple[float, float, float], segments: Sequence[tuple[float, float]], closed: bool
 ) -> PlanarPath:
     """A curve of straights and turns whose curvature rises and falls smoothly.
 
@@ -145,44 +102,26 @@ def straights_and_turns(
         closed: whether the segments return to the start; the rounding error of the numerical
             integration is then spread over the curve.
     """
-    arcs, turned, curvature = _integrate_heading(segments)
-    heading = start[2] + turned
+    arc, turned, curvature = [np.zeros(1)], [np.zeros(1)], [np.zeros(1)]
+    for length, turn in segments:
+        s = np.linspace(0.0, 1.0, max(int(np.ceil(length / _STEP_M)), 4) + 1)[1:]
+        inward = np.minimum(s, 1.0 - s)
+        ramp = np.minimum(inward, _RAMP)
+        # The relative curvature, of mean 1, and its integral from the turn's start.
+        relative = 0.5 * (1.0 - np.cos(np.pi * np.minimum(inward / _RAMP, 1.0))) / (1.0 - _RAMP)
+        area = 0.5 * (ramp - _RAMP / np.pi * np.sin(np.pi * ramp / _RAMP))
+        area += np.maximum(inward - _RAMP, 0.0)
+        area /= 1.0 - _RAMP
+        arc.append(arc[-1][-1] + length * s)
+        turned.append(turned[-1][-1] + turn * np.where(s <= 0.5, area, 1.0 - area))
+        curvature.append(turn / length * relative)
+    arcs, heading = np.concatenate(arc), start[2] + np.concatenate(turned)
     middle = 0.5 * (heading[1:] + heading[:-1])
     step = np.diff(arcs)[:, None] * np.column_stack([np.cos(middle), np.sin(middle)])
     xy = np.vstack([[start[:2]], np.asarray(start[:2]) + np.cumsum(step, axis=0)])
     if closed:
         xy = xy - (arcs / arcs[-1])[:, None] * (xy[-1] - xy[0])
-    return PlanarPath(arcs, xy, heading, curvature, closed)
-
-
-def _integrate_heading(
-    segments: Seq[tuple[float, float]],
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Arc length, angle turned and curvature along the segments, in closed form."""
-    arcs, turned, curvature = [np.zeros(1)], [np.zeros(1)], [np.zeros(1)]
-    for length, turn in segments:
-        s = np.linspace(0.0, 1.0, max(int(np.ceil(length / _STEP_M)), 4) + 1)[1:]
-        arcs.append(arcs[-1][-1] + length * s)
-        turned.append(turned[-1][-1] + turn * _turned_fraction(s))
-        curvature.append(turn / length * _relative_curvature(s))
-    return np.concatenate(arcs), np.concatenate(turned), np.concatenate(curvature)
-
-
-def _relative_curvature(s: FloatArray) -> FloatArray:
-    """Curvature at the fraction ``s`` of a turn, its mean being 1: rises, stays, and falls."""
-    inward = np.minimum(s, 1.0 - s)
-    ramp = 0.5 * (1.0 - np.cos(np.pi * np.minimum(inward / _RAMP, 1.0)))
-    return np.asarray(ramp / (1.0 - _RAMP))
-
-
-def _turned_fraction(s: FloatArray) -> FloatArray:
-    """Integral of the relative curvature from 0 to ``s``."""
-    inward = np.minimum(s, 1.0 - s)
-    ramp = np.minimum(inward, _RAMP)
-    area = 0.5 * (ramp - _RAMP / np.pi * np.sin(np.pi * ramp / _RAMP))
-    area += np.maximum(inward - _RAMP, 0.0)
-    area /= 1.0 - _RAMP
-    return np.asarray(np.where(s <= 0.5, area, 1.0 - area))
+    return PlanarPath(arcs, xy, heading, np.concatenate(curvature), closed)
 
 
 def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
@@ -203,16 +142,11 @@ def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
     knots = np.concatenate([[0.0], np.cumsum(chord)])
     spline = CubicSpline(knots, points, bc_type="periodic" if closed else "natural")
     t = np.linspace(0.0, knots[-1], max(int(np.ceil(knots[-1] / _STEP_M)), 8) + 1)
-    first, second = spline(t, 1), spline(t, 2)
+    xy, first, second = np.asarray(spline(t)), spline(t, 1), spline(t, 2)
     speed = np.maximum(np.linalg.norm(first, axis=1), 1e-9)
     arc = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))])
     heading = np.unwrap(np.arctan2(first[:, 1], first[:, 0]))
     curvature = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / speed**3
-    _refuse_tight_turns(np.asarray(spline(t)), heading, curvature)
-    return PlanarPath(arc, np.asarray(spline(t)), heading, curvature, closed)
-
-
-def _refuse_tight_turns(xy: FloatArray, heading: FloatArray, curvature: FloatArray) -> None:
     # At a cusp the curvature is lost between two samples, but the heading leaps.
     leaps = np.abs(np.diff(heading, prepend=heading[0])) / _STEP_M
     sharpness = np.maximum(leaps, np.abs(curvature))
@@ -223,6 +157,7 @@ def _refuse_tight_turns(xy: FloatArray, heading: FloatArray, curvature: FloatArr
             f"dataset.drive.waypoints_m turn back too sharply near ({x:.2f}, {y:.2f}) m: the curve "
             f"has a radius below {_LEAST_RADIUS_M} m there; add points that lead around the turn"
         )
+    return PlanarPath(arc, xy, heading, curvature, closed)
 
 
 def round_corners(corners: FloatArray, bend_m: float) -> PlanarPath:
@@ -285,10 +220,10 @@ def room_laps(laps: int) -> PlanarPath:
 # Time
 
 
-def fastest_law(
+def fastest_times(
     path: PlanarPath, max_speed: float, max_turn: float, max_acceleration: float
-) -> TimeLaw:
-    """The quickest way along a path from rest to rest within three limits.
+) -> FloatArray:
+    """(n,) seconds at a path's samples, driven from rest to rest as fast as three limits allow.
 
     Args:
         path: the curve.
@@ -305,8 +240,7 @@ def fastest_law(
     for i in range(len(gain) - 1, -1, -1):
         squared[i] = min(squared[i], squared[i + 1] + gain[i])
     speed = np.sqrt(squared)
-    seconds = 2.0 * np.diff(path.arc) / (speed[1:] + speed[:-1])
-    return TimeLaw(np.concatenate([[0.0], np.cumsum(seconds)]), path.arc)
+    return np.concatenate([[0.0], np.cumsum(2.0 * np.diff(path.arc) / (speed[1:] + speed[:-1]))])
 
 
 def drive_along(path: PlanarPath, limits: DriveLimits, frames: int | None) -> Drive:
@@ -315,24 +249,29 @@ def drive_along(path: PlanarPath, limits: DriveLimits, frames: int | None) -> Dr
     Raises:
         ConfigError: the path cannot be driven in so few frames.
     """
-    law = fastest_law(
-        path,
-        limits.max_speed_m_s,
-        np.deg2rad(limits.max_turn_deg_s),
-        MAX_ACCELERATION_M_S2,
-    )
-    rate = limits.frame_rate_hz
-    least = int(np.ceil(law.duration * rate - 1e-9)) + 1
+    rate, max_turn = limits.frame_rate_hz, np.deg2rad(limits.max_turn_deg_s)
+    fastest = fastest_times(path, limits.max_speed_m_s, max_turn, MAX_ACCELERATION_M_S2)
+    least = int(np.ceil(fastest[-1] * rate - 1e-9)) + 1
     if frames is None:
-        frames = int(np.ceil(law.duration / _CRUISE * rate)) + 1
+        frames = int(np.ceil(fastest[-1] / _CRUISE * rate)) + 1
     if frames < least:
         raise ConfigError(
             f"dataset.drive.frames is {frames}, but this {path.length:.1f} m path takes at least "
             f"{least} frames within the speed limits; raise frames or leave it null"
         )
-    duration = (frames - 1) / rate
-    slower = TimeLaw(law.seconds * (duration / law.duration), law.arc)
-    return Drive(path, slower, np.arange(frames) / rate)
+    times = fastest * ((frames - 1) / rate / fastest[-1])
+    tangent = np.column_stack([np.cos(path.heading), np.sin(path.heading)])
+    xy = CubicHermiteSpline(path.arc, path.xy, tangent)
+    heading = CubicHermiteSpline(path.arc, path.heading, path.curvature)
+
+    def planar(seconds: FloatArray) -> FloatArray:
+        arc = np.interp(seconds, times, path.arc)
+        out = np.column_stack([xy(arc), heading(arc)])
+        if path.closed:
+            out[arc >= path.length] = [*path.xy[0], path.heading[0]]
+        return out
+
+    return Drive(np.arange(frames) / rate, planar, np.ones(frames - 1, np.bool_), path)
 
 
 # --------------------------------------------------------------------------------------------
@@ -354,22 +293,6 @@ ALONG_M_SQRT_M, SIDEWAYS_M_SQRT_M, YAW_DEG_SQRT_M, YAW_DEG_SQRT_RAD = 0.02, 0.01
 # noise of an increment, for that of a robot at rest must have a covariance that can be inverted.
 HEIGHT_M_SQRT_M, TILT_DEG_SQRT_M = 0.002, 0.1
 FLOOR_M, FLOOR_DEG = 1e-4, 0.01
-
-
-def wheel_identity(settings: WheelOdometrySettings) -> dict[str, float]:
-    """The drift model by the names under which it is part of a recording's identity."""
-    return {
-        "distance_scale": settings.scale_error,
-        "turn_scale": settings.scale_error,
-        "distance_m_sqrt_m": settings.noise * ALONG_M_SQRT_M,
-        "sideways_m_sqrt_m": settings.noise * SIDEWAYS_M_SQRT_M,
-        "yaw_deg_sqrt_m": settings.noise * YAW_DEG_SQRT_M,
-        "yaw_deg_sqrt_rad": settings.noise * YAW_DEG_SQRT_RAD,
-        "height_m_sqrt_m": HEIGHT_M_SQRT_M,
-        "tilt_deg_sqrt_m": TILT_DEG_SQRT_M,
-        "floor_m": FLOOR_M,
-        "floor_deg": FLOOR_DEG,
-    }
 
 
 def increment_variances(
@@ -414,7 +337,10 @@ def simulate_wheels(
     variances = increment_variances(settings, way, turn)
     out = []
     for motion, angle, drawn, variance in zip(motions, turn, noise, variances, strict=True):
-        by_turn, by_distance = _scale_directions(motion, float(angle))
+        # Tangent vectors at the new pose of a unit relative error of turn and of distance.
+        by_turn, by_distance = np.zeros(6), np.zeros(6)
+        by_turn[_YAW] = angle
+        by_distance[_ALONG:] = motion[:3, :3].T @ motion[:3, 3]
         xi = drawn * np.sqrt(variance) + scale[0] * by_turn + scale[1] * by_distance
         covariance = (
             np.diag(variance)
@@ -423,14 +349,6 @@ def simulate_wheels(
         )
         out.append(Odometry(np.asarray(motion @ geometry.se3_exp(xi)), covariance))
     return out
-
-
-def _scale_directions(motion: FloatArray, turn: float) -> tuple[FloatArray, FloatArray]:
-    """Tangent vectors (6,) at the new pose of a unit relative error of turn and of distance."""
-    by_turn, by_distance = np.zeros(6), np.zeros(6)
-    by_turn[_YAW] = turn
-    by_distance[_ALONG:] = motion[:3, :3].T @ motion[:3, 3]
-    return by_turn, by_distance
 
 
 # --------------------------------------------------------------------------------------------
@@ -520,7 +438,11 @@ class Wheelchair:
         self.turn_rate += float(np.clip(self._aim[1] - self.turn_rate, -turn_gain, turn_gain))
         self._steps += 1
         self.time = self._steps * _STEP_S
-        way, turn = self._slipped(self.speed * _STEP_S, self.turn_rate * _STEP_S)
+        wheels, noise = self.speed * _STEP_S, self._rng.standard_normal(2)
+        root = np.sqrt(abs(wheels))  # of the way, which slip and drift grow with
+        way = wheels * self._speed_scale + SLIP_M_SQRT_M * root * noise[0]
+        drift = self._pull * abs(wheels) + np.deg2rad(SLIP_DEG_SQRT_M) * root * noise[1]
+        turn = self.turn_rate * _STEP_S * self._turn_scale + drift
         middle = self.pose[2] + 0.5 * turn
         place = self.pose[:2] + way * np.array([np.cos(middle), np.sin(middle)])
         self.pose[2] = wrap(self.pose[2] + turn)
@@ -529,14 +451,6 @@ class Wheelchair:
             return True
         self.pose[:2] = place
         return False
-
-    def _slipped(self, way: float, turn: float) -> tuple[float, float]:
-        """What the floor makes of a small motion of the wheels."""
-        noise = self._rng.standard_normal(2)
-        root = np.sqrt(abs(way))
-        true_way = way * self._speed_scale + SLIP_M_SQRT_M * root * noise[0]
-        drift = self._pull * abs(way) + np.deg2rad(SLIP_DEG_SQRT_M) * root * noise[1]
-        return float(true_way), float(turn * self._turn_scale + drift)
 
 
 # --------------------------------------------------------------------------------------------
@@ -575,29 +489,19 @@ class RangeSensor:
             rng: of the noise.
         """
         direction = unit(self.angles + pose[2])
-        ranges = np.minimum(self._to_things(pose, direction), _to_discs(pose[:2], direction, discs))
+        rays = np.column_stack([direction, np.zeros(BEAMS)]).astype(np.float32)
+        ranges = np.full(BEAMS, np.inf)
+        for height in _HEIGHTS_M:
+            _, distance = self._caster.cast(np.array([pose[0], pose[1], height]), rays)
+            ranges = np.minimum(ranges, distance)
+        for x, y, radius in discs:  # upright cylinders; 0 inside one
+            offset = np.array([x, y]) - pose[:2]
+            along = direction @ offset
+            aside2 = np.sum(offset * offset) - along**2
+            hit = (aside2 < radius**2) & (along > 0.0)
+            distance = np.maximum(along - np.sqrt(np.maximum(radius**2 - aside2, 0.0)), 0.0)
+            ranges = np.where(hit, np.minimum(ranges, distance), ranges)
         seen = ranges < MAX_RANGE_M
         noise = self._noise_m * rng.standard_normal(BEAMS)
         noisy = np.clip(ranges + noise, 0.0, MAX_RANGE_M)
         return self.angles.copy(), np.where(seen, noisy, MAX_RANGE_M)
-
-    def _to_things(self, pose: FloatArray, direction: FloatArray) -> FloatArray:
-        rays = np.column_stack([direction, np.zeros(len(direction))]).astype(np.float32)
-        nearest = np.full(len(rays), np.inf)
-        for height in _HEIGHTS_M:
-            _, distance = self._caster.cast(np.array([pose[0], pose[1], height]), rays)
-            nearest = np.minimum(nearest, distance)
-        return nearest
-
-
-def _to_discs(place: FloatArray, direction: FloatArray, discs: FloatArray) -> FloatArray:
-    """(n,) distance along unit directions (n, 2) to upright cylinders; 0 inside one."""
-    nearest = np.full(len(direction), np.inf)
-    for x, y, radius in discs:
-        offset = np.array([x, y]) - place
-        along = direction @ offset
-        aside2 = np.sum(offset * offset) - along**2
-        hit = (aside2 < radius**2) & (along > 0.0)
-        distance = along - np.sqrt(np.maximum(radius**2 - aside2, 0.0))
-        nearest = np.where(hit, np.minimum(nearest, np.maximum(distance, 0.0)), nearest)
-    return nearest

@@ -1,4 +1,4 @@
-"""The free floor of a scene, random poses all over it, and reference paths through it.
+"""The free floor of a scene, random poses all over it, and reference paths through the house.
 
 Obstacles are all patches that reach into the robot's band of heights, seen from above: their edges
 as line segments. A closed outline is all that is needed, as the robot starts outside and does not
@@ -8,7 +8,6 @@ jump.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,10 +17,9 @@ from scipy.sparse.csgraph import dijkstra
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.geometry import unit, wrap
-from fgslam.worlds.buildings.floor_plan import Room
-from fgslam.worlds.buildings.house import ROOMS
-from fgslam.worlds.driving import planar_poses
+from fgslam.worlds.driving import Drive
 from fgslam.worlds.patches import PatchArrays
+from fgslam.worlds.places import HOUSE
 from fgslam.worlds.settings import LabDriveSettings
 
 # What is lower is driven over (rugs), what is higher driven under (lintels, lamps); metres.
@@ -38,22 +36,34 @@ class FloorSpace:
         cell: side of its cells, metres.
         clearances: (rows, columns) distance of each cell's middle to the nearest obstacle; rows
             go along y.
+        outlines: (n, 2, 2) edges of all obstacles, from above: ends, then x and y in metres.
     """
 
     def __init__(self, patches: PatchArrays, low: FloatArray, high: FloatArray) -> None:
         """Takes the obstacles between two corners (2,) of the floor."""
-        self._start, self._end = _segments(patches)
+        c, u, v = patches.corner, patches.edge_u, patches.edge_v
+        corners = np.stack([c, c + u, c + u + v, c + v], axis=1)
+        z = corners[..., 2]
+        start = corners[(z.max(axis=1) > BAND[0]) & (z.min(axis=1) < BAND[1])][..., :2]
+        start, end = start.reshape(-1, 2), np.roll(start, -1, axis=1).reshape(-1, 2)
+        both = np.round(np.hstack([np.minimum(start, end), np.maximum(start, end)]), 6)
+        once = np.sort(np.unique(both, axis=0, return_index=True)[1])
+        length = np.linalg.norm(end[once] - start[once], axis=1)
+        once, length = once[length > 1e-6], length[length > 1e-6]
+        start, end = self._start, self._end = start[once], end[once]
+        self.outlines: FloatArray = np.stack([start, end], axis=1)
         self.low, self.cell = np.asarray(low, dtype=np.float64), _CELL
         columns, rows = np.ceil((np.asarray(high) - self.low) / _CELL).astype(int)
-        blocked = np.zeros((rows, columns), dtype=np.bool_)
-        i, j = self._marks(rows, columns)
-        blocked[i, j] = True
-        self.clearances = ndimage.distance_transform_edt(~blocked) * _CELL
-
-    @property
-    def outlines(self) -> FloatArray:
-        """(n, 2, 2) edges of all obstacles, from above: ends, then x and y in metres."""
-        return np.stack([self._start, self._end], axis=1)
+        count = np.ceil(length / (0.4 * _CELL)).astype(int) + 1  # of the points on each outline
+        which = np.repeat(np.arange(len(count)), count)
+        first = np.repeat(np.cumsum(count) - count, count)
+        part = (np.arange(len(which)) - first) / np.maximum(count[which] - 1, 1)
+        points = start[which] + part[:, None] * (end - start)[which]
+        j, i = ((points - self.low) / _CELL).astype(int).T
+        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
+        free = np.ones((rows, columns), dtype=np.bool_)
+        free[i[inside], j[inside]] = False
+        self.clearances = ndimage.distance_transform_edt(free) * _CELL
 
     def clearance(self, points: FloatArray) -> FloatArray:
         """(n,) exact distance in metres of points (n, 2) to the nearest obstacle.
@@ -61,9 +71,8 @@ class FloorSpace:
         Farther than a metre from anything the grid answers, to half a cell.
         """
         points = np.atleast_2d(np.asarray(points, dtype=np.float64))
-        coarse = self._coarse(points)
-        out = coarse.copy()
-        for k in np.flatnonzero(coarse < _NEAR):
+        out = self._coarse(points)
+        for k in np.flatnonzero(out < _NEAR):
             out[k] = self._exact(points[k])
         return out
 
@@ -73,9 +82,7 @@ class FloorSpace:
         The margin must exceed the grid's error, a cell.
         """
         coarse = float(self._coarse(place[None])[0])
-        if abs(coarse - radius) > margin:
-            return coarse < radius
-        return self._exact(place) < radius
+        return (coarse if abs(coarse - radius) > margin else self._exact(place)) < radius
 
     def line_is_free(self, start: FloatArray, ends: FloatArray, radius: float) -> BoolArray:
         """(n,) whether a disc can go straight from ``start`` (2,) to each of ``ends`` (n, 2).
@@ -88,6 +95,13 @@ class FloorSpace:
         free = self._coarse(along.reshape(-1, 2)).reshape(along.shape[:2])
         return np.asarray((free > radius + 0.5 * _CELL).all(axis=0))
 
+    def values(self, grid: npt.NDArray[np.generic], points: FloatArray) -> npt.NDArray[np.generic]:
+        """(n,) values of a grid (rows, columns) at points (n, 2); 0 outside."""
+        cell = np.floor((points - self.low) / _CELL).astype(np.int64)
+        inside = np.all((cell >= 0) & (cell < np.array(grid.shape)[::-1]), axis=1)
+        column, row = np.where(inside[:, None], cell, 0).T
+        return np.where(inside, grid[row, column], 0)
+
     def _coarse(self, points: FloatArray) -> FloatArray:
         place = (points - self.low) / _CELL - 0.5
         inside = [place[:, 1], place[:, 0]]
@@ -99,36 +113,8 @@ class FloorSpace:
         edge = self._end - self._start
         length2 = np.maximum(np.sum(edge * edge, axis=1), 1e-18)
         part = np.clip(np.sum((point - self._start) * edge, axis=1) / length2, 0.0, 1.0)
-        away = self._start + part[:, None] * edge - point
-        return float(np.sqrt(np.min(np.sum(away * away, axis=1))))
-
-    def _marks(self, rows: int, columns: int) -> tuple[FloatArray, FloatArray]:
-        """Cells that the outlines go through."""
-        length = np.linalg.norm(self._end - self._start, axis=1)
-        count = np.ceil(length / (0.4 * _CELL)).astype(int) + 1
-        which = np.repeat(np.arange(len(count)), count)
-        first = np.repeat(np.cumsum(count) - count, count)
-        part = (np.arange(len(which)) - first) / np.maximum(count[which] - 1, 1)
-        points = self._start[which] + part[:, None] * (self._end - self._start)[which]
-        j, i = ((points - self.low) / _CELL).astype(int).T
-        inside = (i >= 0) & (i < rows) & (j >= 0) & (j < columns)
-        return i[inside], j[inside]
-
-
-def _segments(patches: PatchArrays) -> tuple[FloatArray, FloatArray]:
-    """Start and end (n, 2) of the outlines, seen from above, of what reaches into the band."""
-    c, u, v = patches.corner, patches.edge_u, patches.edge_v
-    corners = np.stack([c, c + u, c + u + v, c + v], axis=1)
-    z = corners[..., 2]
-    inside = (z.max(axis=1) > BAND[0]) & (z.min(axis=1) < BAND[1])
-    start = corners[inside][..., :2]
-    end = np.roll(start, -1, axis=1)
-    start, end = start.reshape(-1, 2), end.reshape(-1, 2)
-    both = np.round(np.hstack([np.minimum(start, end), np.maximum(start, end)]), 6)
-    _, first = np.unique(both, axis=0, return_index=True)
-    keep = np.sort(first)
-    long = np.linalg.norm(end[keep] - start[keep], axis=1) > 1e-6
-    return start[keep][long], end[keep][long]
+        offset = self._start + part[:, None] * edge - point
+        return float(np.sqrt(np.min(np.sum(offset * offset, axis=1))))
 
 
 # --------------------------------------------------------------------------------------------
@@ -145,30 +131,10 @@ RANDOM_CLEARANCE_M = 0.4  # of robot and camera from walls and furniture
 BURST_STEP_M = 0.1  # between the frames of a burst: about that of the lab's drives
 
 
-class RandomPoses:
-    """Where the robot is at each frame; between poses it is carried, and stands still at each."""
-
-    def __init__(self, planar: FloatArray, burst: int, frame_rate_hz: float) -> None:
-        self._planar = planar
-        self.timestamps = np.asarray(np.arange(len(planar)) / frame_rate_hz)
-        self._burst = burst
-
-    @property
-    def driven(self) -> BoolArray:
-        """(n - 1,) whether the robot drove from a frame to the next: wheels know of no carrying."""
-        return np.asarray(np.arange(1, len(self._planar)) % self._burst != 0)
-
-    def body_poses(self, seconds: FloatArray) -> FloatArray:
-        """(n, 4, 4) ``wTb`` in the room's frame at the nearest frames' times."""
-        rate = 1.0 / self.timestamps[1]
-        frame = np.rint(np.asarray(seconds) * rate).astype(np.int64)
-        return planar_poses(self._planar[np.clip(frame, 0, len(self._planar) - 1)])
-
-
 def draw_poses(
     settings: LabDriveSettings, space: FloorSpace, start: FloatArray, camera: FloatArray
-) -> RandomPoses:
-    """Draws the poses that the settings ask for.
+) -> Drive:
+    """Draws the poses that the settings ask for; between bursts the robot is carried.
 
     Args:
         settings: how many frames and bursts.
@@ -179,7 +145,7 @@ def draw_poses(
     Raises:
         ConfigError: the frames are no whole number of bursts, or no place has room for one.
     """
-    burst, seed = settings.random_poses.burst, settings.random_poses.seed
+    burst, rate = settings.random_poses.burst, settings.frame_rate_hz
     frames = _POSES * burst if settings.frames is None else settings.frames
     if frames % burst:
         raise ConfigError(
@@ -189,13 +155,19 @@ def draw_poses(
     robot = np.column_stack([BURST_STEP_M * np.arange(burst), np.zeros(burst)])
     offsets = np.vstack([robot, robot + camera])
     parts, _ = ndimage.label(space.clearances >= RANDOM_CLEARANCE_M)
-    here = _cells(space, parts, np.asarray(start, dtype=np.float64)[None])[0]
-    poses = [
-        _draw(space, parts == here, offsets, np.random.default_rng([seed, _STREAM, k]))
-        for k in range(frames // burst)
-    ]
-    planar = np.concatenate([_moved(pose, offsets[:burst]) for pose in poses])
-    return RandomPoses(planar, burst, settings.frame_rate_hz)
+    reached = parts == space.values(parts, np.asarray(start, dtype=np.float64)[None])[0]
+    bursts = []
+    for k in range(frames // burst):
+        rng = np.random.default_rng([settings.random_poses.seed, _STREAM, k])
+        bursts.append(_moved(_draw(space, reached, offsets, rng), robot))
+    poses = np.concatenate(bursts)
+    timestamps = np.asarray(np.arange(frames) / rate)
+
+    def planar(seconds: FloatArray) -> FloatArray:
+        nearest = np.rint(np.asarray(seconds) * (1.0 / timestamps[1])).astype(np.int64)
+        return np.asarray(poses[np.clip(nearest, 0, frames - 1)])
+
+    return Drive(timestamps, planar, np.asarray(np.arange(1, frames) % burst != 0))
 
 
 def _draw(
@@ -211,7 +183,7 @@ def _draw(
         xy = rng.uniform(space.low, high, (_BLOCK, 2))
         drawn = np.column_stack([xy, rng.uniform(-np.pi, np.pi, _BLOCK)])
         places = np.array([_moved(pose, offsets)[:, :2] for pose in drawn])
-        probably = _cells(space, reached, places.reshape(-1, 2)).reshape(places.shape[:-1])
+        probably = space.values(reached, places.reshape(-1, 2)).reshape(places.shape[:-1])
         for k in np.flatnonzero(probably.all(axis=1)):
             if (space.clearance(places[k]) >= RANDOM_CLEARANCE_M).all():
                 return np.asarray(drawn[k])
@@ -219,16 +191,6 @@ def _draw(
         f"no place with room for dataset.drive.random_poses.burst {len(offsets) // 2} is found; "
         "lower it"
     )
-
-
-def _cells(
-    space: FloorSpace, grid: npt.NDArray[np.generic], points: FloatArray
-) -> npt.NDArray[np.generic]:
-    """Values (n,) of a grid (rows, columns) at points (n, 2); 0 outside."""
-    cell = np.floor((points - space.low) / space.cell).astype(np.int64)
-    inside = np.all((cell >= 0) & (cell < np.array(grid.shape)[::-1]), axis=1)
-    column, row = np.where(inside[:, None], cell, 0).T
-    return np.where(inside, grid[row, column], 0)
 
 
 def _moved(pose: FloatArray, offsets: FloatArray) -> FloatArray:
@@ -248,6 +210,8 @@ def _moved(pose: FloatArray, offsets: FloatArray) -> FloatArray:
 
 # A closed walk through the house: every room, and the corridor twice.
 _TOUR = ("hall", "office", "corridor", "studio", "workshop", "library", "corridor")
+_ROOMS = {room.name: room for room in HOUSE.rooms}
+_SKIP = 2  # of the floor's cells, for the grid of ways
 _DIRECTIONS = 72
 _CHILDREN = 4
 _MOST_STEPS = 4000
@@ -259,12 +223,29 @@ _SHARP = np.deg2rad(45.0)
 
 
 class PathPlanner:
-    """Lays reference paths in one house."""
+    """Lays reference paths in the house."""
 
     def __init__(self, space: FloorSpace, clearance: float) -> None:
         """For paths that keep ``clearance`` metres from everything."""
         self._space, self._clearance = space, clearance
-        self._grid = _Grid(space, clearance)
+        free = space.clearances[::_SKIP, ::_SKIP] >= clearance
+        number = np.arange(free.size).reshape(free.shape)
+        pairs, weights = [], []
+        everything, ahead, behind = slice(None), slice(1, None), slice(None, -1)
+        for first, second, length in (
+            ((everything, behind), (everything, ahead), 1.0),
+            ((behind, everything), (ahead, everything), 1.0),
+            ((behind, behind), (ahead, ahead), np.sqrt(2.0)),
+            ((behind, ahead), (ahead, behind), np.sqrt(2.0)),
+        ):
+            both = free[first] & free[second]
+            pairs.append(np.stack([number[first][both], number[second][both]]))
+            weights.append(np.full(int(both.sum()), length * (space.cell * _SKIP)))
+        entries = (np.concatenate(weights), tuple(np.hstack(pairs)))
+        self._graph = sparse.csr_matrix(entries, shape=(free.size, free.size))
+        parts = sparse.csgraph.connected_components(self._graph, directed=False)[1]
+        largest = np.argmax(np.bincount(parts[free.ravel()]))
+        self._shape, self._inside = free.shape, free.ravel() & (parts == largest)
 
     def reference_path(
         self,
@@ -285,7 +266,15 @@ class PathPlanner:
             DatasetError: no such path is found.
         """
         for _ in range(_STARTS):
-            points = self.walk(self._tour(rng, within), spacing, legs, rng, within)
+            if within is not None:
+                names = [within] * 24
+            else:
+                first = int(rng.integers(0, len(_TOUR)))
+                names = [_TOUR[(first + k) % len(_TOUR)] for k in range(3 * len(_TOUR))]
+                if rng.random() < 0.5:
+                    names = names[::-1]
+            tour = [self._spot(name, rng) for name in names]
+            points = self.walk(tour, spacing, legs, rng, within)
             if points is not None:
                 return _with_headings(points)
         where = "the house" if within is None else f"the {within}"
@@ -305,10 +294,10 @@ class PathPlanner:
         Raises:
             DatasetError: no such routes are found.
         """
-        rooms = [room.name for room in ROOMS if room.name != "corridor"]
+        rooms = [name for name in _ROOMS if name != "corridor"]
         for _ in range(_STARTS):
-            a, b, c, d = (self._spot(_room(str(name)), rng) for name in rng.permutation(rooms)[:4])
-            middle = self._spot(_room("corridor"), rng)
+            a, b, c, d = (self._spot(str(name), rng) for name in rng.permutation(rooms)[:4])
+            middle = self._spot("corridor", rng)
             one = self.walk((a, middle, b), spacing, None, rng)
             other = self.walk((c, middle, d), spacing, None, rng)
             if one is not None and other is not None:
@@ -327,165 +316,80 @@ class PathPlanner:
     ) -> FloatArray | None:
         """(legs + 1, 2) places of a walk from the first of some free places (2,) by the others.
 
-        None where no such walk is found. Without ``legs`` it ends a leg before the last place.
+        Searched depth-first; None where no such walk is found. Without ``legs`` it ends a leg
+        before the last place.
         """
-        search = _Search(self._space, self._grid, tour, spacing, self._clearance)
-        return search.run(legs, rng, None if within is None else _room(within))
+        ways: dict[int, FloatArray] = {}
+        last = len(tour) - 1
 
-    def _tour(self, rng: np.random.Generator, within: str | None) -> list[FloatArray]:
-        """Places to head for in turn; the first is the start."""
-        if within is not None:
-            return [self._spot(_room(within), rng) for _ in range(24)]
-        first = int(rng.integers(0, len(_TOUR)))
-        names = [_TOUR[(first + k) % len(_TOUR)] for k in range(3 * len(_TOUR))]
-        if rng.random() < 0.5:
-            names = names[::-1]
-        return [self._spot(_room(name), rng) for name in names]
+        def way(goal: int, places: FloatArray) -> FloatArray:
+            """(n,) metres to drive from places (n, 2) to one of the tour's."""
+            if goal not in ways:
+                start = int(self._cells(tour[goal][None])[0])
+                ways[goal] = np.asarray(dijkstra(self._graph, directed=False, indices=start))
+            cells = self._cells(places)
+            return np.where(cells >= 0, ways[goal][cells], np.inf)
 
-    def _spot(self, room: Room, rng: np.random.Generator) -> FloatArray:
+        def next_places() -> list[FloatArray]:
+            """The best places to go on to, best last."""
+            here = path[-1]
+            angles = 2.0 * np.pi * (np.arange(_DIRECTIONS) + rng.random()) / _DIRECTIONS
+            places = here + spacing * unit(angles)
+            cost = way(goals[-1], places) + _CHANCE * rng.random(_DIRECTIONS)
+            cost[~self._space.line_is_free(here, places, self._clearance)] = np.inf
+            if within is not None:
+                cost[[not _ROOMS[within].holds(float(x), float(y)) for x, y in places]] = np.inf
+            if len(path) > 1:
+                step = here - path[-2]
+                turn = np.abs(wrap(angles - np.arctan2(step[1], step[0])))
+                cost += _TURN_COST * np.maximum(turn - _SHARP, 0.0)
+            old = np.array(path[:-1]).reshape(-1, 2)
+            near = np.linalg.norm(places[:, None] - old[None], axis=2).min(axis=1, initial=np.inf)
+            cost += _REVISIT_COST * np.maximum(1.0 - near, 0.0)
+            order = np.argsort(cost)[:_CHILDREN]
+            return [places[k] for k in order[::-1] if np.isfinite(cost[k])]
+
+        # Of each target laid: where, which place of the tour is next, and what to try from it.
+        path, goals = [tour[0]], [1]
+        untried = [next_places()]
+        for _ in range(_MOST_STEPS):
+            near_end = legs is None and goals[-1] == last and way(last, path[-1][None])[0] < spacing
+            if len(path) - 1 == legs or near_end:
+                return np.array(path)
+            if not untried[-1]:
+                for stack in (path, goals, untried):
+                    stack.pop()
+                if not path:
+                    return None
+                continue
+            place, goal = untried[-1].pop(), goals[-1]
+            while way(goal, place[None])[0] < spacing and goal < last:
+                goal += 1
+            path.append(place)
+            goals.append(goal)
+            untried.append(next_places())
+        return None
+
+    def _spot(self, name: str, rng: np.random.Generator) -> FloatArray:
         """A roomy place drawn within a room."""
+        room = _ROOMS[name]
         low, high = np.array([room.west, room.south]), np.array([room.east, room.north])
         for bound in (_ROOMY, self._clearance):
             for _ in range(200):
                 place = rng.uniform(low, high)
-                if self._grid.reached(place) and self._space.clearance(place)[0] >= bound:
+                free = self._cells(place[None])[0] >= 0
+                if free and self._space.clearance(place)[0] >= bound:
                     return np.asarray(place)
-        raise DatasetError(f"no free place in the {room.name} with {self._clearance} m around it")
+        raise DatasetError(f"no free place in the {name} with {self._clearance} m around it")
 
-
-class _Grid:
-    """Ways over free cells, measured around corners."""
-
-    def __init__(self, space: FloorSpace, clearance: float) -> None:
-        skip = 2
-        self._low, self._cell = space.low, space.cell * skip
-        free = space.clearances[::skip, ::skip] >= clearance
-        self._shape = free.shape
-        self._graph = _graph(free, self._cell)
-        parts = sparse.csgraph.connected_components(self._graph, directed=False)[1]
-        largest = np.argmax(np.bincount(parts[free.ravel()]))
-        self._inside = free.ravel() & (parts == largest)
-
-    def cells(self, points: FloatArray) -> IntArray:
-        """(n,) numbers of the cells that hold points (n, 2), -1 outside the free floor."""
-        column, row = np.floor((points - self._low) / self._cell).astype(int).T
+    def _cells(self, points: FloatArray) -> IntArray:
+        """(n,) numbers of the cells that hold points (n, 2), -1 outside the connected floor."""
+        at = (points - self._space.low) / (self._space.cell * _SKIP)
+        column, row = np.floor(at).astype(int).T
         rows, columns = self._shape
         valid = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
         number = np.where(valid, row * columns + column, 0)
         return np.where(valid & self._inside[number], number, -1)
-
-    def reached(self, place: FloatArray) -> bool:
-        """Whether a place is part of the connected free floor."""
-        return bool(self.cells(place[None])[0] >= 0)
-
-    def ways_to(self, goal: FloatArray) -> FloatArray:
-        """(cells,) metres to drive from each cell to a free place."""
-        number = int(self.cells(goal[None])[0])
-        return np.asarray(dijkstra(self._graph, directed=False, indices=number))
-
-
-def _graph(free: np.typing.NDArray[np.bool_], cell: float) -> sparse.csr_matrix:
-    """Edges between free neighbours, straight and diagonal."""
-    number = np.arange(free.size).reshape(free.shape)
-    pairs, weights = [], []
-    everything, ahead, behind = slice(None), slice(1, None), slice(None, -1)
-    for first, second, length in (
-        ((everything, behind), (everything, ahead), 1.0),
-        ((behind, everything), (ahead, everything), 1.0),
-        ((behind, behind), (ahead, ahead), np.sqrt(2.0)),
-        ((behind, ahead), (ahead, behind), np.sqrt(2.0)),
-    ):
-        both = free[first] & free[second]
-        pairs.append(np.stack([number[first][both], number[second][both]]))
-        weights.append(np.full(int(both.sum()), length * cell))
-    i, j = np.hstack(pairs)
-    return sparse.csr_matrix((np.concatenate(weights), (i, j)), shape=(free.size, free.size))
-
-
-@dataclass(slots=True)
-class _Node:
-    """A laid target: where, which goal of the tour it heads for, and what to try next."""
-
-    place: FloatArray
-    goal: int
-    children: list[FloatArray]
-
-
-class _Search:
-    """Depth-first search for one path."""
-
-    def __init__(
-        self,
-        space: FloorSpace,
-        grid: _Grid,
-        tour: Sequence[FloatArray],
-        spacing: float,
-        clearance: float,
-    ) -> None:
-        self._space, self._grid, self._tour = space, grid, tour
-        self._spacing, self._clearance = spacing, clearance
-        self._ways: dict[int, FloatArray] = {}
-
-    def run(
-        self, legs: int | None, rng: np.random.Generator, room: Room | None
-    ) -> FloatArray | None:
-        """(legs + 1, 2) targets, or None where nothing is found; legs None: to the last place."""
-        path = [_Node(self._tour[0], 1, [])]
-        path[0].children = self._candidates(path, rng, room)
-        for _ in range(_MOST_STEPS):
-            if len(path) - 1 == legs or (legs is None and self._ends(path[-1])):
-                return np.array([node.place for node in path])
-            if not path[-1].children:
-                path.pop()
-                if not path:
-                    return None
-                continue
-            place = path[-1].children.pop()
-            path.append(_Node(place, self._next_goal(path[-1].goal, place), []))
-            path[-1].children = self._candidates(path, rng, room)
-        return None
-
-    def _ends(self, node: _Node) -> bool:
-        """Whether the tour's last place is within a leg."""
-        last = len(self._tour) - 1
-        return node.goal == last and bool(self._way(last, node.place[None])[0] < self._spacing)
-
-    def _next_goal(self, goal: int, place: FloatArray) -> int:
-        """The goal after a place: the next one of the tour as soon as this one is near."""
-        while self._way(goal, place[None])[0] < self._spacing and goal < len(self._tour) - 1:
-            goal += 1
-        return goal
-
-    def _way(self, goal: int, places: FloatArray) -> FloatArray:
-        if goal not in self._ways:
-            self._ways[goal] = self._grid.ways_to(self._tour[goal])
-        cells = self._grid.cells(places)
-        return np.where(cells >= 0, self._ways[goal][cells], np.inf)
-
-    def _candidates(
-        self, path: list[_Node], rng: np.random.Generator, room: Room | None
-    ) -> list[FloatArray]:
-        """The best next places, best last."""
-        here = path[-1]
-        angles = 2.0 * np.pi * (np.arange(_DIRECTIONS) + rng.random()) / _DIRECTIONS
-        places = here.place + self._spacing * unit(angles)
-        cost = self._way(here.goal, places) + _CHANCE * rng.random(_DIRECTIONS)
-        cost[~self._space.line_is_free(here.place, places, self._clearance)] = np.inf
-        if room is not None:
-            cost[[not room.holds(float(x), float(y)) for x, y in places]] = np.inf
-        if len(path) > 1:
-            step = here.place - path[-2].place
-            turn = np.abs(wrap(angles - np.arctan2(step[1], step[0])))
-            cost += _TURN_COST * np.maximum(turn - _SHARP, 0.0)
-        old = np.array([node.place for node in path[:-1]]).reshape(-1, 2)
-        near = np.linalg.norm(places[:, None] - old[None], axis=2).min(axis=1, initial=np.inf)
-        cost += _REVISIT_COST * np.maximum(1.0 - near, 0.0)
-        order = np.argsort(cost)[:_CHILDREN]
-        return [places[k] for k in order[::-1] if np.isfinite(cost[k])]
-
-
-def _room(name: str) -> Room:
-    return next(room for room in ROOMS if room.name == name)
 
 
 def _with_headings(points: FloatArray) -> FloatArray:

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from fgslam.cameras.omni import Equirectangular, HyperbolicMirror, OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.errors import CalibrationError
-from fgslam.worlds.buildings.house import DEPTH, WIDTH, build_house
 from fgslam.worlds.driving import RADIUS_M, RangeSensor, Wheelchair
 from fgslam.worlds.floor import FloorSpace, PathPlanner
 from fgslam.worlds.patches import RayCaster, stack
 from fgslam.worlds.people import PERSON_RADIUS, People
+from fgslam.worlds.places import build_house
 from fgslam.worlds.renderer import Layer, Renderer, bake, noisy, omni_view, surface_points, visible
 from fgslam.worlds.settings import (
     HouseCalibrationSettings,
@@ -31,8 +31,6 @@ from fgslam.worlds.textures import ColourBank, build_colour_library
 
 Float32 = npt.NDArray[np.float32]
 
-# Coarser than in the lab: the mirror's pixels are wider.
-_LIGHT_SPACING_M = 0.2
 # Smoothing a border costs four rays a pixel: weaker contrast, summed over the three channels, is
 # not worth it.
 _EDGE_CONTRAST = 24.0
@@ -55,8 +53,10 @@ _TARGET_BALANCE = np.array([[1.04], [1.0], [1.0 - 0.04]], dtype=np.float32)
 """(3, 1) of red, green, blue: warmer."""
 _EVENING_PART = 0.3  # in the evening's light every other lamp is off, and shadows fall otherwise
 _GAIN = 1.25  # of the camera: brings the house's baked light to mid-grey
-_WAVE_PERIOD_S = 20.0  # automatic exposure follows the scene slowly
-_SWAY_PERIOD_S = 7.0  # of a wheelchair on a soft floor
+_WAVE_PERIOD_S = 20.0  # of the camera's automatic exposure
+
+
+_SEED = 0  # of textures, furniture and light
 
 
 class HouseModel:
@@ -68,25 +68,25 @@ class HouseModel:
         bank: all textures.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self) -> None:
         """Builds everything, some seconds. Raises MissingDependencyError without Open3D."""
-        things, lamps = build_house(np.random.default_rng([seed, 2]))
-        patches = stack(things)
+        house = build_house(np.random.default_rng([_SEED, 2]))
+        patches = stack(house.things)
         caster = RayCaster(patches)
-        self.bank = ColourBank(build_colour_library(np.random.default_rng([seed, 1])))
-        lights = [
-            bake(patches, caster, chosen, np.random.default_rng([seed, 3]), _LIGHT_SPACING_M)
-            for chosen in (lamps, lamps[::2])
-        ]
-        self.layer = Layer(patches, caster, lights[0], self.bank)
-        self.evening = lights[1].values
-        self.space = FloorSpace(patches, np.zeros(2), np.array([WIDTH, DEPTH]))
+        self.bank = ColourBank(build_colour_library(np.random.default_rng([_SEED, 1])))
+        day, evening = (
+            bake(patches, caster, lamps, np.random.default_rng([_SEED, 3]), house.light_spacing_m)
+            for lamps in (house.lamps, house.lamps[::2])
+        )
+        self.layer = Layer(patches, caster, day, self.bank)
+        self.evening = evening.values
+        self.space = FloorSpace(patches, house.low, house.high)
 
 
-@lru_cache(maxsize=2)
-def open_house(seed: int) -> HouseModel:
-    """The house, kept for the next world in it (some 100 MB each)."""
-    return HouseModel(seed)
+@lru_cache(maxsize=1)
+def open_house() -> HouseModel:
+    """The house, kept for the next world in it (some 100 MB)."""
+    return HouseModel()
 
 
 def make_house_camera(settings: HouseCameraSettings) -> OmniCamera:
@@ -150,7 +150,7 @@ class OmniWorld:
             MissingDependencyError: Open3D cannot be loaded.
         """
         self.settings, self._seed = settings, seed
-        self.model = open_house(settings.house_seed)
+        self.model = open_house()
         self.camera: OmniCamera = make_house_camera(settings.camera)
         self.calibration = miscalibrated(self.camera, settings.calibration, self._rng(8))
         self._renderer = Renderer(omni_view(self.camera), self.model.bank, _EDGE_CONTRAST)
@@ -160,9 +160,8 @@ class OmniWorld:
             settings.path.spacing_m, settings.path.legs, self._rng(0), within
         )
         self._people = People(self._people_routes(), self._rng(1), self.model.bank)
-        self._tilt = CameraTilt(settings, self._rng(2))
+        self._tilt = camera_tilt(settings.tilt_deg, self._rng(2))
         self._sensor = RangeSensor(self.model.layer.caster)
-        self._scene = lit(self.model.layer, self.model.layer.light, settings.light)
         self.put(self.reference_poses[0])
 
     # ---------------------------------------------------------------------------- acting
@@ -200,13 +199,14 @@ class OmniWorld:
         """(h, w, 3) red, green, blue from where the wheelchair is.
 
         Args:
-            time: seconds, for exposure, swaying and noise.
+            time: seconds, for exposure and noise.
         """
-        s = self.settings
-        pose = camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, self._tilt.angles(time))
-        levels = self._renderer.levels(self._scene, pose, self._people.bodies())
-        seen = exposed(levels, s.exposure_wave, time)
-        return self._with_noise(seen, 1, round(abs(time) * 1e6))
+        pose = camera_pose(self.wheelchair.pose, CAMERA_HEIGHT_M, self._tilt)
+        levels = self._renderer.levels(self.model.layer, pose, self._people.bodies())
+        # Automatic exposure follows the scene slowly.
+        wave = np.sin(2.0 * np.pi * time / _WAVE_PERIOD_S)
+        gain = _GAIN * (1.0 + self.settings.exposure_wave * wave)
+        return self._exposed(levels, gain, 1, round(abs(time) * 1e6))
 
     def scan(self) -> tuple[FloatArray, FloatArray]:
         """Angles (n,) in the robot's axes, radians, and ranges (n,), metres."""
@@ -224,10 +224,8 @@ class OmniWorld:
     @cached_property
     def targets(self) -> tuple[Image, ...]:
         """The target images, taken at another time: other light and noise, nobody about."""
-        tilt = CameraTilt(self.settings, self._rng(5))
-        return tuple(
-            self.picture(pose, k, tilt.angles(10.0 * k)) for k, pose in enumerate(self.target_poses)
-        )
+        tilt = camera_tilt(self.settings.tilt_deg, self._rng(5))
+        return tuple(self.picture(pose, k, tilt) for k, pose in enumerate(self.target_poses))
 
     def crossing_routes(self) -> tuple[FloatArray, FloatArray]:
         """Poses (n, 3) and (m, 3) of two routes through the house that meet in its corridor.
@@ -240,17 +238,18 @@ class OmniWorld:
     def picture(self, pose: FloatArray, number: int, tilt: FloatArray | None = None) -> Image:
         """(h, w, 3) as target images are taken, from any planar pose (3,); ``number`` seeds it."""
         day = (1.0 - _EVENING_PART) * self.model.layer.light
-        light = day + _EVENING_PART * self.model.evening
-        scene = lit(self.model.layer, light, _TARGET_LEVEL)
+        light = _TARGET_LEVEL * (day + _EVENING_PART * self.model.evening)
         upright = np.zeros(2) if tilt is None else tilt
         seen_from = camera_pose(pose, CAMERA_HEIGHT_M, upright)
-        levels = self._renderer.levels(scene, seen_from)
-        seen = exposed(levels * _TARGET_BALANCE, 0.0, 0.0)
-        return self._with_noise(seen, 2, number)
+        scene = self.model.layer.lit(np.asarray(light, dtype=np.float32))
+        levels = self._renderer.levels(scene, seen_from) * _TARGET_BALANCE
+        return self._exposed(levels, _GAIN, 2, number)
 
-    def _with_noise(self, levels: Float32, stream: int, number: int) -> Image:
+    def _exposed(self, levels: Float32, gain: float, stream: int, number: int) -> Image:
+        """(h, w, 3) of levels (3, n), with noise that seed, stream and number determine."""
+        seen = np.asarray(levels * np.float32(gain))
         name = (self._seed, stream, number)
-        return self._renderer.assemble(noisy(levels, self.settings.noise_grey, name))
+        return self._renderer.assemble(noisy(seen, self.settings.noise_grey, name))
 
     # ---------------------------------------------------------------------------- truth
 
@@ -305,35 +304,10 @@ class OmniWorld:
         return self.model.space.touches(place, RADIUS_M, _CONTACT_M)
 
 
-# --------------------------------------------------------------------------------------------
-# Disturbances
-
-
-def lit(layer: Layer, light: Float32, level: float) -> Layer:
-    """The same layer in another light, at some level."""
-    return layer.lit(np.asarray(level * light, dtype=np.float32))
-
-
-def exposed(levels: Float32, amplitude: float, time: float) -> Float32:
-    """(3, n) levels as the camera's exposure, a wave of the gain, makes them at a time in s."""
-    wave = 1.0 + amplitude * np.sin(2.0 * np.pi * time / _WAVE_PERIOD_S)
-    return np.asarray(levels * np.float32(_GAIN * wave))
-
-
-class CameraTilt:
-    """Roll and pitch of the camera over time: a constant part and a slow oscillation."""
-
-    def __init__(self, settings: OmniHouseSettings, rng: np.random.Generator) -> None:
-        """Draws to which side the camera leans, and the swaying's phases."""
-        side = float(rng.uniform(0.0, 2.0 * np.pi))
-        self._constant = np.deg2rad(settings.tilt_deg) * np.array([np.cos(side), np.sin(side)])
-        self._sway = np.deg2rad(settings.sway_deg)
-        self._phase = rng.uniform(0.0, 2.0 * np.pi, 2)
-
-    def angles(self, time: float) -> FloatArray:
-        """(2,) roll about the forward axis and pitch about the left one, radians."""
-        turn = 2.0 * np.pi * time / _SWAY_PERIOD_S * np.array([1.0, 0.77]) + self._phase
-        return np.asarray(self._constant + self._sway * np.sin(turn))
+def camera_tilt(degrees: float, rng: np.random.Generator) -> FloatArray:
+    """(2,) roll about the forward axis and pitch about the left one, radians; the side is drawn."""
+    side = float(rng.uniform(0.0, 2.0 * np.pi))
+    return np.asarray(np.deg2rad(degrees) * np.array([np.cos(side), np.sin(side)]))
 
 
 def camera_pose(pose: FloatArray, height: float, tilt: FloatArray) -> FloatArray:

@@ -17,42 +17,30 @@ from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.buildings import corridors as alike
-from fgslam.worlds.buildings import lab, office
+from fgslam.worlds import driving
 from fgslam.worlds.driving import (
-    MAX_ACCELERATION_M_S2,
+    Drive,
     PlanarPath,
-    PosesInTime,
     drive_along,
     paper_loop,
     planar_poses,
     room_laps,
     round_corners,
     through_waypoints,
-    wheel_identity,
 )
-from fgslam.worlds.floor import (
-    BURST_STEP_M,
-    RANDOM_CLEARANCE_M,
-    FloorSpace,
-    draw_poses,
-)
-from fgslam.worlds.patches import RayCaster, Thing, stack
+from fgslam.worlds.floor import BURST_STEP_M, RANDOM_CLEARANCE_M, FloorSpace, draw_poses
+from fgslam.worlds.patches import RayCaster, stack
 from fgslam.worlds.people import ACROSS_M, WALK_FRAMES, Stance, person
-from fgslam.worlds.renderer import (
-    BLUR_RENDERS,
-    JUMP,
-    JUMP_FRAME,
-    LIGHT_SPACING_M,
-    WAVE,
-    WAVE_FRAMES,
-    Body,
-    Layer,
-    Renderer,
-    bake,
-    flat_light,
-    pinhole_view,
+from fgslam.worlds.places import (
+    Place,
+    build_corridors,
+    build_lab,
+    build_office,
+    office_tour,
+    ring_one_way,
+    ring_tour,
 )
+from fgslam.worlds.renderer import Body, Layer, Renderer, bake, flat_light, pinhole_view
 from fgslam.worlds.settings import (
     LabDriveSettings,
     LabRigSettings,
@@ -60,13 +48,7 @@ from fgslam.worlds.settings import (
     PathName,
     PlaceName,
 )
-from fgslam.worlds.textures import (
-    Grey,
-    GreyBank,
-    build_library,
-    building_library,
-    corridor_library,
-)
+from fgslam.worlds.textures import GreyBank, build_library, building_library, corridor_library
 
 FIELD_OF_VIEW_DEG = 60.0  # its width
 AHEAD_M, ABOVE_M = 0.25, 1.0  # reference camera from the robot's centre, and above the floor
@@ -81,6 +63,9 @@ PATHS: dict[PlaceName, tuple[PathName, ...]] = {
 """Drives that each place offers; the first is its own."""
 
 
+_LIBRARIES = {"lab": build_library, "rooms": building_library, "corridors": corridor_library}
+
+
 @dataclass(frozen=True, slots=True)
 class PlaceChoice:
     """What makes a place the one it is.
@@ -93,9 +78,9 @@ class PlaceChoice:
     """
 
     name: PlaceName
-    seed: int
-    visit: int
-    identical_posters: bool
+    seed: int = 0
+    visit: int = 1
+    identical_posters: bool = False
 
     @staticmethod
     def of(settings: LabSettings) -> PlaceChoice:
@@ -104,51 +89,29 @@ class PlaceChoice:
         return PlaceChoice(settings.place, settings.room_seed, settings.visit, identical)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Place:
-    """A furnished place.
-
-    Attributes:
-        things: with their patches.
-        lamps: (k, 3, 3) corner and two edges of each, metres.
-        low, high: (2,) corners of the floor, metres.
-        light_spacing_m: of the points where the light is computed.
-        light_reach_m: of a lamp; None for any distance.
-    """
-
-    things: tuple[Thing, ...]
-    lamps: FloatArray
-    low: FloatArray
-    high: FloatArray
-    light_spacing_m: float = 0.15
-    light_reach_m: float | None = 7.0
-
-
 def build_place(choice: PlaceChoice) -> Place:
     """What stands where.
 
     Raises:
-        ConfigError: the place has no second visit, or no two posters.
+        ConfigError: the place has no such visit, or no two posters.
     """
-    _require_offer(choice)
+    visits = {"lab": 3, "rooms": 2, "corridors": 1}[choice.name]
+    if choice.visit > visits:
+        raise ConfigError(
+            f"dataset.visit {choice.visit}: dataset.place {choice.name} has "
+            f"{visits}, the lab 3, in which more has been moved each time"
+        )
+    if choice.identical_posters and choice.name != "lab":
+        raise ConfigError(
+            f"dataset.posters identical means nothing in dataset.place {choice.name}; the two "
+            "posters hang in the lab"
+        )
     rng = np.random.default_rng([choice.seed, 2])
     if choice.name == "rooms":
-        things, lamps = office.build_office(rng, choice.visit)
-        return Place(things, lamps, np.zeros(2), np.array([office.WIDTH, office.DEPTH]))
+        return build_office(rng, choice.visit)
     if choice.name == "corridors":
-        things, lamps = alike.build_alike(rng)
-        edge = np.full(2, alike.HALF_WIDTH)
-        return Place(things, lamps, -edge, alike.SIDE + edge)
-    things = lab.build_lab(rng, choice.visit, choice.identical_posters)
-    side = np.full(2, lab.HALF_SIDE)
-    return Place(things, lab.lamps(), -side, side, LIGHT_SPACING_M, None)
-
-
-def build_textures(choice: PlaceChoice) -> dict[str, Grey]:
-    """The place's textures by name."""
-    rng = np.random.default_rng([choice.seed, 1])
-    libraries = {"lab": build_library, "rooms": building_library, "corridors": corridor_library}
-    return libraries[choice.name](rng)
+        return build_corridors(rng)
+    return build_lab(rng, choice.visit, choice.identical_posters)
 
 
 def place_path(name: PlaceName, settings: LabDriveSettings) -> PlanarPath:
@@ -163,10 +126,10 @@ def place_path(name: PlaceName, settings: LabDriveSettings) -> PlanarPath:
             f"one of {', '.join(PATHS[name])}"
         )
     if settings.path == "tour":
-        corners = (office if name == "rooms" else alike).tour(settings.laps)
-        return round_corners(corners, _BEND_M)
+        tour = office_tour if name == "rooms" else ring_tour
+        return round_corners(tour(settings.laps), _BEND_M)
     if settings.path == "one_way":
-        return round_corners(alike.one_way(), _BEND_M)
+        return round_corners(ring_one_way(), _BEND_M)
     if settings.path == "paper_loop":
         return paper_loop()
     if settings.path == "laps":
@@ -175,7 +138,7 @@ def place_path(name: PlaceName, settings: LabDriveSettings) -> PlanarPath:
     return through_waypoints(points, settings.closed)
 
 
-def plan_in_place(choice: PlaceChoice, settings: LabDriveSettings, rig: CameraRig) -> PosesInTime:
+def plan_in_place(choice: PlaceChoice, settings: LabDriveSettings, rig: CameraRig) -> Drive:
     """Poses and time stamps of a drive in a place, or of random poses in it.
 
     Raises:
@@ -201,32 +164,13 @@ def first_pose(name: PlaceName, settings: LabDriveSettings) -> FloatArray:
     return np.asarray(planar_poses(np.array([[*path.xy[0], path.heading[0]]]))[0])
 
 
-def _require_offer(choice: PlaceChoice) -> None:
-    if choice.identical_posters and choice.name != "lab":
-        raise ConfigError(
-            f"dataset.posters identical means nothing in dataset.place {choice.name}; the two "
-            "posters hang in the lab"
-        )
-    if choice.visit > 1 and choice.name == "corridors":
-        raise ConfigError(
-            f"dataset.visit {choice.visit}: nothing is ever moved in dataset.place corridors; "
-            "choose the lab or rooms"
-        )
-    if choice.visit > 2 and choice.name != "lab":
-        raise ConfigError(
-            f"dataset.visit {choice.visit}: only the lab has been rearranged; dataset.place "
-            f"{choice.name} has the visits 1 and 2"
-        )
-
-
 def identity_values(settings: LabSettings) -> dict[str, Any]:
     """Settings as plain values, with the constants that shape a recording of them.
 
     By the names that they had when its identity and the name of its rendered frames were made:
     so both stay what they are while settings become constants and other places come.
     """
-    out = asdict(settings)
-    effects, drive = settings.effects, out["drive"]
+    out, effects = asdict(settings), settings.effects
     out["rig"] |= {
         "horizontal_fov_deg": FIELD_OF_VIEW_DEG,
         "ahead_m": AHEAD_M,
@@ -234,22 +178,29 @@ def identity_values(settings: LabSettings) -> dict[str, Any]:
         "above_m": ABOVE_M,
         "tilt_deg": 0.0,
     }
-    out["odometry"] = wheel_identity(settings.odometry)
-    drive["max_acceleration_m_s2"] = MAX_ACCELERATION_M_S2
-    drive["random_poses"] |= {"clearance_m": RANDOM_CLEARANCE_M, "step_m": BURST_STEP_M}
-    exposure = {"wave": WAVE, "jump": JUMP}
-    exposure |= {"wave_period_frames": WAVE_FRAMES, "jump_frame": JUMP_FRAME}
-    blur = {"exposure_s": effects.motion_blur_s, "samples": BLUR_RENDERS}
+    wheels = settings.odometry
+    out["odometry"] = {
+        "distance_scale": wheels.scale_error,
+        "turn_scale": wheels.scale_error,
+        "distance_m_sqrt_m": wheels.noise * driving.ALONG_M_SQRT_M,
+        "sideways_m_sqrt_m": wheels.noise * driving.SIDEWAYS_M_SQRT_M,
+        "yaw_deg_sqrt_m": wheels.noise * driving.YAW_DEG_SQRT_M,
+        "yaw_deg_sqrt_rad": wheels.noise * driving.YAW_DEG_SQRT_RAD,
+        "height_m_sqrt_m": driving.HEIGHT_M_SQRT_M,
+        "tilt_deg_sqrt_m": driving.TILT_DEG_SQRT_M,
+        "floor_m": driving.FLOOR_M,
+        "floor_deg": driving.FLOOR_DEG,
+    }
+    out["drive"]["max_acceleration_m_s2"] = driving.MAX_ACCELERATION_M_S2
+    out["drive"]["random_poses"] |= {"clearance_m": RANDOM_CLEARANCE_M, "step_m": BURST_STEP_M}
     walk = {"first_frame": effects.person, "frames": WALK_FRAMES, "distance_m": ACROSS_M}
-    out["effects"] = {
-        "noise_grey": effects.noise_grey,
-        "exposure": exposure if effects.exposure else None,
-        "motion_blur": None if effects.motion_blur_s is None else blur,
+    out["effects"] |= {
+        "exposure": None,
+        "motion_blur": None,
         "person": None if effects.person is None else walk,
-        "blocked_frames": effects.blocked_frames,
     }
     if settings.drive.path != "random_poses":
-        del drive["random_poses"]
+        del out["drive"]["random_poses"]
     if settings.place == "lab":
         del out["place"]
     if settings.posters == "different":
@@ -314,7 +265,7 @@ class Room:
         self.low, self.high = place.low, place.high
         self.things = (*(thing.name for thing in place.things), "person")
         self.caster = RayCaster(patches)
-        self.bank = GreyBank(build_textures(choice))
+        self.bank = GreyBank(_LIBRARIES[choice.name](np.random.default_rng([choice.seed, 1])))
         rng = np.random.default_rng([choice.seed, 3])
         spacing, reach = place.light_spacing_m, place.light_reach_m
         light = bake(patches, self.caster, place.lamps, rng, spacing, reach)

@@ -6,14 +6,14 @@ Those of the house wait for the robot and turn back.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.driving import PosesInTime, planar_poses
+from fgslam.worlds.driving import Drive, planar_poses
 from fgslam.worlds.patches import (
     Patch,
     RayCaster,
@@ -67,8 +67,10 @@ class Walk:
         return Stance(float(x), float(y), float(np.arctan2(step[1], step[0])), part * length)
 
 
-def make_walk(settings: LabSettings, drive: PosesInTime, rig: CameraRig) -> Walk | None:
+def make_walk(settings: LabSettings, drive: Drive, rig: CameraRig) -> Walk | None:
     """The walk across the view that the settings ask for, or None.
+
+    From the right of the view at the middle of the walk to its left, square to its axis.
 
     Raises:
         ConfigError: the drive is over before the person comes.
@@ -81,11 +83,7 @@ def make_walk(settings: LabSettings, drive: PosesInTime, rig: CameraRig) -> Walk
             f"effects.person is {first}, but the drive has only {frames} frames; lower it"
         )
     rate = settings.drive.frame_rate_hz
-    return across_view(first / rate, (first + WALK_FRAMES - 1) / rate, drive, rig)
-
-
-def across_view(begins: float, ends: float, drive: PosesInTime, rig: CameraRig) -> Walk:
-    """From the right of the view at the middle of the walk to its left, square to its axis."""
+    begins, ends = first / rate, (first + WALK_FRAMES - 1) / rate
     camera = (drive.body_poses(np.array([0.5 * (begins + ends)]))[0] @ rig.bTc)[:3]
     right, ahead = camera[:2, 0], camera[:2, 2] / np.linalg.norm(camera[:2, 2])
     middle = camera[:2, 3] + ACROSS_M * ahead
@@ -93,28 +91,36 @@ def across_view(begins: float, ends: float, drive: PosesInTime, rig: CameraRig) 
     return Walk(middle + half * right, middle - half * right, begins, ends)
 
 
-def person(stance: Stance) -> Thing:
+def person(stance: Stance, shirt: str = "shirt") -> Thing:
     """The body at a stance; the gait follows from the way walked."""
     phase = 2.0 * np.pi * stance.way / _STRIDE_M
-    parts = _trunk()
+    parts = _trunk(shirt)
     for side in (-1.0, 1.0):
         swing = float(np.sin(phase)) * side
         lift = max(0.0, float(np.cos(phase)) * side)
-        parts += _limb(
-            (0.0, 0.09 * side, _HIP), (0.45 * swing, -0.7 * lift), (_THIGH, _SHIN),
-            (0.075, 0.055), ("trousers", "trousers"),
-        )  # fmt: skip
-        parts += _limb(
-            (0.0, 0.21 * side, _SHOULDER), (-0.4 * swing, 0.5), (_UPPER_ARM, _FOREARM),
-            (0.05, 0.042), ("shirt", "skin"),
-        )  # fmt: skip
+        for root, turns, lengths, radii, textures in (
+            ((0.0, 0.09 * side, _HIP), (0.45 * swing, -0.7 * lift), (_THIGH, _SHIN),
+             (0.075, 0.055), ("trousers", "trousers")),
+            ((0.0, 0.21 * side, _SHOULDER), (-0.4 * swing, 0.5), (_UPPER_ARM, _FOREARM),
+             (0.05, 0.042), (shirt, "skin")),
+        ):  # fmt: skip
+            (x, y, z), angle = root, 0.0  # two bars, swung by the first angle, bent by the second
+            for turn, length, radius, texture in zip(turns, lengths, radii, textures, strict=True):
+                angle += turn
+                end = (x + length * float(np.sin(angle)), y, z - length * float(np.cos(angle)))
+                parts += prism(end, (x, y, z), radius, Surface(texture, 0.4))
+                x, y, z = end
     turned = placed(parts, stance.x, stance.y, 0.0, float(np.rad2deg(stance.heading)))
     return Thing("person", tuple(turned))
 
 
-def _trunk() -> list[Patch]:
+def _trunk(shirt_texture: str) -> list[Patch]:
     """Torso, neck, head and hair; the body walks towards +x."""
-    shirt, skin, hair = Surface("shirt", 0.5), Surface("skin", 0.3), Surface("plain_dark", 0.3)
+    shirt, skin, hair = (
+        Surface(shirt_texture, 0.5),
+        Surface("skin", 0.3),
+        Surface("plain_dark", 0.3),
+    )
     torso = prism((0, 0, _HIP - 0.05), (0, 0, _SHOULDER + 0.04), 0.19, shirt, 12)
     flat = np.array([0.62, 1.0, 1.0])  # a torso is wider than deep
     out = [Patch(p.corner * flat, p.edge_u * flat, p.edge_v * flat, shirt) for p in torso]
@@ -122,25 +128,6 @@ def _trunk() -> list[Patch]:
     out += prism((0, 0, _SHOULDER), (0, 0, 1.55), 0.055, skin)
     out += prism((0, 0, 1.52), (0, 0, 1.74), 0.088, skin, 12)
     out += prism((0, 0, 1.66), (0, 0, 1.78), 0.097, hair, 12)
-    return out
-
-
-def _limb(
-    root: tuple[float, float, float],
-    angles: tuple[float, float],
-    lengths: tuple[float, float],
-    radii: tuple[float, float],
-    textures: tuple[str, str],
-) -> list[Patch]:
-    """Two bars hanging from ``root``: swung forward by the first angle, bent by the second."""
-    out: list[Patch] = []
-    x, y, z = root
-    angle = 0.0
-    for turn, length, radius, texture in zip(angles, lengths, radii, textures, strict=True):
-        angle += turn
-        end = (x + length * float(np.sin(angle)), y, z - length * float(np.cos(angle)))
-        out += prism(end, (x, y, z), radius, Surface(texture, 0.4))
-        x, y, z = end
     return out
 
 
@@ -241,14 +228,8 @@ class People:
     def _layer(self, phase: int, shirt: int) -> Layer:
         """The body in its own frame at one of the gait's phases; kept, as building it is slow."""
         if (phase, shirt) not in self._layers:
-            body = person(Stance(0.0, 0.0, 0.0, phase * _STRIDE_M / _PHASES)).patches
-            dressed = (
-                replace(p, surface=replace(p.surface, texture=f"shirt_{shirt}"))
-                if p.surface.texture == "shirt"
-                else p
-                for p in body
-            )
-            patches = stack([Thing("person", tuple(dressed))])
+            body = person(Stance(0.0, 0.0, 0.0, phase * _STRIDE_M / _PHASES), f"shirt_{shirt}")
+            patches = stack([body])
             light = flat_light(patches, np.array([0.0, 0.0, 1.0]))
             self._layers[phase, shirt] = Layer(patches, RayCaster(patches), light, self._bank)
         return self._layers[phase, shirt]

@@ -18,19 +18,19 @@ import hashlib
 import json
 import os
 import struct
-import threading
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
-from fgslam.core.errors import DatasetError
+from fgslam.core.errors import DatasetError, OutputError
+from fgslam.core.files import replacing
 from fgslam.worlds.patches import PatchArrays, RayCaster
 from fgslam.worlds.settings import LabEffectsSettings
 from fgslam.worlds.textures import TextureBank
@@ -92,38 +92,25 @@ def bake(
         reach_m: how far a lamp shines, its light fading smoothly to nothing; None for any
             distance. Where walls hide most lamps from most places this saves most of the work.
     """
-    columns = _grid_size(np.linalg.norm(patches.edge_u, axis=1), spacing_m)
-    rows = _grid_size(np.linalg.norm(patches.edge_v, axis=1), spacing_m)
+    columns, rows = (
+        np.clip(np.ceil(np.linalg.norm(edge, axis=1) / spacing_m).astype(int) + 1, 2, _MAX_CELLS)
+        for edge in (patches.edge_u, patches.edge_v)
+    )
     count = columns * rows
     offset = np.concatenate([[0], np.cumsum(count)[:-1]])
     patch = np.repeat(np.arange(len(patches)), count)
-    points = _grid_points(patches, columns, patch, offset, rows)
-    normals = patches.normal[patch]
+    place = np.arange(len(patch)) - offset[patch]
+    # Drawn in from the edges, and just before the surface.
+    s = 0.02 + 0.96 * ((place % columns[patch]) / (columns[patch] - 1.0))
+    t = 0.02 + 0.96 * ((place // columns[patch]) / (rows[patch] - 1.0))
+    normals, on_patch = patches.normal[patch], patches.corner[patch]
+    on_patch = on_patch + s[:, None] * patches.edge_u[patch] + t[:, None] * patches.edge_v[patch]
+    points = on_patch + _LIFT_M * normals
     light = _AMBIENT * _openness(caster, points, normals, rng)
-    if reach_m is None:
-        light += _lamp_light(caster, points, normals, lamps, rng)
-    else:
-        light += _lamp_light_within(reach_m, caster, points, normals, lamps, rng)
+    light += _lamp_light(caster, points, normals, lamps, rng, reach_m)
     glow = np.array([surface.glow for surface in patches.surfaces])[patch]
     values = np.where(glow > 0.0, glow, light)
     return LightMaps(values.astype(np.float32), offset, columns, rows)
-
-
-def _grid_size(metres: FloatArray, spacing_m: float) -> IntArray:
-    return np.clip(np.ceil(metres / spacing_m).astype(np.int64) + 1, 2, _MAX_CELLS)
-
-
-def _grid_points(
-    patches: PatchArrays, columns: IntArray, patch: IntArray, offset: IntArray, rows: IntArray
-) -> FloatArray:
-    """Points just before the patches' surfaces, drawn in from their edges."""
-    place = np.arange(len(patch)) - offset[patch]
-    s = (place % columns[patch]) / (columns[patch] - 1.0)
-    t = (place // columns[patch]) / (rows[patch] - 1.0)
-    s, t = 0.02 + 0.96 * s, 0.02 + 0.96 * t
-    on_patch = patches.corner[patch]
-    on_patch = on_patch + s[:, None] * patches.edge_u[patch] + t[:, None] * patches.edge_v[patch]
-    return np.asarray(on_patch + _LIFT_M * patches.normal[patch])
 
 
 def _openness(
@@ -146,57 +133,35 @@ def _lamp_light(
     normals: FloatArray,
     lamps: FloatArray,
     rng: np.random.Generator,
+    reach_m: float | None,
 ) -> FloatArray:
-    """(n,) light of all lamps; each is sampled at a few points, which softens its shadows."""
-    light = np.zeros(len(points))
-    for lamp in lamps:
-        samples = rng.random((_LAMP_SAMPLES, 2))
-        _add_light(light, lamp, samples, caster, (points, normals))
-    return np.asarray(light * (_LAMP_POWER / _LAMP_SAMPLES))
+    """(n,) light of all lamps; each is sampled at a few points, which softens its shadows.
 
-
-def _lamp_light_within(
-    reach_m: float,
-    caster: RayCaster,
-    points: FloatArray,
-    normals: FloatArray,
-    lamps: FloatArray,
-    rng: np.random.Generator,
-) -> FloatArray:
-    """(n,) light of all lamps on what is less than ``reach_m`` from the middle of each.
-
-    All are sampled at the same points of their surfaces: lamps that are alike shine alike.
+    With a reach all are sampled at the same points of their surfaces: lamps that are alike shine
+    alike.
     """
     light = np.zeros(len(points))
-    samples = rng.random((_LAMP_SAMPLES, 2))
-    for lamp in lamps:
-        middle = lamp[0] + 0.5 * (lamp[1] + lamp[2])
-        far2 = np.sum(np.square(points - middle), axis=1)
-        near = np.flatnonzero(far2 < reach_m**2)
-        window = np.square(1.0 - far2[near] / reach_m**2)
-        here = np.zeros(len(near))
-        _add_light(here, lamp, samples, caster, (points[near], normals[near]))
-        light[near] += window * here
+    samples = rng.random((_LAMP_SAMPLES, 2)) if reach_m is not None else None
+    for corner, edge_u, edge_v in lamps:
+        near: slice | IntArray = slice(None)
+        total, window = light, None
+        if reach_m is not None:
+            far2 = np.sum(np.square(points - (corner + 0.5 * (edge_u + edge_v))), axis=1)
+            near = np.flatnonzero(far2 < reach_m**2)
+            window = np.square(1.0 - far2[near] / reach_m**2)
+            total = np.zeros(len(near))
+        here, normal = points[near], normals[near]
+        for s, t in rng.random((_LAMP_SAMPLES, 2)) if samples is None else samples:
+            offset = corner + s * edge_u + t * edge_v - here
+            far2 = np.sum(offset * offset, axis=1)
+            towards = offset / np.sqrt(far2)[:, None]
+            facing = np.sum(normal * towards, axis=1) * np.maximum(towards[:, 2], 0.0)
+            lit = facing > 1e-3
+            lit[lit] = ~caster.blocked(here[lit], offset[lit], 0.995)
+            total[lit] += facing[lit] / (1.0 + far2[lit])
+        if window is not None:
+            light[near] += window * total
     return np.asarray(light * (_LAMP_POWER / _LAMP_SAMPLES))
-
-
-def _add_light(
-    light: FloatArray,
-    lamp: FloatArray,
-    samples: FloatArray,
-    caster: RayCaster,
-    surface: tuple[FloatArray, FloatArray],
-) -> None:
-    """Adds one lamp's light, not yet scaled, from samples (k, 2) of it, to points and normals."""
-    points, normals = surface
-    for s, t in samples:
-        offset = lamp[0] + s * lamp[1] + t * lamp[2] - points
-        far2 = np.sum(offset * offset, axis=1)
-        towards = offset / np.sqrt(far2)[:, None]
-        facing = np.sum(normals * towards, axis=1) * np.maximum(towards[:, 2], 0.0)
-        lit = facing > 1e-3
-        lit[lit] = ~caster.blocked(points[lit], offset[lit], 0.995)
-        light[lit] += facing[lit] / (1.0 + far2[lit])
 
 
 # --------------------------------------------------------------------------------------------
@@ -295,88 +260,36 @@ class Body:
 
 
 # --------------------------------------------------------------------------------------------
-# How cameras look at a scene: the rays of their pixels, and how those change within a pixel
-#
-# A ray ``d`` has three coordinates. Shading needs of it the products ``g . d`` with a plane's
-# coefficients and their derivatives by column and row (``along`` and its companions).
+# Cameras as the renderer sees them
 
 
 _TILT_MARGIN = 0.1
 
 
-# --------------------------------------------------------------------------------------------
-# Pinhole
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class PixelRays:
-    """Rays (column, row, 1) of pixels (n, 2); ``matrix`` (3, 3) takes them to unit depth."""
+class Rays:
+    """Rays of n pixels in single precision, and how they change within a pixel.
 
-    pixels: Float32
-    matrix: FloatArray
+    Shading needs of a ray its products ``g . d`` with a plane's coefficients and their derivatives
+    by column and row.
 
-    def along(self, g: Float32) -> Float32:
-        """(n,) products with coefficients (3, n)."""
-        column, row = self.pixels[:, 0], self.pixels[:, 1]
-        return np.asarray(g[0] * column + g[1] * row + g[2])
-
-    def by_column(self, g: Float32) -> Float32:
-        """(n,) derivative by the column."""
-        return np.asarray(g[0])
-
-    def by_row(self, g: Float32) -> Float32:
-        """(n,) derivative by the row."""
-        return np.asarray(g[1])
-
-    def shifted(self, chosen: IntArray, column: float, row: float) -> PixelRays:
-        """Some of the rays, moved within their pixels."""
-        shift = np.array([column, row], dtype=np.float32)
-        return PixelRays(self.pixels[chosen] + shift, self.matrix)
-
-    def directions(self, pose: FloatArray) -> Float32:
-        """(n, 3) of unit depth."""
-        matrix = (pose[:3, :3] @ self.matrix).astype(np.float32)
-        return np.asarray(self.pixels @ matrix[:, :2].T + matrix[:, 2])
-
-    def towards(self, body: Body, pose: FloatArray, distance: Float32) -> IntArray:
-        """All: the field of view is narrow."""
-        return np.arange(len(distance))
-
-
-# --------------------------------------------------------------------------------------------
-# Omnidirectional
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OmniRays:
-    """Unit viewing directions (3, n), their derivatives, and their level parts (2, n) as units."""
+    Attributes:
+        direction: (3, n) viewing directions.
+        column, row: (3, n), or (3, 1) where all are the same: their derivatives.
+        level: (2, n) their level parts as units; None for a narrow field of view.
+    """
 
     direction: Float32
     column: Float32
     row: Float32
-    level: Float32
+    level: Float32 | None
 
-    def along(self, g: Float32) -> Float32:
-        """(n,) products with coefficients (3, n)."""
-        return _dot(g, self.direction)
-
-    def by_column(self, g: Float32) -> Float32:
-        """(n,) derivative by the column."""
-        return _dot(g, self.column)
-
-    def by_row(self, g: Float32) -> Float32:
-        """(n,) derivative by the row."""
-        return _dot(g, self.row)
-
-    def shifted(self, chosen: IntArray, column: float, row: float) -> OmniRays:
+    def shifted(self, chosen: IntArray, column: float, row: float) -> Rays:
         """Some of the rays, moved within their pixels to first order."""
-        d, level = self.direction.take(chosen, axis=1), self.level[:, chosen]
-        dc, dr = self.column.take(chosen, axis=1), self.row.take(chosen, axis=1)
-        return OmniRays(d + np.float32(column) * dc + np.float32(row) * dr, dc, dr, level)
-
-    def directions(self, pose: FloatArray) -> Float32:
-        """(n, 3) of unit length."""
-        return np.asarray((pose[:3, :3].astype(np.float32) @ self.direction).T)
+        level = None if self.level is None else self.level[:, chosen]
+        dc, dr = (d if d.shape[1] == 1 else d.take(chosen, axis=1) for d in (self.column, self.row))
+        d = self.direction.take(chosen, axis=1)
+        return Rays(d + np.float32(column) * dc + np.float32(row) * dr, dc, dr, level)
 
     def towards(self, body: Body, pose: FloatArray, distance: Float32) -> IntArray:
         """Rays that may meet a body: by their bearing, and as nothing nearer is before it.
@@ -385,7 +298,7 @@ class OmniRays:
         """
         offset = (body.wTo[:3, 3] - pose[:3, 3])[:2]
         far = float(np.hypot(*offset))
-        if far <= body.radius + 0.1:
+        if self.level is None or far <= body.radius + 0.1:
             return np.arange(len(distance))
         forward = float(np.arctan2(pose[1, 0], pose[0, 0]))
         middle = float(np.arctan2(offset[1], offset[0])) - forward
@@ -395,14 +308,6 @@ class OmniRays:
         return np.flatnonzero(
             (self.level[0] * x + self.level[1] * y > least) & (distance > nearest)
         )
-
-
-# --------------------------------------------------------------------------------------------
-# Cameras as the renderer sees them
-
-
-Rays: TypeAlias = PixelRays | OmniRays
-"""Rays of n pixels, in single precision."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -432,36 +337,28 @@ def pinhole_view(shape: tuple[int, int], focal: float, cx: float, cy: float) -> 
     columns, rows = np.meshgrid(np.arange(shape[1]), np.arange(shape[0]))
     exact = np.column_stack([columns.ravel(), rows.ravel(), np.ones(rows.size)]).astype(np.float64)
     matrix = np.array([[1 / focal, 0, -cx / focal], [0, 1 / focal, -cy / focal], [0, 0, 1.0]])
-    seen = PixelRays(exact[:, :2].astype(np.float32), matrix)
+    right, down = np.eye(3, dtype=np.float32)[:2, :, None]
+    seen = Rays(np.ascontiguousarray(exact.T, np.float32), right, down, None)
     return View(shape, np.arange(rows.size), exact, matrix, seen)
 
 
 def omni_view(camera: OmniCamera) -> View:
     """Any camera with a single viewpoint, axes x forward, y left, z up; distances are ranges."""
-    rays, steps = _pixel_rays(camera)
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
+    rays = camera.rays(pixels)
+    steps = []  # central differences of half a pixel, one-sided at the border of the field
+    for step in (np.array([0.5, 0.0]), np.array([0.0, 0.5])):
+        after, before = camera.rays(pixels + step), camera.rays(pixels - step)
+        both = after - before
+        one = 2.0 * np.where(np.isnan(after), rays - before, after - rays)
+        steps.append(np.nan_to_num(np.where(np.isnan(both), one, both)))
     valid = np.flatnonzero(np.isfinite(rays[:, 0]))
     direction, column, row = (np.ascontiguousarray(a[valid].T, np.float32) for a in (rays, *steps))
     level = direction[:2]
     level = level / np.maximum(np.linalg.norm(level, axis=0), np.float32(1e-9))
-    seen = OmniRays(direction, column, row, level)
+    seen = Rays(direction, column, row, level)
     return View((camera.height, camera.width), valid, rays[valid], np.eye(3), seen)
-
-
-def _pixel_rays(camera: OmniCamera) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
-    """Rays (h * w, 3) of all pixels and their derivatives by central differences of half a pixel.
-
-    Where a neighbour is out of the field, the other side's difference stands in.
-    """
-    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    pixels = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)
-    centre = camera.rays(pixels)
-    steps = []
-    for step in (np.array([0.5, 0.0]), np.array([0.0, 0.5])):
-        after, before = camera.rays(pixels + step), camera.rays(pixels - step)
-        both = after - before
-        one = 2.0 * np.where(np.isnan(after), centre - before, after - centre)
-        steps.append(np.nan_to_num(np.where(np.isnan(both), one, both)))
-    return centre, (steps[0], steps[1])
 
 
 def _dot(a: Float32, b: Float32) -> Float32:
@@ -575,19 +472,24 @@ class Renderer:
         self, layers: Sequence[tuple[Layer, FloatArray]], bodies: Sequence[Body], rays: Rays
     ) -> _Hits:
         scene, pose = layers[0]
-        patch, distance = scene.caster.cast(pose[:3, 3], rays.directions(pose))
+        patch, distance = scene.caster.cast(pose[:3, 3], self._directions(rays, pose))
         layer = np.where(patch >= 0, np.int32(0), _NOTHING)
         for k, body in enumerate(bodies, start=1):
             chosen = rays.towards(body, pose, distance)
             if len(chosen) == 0:
                 continue
             other, seen = layers[k]
-            directions = rays.shifted(chosen, 0.0, 0.0).directions(seen)
+            directions = self._directions(rays.shifted(chosen, 0.0, 0.0), seen)
             other_patch, other_distance = other.caster.cast(seen[:3, 3], directions)
             nearer = other_distance < distance[chosen]
             hit = chosen[nearer]
             layer[hit], patch[hit], distance[hit] = k, other_patch[nearer], other_distance[nearer]
         return _Hits(layer, patch, distance)
+
+    def _directions(self, rays: Rays, pose: FloatArray) -> Float32:
+        """(n, 3) in the scene's axes."""
+        matrix = (pose[:3, :3] @ self._view.matrix).astype(np.float32)
+        return np.asarray((matrix @ rays.direction).T)
 
     def _shade(
         self,
@@ -609,15 +511,15 @@ class Renderer:
     def _shade_layer(self, layer: Layer, planes: Float32, patch: Int32, rays: Rays) -> Float32:
         g = planes.take(patch, axis=1)
         g_u, g_v, g_w = g[:3], g[4:7], g[8:]
-        inverse = np.maximum(rays.along(g_w), np.float32(_LEAST_INVERSE_DISTANCE))
+        inverse = np.maximum(_dot(g_w, rays.direction), np.float32(_LEAST_INVERSE_DISTANCE))
         distance = np.reciprocal(inverse)
-        u, v = rays.along(g_u) * distance, rays.along(g_v) * distance
-        w_column, w_row = rays.by_column(g_w), rays.by_row(g_w)
+        u, v = _dot(g_u, rays.direction) * distance, _dot(g_v, rays.direction) * distance
         width, height = (side.take(patch) * distance for side in layer.size.astype(np.float32).T)
-        across = np.square((rays.by_column(g_u) - u * w_column) * width)
-        across += np.square((rays.by_column(g_v) - v * w_column) * height)
-        down = np.square((rays.by_row(g_u) - u * w_row) * width)
-        down += np.square((rays.by_row(g_v) - v * w_row) * height)
+        across, down = (
+            np.square((_dot(g_u, change) - u * w_change) * width)
+            + np.square((_dot(g_v, change) - v * w_change) * height)
+            for change, w_change in ((d, _dot(g_w, d)) for d in (rays.column, rays.row))
+        )
         footprint = np.sqrt(np.maximum(across, down))
         u += g[3]
         v += g[7]
@@ -704,11 +606,6 @@ def _neighbours(valid: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntA
 
 
 _COVER_SEED = 7
-# The camera's automatic exposure: a slow wave of the gain, half a minute at two frames a second,
-# and a sudden jump half way through the paper's drive.
-WAVE, WAVE_FRAMES = 0.15, 60.0
-JUMP, JUMP_FRAME = 0.7, 125
-BLUR_RENDERS = 5  # a frame with motion blur: more look the same at 8 bits
 
 
 def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
@@ -720,12 +617,6 @@ def noisy(levels: Float32, sigma: float, seed: tuple[int, ...]) -> Float32:
     noise *= np.float32(sigma)
     noise += levels
     return noise
-
-
-def exposure_gain(index: int) -> float:
-    """Gain of frame ``index``: a slow wave, and a factor from the jump on."""
-    wave = 1.0 + WAVE * np.sin(2.0 * np.pi * index / WAVE_FRAMES)
-    return float(wave * (JUMP if index >= JUMP_FRAME else 1.0))
 
 
 def is_blocked(settings: LabEffectsSettings, index: int) -> bool:
@@ -754,19 +645,16 @@ def apply_effects(
 
     Args:
         clean: (k, h, w) rendered images of one frame.
-        settings: the effects; motion blur and the person are in the render already.
+        settings: the effects; the person is in the render already.
         index: the recording's frame number.
         seed: of the recording; frame and seed together determine the noise.
     """
-    gain = exposure_gain(index) if settings.exposure else 1.0
     if is_blocked(settings, index):
         grey = cover(clean.shape)
-    elif gain == 1.0 and settings.noise_grey == 0.0:
+    elif settings.noise_grey == 0.0:
         return tuple(clean)
     else:
         grey = clean.astype(np.float32)
-    if gain != 1.0:
-        grey *= np.float32(gain)
     grey = noisy(grey, settings.noise_grey, (seed, index, 0))
     # Adding one half before the cut to integers rounds; it is faster than np.rint and clip.
     grey += np.float32(0.5)
@@ -801,13 +689,9 @@ class RenderCache:
         """Opens or makes the folder. Raises DatasetError when it cannot be made or written."""
         self.folder = cache_root() / f"lab-{digest[:20]}"
         self._shape = shape
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            note = self.folder / "settings.json"
-            if not note.exists():
-                self._replace(note, json.dumps(description, indent=1, sort_keys=True).encode())
-        except OSError as error:
-            raise _cannot_write(self.folder, error) from error
+        note = self.folder / "settings.json"
+        if not note.exists():
+            self._replace(note, json.dumps(description, indent=1, sort_keys=True).encode())
 
     def path(self, index: int) -> Path:
         """File of one frame."""
@@ -816,24 +700,17 @@ class RenderCache:
     def present(self, index: int) -> bool:
         """Whether a file of the right length is there (its checksum is tested on reading)."""
         try:
-            size = self.path(index).stat().st_size
+            return self.path(index).stat().st_size == _HEADER.size + int(np.prod(self._shape))
         except OSError:
             return False
-        return size == _HEADER.size + int(np.prod(self._shape))
 
     def read(self, index: int) -> Image | None:
         """Images of one frame, or None where the file is absent, foreign, cut or damaged."""
-        try:
-            content = self.path(index).read_bytes()
-        except OSError:
+        if not self.present(index):
             return None
-        if len(content) != _HEADER.size + int(np.prod(self._shape)):
-            return None
-        magic, cameras, height, width, checksum = _HEADER.unpack_from(content)
-        if magic != _MAGIC or (cameras, height, width) != self._shape:
-            return None
-        pixels = memoryview(content)[_HEADER.size :]
-        if zlib.crc32(pixels) != checksum:
+        content = self.path(index).read_bytes()
+        header, pixels = content[: _HEADER.size], content[_HEADER.size :]
+        if header != self._header(pixels):
             return None
         return np.frombuffer(pixels, dtype=np.uint8).reshape(self._shape)
 
@@ -844,23 +721,18 @@ class RenderCache:
             DatasetError: the folder cannot be written or the disk is full.
         """
         pixels = np.ascontiguousarray(images).tobytes()
-        header = _HEADER.pack(_MAGIC, *self._shape, zlib.crc32(pixels))
-        try:
-            self._replace(self.path(index), header + pixels)
-        except OSError as error:
-            raise _cannot_write(self.folder, error) from error
+        self._replace(self.path(index), self._header(pixels) + pixels)
+
+    def _header(self, pixels: bytes) -> bytes:
+        return _HEADER.pack(_MAGIC, *self._shape, zlib.crc32(pixels))
 
     def _replace(self, path: Path, content: bytes) -> None:
-        beside = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}")
         try:
-            beside.write_bytes(content)
-            os.replace(beside, path)
-        finally:
-            beside.unlink(missing_ok=True)
-
-
-def _cannot_write(folder: Path, error: OSError) -> DatasetError:
-    return DatasetError(
-        f"rendered frames cannot be stored in {folder}: {error.strerror or error}; "
-        "set FGSLAM_CACHE to a folder that can be written"
-    )
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as partial:
+                partial.write_bytes(content)
+        except (OSError, OutputError) as error:
+            raise DatasetError(
+                f"rendered frames cannot be stored in {self.folder}: {error}; set FGSLAM_CACHE to "
+                "a folder that can be written"
+            ) from error

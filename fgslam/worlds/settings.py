@@ -20,23 +20,28 @@ from fgslam.core.settings import (
     Positive,
 )
 
-# --------------------------------------------------------------------------------------------
-# The lab, and the other places with a pinhole rig
-
+ImageSide: TypeAlias = Annotated[int, Field(ge=16, le=4096)]
+Baseline: TypeAlias = Annotated[float, Field(gt=0.0, le=2.0)]
+GreyLevels: TypeAlias = Annotated[float, Field(ge=0.0, le=50.0)]
+Frames: TypeAlias = Annotated[int, Field(ge=2, le=100_000)]
+Laps: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+ScaleError: TypeAlias = Annotated[float, Field(ge=0.0, le=0.5)]
+_SCALE_ERROR = "deviation of the constant relative errors of way and turns, once a drive"
 PlaceName: TypeAlias = Literal["lab", "rooms", "corridors"]
 PathName: TypeAlias = Literal["paper_loop", "laps", "waypoints", "tour", "one_way", "random_poses"]
+
+# --------------------------------------------------------------------------------------------
+# The lab, and the other places with a pinhole rig
 
 
 @dataclass(frozen=True, config=STRICT)
 class LabRigSettings:
     """The cameras: the right one is the reference, left beside it, top above it."""
 
-    width: int = Field(default=320, ge=16, le=4096, description="image width, pixels")
-    height: int = Field(default=240, ge=16, le=4096, description="image height, pixels")
-    baseline_m: float = Field(
-        default=0.10, gt=0.0, le=2.0, description="right to left camera, metres"
-    )
-    vertical_baseline_m: Annotated[float, Field(gt=0.0, le=2.0)] | None = Field(
+    width: ImageSide = Field(default=320, description="image width, pixels")
+    height: ImageSide = Field(default=240, description="image height, pixels")
+    baseline_m: Baseline = Field(default=0.10, description="right to left camera, metres")
+    vertical_baseline_m: Baseline | None = Field(
         default=0.10, description="right to top camera, metres; null for a two-camera rig"
     )
 
@@ -46,8 +51,8 @@ class RandomPosesSettings:
     """Poses all over the free floor, in any heading: those of a robot that was carried away."""
 
     seed: Index = Field(default=0, description="of the poses; not the run's seed")
-    burst: int = Field(
-        default=1, ge=1, le=100, description="consecutive frames from each pose on, straight ahead"
+    burst: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=1, description="consecutive frames from each pose on, straight ahead"
     )
 
 
@@ -55,8 +60,12 @@ class RandomPosesSettings:
 class DriveLimits:
     """How fast the robot drives, and how often it takes images."""
 
-    frame_rate_hz: float = Field(default=2.0, gt=0.0, le=120.0, description="frames a second")
-    max_speed_m_s: float = Field(default=0.40, gt=0.0, le=5.0, description="limit, metres a second")
+    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0)] = Field(
+        default=2.0, description="frames a second"
+    )
+    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0)] = Field(
+        default=0.40, description="limit, metres a second"
+    )
     max_turn_deg_s: Degrees = Field(default=10.0, description="limit, degrees a second")
 
 
@@ -69,14 +78,11 @@ class LabDriveSettings(DriveLimits):
         description="lab: `paper_loop`, `laps`; rooms: `tour`; corridors: `tour`, `one_way`; any: "
         "the others",
     )
-    frames: Annotated[int, Field(ge=2, le=100_000)] | None = Field(
+    frames: Frames | None = Field(
         default=249, description="number of frames; null: at nine tenths of the speed limits"
     )
-    laps: int = Field(
-        default=1,
-        ge=1,
-        le=1000,
-        description="times around the room, for `laps`; rounds of a `tour`",
+    laps: Laps = Field(
+        default=1, description="times around the room, for `laps`; rounds of a `tour`"
     )
     waypoints_m: tuple[tuple[float, float], ...] = Field(
         default=(), description="(x, y) in the room, metres from its centre, for `waypoints`"
@@ -93,30 +99,17 @@ class LabDriveSettings(DriveLimits):
 class WheelOdometrySettings:
     """Drift of the wheel odometry (docs/datasets/rendered.md)."""
 
-    scale_error: float = Field(
-        default=0.01,
-        ge=0.0,
-        le=0.5,
-        description="deviation of the constant relative errors of way and turns, once a drive",
-    )
-    noise: float = Field(
-        default=1.0, ge=0.0, le=50.0, description="times the noise along, across and of heading"
+    scale_error: ScaleError = Field(default=0.01, description=_SCALE_ERROR)
+    noise: Annotated[float, Field(ge=0.0, le=50.0)] = Field(
+        default=1.0, description="times the noise along, across and of heading"
     )
 
 
 @dataclass(frozen=True, config=STRICT)
 class LabEffectsSettings:
-    """Disturbances of the images; each null, false or zero when off."""
+    """Disturbances of the images; null or zero when off."""
 
-    noise_grey: float = Field(
-        default=1.5, ge=0.0, le=50.0, description="Gaussian image noise, grey levels"
-    )
-    exposure: bool = Field(
-        default=False, description="a slow wave of the gain of 15 %, and a jump to 70 % half way"
-    )
-    motion_blur_s: Annotated[float, Field(gt=0.0, le=0.5)] | None = Field(
-        default=None, description="shutter time, seconds"
-    )
+    noise_grey: GreyLevels = Field(default=1.5, description="Gaussian image noise, grey levels")
     person: Index | None = Field(
         default=None, description="frame in which a person begins to walk through the view"
     )
@@ -139,12 +132,10 @@ class LabSettings:
     effects: LabEffectsSettings = LabEffectsSettings()
     room_seed: Index = Field(default=0, description="of the room's textures and small things")
     visit: Literal[1, 2, 3] = Field(
-        default=1,
-        description="2: chairs and cartons moved; 3: shelves and posters exchanged too",
+        default=1, description="2: chairs and cartons moved; 3: shelves and posters exchanged too"
     )
     posters: Literal["different", "identical"] = Field(
-        default="different",
-        description="`identical`: two posters on different walls are the same",
+        default="different", description="`identical`: two posters on different walls are the same"
     )
 
 
@@ -177,11 +168,11 @@ class HouseCameraSettings:
 class HouseCalibrationSettings:
     """Errors of the mirror's calibration that the robot has; its images obey the true mirror."""
 
-    mirror: float = Field(
-        default=0.0, ge=0.0, le=0.08, description="relative, of xi and focal length; signs drawn"
+    mirror: Annotated[float, Field(ge=0.0, le=0.08)] = Field(
+        default=0.0, description="relative, of xi and focal length; signs drawn"
     )
-    centre_px: float = Field(
-        default=0.0, ge=0.0, le=20.0, description="of the mirror's centre; its direction is drawn"
+    centre_px: Annotated[float, Field(ge=0.0, le=20.0)] = Field(
+        default=0.0, description="of the mirror's centre; its direction is drawn"
     )
 
 
@@ -189,9 +180,11 @@ class HouseCalibrationSettings:
 class HousePathSettings:
     """The reference path, laid by a planner from the seed."""
 
-    legs: int = Field(default=10, ge=1, le=100, description="targets to reach one after another")
-    spacing_m: float = Field(
-        default=3.0, ge=0.5, le=8.0, description="between a target and the next, metres"
+    legs: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=10, description="targets to reach one after another"
+    )
+    spacing_m: Annotated[float, Field(ge=0.5, le=8.0)] = Field(
+        default=3.0, description="between a target and the next, metres"
     )
     rooms: Literal["house", "hall"] = Field(
         default="house", description="`house`: from room to room; `hall`: within the largest"
@@ -204,23 +197,16 @@ class OmniHouseSettings:
 
     kind: Literal["omni_house"] = "omni_house"
     camera: HouseCameraSettings = HouseCameraSettings()
-    house_seed: Index = Field(default=0, description="of textures and furniture")
-    noise_grey: float = Field(
-        default=2.0, ge=0.0, le=50.0, description="Gaussian image noise, grey levels"
+    noise_grey: GreyLevels = Field(default=2.0, description="Gaussian image noise, grey levels")
+    people: Annotated[int, Field(ge=0, le=8)] = Field(
+        default=0, description="who walk about in the house"
     )
-    people: int = Field(default=0, ge=0, le=8, description="who walk about in the house")
     path: HousePathSettings = HousePathSettings()
-    exposure_wave: float = Field(
-        default=0.0, ge=0.0, lt=0.9, description="amplitude of a slow wave of the camera's gain"
+    exposure_wave: Annotated[float, Field(ge=0.0, lt=0.9)] = Field(
+        default=0.0, description="amplitude of a slow wave of the camera's gain"
     )
-    light: float = Field(
-        default=1.0, gt=0.0, le=3.0, description="brightness of the lamps; 0.05 is a dark house"
-    )
-    tilt_deg: float = Field(
-        default=0.0, ge=0.0, le=10.0, description="constant tilt of the camera; its side is drawn"
-    )
-    sway_deg: float = Field(
-        default=0.0, ge=0.0, le=10.0, description="amplitude of a slow swaying, roll and pitch"
+    tilt_deg: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
+        default=0.0, description="constant tilt of the camera; its side is drawn"
     )
     calibration: HouseCalibrationSettings = HouseCalibrationSettings()
 
@@ -237,11 +223,8 @@ class MeasurementWorldSettings:
         default="room",
         description="`room`: the lab's walls and furniture; `corridor`: walls along the way",
     )
-    landmarks: int = Field(
-        default=2500, ge=10, le=1_000_000, description="points in the room, or in 100 m of corridor"
-    )
-    world_seed: Index = Field(
-        default=0, description="where the points lie; the run's seed changes noise only"
+    landmarks: Annotated[int, Field(ge=10, le=1_000_000)] = Field(
+        default=2500, description="points in the room, or in 100 m of corridor"
     )
 
 
@@ -249,17 +232,16 @@ class MeasurementWorldSettings:
 class MeasurementDriveSettings(DriveLimits):
     """The robot's path and speed."""
 
-    path: Literal["lab_loop", "laps", "sharp_turns", "exploring"] = Field(
-        default="lab_loop",
-        description="`lab_loop` the paper's; `laps`; `sharp_turns`; `exploring` through corridors",
+    path: Literal["lab_loop", "laps", "sharp_turns"] = Field(
+        default="lab_loop", description="`lab_loop` the paper's; `laps`; `sharp_turns`"
     )
-    frames: Annotated[int, Field(ge=2, le=100_000)] | None = Field(
+    frames: Frames | None = Field(
         default=249,
         description="number of frames; null: one way at nine tenths of the speed limits",
     )
-    laps: int = Field(default=1, ge=1, le=1000, description="rounds, for `laps`")
-    turn_deg_per_frame: float = Field(
-        default=12.0, gt=0.0, le=45.0, description="turn a frame, degrees, for `sharp_turns`"
+    laps: Laps = Field(default=1, description="rounds, for `laps`")
+    turn_deg_per_frame: Annotated[float, Field(gt=0.0, le=45.0)] = Field(
+        default=12.0, description="turn a frame, degrees, for `sharp_turns`"
     )
 
 
@@ -270,11 +252,11 @@ class DetectionSettings:
     noise_scale: NonNegative = Field(
         default=1.0, description="drawn over stated noise, of pixels and odometry; 0: exact"
     )
-    features: int = Field(
-        default=100, ge=1, le=10_000, description="most landmarks measured in a frame"
+    features: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        default=100, description="most landmarks measured in a frame"
     )
-    probability: float = Field(
-        default=0.85, gt=0.0, le=1.0, description="that a landmark in view is found in a frame"
+    probability: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
+        default=0.85, description="that a landmark in view is found in a frame"
     )
 
 
@@ -282,12 +264,7 @@ class DetectionSettings:
 class WhiteWheelOdometrySettings(WheelOdometrySettings):
     """The rendered lab's wheels, by default without scale errors: each step errs by itself."""
 
-    scale_error: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=0.5,
-        description="deviation of the constant relative errors of way and turns, once a drive",
-    )
+    scale_error: ScaleError = Field(default=0.0, description=_SCALE_ERROR)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -296,8 +273,8 @@ class OdometryFaultSettings:
 
     start: Count = Field(description="first step with the fault (into this frame)")
     frames: Count = Field(default=10, description="how many steps")
-    scale: float = Field(
-        default=0.5, ge=-2.0, le=5.0, description="reported over true motion, way and turn"
+    scale: Annotated[float, Field(ge=-2.0, le=5.0)] = Field(
+        default=0.5, description="reported over true motion, way and turn"
     )
 
 
@@ -310,14 +287,6 @@ class BlackoutSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class MovedLandmarksSettings:
-    """Landmarks that are somewhere else from one frame on."""
-
-    frame: Count = Field(description="from this frame on")
-    fraction: float = Field(default=0.1, gt=0.0, le=1.0, description="of all landmarks")
-
-
-@dataclass(frozen=True, config=STRICT)
 class SimulatedMeasurementsSettings(FrameSelection):
     """A simulated drive without images (docs/datasets/rendered.md)."""
 
@@ -327,15 +296,12 @@ class SimulatedMeasurementsSettings(FrameSelection):
     rig: LabRigSettings = LabRigSettings()
     detection: DetectionSettings = DetectionSettings()
     odometry: WhiteWheelOdometrySettings = WhiteWheelOdometrySettings()
-    outlier_fraction: float = Field(
+    outlier_fraction: Annotated[float, Field(ge=0.0, le=0.9)] = Field(
         default=0.0,
-        ge=0.0,
-        le=0.9,
         description="share of wrong matches: another landmark's, or anywhere, half each",
     )
     odometry_fault: OdometryFaultSettings | None = None
     blackout: BlackoutSettings | None = None
-    moved: MovedLandmarksSettings | None = None
 
 
 # --------------------------------------------------------------------------------------------
@@ -346,11 +312,11 @@ class SimulatedMeasurementsSettings(FrameSelection):
 class SimulatedBearingsSettings:
     """A room of points, a start, a target, and a robot that drives from one towards the other."""
 
-    features: int = Field(
-        default=30, ge=3, description="points matched rightly; wrong matches come on top"
+    features: Annotated[int, Field(ge=3)] = Field(
+        default=30, description="points matched rightly; wrong matches come on top"
     )
-    part: float = Field(
-        default=0.8, gt=0.0, lt=1.0, description="part of the way after which the drive ends"
+    part: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.8, description="part of the way after which the drive ends"
     )
     images_per_s: Positive = Field(default=10.0, description="tracked images a second (paper: 10)")
     lost_per_s: NonNegative = Field(

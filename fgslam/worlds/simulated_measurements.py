@@ -8,7 +8,6 @@ docs/derivations/measurements.md derives. Everything follows from two seeds: the
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,9 +25,7 @@ from fgslam.core.sensors import (
     vertical_to_horizontal,
 )
 from fgslam.core.types import Trajectory
-from fgslam.worlds.buildings.lab import build_lab
 from fgslam.worlds.driving import (
-    PlanarPath,
     drive_along,
     paper_loop,
     planar_poses,
@@ -38,6 +35,7 @@ from fgslam.worlds.driving import (
 )
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.patches import stack
+from fgslam.worlds.places import build_lab
 from fgslam.worlds.settings import (
     MeasurementDriveSettings,
     MeasurementWorldSettings,
@@ -46,14 +44,12 @@ from fgslam.worlds.settings import (
 
 # Streams of random numbers, apart so that one imperfection does not redraw another's.
 _DETECTION, _PIXELS, _ODOMETRY, _WRONG = 1, 2, 3, 4
-_MOVED = 5
 _BORDER_PX = 8.0  # nearer to the edge a landmark may be seen, but is not missed
 _STRENGTH_JITTER = 0.1
 _LEAST_DISPARITY_PX = 0.5  # a fainter one cannot be triangulated
 PIXEL_SIGMA = 0.2  # of a coordinate in each image: that of SIFT in rendered ones
 LEAST_RANGE_M = 0.4  # nearer ones are in one image only, or out of focus
 MOST_RANGE_M = 8.0  # farther ones are not in view
-_MOVED_M = 0.5  # landmarks move so far, level, in any direction
 OBLIQUE_DEG = 75.0  # off its surface's normal a landmark is foreshortened beyond recognition
 PRUNE_AFTER = 20  # consecutive misses in view until an identity is dropped, as in Se et al. 4.3
 
@@ -66,7 +62,7 @@ class SimulatedMeasurements:
         rig: the cameras.
         increments: one a selected frame.
         truth: exact poses of the reference camera.
-        landmark_ids: (n,) identities whose landmark stood still, ascending.
+        landmark_ids: (n,) all identities, ascending.
         landmark_positions: (n, 3) where they are, metres.
         wrong_matches: how many matched observations are wrong.
     """
@@ -82,62 +78,50 @@ class SimulatedMeasurements:
 def simulate_measurements(
     settings: SimulatedMeasurementsSettings, seed: int
 ) -> SimulatedMeasurements:
-    """Drives, measures, and keeps the books; the selected frames only.
+    """Drives and measures the selected frames.
 
     Raises:
         ConfigError: the drive does not exist in the place, or not in so few frames, the selection
             leaves none of them, or an imperfection would begin after the last.
     """
-    drive = plan_measured_drive(settings.drive, settings.world.place)
-    _require_effect(settings, len(drive.timestamps))
+    timestamps, body, corners = plan_measured_drive(settings.drive, settings.world.place)
+    frames = len(timestamps)
+    for key, fault in (
+        ("odometry_fault", settings.odometry_fault),
+        ("blackout", settings.blackout),
+    ):
+        if fault is not None and fault.start >= frames:
+            raise ConfigError(
+                f"dataset.{key}.start is {fault.start}, but the drive has the frames 0 to "
+                f"{frames - 1}; choose an earlier one"
+            )
+    chosen = np.arange(frames)[settings.start : settings.stop : settings.stride]
+    if not len(chosen):
+        raise ConfigError(
+            f"dataset.start {settings.start}, stop {settings.stop} leave none of the drive's "
+            f"{frames} frames; lower dataset.start or raise dataset.stop"
+        )
     rig = make_rig(settings.rig)
-    world = build_world(settings.world, drive.corners)
-    chosen = _selection(len(drive.timestamps), settings)
-    steps = simulate_odometry(settings, drive.body, np.random.default_rng([seed, _ODOMETRY]))
-    wTc = drive.body @ rig.bTc
+    world = build_world(settings.world, corners)
+    steps = simulate_odometry(settings, body, np.random.default_rng([seed, _ODOMETRY]))
+    wTc = body @ rig.bTc
     camera = _Camera(settings, rig, world, seed)
     increments = []
     for k, index in enumerate(chosen):
         since = steps[chosen[k - 1] : index] if k else []
         odometry = g.odometry_of_camera(g.compose_odometry(since), rig.bTc) if k else None
-        stamp = float(drive.timestamps[index])
+        stamp = float(timestamps[index])
         increments.append(camera.increment(int(index), stamp, odometry, wTc[index]))
     first = g.inverse(wTc[chosen[0]])
-    ids, positions = camera.landmark_truth(int(chosen[-1]))
+    positions = world.points[camera.point_of_id]
     return SimulatedMeasurements(
         rig=rig,
         increments=tuple(increments),
-        truth=Trajectory(drive.timestamps[chosen], first @ wTc[chosen]),
-        landmark_ids=ids,
+        truth=Trajectory(timestamps[chosen], first @ wTc[chosen]),
+        landmark_ids=np.arange(len(positions)),
         landmark_positions=g.transform_to_world(first, positions),
         wrong_matches=camera.wrong_matches,
     )
-
-
-def _selection(count: int, settings: SimulatedMeasurementsSettings) -> IntArray:
-    chosen = np.arange(count)[settings.start : settings.stop : settings.stride]
-    if not len(chosen):
-        raise ConfigError(
-            f"dataset.start {settings.start}, stop {settings.stop} leave none of the drive's "
-            f"{count} frames; lower dataset.start or raise dataset.stop"
-        )
-    return chosen
-
-
-def _require_effect(settings: SimulatedMeasurementsSettings, frames: int) -> None:
-    """Refuses keys that would do nothing."""
-    fault, blackout, moved = settings.odometry_fault, settings.blackout, settings.moved
-    starts = {
-        "odometry_fault.start": None if fault is None else fault.start,
-        "blackout.start": None if blackout is None else blackout.start,
-        "moved.frame": None if moved is None else moved.frame,
-    }
-    for key, start in starts.items():
-        if start is not None and start >= frames:
-            raise ConfigError(
-                f"dataset.{key} is {start}, but the drive has the frames 0 to {frames - 1}; "
-                "choose an earlier one"
-            )
 
 
 class _Camera:
@@ -156,9 +140,7 @@ class _Camera:
         self._detection = np.random.default_rng([seed, _DETECTION])
         self._pixel_noise = np.random.default_rng([seed, _PIXELS])
         self._wrong = np.random.default_rng([seed, _WRONG])
-        self._after = _moved_points(settings, world)
         self._book = IdentityBook(len(world), PRUNE_AFTER)
-        self._index_of_birth: list[int] = []
         ratio = vertical_to_horizontal(rig)
         self._model = pixel_model(rig.cameras, ratio)
         self._fuse = measurement_map("fused", rig.cameras, ratio)
@@ -169,12 +151,11 @@ class _Camera:
         self, index: int, timestamp: float, odometry: Odometry | None, wTc: FloatArray
     ) -> Increment:
         """One frame at a true pose in the room."""
-        if self._blocked(index):
-            sightings = Sightings.nothing()
-            pixels = np.empty((0, 2 * self._rig.cameras))
+        blackout = self._settings.blackout
+        if blackout is not None and 0 <= index - blackout.start < blackout.frames:
+            sightings, pixels = Sightings.nothing(), np.empty((0, 2 * self._rig.cameras))
         else:
-            sightings, pixels = self._look(wTc, g.transform_to_camera(wTc, self._points(index)))
-        self._index_of_birth += [index] * len(sightings.new)
+            sightings, pixels = self._look(wTc, g.transform_to_camera(wTc, self._world.points))
         observations = self._observe(sightings, pixels)
         return Increment(
             index=index,
@@ -186,26 +167,10 @@ class _Camera:
             pruned_ids=sightings.pruned_ids,
         )
 
-    def landmark_truth(self, last_index: int) -> tuple[IntArray, FloatArray]:
-        """Identities whose point has not moved since they were given, and where it is."""
-        points = self._book.point_of_id
-        final = self._points(last_index)[points]
-        born = np.array(self._index_of_birth, np.int64)
-        moved = self._settings.moved
-        still = np.ones(len(points), np.bool_)
-        if moved is not None and last_index >= moved.frame:
-            still = (final == self._world.points[points]).all(axis=1) | (born >= moved.frame)
-        return np.flatnonzero(still), final[still]
-
-    # ----------------------------------------------------------------------------------------
-
-    def _points(self, index: int) -> FloatArray:
-        moved = self._settings.moved
-        return self._world.points if moved is None or index < moved.frame else self._after
-
-    def _blocked(self, index: int) -> bool:
-        blackout = self._settings.blackout
-        return blackout is not None and 0 <= index - blackout.start < blackout.frames
+    @property
+    def point_of_id(self) -> IntArray:
+        """(n,) point behind each identity given so far."""
+        return self._book.point_of_id
 
     def _look(self, wTc: FloatArray, local: FloatArray) -> tuple[Sightings, FloatArray]:
         """Who is seen, and the noisy pixels (k, 2 * cameras) of the matched, then the new."""
@@ -261,27 +226,20 @@ class _Camera:
 
     def _confuse(self, matched: FloatArray, in_view: FloatArray, noise: FloatArray) -> None:
         """Replaces some rows by another landmark's pixels or by anything in the image."""
-        fraction, count = self._settings.outlier_fraction, len(matched)
+        fraction, count, rig = self._settings.outlier_fraction, len(matched), self._rig
         if fraction == 0.0 or not count:
             return
         draw = self._wrong.uniform(size=(count, 2))
         other = in_view[self._wrong.integers(len(in_view), size=count)]
-        shown = np.where(draw[:, 1:] < 0.5, other, self._anywhere(count)) + noise[:count]
-        wrong = (draw[:, 0] < fraction) & self._measurable(shown)
-        matched[wrong] = shown[wrong]
-        self.wrong_matches += int(wrong.sum())
-
-    def _anywhere(self, count: int) -> FloatArray:
-        """Pixels (count, 2 * cameras) of points anywhere in the reference image."""
-        rig = self._rig
+        uniform = self._wrong.uniform(size=(count, 3))
         size = np.array([rig.width - 1.0, rig.height - 1.0])
         least = rig.fx * rig.baseline / MOST_RANGE_M
         most = min(rig.fx * rig.baseline / LEAST_RANGE_M, rig.width / 2)
-        uniform = self._wrong.uniform(size=(count, 3))
-        measurement = np.column_stack(
-            [uniform[:, :2] * size, least + uniform[:, 2] * (most - least)]
-        )
-        return np.asarray(measurement @ self._model.T)
+        anywhere = np.column_stack([uniform[:, :2] * size, least + uniform[:, 2] * (most - least)])
+        shown = np.where(draw[:, 1:] < 0.5, other, anywhere @ self._model.T) + noise[:count]
+        wrong = (draw[:, 0] < fraction) & self._measurable(shown)
+        matched[wrong] = shown[wrong]
+        self.wrong_matches += int(wrong.sum())
 
     def _observe(self, sightings: Sightings, pixels: FloatArray) -> Observations:
         count = len(pixels)
@@ -294,18 +252,6 @@ class _Camera:
             pixels=raw,
             is_new=np.arange(count) >= len(sightings.matched),
         )
-
-
-def _moved_points(settings: SimulatedMeasurementsSettings, world: LandmarkWorld) -> FloatArray:
-    """Where the points are after some have moved; the world's seed chooses which."""
-    moved = settings.moved
-    if moved is None:
-        return world.points
-    rng = np.random.default_rng([settings.world.world_seed, _MOVED])
-    gone = rng.uniform(size=len(world)) < moved.fraction
-    angle = rng.uniform(0.0, 2.0 * np.pi, size=len(world))
-    shift = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(world))])
-    return np.asarray(world.points + _MOVED_M * gone[:, None] * shift)
 
 
 # --------------------------------------------------------------------------------------------
@@ -335,7 +281,7 @@ def simulate_odometry(
 
 
 # --------------------------------------------------------------------------------------------
-# Drives: the lab's own, rounds, sharp turns, and long corridors
+# Drives: the lab's own, rounds of it or of a corridor, and sharp turns
 #
 # Room frame as in :mod:`fgslam.worlds.driving`: x east, y north, metres; heading counter-clockwise.
 
@@ -343,12 +289,10 @@ def simulate_odometry(
 CORRIDOR_WIDTH_M = 2.4
 
 _ROUND_M = (16.0, 10.0)  # centre line of the closed corridor
-_LEGS_M = (12.0, 8.0, 15.0, 7.0)  # of the long one, over and over
-_LEAST_WAY_M = 200.0  # in the long one
 _BEND_M = 2.5  # way over which a corridor's corner is driven
 _PLACES_OF_PATHS = {
     "room": ("lab_loop", "laps", "sharp_turns"),
-    "corridor": ("laps", "exploring"),
+    "corridor": ("laps",),
 }
 
 # Half a round of sharp turns: (metres, degrees). Turned by half a turn, it closes upon itself.
@@ -357,23 +301,12 @@ _SHARP_HALF = ((1.9, 0.0), (0.0, 360.0), (1.9, 0.0), (0.5, 90.0), (1.2, 0.0), (0
 _CRUISE = 0.9
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PlannedDrive:
-    """Where the robot is when.
+def plan_measured_drive(
+    settings: MeasurementDriveSettings, place: str
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Time stamps (n,), poses (n, 4, 4) ``wTb`` on the floor, and the corridor's centre line.
 
-    Attributes:
-        timestamps: (n,) seconds from 0.
-        body: (n, 4, 4) ``wTb`` in the room's frame, on the floor.
-        corners: (k, 2) centre line of the corridor, metres; None in the room.
-    """
-
-    timestamps: FloatArray
-    body: FloatArray
-    corners: FloatArray | None
-
-
-def plan_measured_drive(settings: MeasurementDriveSettings, place: str) -> PlannedDrive:
-    """The drive that the settings name, in a place.
+    Seconds from 0; the corners (k, 2) of the line are None in the room.
 
     Raises:
         ConfigError: the path does not exist in the place, or not in so few frames.
@@ -386,57 +319,22 @@ def plan_measured_drive(settings: MeasurementDriveSettings, place: str) -> Plann
     if settings.path == "sharp_turns":
         planar = _sharp_turns(settings)
         stamps = np.arange(len(planar)) / settings.frame_rate_hz
-        return PlannedDrive(stamps, planar_poses(planar), None)
+        return stamps, planar_poses(planar), None
     corners = None
     if place == "room":
         path = paper_loop() if settings.path == "lab_loop" else room_laps(settings.laps)
-    elif settings.path == "laps":
-        path, corners = _closed_corridor(settings.laps)
-    else:
-        path, corners = _long_corridor()
+    else:  # from the middle of a rectangle's first side
+        a, b = _ROUND_M
+        turn = (_BEND_M, np.pi / 2)
+        bend = straights_and_turns((0.0, 0.0, 0.0), [turn], closed=False)
+        cut = float(bend.xy[-1, 0])  # before and after a corner the bend begins and ends
+        half, long, short = a / 2 - cut, a - 2 * cut, b - 2 * cut
+        lap = [(half, 0.0), turn, (short, 0.0), turn, (long, 0.0), turn, (short, 0.0), turn]
+        laps = [*lap, (half, 0.0)] * settings.laps
+        path = straights_and_turns((a / 2, 0.0, 0.0), laps, closed=True)
+        corners = np.array([[0.0, 0.0], [a, 0.0], [a, b], [0.0, b], [0.0, 0.0]])
     drive = drive_along(path, settings, settings.frames)
-    return PlannedDrive(drive.timestamps, drive.body_poses(drive.timestamps), corners)
-
-
-# --------------------------------------------------------------------------------------------
-# Corridors
-
-
-def _closed_corridor(laps: int) -> tuple[PlanarPath, FloatArray]:
-    """``laps`` rounds of a rectangle, from the middle of its first side."""
-    a, b = _ROUND_M
-    cut = _bend_cut()
-    half, long, short = a / 2 - cut, a - 2 * cut, b - 2 * cut
-    turn = (_BEND_M, np.pi / 2)
-    lap = [(half, 0.0), turn, (short, 0.0), turn, (long, 0.0), turn, (short, 0.0), turn]
-    path = straights_and_turns((a / 2, 0.0, 0.0), [*lap, (half, 0.0)] * laps, closed=True)
-    return path, np.array([[0.0, 0.0], [a, 0.0], [a, b], [0.0, b], [0.0, 0.0]])
-
-
-def _long_corridor() -> tuple[PlanarPath, FloatArray]:
-    """Stairs seen from above, left and right in turns: it never meets itself."""
-    legs: list[float] = []
-    while sum(legs) < _LEAST_WAY_M:
-        legs.append(_LEGS_M[len(legs) % len(_LEGS_M)])
-    cut = _bend_cut()
-    segments: list[tuple[float, float]] = []
-    for i, leg in enumerate(legs):
-        inner = 0 < i < len(legs) - 1
-        segments.append((leg - cut - (cut if inner else 1.0), 0.0))
-        segments.append((_BEND_M, np.pi / 2 if i % 2 == 0 else -np.pi / 2))
-    along = np.array([[1.0, 0.0] if i % 2 == 0 else [0.0, 1.0] for i in range(len(legs))])
-    corners = np.vstack([[0.0, 0.0], np.cumsum(along * np.array(legs)[:, None], axis=0)])
-    return straights_and_turns((1.0, 0.0, 0.0), segments[:-1], closed=False), corners
-
-
-def _bend_cut() -> float:
-    """How far before and after a corner a bend of 90 degrees begins and ends, metres."""
-    bend = straights_and_turns((0.0, 0.0, 0.0), [(_BEND_M, np.pi / 2)], closed=False)
-    return float(bend.xy[-1, 0])
-
-
-# --------------------------------------------------------------------------------------------
-# Sharp turns
+    return drive.timestamps, drive.body_poses(drive.timestamps), corners
 
 
 def _sharp_turns(settings: MeasurementDriveSettings) -> FloatArray:
@@ -505,20 +403,22 @@ class LandmarkWorld:
 
 
 def build_world(settings: MeasurementWorldSettings, corners: FloatArray | None) -> LandmarkWorld:
-    """The landmarks of a place, from its own seed.
+    """The landmarks of a place, the same for every run.
 
     Args:
-        settings: how many, and where. The furniture is that of the rendered lab's ``room_seed``.
+        settings: how many, and where. The furniture is that of the rendered lab.
         corners: (k, 2) centre line of the corridors, metres; None for the room.
     """
-    rng = np.random.default_rng([settings.world_seed, _STREAM])
+    rng = np.random.default_rng([0, _STREAM])
     if corners is None:
-        points, normals = _lab_points(settings, rng)
+        points, normals = _lab_points(settings.landmarks, rng)
         boxes = np.array([[points[:, :2].min(axis=0) - 1.0, points[:, :2].max(axis=0) + 1.0]])
     else:
         way = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
         count = int(np.ceil(settings.landmarks * way / 100.0))
-        boxes = _corridor_boxes(corners)
+        # One rectangle for each leg, the squares at its ends included.
+        half, legs = CORRIDOR_WIDTH_M / 2, np.stack([corners[:-1], corners[1:]], axis=1)
+        boxes = np.stack([legs.min(axis=1) - half, legs.max(axis=1) + half], axis=1)
         points, normals = _corridor_points(boxes, count, rng)
     strength = rng.uniform(size=len(points))
     return LandmarkWorld(points, normals, strength, boxes, _inside(points, boxes))
@@ -532,12 +432,9 @@ def _inside(points: FloatArray, boxes: FloatArray) -> BoolArray:
     )
 
 
-def _lab_points(
-    settings: MeasurementWorldSettings, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+def _lab_points(count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Spread over walls, furniture and what hangs on the walls, by area."""
-    count = settings.landmarks
-    things = build_lab(np.random.default_rng([settings.world_seed, 2]), visit=1)
+    things = build_lab(np.random.default_rng([0, 2])).things
     patches = stack(things)
     area = np.linalg.norm(np.cross(patches.edge_u, patches.edge_v), axis=1)
     bare = np.array([thing.name in _BARE for thing in things])
@@ -546,13 +443,6 @@ def _lab_points(
     u, v = rng.uniform(size=(2, count, 1))
     points = patches.corner[which] + u * patches.edge_u[which] + v * patches.edge_v[which]
     return points, patches.normal[which]
-
-
-def _corridor_boxes(corners: FloatArray) -> FloatArray:
-    """(k, 2, 2) one rectangle for each leg, the squares at its ends included."""
-    half = CORRIDOR_WIDTH_M / 2
-    pairs = [np.array([a, b]) for a, b in itertools.pairwise(corners)]
-    return np.array([[p.min(axis=0) - half, p.max(axis=0) + half] for p in pairs])
 
 
 def _corridor_points(

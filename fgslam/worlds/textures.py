@@ -211,8 +211,7 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Grey:
             left = 8 + column * width // columns
             cell = paper[top : top + (height - banner) // rows - 10, left : left + width // 2 - 14]
             _fill_cell(rng, cell)
-    paper[:3], paper[-3:], paper[:, :3], paper[:, -3:] = 40.0, 40.0, 40.0, 40.0
-    return _soft(paper)
+    return _soft(_framed(paper, 3, 40.0))
 
 
 def pinboard(rng: np.random.Generator, size: int) -> Grey:
@@ -220,17 +219,11 @@ def pinboard(rng: np.random.Generator, size: int) -> Grey:
     image = 120.0 + 9.0 * fractal_noise(rng, (size, size), 0.9)
     for _ in range(11):
         h, w = (rng.uniform(0.16, 0.32, 2) * size).astype(int)
-        top, left = (
-            int(rng.uniform(0.03, 0.95) * (size - h)),
-            int(rng.uniform(0.03, 0.95) * (size - w)),
-        )
-        note = image[top : top + h, left : left + w]
+        note = _window(rng, image, h, w, 0.03, 0.95)
         note[:] = rng.uniform(150.0, 215.0)
         note[6:, 5:] -= 90.0 * text_lines(rng, (h - 6, w - 5), max(h // 16, 1), 0.9)
-        image[top + 2 : top + 6, left + w // 2 : left + w // 2 + 4] = 35.0
-    edge = max(size // 40, 2)
-    image[:edge], image[-edge:], image[:, :edge], image[:, -edge:] = 70.0, 70.0, 70.0, 70.0
-    return _soft(image)
+        note[2:6, w // 2 : w // 2 + 4] = 35.0
+    return _soft(_framed(image, max(size // 40, 2), 70.0))
 
 
 def _fill_cell(rng: np.random.Generator, cell: Grey) -> None:
@@ -257,19 +250,13 @@ def screen(rng: np.random.Generator, height: int, width: int) -> Grey:
     image = 70.0 + 12.0 * fractal_noise(rng, (height, width), 2.5)
     for _ in range(4):
         h, w = int(rng.uniform(0.3, 0.6) * height), int(rng.uniform(0.3, 0.55) * width)
-        top, left = (
-            int(rng.uniform(0.05, 0.9) * (height - h)),
-            int(rng.uniform(0.05, 0.9) * (width - w)),
-        )
+        window = _window(rng, image, h, w, 0.05, 0.9)
         dark = rng.random() < 0.5
-        window = image[top : top + h, left : left + w]
         window[:] = 28.0 if dark else 215.0
         ink = text_lines(rng, (h - 12, w - 8), max(h // 14, 1), 0.9)
         window[12:, 4 : w - 4] += ink * (150.0 if dark else -165.0)
         window[:9] = rng.uniform(90.0, 190.0)
-    edge = max(height // 28, 2)
-    image[:edge], image[-edge:], image[:, :edge], image[:, -edge:] = 24.0, 24.0, 24.0, 24.0
-    return _soft(image)
+    return _soft(_framed(image, max(height // 28, 2), 24.0))
 
 
 def keyboard(rng: np.random.Generator, height: int, width: int) -> Grey:
@@ -336,8 +323,7 @@ def window_view(rng: np.random.Generator, height: int, width: int) -> Grey:
     image[trees & (y > 0.5)] = 55.0
     image += 5.0 * fractal_noise(rng, (height, width), 1.0)
     bar = max(width // 40, 2)
-    for part in (image[:, :bar], image[:, -bar:], image[:bar], image[-bar:]):
-        part[:] = 205.0
+    _framed(image, bar, 205.0)
     image[:, width // 2 - bar : width // 2 + bar] = 205.0
     return _soft(image)
 
@@ -386,6 +372,20 @@ def abstract(rng: np.random.Generator, side: int) -> Grey:
     return np.asarray(image, dtype=np.float32)
 
 
+def _framed(image: Grey, width: int, level: float | Grey) -> Grey:
+    """The image with a border so wide, drawn into it."""
+    for part in (image[:width], image[-width:], image[:, :width], image[:, -width:]):
+        part[:] = level
+    return image
+
+
+def _window(rng: np.random.Generator, image: Grey, h: int, w: int, low: float, high: float) -> Grey:
+    """A part of the image (h, w), somewhere between two shares of its free height and width."""
+    top = int(rng.uniform(low, high) * (image.shape[0] - h))
+    left = int(rng.uniform(low, high) * (image.shape[1] - w))
+    return image[top : top + h, left : left + w]
+
+
 def _soft(image: npt.NDArray[np.floating]) -> Grey:
     """Clipped to grey levels and slightly smoothed: nothing is sharper than its own texels."""
     clipped = np.clip(image, 4.0, 250.0).astype(np.float32)
@@ -417,21 +417,17 @@ BOOK_ROWS, BINDER_ROWS, POSTERS, PINBOARDS, SCREENS, CARTONS = 14, 10, 8, 5, 8, 
 def build_library(rng: np.random.Generator) -> dict[str, Grey]:
     """Every texture of the lab, by name; sides are powers of two."""
     out = _materials(rng)
-    for i in range(BOOK_ROWS):
-        out[f"books_{i}"] = faded(book_row(rng, 256, 1024), 0.42)
-    for i in range(BINDER_ROWS):
-        out[f"binders_{i}"] = faded(binder_row(rng, 256, 1024), 0.7)
-    for i in range(POSTERS):
-        out[f"poster_{i}"] = faded(poster(rng, 512, 512), 0.42)
-    for i in range(PINBOARDS):
-        out[f"pinboard_{i}"] = faded(pinboard(rng, 256), 0.45)
-    for i in range(SCREENS):
-        out[f"screen_{i}"] = faded(screen(rng, 256, 256), 0.5)
-    for i in range(CARTONS):
-        out[f"carton_{i}"] = faded(carton(rng, 256, float(rng.uniform(95.0, 165.0))), 0.55)
-    for name in PHOTOGRAPHS:
-        out[f"photo_{name}"] = faded(photograph(name, 512), 0.55)
-    return out
+    families: tuple[tuple[str, int, Callable[[], Grey], float], ...] = (
+        ("books", BOOK_ROWS, lambda: book_row(rng, 256, 1024), 0.42),
+        ("binders", BINDER_ROWS, lambda: binder_row(rng, 256, 1024), 0.7),
+        ("poster", POSTERS, lambda: poster(rng, 512, 512), 0.42),
+        ("pinboard", PINBOARDS, lambda: pinboard(rng, 256), 0.45),
+        ("screen", SCREENS, lambda: screen(rng, 256, 256), 0.5),
+        ("carton", CARTONS, lambda: carton(rng, 256, float(rng.uniform(95.0, 165.0))), 0.55),
+    )
+    for family, count, draw, contrast in families:
+        out |= {f"{family}_{i}": faded(draw(), contrast) for i in range(count)}
+    return out | {f"photo_{name}": faded(photograph(name, 512), 0.55) for name in PHOTOGRAPHS}
 
 
 def _materials(rng: np.random.Generator) -> dict[str, Grey]:
@@ -464,14 +460,14 @@ def photograph(name: str, side: int) -> Grey:
     image = _picture(name)
     if image.ndim == 3:
         image = image[..., :3] @ np.array([0.299, 0.587, 0.114])
-    return _framed(_resized(image.astype(np.float32), side))
+    return _printed(image, side)
 
 
 def colour_photograph(name: str, side: int) -> Grey:
     """The same in colour, (side, side, 3) levels of red, green, blue; grey where it is grey."""
-    image = _picture(name)
-    channels = [image] * 3 if image.ndim == 2 else [image[..., k] for k in range(3)]
-    return np.stack([_framed(_resized(c.astype(np.float32), side)) for c in channels], axis=-1)
+    image = np.atleast_3d(_picture(name))
+    channels = [_printed(image[..., min(k, image.shape[2] - 1)], side) for k in range(3)]
+    return np.stack(channels, axis=-1)
 
 
 def _picture(name: str) -> npt.NDArray[np.generic]:
@@ -479,27 +475,22 @@ def _picture(name: str) -> npt.NDArray[np.generic]:
     return np.asarray(picture[0] if isinstance(picture, tuple) else picture)
 
 
-def faded(image: Grey, contrast: float) -> Grey:
-    """The texture with its contrast about the mean reduced to this fraction."""
-    mean = float(image.mean())
-    return np.asarray(mean + contrast * (image - mean), dtype=np.float32)
-
-
-def _resized(image: Grey, side: int) -> Grey:
-    """Bilinear, after the low-pass that shrinking needs."""
+def _printed(picture: npt.NDArray[np.generic], side: int) -> Grey:
+    """(side, side), bilinear after the low-pass that shrinking needs, with a white margin."""
+    image = picture.astype(np.float32)
     factor = np.array(image.shape) / side
     smooth = ndimage.gaussian_filter(image, np.maximum(factor - 1.0, 0.0) * 0.5)
     rows = np.clip((np.arange(side) + 0.5) * factor[0] - 0.5, 0, image.shape[0] - 1)
     columns = np.clip((np.arange(side) + 0.5) * factor[1] - 0.5, 0, image.shape[1] - 1)
     grid = np.meshgrid(rows, columns, indexing="ij")
-    return np.asarray(ndimage.map_coordinates(smooth, grid, order=1, mode="nearest"))
+    out = np.asarray(ndimage.map_coordinates(smooth, grid, order=1, mode="nearest"))
+    return np.clip(_framed(out, side // 40, 228.0), 8.0, 245.0)
 
 
-def _framed(image: npt.NDArray[np.float32]) -> Grey:
-    margin = image.shape[0] // 40
-    for part in (image[:margin], image[-margin:], image[:, :margin], image[:, -margin:]):
-        part[:] = 228.0
-    return np.clip(image, 8.0, 245.0)
+def faded(image: Grey, contrast: float) -> Grey:
+    """The texture with its contrast about the mean reduced to this fraction."""
+    mean = float(image.mean())
+    return np.asarray(mean + contrast * (image - mean), dtype=np.float32)
 
 
 # --------------------------------------------------------------------------------------------
@@ -581,16 +572,16 @@ def ramped(rng: np.random.Generator, grey: Grey, saturation: float) -> Colour:
 def painting(rng: np.random.Generator, side: int) -> Colour:
     """An abstract picture of many colours in a dark or light frame."""
     out = ramped(rng, abstract(rng, side), 0.75)
-    edge = max(side // 24, 2)
     frame = np.array(rng.choice([[52.0, 40.0, 30.0], [215.0, 205.0, 190.0], [120.0, 90.0, 45.0]]))
-    for part in (out[:edge], out[-edge:], out[:, :edge], out[:, -edge:]):
-        part[:] = frame
-    return out
+    return _framed(out, max(side // 24, 2), frame)
 
 
 def build_colour_library(rng: np.random.Generator) -> dict[str, Colour]:
     """Every texture of the house, by name; sides are powers of two."""
-    out = _colour_materials(rng) | _wall_covers(rng) | _clothes(rng)
+    out = _colour_materials(rng)
+    for i in range(SHIRTS):
+        red, blue = rng.uniform(-0.4, 0.6), rng.uniform(-0.5, 0.5)
+        out[f"shirt_{i}"] = tinted(cloth(rng, 128, 130.0), float(red), float(blue))
     families: tuple[tuple[str, int, Callable[[], Grey], float], ...] = (
         ("books", BOOK_ROWS, lambda: book_row(rng, 128, 512), 0.55),
         ("binders", BINDER_ROWS, lambda: binder_row(rng, 128, 512), 0.5),
@@ -603,11 +594,8 @@ def build_colour_library(rng: np.random.Generator) -> dict[str, Colour]:
     for i in range(CARTONS):
         box = carton(rng, 128, float(rng.uniform(95.0, 165.0)))
         out[f"carton_{i}"] = tinted(box, 0.22, -0.35)
-    for i in range(PAINTINGS):
-        out[f"painting_{i}"] = painting(rng, 256)
-    for name in PHOTOGRAPHS:
-        out[f"photo_{name}"] = colour_photograph(name, 256)
-    return out
+    out |= {f"painting_{i}": painting(rng, 256) for i in range(PAINTINGS)}
+    return out | {f"photo_{name}": colour_photograph(name, 256) for name in PHOTOGRAPHS}
 
 
 def _colour_materials(rng: np.random.Generator) -> dict[str, Colour]:
@@ -629,12 +617,7 @@ def _colour_materials(rng: np.random.Generator) -> dict[str, Colour]:
         "plain_dark": tinted(plaster(rng, 128, 42.0), 0.0, 0.05),
         "plain_light": tinted(plaster(rng, 128, 215.0), 0.0, 0.0),
         "lamp": np.full((16, 16, 3), 235.0, dtype=np.float32),
-    }
-
-
-def _wall_covers(rng: np.random.Generator) -> dict[str, Colour]:
-    """One cover for each room and the corridor."""
-    return {
+        # One cover for each room and the corridor.
         "wall_cream": tinted(plaster(rng, 512, 185.0), 0.06, -0.22),
         "wall_white": tinted(plaster(rng, 512, 200.0), 0.0, -0.04),
         "wall_blue": tinted(plaster(rng, 512, 150.0), -0.22, 0.30),
@@ -642,18 +625,9 @@ def _wall_covers(rng: np.random.Generator) -> dict[str, Colour]:
         "wall_rose": tinted(wallpaper(rng, 512, 160.0), 0.25, 0.0),
         "wall_ochre": tinted(plaster(rng, 512, 150.0), 0.28, -0.5),
         "bricks": tinted(bricks(rng, 512, 30), 0.55, -0.25),
-    }
-
-
-def _clothes(rng: np.random.Generator) -> dict[str, Colour]:
-    out = {
         "skin": tinted(plaster(rng, 64, 165.0), 0.22, -0.25),
         "trousers": tinted(cloth(rng, 128, 60.0), -0.1, 0.5),
     }
-    for i in range(SHIRTS):
-        red, blue = rng.uniform(-0.4, 0.6), rng.uniform(-0.5, 0.5)
-        out[f"shirt_{i}"] = tinted(cloth(rng, 128, 130.0), float(red), float(blue))
-    return out
 
 
 Float32 = npt.NDArray[np.float32]

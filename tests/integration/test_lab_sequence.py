@@ -258,28 +258,6 @@ def test_half_written_cache_is_continued_and_damage_repaired() -> None:
 # ---------------------------------------------------------------- effects
 
 
-def test_exposure_changes_gain_as_stated() -> None:
-    plain = opened(QUICK, (124, 126))
-    changed = opened(replace(QUICK, effects=replace(CLEAN, exposure=True)), (124, 126))
-    for i, jump in ((0, 1.0), (1, 0.7)):
-        gain = jump * (1.0 + 0.15 * np.sin(2.0 * np.pi * (124 + i) / 60.0))
-        a, b = plain.frame(i).images[0], changed.frame(i).images[0]
-        assert np.abs(b - np.minimum(gain * a.astype(float), 255.0)).max() <= 0.5 + 1e-4
-    assert changed.notes == ("effect: exposure",)
-
-
-def test_motion_blur_smears_a_turn_sideways_only() -> None:
-    blurred = replace(CLEAN, motion_blur_s=0.3)
-    turning = (84, 85)
-    sharp = opened(QUICK, turning).frame(0).images[0].astype(float)
-    smeared = opened(replace(QUICK, effects=blurred), turning).frame(0).images[0].astype(float)
-    across = [np.abs(np.diff(image, axis=1)).mean() for image in (sharp, smeared)]
-    down = [np.abs(np.diff(image, axis=0)).mean() for image in (sharp, smeared)]
-    assert across[1] < 0.9 * across[0]
-    assert down[1] / down[0] > across[1] / across[0]
-    assert smeared.mean() == pytest.approx(sharp.mean(), rel=0.01)
-
-
 def test_person_crosses_the_view_and_is_gone() -> None:
     settings = replace(QUICK, effects=replace(CLEAN, person=20))
     sequence = opened(settings, (18, 34))

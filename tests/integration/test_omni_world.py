@@ -15,7 +15,7 @@ from fgslam.worlds.settings import (
 )
 
 SETTINGS = OmniHouseSettings(path=HousePathSettings(legs=3, spacing_m=2.0))
-DISTURBED = replace(SETTINGS, people=3, tilt_deg=1.0, sway_deg=1.0)
+DISTURBED = replace(SETTINGS, people=3, tilt_deg=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -94,12 +94,6 @@ def test_truth_of_matches(world: OmniWorld) -> None:
     assert np.median(difference) < 0.35 * np.median(shuffled)
 
 
-def test_dark_house_shows_nothing() -> None:
-    dark = OmniWorld(replace(SETTINGS, light=0.02), 1)
-    assert count_sift(dark.image(0.0)) < 10
-    assert count_sift(dark.targets[0]) > 100
-
-
 def test_wheelchair_is_stopped_by_furniture_and_walls(world: OmniWorld) -> None:
     world.put(world.reference_poses[0])
     least, ran_into = np.inf, False
@@ -115,7 +109,7 @@ def test_wheelchair_is_stopped_by_furniture_and_walls(world: OmniWorld) -> None:
 
 
 def test_people_walk_about() -> None:
-    peopled = OmniWorld(replace(DISTURBED, tilt_deg=0.0, sway_deg=0.0, noise_grey=0.0), 2)
+    peopled = OmniWorld(replace(DISTURBED, tilt_deg=0.0, noise_grey=0.0), 2)
     empty = OmniWorld(replace(SETTINGS, noise_grey=0.0), 2)
     alone = empty.image(0.0).astype(int)
     changed = []

@@ -13,7 +13,9 @@ from fgslam.worlds.driving import (
     MAX_ACCELERATION_M_S2,
     Drive,
     Wheelchair,
+    fastest_times,
     increment_variances,
+    round_corners,
     simulate_wheels,
 )
 from fgslam.worlds.settings import (
@@ -68,9 +70,12 @@ def test_limits_hold_at_every_instant(settings: LabDriveSettings) -> None:
 
 @pytest.mark.parametrize("settings", DRIVES, ids=names)
 def test_acceleration_limit(settings: LabDriveSettings) -> None:
-    law = plan_drive(settings).law
-    speed = np.diff(law.arc) / np.diff(law.seconds)
-    middle = 0.5 * (law.seconds[1:] + law.seconds[:-1])
+    path = plan_drive(settings).path
+    assert path is not None
+    speed_limit, turn_limit = settings.max_speed_m_s, np.deg2rad(settings.max_turn_deg_s)
+    seconds = fastest_times(path, speed_limit, turn_limit, MAX_ACCELERATION_M_S2)
+    speed = np.diff(path.arc) / np.diff(seconds)
+    middle = 0.5 * (seconds[1:] + seconds[:-1])
     acceleration = np.abs(np.diff(speed) / np.diff(middle))
     # The first and last cell have the mean speed of a start from rest.
     assert acceleration[2:-2].max() <= MAX_ACCELERATION_M_S2 * 1.05
@@ -113,6 +118,7 @@ def test_closed_paths_end_where_they_began(settings: LabDriveSettings) -> None:
 
 def test_waypoints_are_passed() -> None:
     drive = plan_drive(LabDriveSettings(path="waypoints", waypoints_m=SQUARE, frames=None))
+    assert drive.path is not None
     for point in SQUARE:
         assert np.linalg.norm(drive.path.xy - point, axis=1).min() < 5e-3
 
@@ -121,7 +127,7 @@ def test_frames_given_are_frames_driven() -> None:
     for frames in (160, 249, 1000):
         drive = plan_drive(LabDriveSettings(frames=frames))
         assert len(drive.timestamps) == frames
-        assert drive.law.duration == pytest.approx(drive.timestamps[-1])
+        assert drive.planar(drive.timestamps)[-1] == pytest.approx(drive.planar(np.zeros(1))[0])
 
 
 def test_too_few_frames_are_refused_with_the_least_number() -> None:
@@ -148,6 +154,21 @@ def test_turning_back_on_the_spot_is_refused_with_its_place() -> None:
     there_and_back = ((0.0, -1.0), (2.0, -1.0), (0.0, -1.0))
     with pytest.raises(ConfigError, match=r"too sharply near \(2\.00, -1\.00\)"):
         plan_drive(LabDriveSettings(path="waypoints", waypoints_m=there_and_back, frames=None))
+
+
+def test_rounded_corners_start_and_end_where_the_corners_do() -> None:
+    corners = np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 4.0], [9.0, 8.0]])
+    path = round_corners(corners, 2.0)
+    np.testing.assert_allclose(path.xy[[0, -1]], corners[[0, -1]], atol=1e-5)
+    np.testing.assert_allclose(path.heading[-1], np.pi / 4, atol=1e-9)
+    assert not path.closed
+    # Nowhere further from the corners' polyline than a corner is cut.
+    assert np.abs(path.curvature).max() < 1.2
+
+
+def test_corners_too_near_for_their_bends_are_refused() -> None:
+    with pytest.raises(ValueError, match="too near"):
+        round_corners(np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 1.0], [9.0, 1.0]]), 2.0)
 
 
 # --------------------------------------------------------------------------------------------

@@ -1,129 +1,275 @@
-import sys
+"""Drives in the places, what a place does not offer, and places as recordings."""
+
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fgslam.worlds.buildings.lab import HALF_SIDE, HEIGHT, build_lab
-from fgslam.worlds.lab import make_rig
-from fgslam.worlds.patches import RayCaster, Thing, stack
-from fgslam.worlds.people import across_view, person
-from fgslam.worlds.settings import LabDriveSettings, LabRigSettings
-from fgslam.worlds.textures import PHOTOGRAPHS, book_row, build_library, photograph
-from tests.simulated import plan_drive
+from fgslam.core import geometry
+from fgslam.core.errors import ConfigError
+from fgslam.core.geometry import wrap
+from fgslam.datasets.rendered import RenderedLabSequence
+from fgslam.worlds.driving import Drive
+from fgslam.worlds.floor import FloorSpace
+from fgslam.worlds.lab import (
+    PATHS,
+    PlaceChoice,
+    build_place,
+    first_pose,
+    make_rig,
+    place_path,
+    plan_in_place,
+)
+from fgslam.worlds.patches import stack
+from fgslam.worlds.renderer import RenderCache
+from fgslam.worlds.settings import (
+    LabDriveSettings,
+    LabRigSettings,
+    LabSettings,
+    PathName,
+    PlaceName,
+    RandomPosesSettings,
+    RenderedLabSettings,
+)
 
-VISITS = (1, 2, 3)
-
-
-def lab(visit: int) -> tuple[Thing, ...]:
-    return build_lab(np.random.default_rng([0, 2]), visit)
-
-
-def corners(thing: Thing) -> np.ndarray:
-    arrays = stack([thing])
-    c, u, v = arrays.corner, arrays.edge_u, arrays.edge_v
-    return np.concatenate([c, c + u, c + v, c + u + v])
-
-
-@pytest.mark.parametrize("visit", VISITS)
-def test_things_are_inside_the_room_with_unique_names(visit: int) -> None:
-    things = lab(visit)
-    assert len({thing.name for thing in things}) == len(things)
-    for thing in things:
-        points = corners(thing)
-        assert np.abs(points[:, :2]).max() <= HALF_SIDE + 1e-9, thing.name
-        assert points[:, 2].min() >= -1e-9, thing.name
-        assert points[:, 2].max() <= HEIGHT + 1e-9, thing.name
-
-
-@pytest.mark.parametrize("visit", VISITS)
-def test_things_stand_on_something(visit: int) -> None:
-    """What does not stand on the floor rests on something, by a ray cast down from its bottom."""
-    things = [t for t in lab(visit) if t.name.startswith(("carton", "chair", "plotter", "desk"))]
-    for thing in things:
-        points = corners(thing)
-        low = points[:, 2].min()
-        if low < 0.02 or thing.name.startswith("chair"):
-            assert low < 0.06, thing.name
-            continue
-        middle = points[points[:, 2] < low + 1e-6][:, :2].mean(axis=0)
-        foot = np.append(middle + 0.03, low + 5e-3)  # not on a seam of what lies below
-        caster = RayCaster(stack(t for t in lab(visit) if t.name != thing.name))
-        _, distance = caster.cast(foot, np.array([[0.0, 0.0, -1.0]], dtype=np.float32))
-        assert distance[0] < 0.02, thing.name
+RIG = make_rig(LabRigSettings(width=80, height=60))
+ROOMS, CORRIDORS, LAB = PlaceChoice("rooms"), PlaceChoice("corridors"), PlaceChoice("lab")
 
 
-@pytest.mark.parametrize("visit", VISITS)
-@pytest.mark.parametrize("path", ["paper_loop", "laps"])
-def test_paths_are_clear_for_a_robot_of_half_a_metre(visit: int, path: str) -> None:
-    drive = plan_drive(LabDriveSettings(path=path, frames=None))  # type: ignore[arg-type]
-    solid = [t for t in lab(visit) if t.name not in ("floor", "ceiling")]
-    caster = RayCaster(stack(solid))
-    for height in (0.2, 0.6, 1.0):
-        points = np.column_stack([drive.path.xy[::50], np.full(len(drive.path.xy[::50]), height)])
-        assert caster.distance(points).min() > 0.25
+def settings(path: PathName, laps: int = 1) -> LabDriveSettings:
+    return LabDriveSettings(path=path, laps=laps, frames=None)
 
 
-def test_second_visit_moves_loose_things_only() -> None:
-    moved = []
-    for before, after in zip(lab(1), lab(2), strict=True):
-        assert before.name == after.name
-        a, b = corners(before), corners(after)
-        if not np.array_equal(a, b):
-            moved.append(before.name)
-    assert "chair" in moved
-    assert 8 <= len(moved) <= 14
-    assert all(name.startswith(("chair", "carton", "plotter")) for name in moved)
+def planned(choice: PlaceChoice, path: PathName, laps: int = 1) -> Drive:
+    return plan_in_place(choice, settings(path, laps), RIG)
 
 
-@pytest.mark.slow
-def test_textures_repeat_exactly_from_their_seed() -> None:
-    once, again = (build_library(np.random.default_rng(5)) for _ in range(2))
-    assert list(once) == list(again)
-    for name, texture in once.items():
-        np.testing.assert_array_equal(texture, again[name])
-        assert texture.dtype == np.float32
-        assert all(side & (side - 1) == 0 for side in texture.shape), name
-        assert 0.0 < texture.min() <= texture.max() < 255.0, name
-    rows = [book_row(np.random.default_rng(seed), 64, 256) for seed in (5, 6)]
-    assert not np.array_equal(*rows)
+@pytest.fixture(scope="module")
+def office_space() -> FloorSpace:
+    place = build_place(ROOMS)
+    return FloorSpace(stack(place.things), place.low, place.high)
 
 
-@pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_photographs_are_in_the_wheel(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pooch", None)
-    image = photograph(name, 64)
-    assert image.shape == (64, 64)
-    assert image.std() > 5.0
+def random_poses(frames: int | None, **keys: int) -> LabDriveSettings:
+    drawn = RandomPosesSettings(**keys)
+    return LabDriveSettings(path="random_poses", frames=frames, random_poses=drawn)
 
 
-def test_person_walks_through_the_middle_of_the_view() -> None:
-    drive, rig = plan_drive(LabDriveSettings()), make_rig(LabRigSettings())
-    walk = across_view(10.0, 15.0, drive, rig)
-    assert walk.stance(9.99) is None
-    assert walk.stance(15.01) is None
-    camera = (drive.body_poses(np.array([12.5])) @ rig.bTc)[0]
-    stance = walk.stance(12.5)
-    assert stance is not None
-    point = (np.array([stance.x, stance.y, camera[2, 3]]) - camera[:3, 3]) @ camera[:3, :3]
-    np.testing.assert_allclose(point, [0.0, 0.0, 1.8], atol=1e-9)
-    first, last = walk.stance(10.0), walk.stance(15.0)
-    assert first is not None
-    assert last is not None
-    for end, sign in ((first, 1.0), (last, -1.0)):
-        x = (np.array([end.x, end.y, 0.0]) - camera[:3, 3]) @ camera[:3, 0]
-        assert sign * x > 2.0 * np.tan(np.deg2rad(30.0)) + 0.3
+def body(settings: LabDriveSettings, place: PlaceChoice = LAB) -> np.ndarray:
+    drawn = plan_in_place(place, settings, RIG)
+    return drawn.body_poses(drawn.timestamps)
 
 
-def test_person_stands_on_the_floor_with_a_head_of_human_height() -> None:
-    drive, rig = plan_drive(LabDriveSettings()), make_rig(LabRigSettings())
-    walk = across_view(10.0, 15.5, drive, rig)
-    spread = []
-    for seconds in np.linspace(walk.begins, walk.ends, 9):
-        stance = walk.stance(float(seconds))
-        assert stance is not None
-        points = corners(person(stance))
-        assert points[:, 2].max() == pytest.approx(1.78)
-        assert -0.05 < points[:, 2].min() < 0.2
-        legs = points[points[:, 2] < 0.3]
-        spread.append(np.ptp(legs[:, :2], axis=0).max())
-    assert max(spread) > min(spread) + 0.2
+def test_tour_is_closed_and_clear_of_everything(office_space: FloorSpace) -> None:
+    drive = planned(ROOMS, "tour", 4)
+    assert drive.path is not None
+    assert drive.path.closed
+    body = drive.body_poses(drive.timestamps)
+    np.testing.assert_allclose(body[-1], body[0], atol=1e-9)
+    for poses in (body, body @ RIG.bTc):
+        assert office_space.clearance(poses[::5, :2, 3]).min() > 0.4
+
+
+def test_tour_of_three_rounds_is_long_and_slow_enough() -> None:
+    drive = planned(ROOMS, "tour", 3)
+    assert drive.path is not None
+    assert drive.path.length > 200.0
+    planar = drive.planar(drive.timestamps)
+    assert np.linalg.norm(np.diff(planar[:, :2], axis=0), axis=1).max() <= 0.2
+    turned = wrap(np.diff(planar[:, 2]))
+    assert np.rad2deg(np.abs(turned)).max() <= 5.0
+    assert len(planned(ROOMS, "tour", 4).timestamps) * 0.9 <= 2500
+
+
+def test_first_round_comes_to_no_place_twice() -> None:
+    path = place_path("rooms", settings("tour"))
+    chosen = np.arange(0, len(path.arc), 100)
+    arc, xy = path.arc[chosen], path.xy[chosen]
+    far = np.abs(arc[:, None] - arc) > 12.0
+    far &= np.abs(arc[:, None] - arc) < path.length - 12.0
+    apart = np.linalg.norm(xy[:, None] - xy, axis=2)
+    assert apart[far].min() > 3.0
+
+
+def test_later_rounds_see_places_again_in_both_headings() -> None:
+    path = place_path("rooms", settings("tour", 4))
+    chosen = np.arange(0, len(path.arc), 100)
+    arc, xy, heading = path.arc[chosen], path.xy[chosen], path.heading[chosen]
+    again = (np.linalg.norm(xy[:, None] - xy, axis=2) < 0.3) & (arc[:, None] - arc > 20.0)
+    turned = np.cos(heading[:, None] - heading)[again]
+    assert (turned > 0.99).sum() > 50
+    assert (turned < -0.99).sum() > 50
+
+
+def test_drives_of_the_corridors() -> None:
+    assert place_path("corridors", settings("tour")).closed
+    path = place_path("corridors", settings("one_way"))
+    assert not path.closed
+    assert np.linalg.norm(path.xy[-1] - path.xy[0]) > 6.0
+    assert path.length > 3.0 * 24.0
+    place = build_place(CORRIDORS)
+    space = FloorSpace(stack(place.things), place.low, place.high)
+    for drive in (planned(CORRIDORS, "tour"), planned(CORRIDORS, "one_way")):
+        assert space.clearance(drive.planar(drive.timestamps)[::3, :2]).min() > 0.6
+
+
+@pytest.mark.parametrize(
+    ("place", "path"),
+    [("lab", "tour"), ("rooms", "paper_loop"), ("rooms", "one_way"), ("corridors", "laps")],
+)
+def test_drive_that_a_place_has_not_is_refused(place: PlaceName, path: PathName) -> None:
+    with pytest.raises(ConfigError, match=f"choose one of {PATHS[place][0]}"):
+        place_path(place, settings(path))
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [replace(ROOMS, identical_posters=True), replace(CORRIDORS, visit=2), replace(ROOMS, visit=3)],
+    ids=["posters", "visit", "rearranged"],
+)
+def test_what_a_place_has_not_is_refused(choice: PlaceChoice) -> None:
+    with pytest.raises(ConfigError, match=r"means nothing|dataset\.visit [23]"):
+        build_place(choice)
+
+
+def test_world_is_the_start_of_the_drive_and_of_random_poses_that_of_the_places_own() -> None:
+    own = first_pose("lab", settings("laps"))
+    assert own[:2, 3] == pytest.approx([-1.8, -3.3])
+    drawn = first_pose("lab", settings("random_poses"))
+    assert drawn[:2, 3] == pytest.approx([-1.9, -1.16])
+
+
+def test_robot_and_camera_keep_clear_in_all_headings_all_over_the_room() -> None:
+    poses = body(random_poses(200))
+    place = build_place(LAB)
+    space = FloorSpace(stack(place.things), place.low, place.high)
+    for points in (poses, poses @ RIG.bTc):
+        assert space.clearance(points[:, :2, 3]).min() >= 0.4
+    heading = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
+    assert np.histogram(heading, bins=4, range=(-np.pi, np.pi))[0].min() > 25
+    assert (np.ptp(poses[:, :2, 3], axis=0) > 7.0).all()
+
+
+def test_random_poses_differ() -> None:
+    """How many poses there are changes none of them, another seed all."""
+    many, few = body(random_poses(40)), body(random_poses(10))
+    np.testing.assert_array_equal(many[:10], few)
+    other = body(random_poses(10, seed=1))
+    assert np.linalg.norm(other[:, :2, 3] - few[:, :2, 3], axis=1).min() > 1e-3
+
+
+def test_without_frames_there_are_two_hundred_poses() -> None:
+    assert len(body(random_poses(None))) == 200
+    assert len(body(random_poses(None, burst=3))) == 600
+
+
+def test_bursts_go_straight_ahead() -> None:
+    poses = body(random_poses(30, burst=3))
+    steps = geometry.inverse(poses[:-1]) @ poses[1:]
+    within = np.arange(1, 30) % 3 != 0
+    ahead = np.tile(np.eye(4), (int(within.sum()), 1, 1))
+    ahead[:, 0, 3] = 0.1
+    np.testing.assert_allclose(steps[within], ahead, atol=1e-12)
+    assert (np.linalg.norm(steps[~within, :3, 3], axis=1) > 0.2).all()
+
+
+def test_places_that_cannot_be_driven_to_are_not_drawn() -> None:
+    """The ring's inner square is empty floor behind walls."""
+    poses = body(random_poses(150), CORRIDORS)
+    inside = np.all((poses[:, :2, 3] > 1.2) & (poses[:, :2, 3] < 22.8), axis=1)
+    assert not inside.any()
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        (random_poses(10, burst=3), "no multiple"),
+        (random_poses(100, burst=100), "no place with room for .*burst 100"),
+    ],
+)
+def test_poses_that_do_not_exist_are_refused(bad: LabDriveSettings, why: str) -> None:
+    with pytest.raises(ConfigError, match=why):
+        body(bad)
+
+
+@pytest.fixture
+def _unrendered(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The geometry of a recording without its images."""
+    monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path))
+    monkeypatch.setattr(RenderCache, "present", lambda *_: True)
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_truth_is_in_the_world_of_the_mapping_drive() -> None:
+    mapping = RenderedLabSequence(LabSettings(), 0)
+    carried = RenderedLabSequence(LabSettings(drive=random_poses(6)), 0)
+    np.testing.assert_array_equal(carried.room_from_world, mapping.room_from_world)
+    np.testing.assert_allclose(mapping.ground_truth.poses[0], np.eye(4), atol=1e-12)
+    room = carried.room_from_world @ carried.ground_truth.poses
+    np.testing.assert_allclose(room, carried.room_from_camera(carried.timestamps), atol=1e-12)
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_which_frames_are_used_is_no_part_of_a_recording_s_identity() -> None:
+    """So that a run can go on with the frames after those that its map was made of."""
+
+    def identity(**selection: int) -> str:
+        settings = RenderedLabSettings(**selection)
+        used = settings.start, settings.stop, settings.stride
+        return RenderedLabSequence(settings, 0, *used).identity
+
+    assert identity() == identity(stop=4) == identity(start=4, stop=9, stride=2)
+    assert identity() != identity(room_seed=9)
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_no_odometry_is_given_where_the_robot_was_carried() -> None:
+    carried = RenderedLabSequence(LabSettings(drive=random_poses(9, burst=3)), 0)
+    known = [carried.odometry(i) is not None for i in range(9)]
+    assert known == [False, True, True] * 3
+    step = carried.odometry(1)
+    assert step is not None
+    assert step.motion[0, 3] == pytest.approx(0.1, abs=0.05)
+    strided = RenderedLabSequence(LabSettings(drive=random_poses(9, burst=3)), 0, stride=2)
+    assert [strided.odometry(i) is not None for i in range(5)] == [False, True, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "key"),
+    [
+        (LabSettings(), "23b8a10e304c4be44dc4"),
+        (RenderedLabSettings(start=3, stop=9, stride=2), "23b8a10e304c4be44dc4"),
+        (LabSettings(visit=2), "31858c82fd4d4a0de238"),
+    ],
+    ids=["paper", "selection", "visit"],
+)
+@pytest.mark.usefixtures("_unrendered")
+def test_cache_keys_of_the_lab_do_not_change_with_later_settings(
+    settings: LabSettings, key: str, tmp_path: Path
+) -> None:
+    assert cache_key(settings, tmp_path) == key
+
+
+def cache_key(settings: LabSettings, cache: Path) -> str:
+    """The name of the folder that a recording's frames are kept in."""
+    before = set(cache.iterdir())
+    RenderedLabSequence(settings, 0)
+    (made,) = set(cache.iterdir()) - before
+    return made.name.removeprefix("lab-")
+
+
+@pytest.mark.usefixtures("_unrendered")
+def test_other_places_and_posters_have_other_cache_keys(tmp_path: Path) -> None:
+    drives = {
+        "rooms": LabDriveSettings(path="tour", frames=None),
+        "corridors": LabDriveSettings(path="tour", frames=None),
+    }
+    for settings in (
+        LabSettings(),
+        LabSettings(posters="identical"),
+        *(LabSettings(place=name, drive=d) for name, d in drives.items()),  # type: ignore[arg-type]
+        LabSettings(drive=random_poses(9)),
+        LabSettings(drive=random_poses(9, seed=1)),
+    ):
+        assert len(cache_key(settings, tmp_path)) == 20  # a folder that no other settings made

@@ -1,80 +1,98 @@
-"""Places beside the lab: plans, their drives, corridors that look alike, identical posters."""
+"""Plans, furniture and what hangs where, in the lab, the office, the corridors and the house."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from fgslam.core.errors import ConfigError
-from fgslam.core.geometry import wrap
-from fgslam.worlds.buildings import corridors as alike
-from fgslam.worlds.buildings import office
-from fgslam.worlds.buildings.lab import build_lab
-from fgslam.worlds.driving import Drive, round_corners
-from fgslam.worlds.floor import FloorSpace
-from fgslam.worlds.lab import (
-    PATHS,
-    PlaceChoice,
-    build_place,
-    first_pose,
-    make_rig,
-    place_path,
-    plan_in_place,
-)
-from fgslam.worlds.patches import RayCaster, Surface, Thing, box, rectangle, stack
+from fgslam.worlds import places
+from fgslam.worlds.lab import PlaceChoice, build_place, make_rig
+from fgslam.worlds.patches import RayCaster, Thing, stack
+from fgslam.worlds.places import HOUSE, FloorPlan, Place, build_corridors, build_house, build_lab
 from fgslam.worlds.renderer import Layer, Renderer, bake, pinhole_view
-from fgslam.worlds.settings import (
-    LabDriveSettings,
-    LabRigSettings,
-    PathName,
-    PlaceName,
-)
+from fgslam.worlds.settings import LabDriveSettings, LabRigSettings
 from fgslam.worlds.textures import GreyBank
+from tests.simulated import plan_drive
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
-ROOMS = PlaceChoice("rooms", 0, 1, identical_posters=False)
-CORRIDORS = PlaceChoice("corridors", 0, 1, identical_posters=False)
-LAB = PlaceChoice("lab", 0, 1, identical_posters=False)
+ROOMS = PlaceChoice("rooms")
+OFFICE = places.OFFICE
+VISITS = (1, 2, 3)
 
 
-def settings(path: PathName, laps: int = 1) -> LabDriveSettings:
-    return LabDriveSettings(path=path, laps=laps, frames=None)
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
 
 
-def planned(choice: PlaceChoice, path: PathName, laps: int = 1) -> Drive:
-    drive = plan_in_place(choice, settings(path, laps), RIG)
-    assert isinstance(drive, Drive)
-    return drive
+def lab(visit: int) -> tuple[Thing, ...]:
+    return build_lab(np.random.default_rng([0, 2]), visit).things
+
+
+def corners(thing: Thing) -> np.ndarray:
+    arrays = stack([thing])
+    c, u, v = arrays.corner, arrays.edge_u, arrays.edge_v
+    return np.concatenate([c, c + u, c + v, c + u + v])
+
+
+def middle(thing: Thing) -> np.ndarray:
+    """(3,) of its bounding box."""
+    points = corners(thing)
+    return 0.5 * (points.min(axis=0) + points.max(axis=0))
+
+
+def same(a: Thing, b: Thing) -> bool:
+    return a.name == b.name and all(
+        np.array_equal(p.corner, q.corner) and p.surface.texture == q.surface.texture
+        for p, q in zip(a.patches, b.patches, strict=True)
+    )
+
+
+def changed(first: Place, second: Place) -> set[str]:
+    """Names of the things that differ between two visits."""
+    pairs = zip(first.things, second.things, strict=True)
+    return {a.name for a, b in pairs if not same(a, b)}
+
+
+def rooms_at(plan: FloorPlan, x: float, y: float) -> list[str]:
+    return [room.name for room in plan.rooms if room.holds(x, y)]
 
 
 @pytest.fixture(scope="module")
-def office_space() -> FloorSpace:
-    place = build_place(ROOMS)
-    return FloorSpace(stack(place.things), place.low, place.high)
+def house() -> tuple[Thing, ...]:
+    return build_house(rng(0)).things
 
 
-# ---------------------------------------------------------------- the office
+@pytest.mark.parametrize("plan", [OFFICE, HOUSE], ids=["office", "house"])
+def test_rooms_fill_the_building_without_overlap(plan: FloorPlan) -> None:
+    assert sum(np.prod(room.size) for room in plan.rooms) == pytest.approx(plan.width * plan.depth)
+    x, y = np.arange(0.1, plan.width, 0.2), np.arange(0.1, plan.depth, 0.2)
+    for place in np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)[::7]:
+        assert len(rooms_at(plan, *place)) == 1
 
 
-def test_rooms_fill_the_building_without_overlap() -> None:
-    plan = office.PLAN
-    area = sum((r.east - r.west) * (r.north - r.south) for r in plan.rooms)
-    assert area == pytest.approx(plan.width * plan.depth)
-    grid = np.stack(np.meshgrid(np.arange(0.1, 36, 0.2), np.arange(0.1, 24, 0.2)), axis=-1)
-    for x, y in grid.reshape(-1, 2)[::7]:
-        assert sum(room.holds(x, y) for room in plan.rooms) == 1
-
-
-def test_every_door_joins_two_rooms_and_every_room_has_one() -> None:
-    plan, joined = office.PLAN, set()
+@pytest.mark.parametrize("plan", [OFFICE, HOUSE], ids=["office", "house"])
+def test_every_door_joins_two_rooms_and_every_room_has_one(plan: FloorPlan) -> None:
+    joined = set()
     for door in plan.doors:
         across = np.array([0.0, 0.3]) if door.along_x else np.array([0.3, 0.0])
-        sides = [plan.room_at(*(np.array([door.x, door.y]) + s * across)) for s in (-1, 1)]
-        names = {room.name for room in sides if room is not None}
+        sides = [np.array([door.x, door.y]) + side * across for side in (-1, 1)]
+        names = {name for place in sides for name in rooms_at(plan, *place)}
         assert len(names) == 2, door
         joined |= names
     assert joined == {room.name for room in plan.rooms}
+
+
+@pytest.mark.parametrize("build", [build_house, build_corridors, build_lab])
+def test_same_seed_gives_the_same_place(build: Callable[[np.random.Generator], Place]) -> None:
+    first, again, other = (build(rng(seed)) for seed in (0, 0, 1))
+    assert not changed(first, again)
+    assert [t for t in first.things if "shelf" in t.name] != []
+    textures = [
+        [p.surface.texture for t in place.things for p in t.patches] for place in (first, other)
+    ]
+    assert textures[0] != textures[1]
 
 
 def test_no_picture_of_the_office_hangs_twice() -> None:
@@ -84,69 +102,39 @@ def test_no_picture_of_the_office_hangs_twice() -> None:
     assert len(set(shown)) == len(shown)
 
 
-def test_second_visit_moves_chairs_and_cartons_only() -> None:
-    first = {t.name: t for t in build_place(ROOMS).things}
-    second = {t.name: t for t in build_place(replace(ROOMS, visit=2)).things}
-    assert first.keys() == second.keys()
-    moved = {
-        name
-        for name, thing in first.items()
-        if any(
-            not np.array_equal(a.corner, b.corner)
-            for a, b in zip(thing.patches, second[name].patches, strict=True)
-        )
-    }
+def test_second_visit_of_the_office_moves_chairs_and_cartons_only() -> None:
+    moved = changed(build_place(ROOMS), build_place(replace(ROOMS, visit=2)))
     assert moved
     assert all(name.rsplit("_", 2)[-2] == "chair" or name.endswith("carton") for name in moved)
 
 
-def test_tour_is_closed_and_clear_of_everything(office_space: FloorSpace) -> None:
-    drive = planned(ROOMS, "tour", 4)
-    assert drive.path.closed
-    body = drive.body_poses(drive.timestamps)
-    np.testing.assert_allclose(body[-1], body[0], atol=1e-9)
-    for poses in (body, body @ RIG.bTc):
-        assert office_space.clearance(poses[::5, :2, 3]).min() > 0.4
+def test_some_picture_hangs_in_every_room(house: tuple[Thing, ...]) -> None:
+    for name in ("painting_0", "poster_0"):
+        rooms = {
+            thing.name.split("_")[0]
+            for thing in house
+            if "picture" in thing.name and thing.patches[0].surface.texture == name
+        }
+        assert len(rooms) >= 5
 
 
-def test_tour_of_three_rounds_is_long_and_slow_enough() -> None:
-    drive = planned(ROOMS, "tour", 3)
-    assert drive.path.length > 200.0
-    planar = drive.planar(drive.timestamps)
-    assert np.linalg.norm(np.diff(planar[:, :2], axis=0), axis=1).max() <= 0.2
-    turned = wrap(np.diff(planar[:, 2]))
-    assert np.rad2deg(np.abs(turned)).max() <= 5.0
-    assert len(planned(ROOMS, "tour", 4).timestamps) * 0.9 <= 2500
-
-
-def test_first_round_comes_to_no_place_twice() -> None:
-    path = place_path("rooms", settings("tour"))
-    chosen = np.arange(0, len(path.arc), 100)
-    arc, xy = path.arc[chosen], path.xy[chosen]
-    far = np.abs(arc[:, None] - arc) > 12.0
-    far &= np.abs(arc[:, None] - arc) < path.length - 12.0
-    apart = np.linalg.norm(xy[:, None] - xy, axis=2)
-    assert apart[far].min() > 3.0
-
-
-def test_later_rounds_see_places_again_in_both_headings() -> None:
-    path = place_path("rooms", settings("tour", 4))
-    chosen = np.arange(0, len(path.arc), 100)
-    arc, xy, heading = path.arc[chosen], path.xy[chosen], path.heading[chosen]
-    again = (np.linalg.norm(xy[:, None] - xy, axis=2) < 0.3) & (arc[:, None] - arc > 20.0)
-    turned = np.cos(heading[:, None] - heading)[again]
-    assert (turned > 0.99).sum() > 50
-    assert (turned < -0.99).sum() > 50
-
-
-# ---------------------------------------------------------------- corridors that look alike
+def test_all_furniture_stands_in_its_room(house: tuple[Thing, ...]) -> None:
+    low, high = np.array([0.0, 0.0, 0.0]), np.array([HOUSE.width, HOUSE.depth, 2.7])
+    for thing in house:
+        for patch in thing.patches:
+            corners = patch.corner + np.array(
+                [0 * patch.edge_u, patch.edge_u, patch.edge_v, patch.edge_u + patch.edge_v]
+            )
+            assert (corners > low - 0.1).all(), thing.name
+            assert (corners < high + 0.1).all(), thing.name
 
 
 def test_each_leg_is_the_one_before_turned_by_a_quarter() -> None:
-    things, lamps = alike.build_alike(np.random.default_rng(0))
+    place = build_corridors(rng())
+    things, lamps = place.things, place.lamps
     legs = [[t for t in things if t.name.startswith(f"leg_{k}_")] for k in (1, 2, 3, 4)]
     assert len(lamps) % 4 == 0
-    middle = np.array([alike.SIDE / 2, alike.SIDE / 2, 0.0])
+    middle = np.array([24.0 / 2, 24.0 / 2, 0.0])
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for before, after in pairwise(legs):
         a, b = stack(before), stack(after)
@@ -155,31 +143,30 @@ def test_each_leg_is_the_one_before_turned_by_a_quarter() -> None:
 
 
 def test_array_sections_are_copies() -> None:
-    things, _ = alike.build_alike(np.random.default_rng(0))
+    things = build_corridors(rng()).things
     first = stack(t for t in things if t.name.startswith("leg_1_section_1_"))
     for k in (2, 3, 4):
         other = stack(t for t in things if t.name.startswith(f"leg_1_section_{k}_"))
-        shift = [(k - 1) * alike.SECTION, 0.0, 0.0]
+        shift = [(k - 1) * 6.0, 0.0, 0.0]
         np.testing.assert_allclose(first.corner + shift, other.corner, atol=1e-9)
         assert [s.texture for s in first.surfaces] == [s.texture for s in other.surfaces]
 
 
 def test_legs_look_alike_in_the_images() -> None:
     """A pose and its copy a leg on see the same but for chance in the dimness of corners."""
-    rng = np.random.default_rng(0)
-    place = build_place(CORRIDORS)
+    place = build_corridors(rng())
     patches = stack(place.things)
     names = {surface.texture for surface in patches.surfaces}
     bank = GreyBank(
-        {name: rng.uniform(60, 200, (64, 64)).astype(np.float32) for name in sorted(names)}
+        {name: rng(1).uniform(60, 200, (64, 64)).astype(np.float32) for name in sorted(names)}
     )
     caster = RayCaster(patches)
-    light = bake(patches, caster, place.lamps, rng, 0.5, place.light_reach_m)
+    light = bake(patches, caster, place.lamps, rng(), 0.5, place.light_reach_m)
     layer = Layer(patches, caster, light, bank)
     renderer = Renderer(pinhole_view((RIG.height, RIG.width), RIG.fx, RIG.cx, RIG.cy), bank)
     turn = np.eye(4)
     turn[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    turn[:2, 3] = [alike.SIDE, 0.0]
+    turn[:2, 3] = [24.0, 0.0]
     body = np.eye(4)
     body[:2, 3] = [9.0, 0.1]
     here, there = (renderer.image(layer, pose @ RIG.bTc) for pose in (body, turn @ body))
@@ -189,24 +176,57 @@ def test_legs_look_alike_in_the_images() -> None:
     assert alike_by < 0.1 * np.abs(here - elsewhere).mean()
 
 
-def test_drives_of_the_corridors() -> None:
-    there_and_back, one_way = planned(CORRIDORS, "tour"), planned(CORRIDORS, "one_way")
-    assert there_and_back.path.closed
-    assert not one_way.path.closed
-    assert np.linalg.norm(one_way.path.xy[-1] - one_way.path.xy[0]) > alike.SECTION
-    assert one_way.path.length > 3.0 * alike.SIDE
-    place = build_place(CORRIDORS)
-    space = FloorSpace(stack(place.things), place.low, place.high)
-    for drive in (there_and_back, one_way):
-        assert space.clearance(drive.planar(drive.timestamps)[::3, :2]).min() > 0.6
+@pytest.mark.parametrize("visit", VISITS)
+def test_things_are_inside_the_room_with_unique_names(visit: int) -> None:
+    things = lab(visit)
+    assert len({thing.name for thing in things}) == len(things)
+    for thing in things:
+        points = corners(thing)
+        assert np.abs(points[:, :2]).max() <= places.HALF_SIDE + 1e-9, thing.name
+        assert points[:, 2].min() >= -1e-9, thing.name
+        assert points[:, 2].max() <= places.LAB_HEIGHT + 1e-9, thing.name
 
 
-# ---------------------------------------------------------------- identical posters
+@pytest.mark.parametrize("visit", VISITS)
+def test_things_stand_on_something(visit: int) -> None:
+    """What does not stand on the floor rests on something, by a ray cast down from its bottom."""
+    things = [t for t in lab(visit) if t.name.startswith(("carton", "chair", "plotter", "desk"))]
+    for thing in things:
+        points = corners(thing)
+        low = points[:, 2].min()
+        if low < 0.02 or thing.name.startswith("chair"):
+            assert low < 0.06, thing.name
+            continue
+        middle = points[points[:, 2] < low + 1e-6][:, :2].mean(axis=0)
+        foot = np.append(middle + 0.03, low + 5e-3)  # not on a seam of what lies below
+        caster = RayCaster(stack(t for t in lab(visit) if t.name != thing.name))
+        _, distance = caster.cast(foot, np.array([[0.0, 0.0, -1.0]], dtype=np.float32))
+        assert distance[0] < 0.02, thing.name
+
+
+@pytest.mark.parametrize("visit", VISITS)
+@pytest.mark.parametrize("path", ["paper_loop", "laps"])
+def test_paths_are_clear_for_a_robot_of_half_a_metre(visit: int, path: str) -> None:
+    drive = plan_drive(LabDriveSettings(path=path, frames=None))  # type: ignore[arg-type]
+    assert drive.path is not None
+    xy = drive.path.xy[::50]
+    solid = [t for t in lab(visit) if t.name not in ("floor", "ceiling")]
+    caster = RayCaster(stack(solid))
+    for height in (0.2, 0.6, 1.0):
+        points = np.column_stack([xy, np.full(len(xy), height)])
+        assert caster.distance(points).min() > 0.25
+
+
+def test_second_visit_of_the_lab_moves_loose_things_only() -> None:
+    moved = changed(*(build_place(PlaceChoice("lab", visit=visit)) for visit in (1, 2)))
+    assert "chair" in moved
+    assert 8 <= len(moved) <= 14
+    assert all(name.startswith(("chair", "carton", "plotter")) for name in moved)
 
 
 def test_identical_posters_change_one_poster_and_nothing_else() -> None:
-    plain = build_lab(np.random.default_rng([0, 2]), 1)
-    alike = build_lab(np.random.default_rng([0, 2]), 1, identical_posters=True)
+    plain = lab(1)
+    alike = build_lab(np.random.default_rng([0, 2]), 1, identical_posters=True).things
     different = [k for k, (a, b) in enumerate(zip(plain, alike, strict=True)) if not same(a, b)]
     assert [plain[k].name for k in different] == ["poster_8"]
     copy = alike[different[0]].patches[0]
@@ -220,8 +240,8 @@ def test_identical_posters_change_one_poster_and_nothing_else() -> None:
 
 
 def test_rearranged_lab_keeps_everything_and_moves_the_big_things() -> None:
-    first = {t.name: t for t in build_place(LAB).things}
-    third = {t.name: t for t in build_place(replace(LAB, visit=3)).things}
+    first = {t.name: t for t in lab(1)}
+    third = {t.name: t for t in lab(3)}
     assert first.keys() == third.keys()
     moved = {name for name, thing in first.items() if not same(thing, third[name])}
     kinds = {name.rsplit("_", 1)[0] for name in moved}
@@ -233,84 +253,3 @@ def test_rearranged_lab_keeps_everything_and_moves_the_big_things() -> None:
             was, now = (middle(t) for t in (first[old], third[new]))
             np.testing.assert_allclose(was[:2], now[:2], atol=0.05)
             assert middle(first[new])[2] == pytest.approx(middle(third[new])[2])
-
-
-def middle(thing: Thing) -> np.ndarray:
-    """(3,) of its bounding box."""
-    arrays = stack([thing])
-    c, u, v = arrays.corner, arrays.edge_u, arrays.edge_v
-    points = np.concatenate([c, c + u, c + v, c + u + v])
-    return 0.5 * (points.min(axis=0) + points.max(axis=0))
-
-
-def same(a: Thing, b: Thing) -> bool:
-    return a.name == b.name and all(
-        np.array_equal(p.corner, q.corner) and p.surface.texture == q.surface.texture
-        for p, q in zip(a.patches, b.patches, strict=True)
-    )
-
-
-# ---------------------------------------------------------------- what does not exist
-
-
-@pytest.mark.parametrize(
-    ("place", "path"),
-    [("lab", "tour"), ("rooms", "paper_loop"), ("rooms", "one_way"), ("corridors", "laps")],
-)
-def test_drive_that_a_place_has_not_is_refused(place: PlaceName, path: PathName) -> None:
-    with pytest.raises(ConfigError, match=f"choose one of {PATHS[place][0]}"):
-        place_path(place, settings(path))
-
-
-@pytest.mark.parametrize(
-    "choice",
-    [replace(ROOMS, identical_posters=True), replace(CORRIDORS, visit=2), replace(ROOMS, visit=3)],
-    ids=["posters", "visit", "rearranged"],
-)
-def test_what_a_place_has_not_is_refused(choice: PlaceChoice) -> None:
-    with pytest.raises(ConfigError, match=r"means nothing|nothing is ever moved|only the lab"):
-        build_place(choice)
-
-
-def test_world_is_the_start_of_the_drive_and_of_random_poses_that_of_the_places_own() -> None:
-    own = first_pose("lab", settings("laps"))
-    assert own[:2, 3] == pytest.approx([-1.8, -3.3])
-    drawn = first_pose("lab", settings("random_poses"))
-    assert drawn[:2, 3] == pytest.approx([-1.9, -1.16])
-
-
-# ---------------------------------------------------------------- paths and light
-
-
-def test_rounded_corners_start_and_end_where_the_corners_do() -> None:
-    corners = np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 4.0], [9.0, 8.0]])
-    path = round_corners(corners, 2.0)
-    np.testing.assert_allclose(path.xy[[0, -1]], corners[[0, -1]], atol=1e-5)
-    np.testing.assert_allclose(path.heading[-1], np.pi / 4, atol=1e-9)
-    assert not path.closed
-    # Nowhere further from the corners' polyline than a corner is cut.
-    assert np.abs(path.curvature).max() < 1.2
-
-
-def test_corners_too_near_for_their_bends_are_refused() -> None:
-    with pytest.raises(ValueError, match="too near"):
-        round_corners(np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 1.0], [9.0, 1.0]]), 2.0)
-
-
-def test_light_with_a_far_reach_is_light_without_one() -> None:
-    grey = Surface("plain")
-    patches = stack(
-        [
-            Thing("floor", (rectangle((-3, 3, 0), (6, 0, 0), (0, -6, 0), grey),)),
-            Thing("box", tuple(box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.8), grey))),
-        ]
-    )
-    caster = RayCaster(patches)
-    lamps = np.array([[[1.0, 0.0, 2.5], [0.5, 0, 0], [0, 0.5, 0]]])
-    baked = {
-        reach: bake(patches, caster, lamps, np.random.default_rng(1), 0.3, reach).values
-        for reach in (None, 1e4, 3.0)
-    }
-    np.testing.assert_allclose(baked[1e4], baked[None], atol=1e-5)
-    assert (baked[3.0] <= baked[None] + 1e-6).all()
-    assert baked[3.0].mean() < 0.9 * baked[None].mean()

@@ -25,6 +25,7 @@ from fgslam.worlds.renderer import (
     Layer,
     RenderCache,
     Renderer,
+    bake,
     content_hash,
     flat_light,
     omni_view,
@@ -326,6 +327,25 @@ def test_white_stays_white_and_black_black() -> None:
 def test_texture_sides_must_be_powers_of_two() -> None:
     with pytest.raises(ValueError, match="powers of two, got 12 x 8"):
         ColourBank({"odd": np.zeros((8, 12, 3), np.float32)})
+
+
+def test_light_with_a_far_reach_is_light_without_one() -> None:
+    grey = Surface("plain")
+    patches = stack(
+        [
+            Thing("floor", (rectangle((-3, 3, 0), (6, 0, 0), (0, -6, 0), grey),)),
+            Thing("box", tuple(box((-0.5, -0.5, 0.0), (0.5, 0.5, 0.8), grey))),
+        ]
+    )
+    caster = RayCaster(patches)
+    lamps = np.array([[[1.0, 0.0, 2.5], [0.5, 0, 0], [0, 0.5, 0]]])
+    baked = {
+        reach: bake(patches, caster, lamps, np.random.default_rng(1), 0.3, reach).values
+        for reach in (None, 1e4, 3.0)
+    }
+    np.testing.assert_allclose(baked[1e4], baked[None], atol=1e-5)
+    assert (baked[3.0] <= baked[None] + 1e-6).all()
+    assert baked[3.0].mean() < 0.9 * baked[None].mean()
 
 
 # --------------------------------------------------------------------------------------------

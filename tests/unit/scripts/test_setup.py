@@ -1,105 +1,17 @@
-"""What setting up says and does on machines that lack something."""
+"""scripts/setup.sh and the Makefile, on machines made up here."""
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import shutil
-import struct
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from fgslam.worlds import open3d_library
-
 ROOT = Path(__file__).parents[3]
 # What a surrounding `make test FGSLAM_PYTHON=...` hands down must not steer the runs in here.
 FROM_MAKE = ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES", "FGSLAM_PYTHON")
-PROVIDED_EVERYWHERE = ("libc.so", "libm.so", "libgcc_s.so", "ld-linux", "libtbb.so", "libpthread")
-
-
-def needed_libraries(path: Path) -> list[str]:
-    """NEEDED entries of a 64-bit little-endian ELF file, from its dynamic section."""
-    with path.open("rb") as file:
-        header = file.read(64)
-        assert header[:6] == b"\x7fELF\x02\x01"
-        sections_at = struct.unpack_from("<Q", header, 40)[0]
-        size, count = struct.unpack_from("<HH", header, 58)
-        file.seek(sections_at)
-        table = file.read(size * count)
-        # Of each section: type, offset, size, link.
-        sections = [(*struct.unpack_from("<4xI16xQQI", table, i * size),) for i in range(count)]
-        _, offset, length, link = next(s for s in sections if s[0] == 6)
-        file.seek(offset)
-        dynamic = struct.iter_unpack("<qQ", file.read(length))
-        names_at = [value for tag, value in dynamic if tag == 1]
-        file.seek(sections[link][1])
-        names = file.read(sections[link][2])
-    return [names[at : names.index(b"\0", at)].decode() for at in names_at]
-
-
-def test_listed_libraries_are_those_that_the_wheel_links() -> None:
-    spec = importlib.util.find_spec("open3d")
-    if spec is None or not spec.submodule_search_locations:
-        pytest.skip("open3d is not installed")
-    folder = Path(spec.submodule_search_locations[0])
-    libraries = sorted(folder.glob("libOpen3D.so*"))
-    if not libraries:
-        pytest.skip(f"this build of open3d has no libOpen3D.so in {folder}")
-    needed = {n for n in needed_libraries(libraries[0]) if not n.startswith(PROVIDED_EVERYWHERE)}
-    assert needed == set(open3d_library.DEBIAN_PACKAGES)
-
-
-def test_no_library_is_reported_where_all_load() -> None:
-    assert open3d_library.missing_libraries(can_load=lambda _: True) == []
-
-
-def test_missing_libraries_are_named_in_order() -> None:
-    absent = {"libX11.so.6", "libGL.so.1"}
-    missing = open3d_library.missing_libraries(can_load=lambda name: name not in absent)
-    assert missing == ["libGL.so.1", "libX11.so.6"]
-
-
-@pytest.mark.parametrize(("carried", "expected"), [(True, []), (False, ["libusb-1.0.so.0"])])
-def test_libusb_may_come_from_its_python_package(carried: bool, expected: list[str]) -> None:
-    missing = open3d_library.missing_libraries(
-        can_load=lambda name: name != "libusb-1.0.so.0",
-        has_package=lambda name: carried and name == "libusb_package",
-    )
-    assert missing == expected
-
-
-def test_the_dynamic_loader_decides() -> None:
-    assert open3d_library.can_load("libc.so.6")
-    assert not open3d_library.can_load("libno-such-library-anywhere.so.1")
-    assert open3d_library.has_package("numpy")
-    assert not open3d_library.has_package("no_such_package_anywhere")
-
-
-def test_the_message_names_libraries_consequence_and_remedy(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(open3d_library, "missing_libraries", lambda: ["libEGL.so.1", "libGL.so.1"])
-    assert open3d_library.main([]) == 1
-    line = capsys.readouterr().out
-    assert line.count("\n") == 1
-    assert "missing libEGL.so.1, libGL.so.1" in line
-    assert "apt-get install libegl1 libgl1" in line
-    assert open3d_library.main(["--packages"]) == 1
-    assert capsys.readouterr().out == "libegl1 libgl1\n"
-
-
-def test_a_complete_machine_gets_no_message(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(open3d_library, "missing_libraries", list)
-    assert open3d_library.main(["--packages"]) == 0
-    assert capsys.readouterr().out == ""
-
-
-# --------------------------------------------------------------------------------------------
-# scripts/setup.sh and the Makefile, on machines made up here
 
 
 def executable(path: Path, script: str) -> Path:

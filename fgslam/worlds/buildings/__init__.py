@@ -1,1 +1,0 @@
-"""What stands where: plans, furniture, and the lab, office, corridors and house made of them."""
