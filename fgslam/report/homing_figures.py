@@ -67,12 +67,11 @@ def curve_figure(
         axes: titles with units.
         y: more of Plotly's y axis.
     """
-    traces = [
-        curve(one.name, one.x[rows], one.y[rows], colour(one.series), width=1.8, dash=one.dash)
-        for one in lines
-        if np.isfinite(one.y).any()
-        for rows in [peaks(one.y, MAX_POINTS)]
-    ]
+    traces = []
+    for one in lines:
+        if np.isfinite(one.y).any():
+            rows, style = peaks(one.y, MAX_POINTS), {"width": 1.8, "dash": one.dash}
+            traces.append(curve(one.name, one.x[rows], one.y[rows], colour(one.series), **style))
     return Figure(*words, drawing(traces, *axes, yaxis=dict(y or {})))
 
 
@@ -94,18 +93,17 @@ def claimed_against_true(
     claimed: Mapping[str, FloatArray], true: Mapping[str, FloatArray], key: str = "claimed"
 ) -> Figure:
     """Errors in degrees against the stated standard deviations, one cloud a series."""
-    hover = "stated %{x:.2f}°, true %{y:.2f}°<extra></extra>"
+    if not any(map(len, claimed.values())):
+        claimed = {}
+    style = {"opacity": 0.75, "hovertemplate": "stated %{x:.2f}°, true %{y:.2f}°<extra></extra>"}
     traces: list[Any] = [
-        dots(name, np.column_stack([claimed[name], np.abs(true[name])]), colour(i), 6.0,
-             opacity=0.75, hovertemplate=hover)
-        for i, name in enumerate(claimed)
-    ]  # fmt: skip
-    top = max((float(np.max(values)) for values in claimed.values() if len(values)), default=1.0)
-    for k in (1.0, 2.0, 3.0):
+        dots(name, np.column_stack([sigma, np.abs(true[name])]), colour(i), 6.0, **style)
+        for i, (name, sigma) in enumerate(claimed.items())
+    ]
+    top = max((float(np.max(sigma)) for sigma in claimed.values() if len(sigma)), default=1.0)
+    for k in (1.0, 2.0, 3.0) if claimed else ():
         ray = np.array([[0.0, 0.0], [top, k * top]])
         traces.append(line(f"{k:.0f} sigma", ray, GREY, 1.0, "dot"))
-    if not any(map(len, claimed.values())):
-        traces = []
     from_zero = {"rangemode": "tozero"}
     return Figure(
         key,
@@ -132,12 +130,8 @@ def effect_figure(
     traces = []
     for i, (name, rows) in enumerate(curves.items()):
         value, mean, lower, upper = rows.T
-        error = {
-            "symmetric": False,
-            "array": np.nan_to_num(upper - mean),
-            "arrayminus": np.nan_to_num(mean - lower),
-            "thickness": 1,
-        }
+        up, down = np.nan_to_num(upper - mean), np.nan_to_num(mean - lower)
+        error = {"symmetric": False, "array": up, "arrayminus": down, "thickness": 1}
         style = {"mode": "lines+markers", "marker": {"size": 6}, "error_y": error, "width": 1.8}
         traces.append(curve(name, value, mean, colour(i), **style))
     over = " and all other settings" if several else ""
@@ -187,19 +181,19 @@ def located_figure(located: Located, key: str, heading: str) -> Figure:
     ranges = bulk_limits(np.concatenate(shown)[:, :3, 3] @ level.T, located.landmarks @ level.T)
     span = max(high - low for low, high in ranges)
     right = located.found & ~located.false
-    covariances = in_plane(
-        world_position_covariances(located.poses[right], located.covariances[right]), level
-    )
+    found = located.poses[right]
+    world = world_position_covariances(found, located.covariances[right])
+    covariances = in_plane(world, level)
     factor = exaggeration(covariances, span)
-    ellipses = outlines(located.poses[right, :3, 3] @ level.T, covariances, factor)
     rows = thinned(len(located.landmarks), _MAX_LANDMARKS)
+    around = outlines(found[:, :3, 3] @ level.T, covariances, factor)
     traces: list[Any] = [
         dots("landmarks", located.landmarks[rows] @ level.T, GREY, 3.0),
         line("drive of the map", located.path[:, :3, 3] @ level.T, GREY, 1.5),
-        line("uncertainty", ellipses, colour(0), 1.0),
+        line("uncertainty", around, colour(0), 1.0),
     ]
     for number, name, poses, symbol in (
-        (0, "found", located.poses[right], "circle"),
+        (0, "found", found, "circle"),
         (1, "found, but false", located.poses[located.false], "circle"),
         (4, "refused", located.truth[~located.found & known], "x-thin-open"),
     ):
@@ -208,9 +202,8 @@ def located_figure(located: Located, key: str, heading: str) -> Figure:
             traces.append(dots(name, at, colour(number), 7.0, symbol, legendgroup=name))
             ticks = np.stack([at, at + _HEADING * span * ahead], axis=1)
             traces.append(line(name, ticks, colour(number), 1.5, group=name))
-    astray = located.false & known
-    if astray.any():
-        ends = np.stack([located.poses[astray, :3, 3], located.truth[astray, :3, 3]], axis=1)
+    if (wrong := located.false & known).any():
+        ends = np.stack([located.poses[wrong, :3, 3], located.truth[wrong, :3, 3]], axis=1)
         traces.append(line("to the true pose", ends @ level.T, colour(1), 1.0))
     return Figure(
         key,
@@ -296,11 +289,10 @@ def local_map_figure(
         path = np.vstack([np.zeros((1, 2)), truth.robots[:, :2] / truth.leg_m])
         always.append(line("true path", _upwards(path), INK, 1.4, "dash"))
     # Axes that do not jump from moment to moment; far features may lie outside.
-    points = [np.array([[0.0, 0.0], [1.0, 0.0]])]
-    points += [np.vstack([e.landmarks, e.robot[None, :2], e.target[None, :2]]) for e in estimates]
-    every = np.vstack(points)
-    seen = _upwards(every[np.isfinite(every).all(axis=1)])
-    low, high = np.percentile(seen, _HOMING_BULK, axis=0)
+    points = [[[0.0, 0.0], [1.0, 0.0]], *(e.landmarks for e in estimates)]
+    points += [[e.robot[:2], e.target[:2]] for e in estimates]
+    every = _upwards(np.vstack(points))
+    low, high = np.percentile(every[np.isfinite(every).all(axis=1)], _HOMING_BULK, axis=0)
     margin = 0.1 * (high - low) + 0.2
     ranges = np.column_stack([low - margin, high + margin]).tolist()
     figure = plane(always, ranges, "right (legs)", "ahead (legs)")
@@ -324,13 +316,9 @@ def _moment(
     estimates: Sequence[HomingEstimate], row: int, truth: HomingTruth | None
 ) -> Iterator[Any]:
     now = estimates[row]
-    features = dots("features", _upwards(now.landmarks), GREY, 8.0, "diamond-open")
-    yield features.update(
-        mode="markers+text",
-        text=[str(identity) for identity in now.ids.tolist()],
-        textposition="top right",
-        textfont={"size": 9},
-    )
+    names = {"text": [*map(str, now.ids.tolist())], "textfont": {"size": 9}}
+    place = {"mode": "markers+text", "textposition": "top right"}
+    yield dots("features", _upwards(now.landmarks), GREY, 8.0, "diamond-open", **place, **names)
     yield dots("lost features", _upwards(_lost(estimates, row)), GREY, 7.0, "star")
     known = np.isfinite(now.landmark_covariances).all(axis=(1, 2))
     around = outlines(now.landmarks[known], now.landmark_covariances[known])
@@ -386,7 +374,40 @@ def drive_figure(
     drive: Drive, key: str = "drive", heading: str = "The drive, from above"
 ) -> Figure:
     """The true trajectory past its targets, and the robot at each moment."""
-    rows = thinned(len(drive.time), _DRIVE_MOMENTS)
+    traces = []
+    if drive.outlines:
+        gap = np.full((1, 2), np.nan)
+        walls = np.vstack([part for one in drive.outlines for part in (one, gap)])
+        traces.append(line("walls", walls, GREY, 1.0))
+    places = drive.targets[:, :2]
+    circle = PASS_RADIUS_M * _unit(np.linspace(0.0, 2.0 * np.pi, 25))
+    ticks = np.stack([places, places + _TICK_M * _unit(drive.targets[:, 2])], axis=1)
+    numbers: dict[str, Any] = {"text": [str(i + 1) for i in range(len(places))]}
+    numbers |= {"mode": "markers+text", "textposition": "top right", "legendgroup": "targets"}
+    traces += [
+        line("targets", places[:, None] + circle, INK, 1.0, group="targets"),
+        line("targets", ticks, INK, 1.0, group="targets"),
+        dots("targets", places, INK, 10.0, "square-open", **numbers),
+    ]
+    rows = thinned(len(drive.time), _MAX_POSES)
+    for leg in np.unique(drive.legs[rows]).tolist():
+        inside = np.flatnonzero(drive.legs[rows] == leg)
+        # The first pose of the next leg belongs to both, else the path has gaps.
+        last = min(inside[-1] + 1, len(rows) - 1)
+        own, hover = drive.poses[rows[inside[0] : last + 1], :2], {"hovertemplate": HOVER_PLACE}
+        traces.append(line(f"leg {leg + 1}", own, colour(leg), hoverinfo=None, **hover))
+    moments = []
+    for row in (shown := thinned(len(drive.time), _DRIVE_MOMENTS)).tolist():
+        place, leg = drive.poses[row, :2], colour(int(drive.legs[row]))
+        ahead = np.array([place, place + _TICK_M * _unit(drive.poses[row, 2])])
+        home = np.array([place, place + 2.0 * _TICK_M * _unit(drive.headings[row])])
+        moments.append(
+            [
+                line("robot", ahead, leg, 4.0, group="robot"),
+                dots("robot", place[None], leg, 12.0, legendgroup="robot"),
+                line("direction of home", home, leg, 2.0, "dot"),
+            ]
+        )
     return Figure(
         key,
         heading,
@@ -394,45 +415,11 @@ def drive_figure(
         f"were taken, with a tick ahead and a circle of {PASS_RADIUS_M:g} m. The robot's arrow "
         "points where the estimator says that the target lies. Grey: walls and furniture.",
         _with_moments(
-            plane((*_surroundings(drive), *_legs(drive)), x="x (m)", y="y (m)"),
-            [list(_robot(drive, int(row))) for row in rows],
-            [f"{drive.time[int(k)] - drive.time[0]:.1f} s" for k in rows],
+            plane(traces, x="x (m)", y="y (m)"),
+            moments,
+            [f"{seconds - drive.time[0]:.1f} s" for seconds in drive.time[shown]],
         ),
     )
-
-
-def _surroundings(drive: Drive) -> Iterator[Any]:
-    if drive.outlines:
-        gap = np.full((1, 2), np.nan)
-        walls = np.vstack([part for one in drive.outlines for part in (one, gap)])
-        yield line("walls", walls, GREY, 1.0)
-    places = drive.targets[:, :2]
-    circle = PASS_RADIUS_M * _unit(np.linspace(0.0, 2.0 * np.pi, 25))
-    ticks = np.stack([places, places + _TICK_M * _unit(drive.targets[:, 2])], axis=1)
-    yield line("targets", places[:, None] + circle, INK, 1.0, group="targets")
-    yield line("targets", ticks, INK, 1.0, group="targets")
-    squares = dots("targets", places, INK, 10.0, "square-open", legendgroup="targets")
-    numbers = [str(i + 1) for i in range(len(places))]
-    yield squares.update(mode="markers+text", text=numbers, textposition="top right")
-
-
-def _legs(drive: Drive) -> Iterator[Any]:
-    rows = thinned(len(drive.time), _MAX_POSES)
-    for leg in np.unique(drive.legs[rows]).tolist():
-        inside = np.flatnonzero(drive.legs[rows] == leg)
-        # The first pose of the next leg belongs to both, else the path has gaps.
-        last = min(inside[-1] + 1, len(rows) - 1)
-        own = drive.poses[rows[inside[0] : last + 1], :2]
-        yield line(f"leg {leg + 1}", own, colour(leg), hoverinfo=None, hovertemplate=HOVER_PLACE)
-
-
-def _robot(drive: Drive, row: int) -> Iterator[Any]:
-    place, leg = drive.poses[row, :2], colour(int(drive.legs[row]))
-    ahead = np.array([place, place + _TICK_M * _unit(drive.poses[row, 2])])
-    yield line("robot", ahead, leg, 4.0, group="robot")
-    yield dots("robot", place[None], leg, 12.0, legendgroup="robot")
-    home = np.array([place, place + 2.0 * _TICK_M * _unit(drive.headings[row])])
-    yield line("direction of home", home, leg, 2.0, "dot")
 
 
 def catchment_figure(
@@ -447,17 +434,18 @@ def catchment_figure(
         key: unique in the page.
     """
     hover = "%{text}<br>%{y:.2f} m ahead, %{x:.2f} m right<extra></extra>"
-    traces: list[Any] = []
+    traces: list[Any] = [dots("target", np.zeros((1, 2)), GREY, 14.0, "square-open")]
     for number, name, which, symbol in (
         (0, "arrived", succeeded, "circle"),
         (1, "did not arrive", ~succeeded, "x-thin-open"),
     ):
         if which.any():
             texts = [html.escape(text) for text, kept in zip(labels, which, strict=True) if kept]
-            starts = dots(name, _upwards(offsets[which]), colour(number), 9.0, symbol)
-            traces.append(starts.update(text=texts, hovertemplate=hover))
-    if traces:
-        traces.insert(0, dots("target", np.zeros((1, 2)), GREY, 14.0, "square-open"))
+            style = {"text": texts, "hovertemplate": hover}
+            at = _upwards(offsets[which])
+            traces.append(dots(name, at, colour(number), 9.0, symbol, **style))
+    if not len(offsets):
+        traces = []
     return Figure(
         key,
         "From where homing succeeds",
@@ -506,19 +494,19 @@ def network_figure(
     for kind in links:
         if kind.pairs:
             ends = places[np.array(kind.pairs, np.int64).reshape(-1, 2)]
-            name, texts = f"{kind.name} ({len(kind.pairs)})", [*map(html.escape, kind.texts)]
+            name, tint = f"{kind.name} ({len(kind.pairs)})", colour(kind.colour)
             of: dict[str, Any] = {"legendgroup": kind.name, "shown": kind.shown}
-            traces.append(line(name, ends, colour(kind.colour), 1.4, **of))
-            middle = dots(name, ends.mean(axis=1), colour(kind.colour), 4.0, **of)
-            traces.append(middle.update(text=texts, hovertemplate=_HOVER_TEXT, showlegend=False))
-    nodes = dots("views", places, INK, 9.0, "square", mode="markers+text")
-    texts = [*map(html.escape, names)]
-    nodes.update(text=texts, textposition="top center", hovertemplate=_HOVER_TEXT)
+            traces.append(line(name, ends, tint, 1.4, **of))
+            of |= {"text": [*map(html.escape, kind.texts)], "hovertemplate": _HOVER_TEXT}
+            traces.append(dots(name, ends.mean(axis=1), tint, 4.0, showlegend=False, **of))
+    texts = {"text": [*map(html.escape, names)], "textposition": "top center"}
+    style = {"mode": "markers+text", "hovertemplate": _HOVER_TEXT}
+    nodes = dots("views", places, INK, 9.0, "square", **texts, **style)
     out = plane((*traces, nodes), x=axes[0], y=axes[1])
     if not any(axes):
         out.update_xaxes(showticklabels=False).update_yaxes(showticklabels=False)
-    key, heading, description = words
-    return Figure(f"drive-{key}", heading, description, out)
+    key, *rest = words
+    return Figure(f"drive-{key}", *rest, out)
 
 
 def unfolded(count: int, pairs: Sequence[tuple[int, int]]) -> FloatArray:
