@@ -95,7 +95,10 @@ def claimed_against_true(
     """Errors in degrees against the stated standard deviations, one cloud a series."""
     if not any(map(len, claimed.values())):
         claimed = {}
-    style = {"opacity": 0.75, "hovertemplate": "stated %{x:.2f}°, true %{y:.2f}°<extra></extra>"}
+    style: dict[str, Any] = {
+        "opacity": 0.75,
+        "hovertemplate": "stated %{x:.2f}°, true %{y:.2f}°<extra></extra>",
+    }
     traces: list[Any] = [
         dots(name, np.column_stack([sigma, np.abs(true[name])]), colour(i), 6.0, **style)
         for i, (name, sigma) in enumerate(claimed.items())
@@ -289,8 +292,8 @@ def local_map_figure(
         path = np.vstack([np.zeros((1, 2)), truth.robots[:, :2] / truth.leg_m])
         always.append(line("true path", _upwards(path), INK, 1.4, "dash"))
     # Axes that do not jump from moment to moment; far features may lie outside.
-    points = [[[0.0, 0.0], [1.0, 0.0]], *(e.landmarks for e in estimates)]
-    points += [[e.robot[:2], e.target[:2]] for e in estimates]
+    points = [np.array([[0.0, 0.0], [1.0, 0.0]]), *(e.landmarks for e in estimates)]
+    points += [np.array([e.robot[:2], e.target[:2]]) for e in estimates]
     every = _upwards(np.vstack(points))
     low, high = np.percentile(every[np.isfinite(every).all(axis=1)], _HOMING_BULK, axis=0)
     margin = 0.1 * (high - low) + 0.2
@@ -394,8 +397,8 @@ def drive_figure(
         inside = np.flatnonzero(drive.legs[rows] == leg)
         # The first pose of the next leg belongs to both, else the path has gaps.
         last = min(inside[-1] + 1, len(rows) - 1)
-        own, hover = drive.poses[rows[inside[0] : last + 1], :2], {"hovertemplate": HOVER_PLACE}
-        traces.append(line(f"leg {leg + 1}", own, colour(leg), hoverinfo=None, **hover))
+        own, hover = drive.poses[rows[inside[0] : last + 1], :2], HOVER_PLACE
+        traces.append(line(f"leg {leg + 1}", own, colour(leg), hoverinfo=None, hovertemplate=hover))
     moments = []
     for row in (shown := thinned(len(drive.time), _DRIVE_MOMENTS)).tolist():
         place, leg = drive.poses[row, :2], colour(int(drive.legs[row]))
@@ -505,8 +508,8 @@ def network_figure(
     out = plane((*traces, nodes), x=axes[0], y=axes[1])
     if not any(axes):
         out.update_xaxes(showticklabels=False).update_yaxes(showticklabels=False)
-    key, *rest = words
-    return Figure(f"drive-{key}", *rest, out)
+    key, heading, description = words
+    return Figure(f"drive-{key}", heading, description, out)
 
 
 def unfolded(count: int, pairs: Sequence[tuple[int, int]]) -> FloatArray:

@@ -1,11 +1,11 @@
-"""The experiments that `fgslam teach`, `follow` and `join` are; what `fgslam route` says."""
+"""A recording as an experiment; routes to teach, follow and join; the shortest way on a map."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from math import degrees, isnan
 from pathlib import Path
@@ -29,9 +29,6 @@ from fgslam.runs.config import (
 from fgslam.runs.named_experiments import find_experiment, suggestion
 
 if TYPE_CHECKING:
-    from fgslam.core.log import ImageSequence
-    from fgslam.datasets.clock import Judged
-    from fgslam.homing.links import Link
     from fgslam.homing.topological_map import MapPlace, RouteMap
 
 
@@ -74,26 +71,48 @@ def bare_experiment(
     Raises:
         FgslamError: the layout is not known, or the recording cannot be opened.
     """
+    from fgslam.datasets.clock import Judged, judged_turns
+    from fgslam.datasets.recording import Recording
     from fgslam.runs.opening import open_sequence  # loads arrays; a configuration needs none
 
-    overrides = tuple(overrides)
+    overrides, where = tuple(overrides), str(folder)
     values: dict[str, Any] = {
         "name": _name(folder),
         "dataset": dataset_of(folder, camera, overrides),
         "odometry": {"kind": "recorded"},
         "estimator": {"kind": DEFAULT_ESTIMATOR},
     }
-    where = str(folder)
     sequence = open_sequence(make_config(values, where, overrides))
-    judged = _judged_odometry(sequence, overrides)
-    if judged.fault or not has_odometry(sequence):
+    asked = any(each.partition("=")[0].strip().startswith("odometry.") for each in overrides)
+    # What the images show of the odometry; an override knows better.
+    judged = Judged()
+    if isinstance(sequence, Recording) and not asked:
+        judged = judged_turns(sequence)
+    steps = [sequence.odometry(i) for i in range(1, len(sequence))]
+    known = [step for step in steps if step is not None]
+    if judged.fault or not known:
         values["odometry"] = {"kind": "constant_velocity"}
     elif judged.time_offset_s:
         values["odometry"]["time_offset_s"] = judged.time_offset_s
     if (noise := getattr(sequence, "disparity_sigma_px", None)) is not None:
         values["frontend"] = {"stereo": {"disparity_sigma_px": noise}}
     config = make_config(values, where, overrides)
-    return Bare(values, config, _said(config, sequence, judged.note))
+    rig, stamps = sequence.rig, sequence.timestamps
+    duration = float(stamps[-1] - stamps[0])
+    rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
+    lenses = ", unrectified" if getattr(sequence, "unrectified", False) else ""
+    motion = {
+        "recorded": "a gyroscope, no odometry" if known and known[0].turned else "odometry",
+        "constant_velocity": "no odometry",
+    }.get(config.odometry.kind, config.odometry.kind)
+    truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
+    line = (
+        f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "
+        f"{rig.width}x{rig.height}{lenses}; {len(stamps)} frames{rate}; {motion}{truth}; "
+        f"estimator {config.estimator.kind}"
+    )
+    notes = [f"note: {note}" for note in (*sequence.notes, judged.note) if note]
+    return Bare(values, config, "\n".join([line, *notes]))
 
 
 def experiment_of(
@@ -137,34 +156,11 @@ def short_config(folder: Path, camera: Path | None = None, overrides: Iterable[s
     return f"# {said}\n{yaml.safe_dump(values, sort_keys=False)}"
 
 
-def has_odometry(sequence: ImageSequence) -> bool:
-    """Whether any step of the recording has odometry. Raises OdometryError where it is damaged."""
-    return any(sequence.odometry(i) is not None for i in range(1, len(sequence)))
-
-
-def _judged_odometry(sequence: ImageSequence, overrides: tuple[str, ...]) -> Judged:
-    """What the images say of the odometry; nothing where an override says more."""
-    from fgslam.datasets.clock import Judged, judged_turns
-    from fgslam.datasets.recording import Recording
-
-    asked = any(each.partition("=")[0].strip().startswith("odometry.") for each in overrides)
-    if asked or not isinstance(sequence, Recording):
-        return Judged()
-    return judged_turns(sequence)
-
-
-def _odometry_in_words(sequence: ImageSequence) -> str:
-    steps = (sequence.odometry(i) for i in range(1, len(sequence)))
-    known = [step for step in steps if step is not None]
-    return "a gyroscope, no odometry" if known and known[0].turned else "odometry"
-
-
 def _name(recording: Path) -> str:
     """Of a folder its name, of a file its name without ending."""
     path = recording.resolve()
-    return (
-        _NOT_IN_NAMES.sub("_", path.name if path.is_dir() else path.stem).strip("_") or "recording"
-    )
+    stem = path.name if path.is_dir() else path.stem
+    return _NOT_IN_NAMES.sub("_", stem).strip("_") or "recording"
 
 
 def dataset_of(folder: Path, camera: Path | None, overrides: tuple[str, ...]) -> dict[str, str]:
@@ -173,61 +169,30 @@ def dataset_of(folder: Path, camera: Path | None, overrides: tuple[str, ...]) ->
     Raises:
         FgslamError: the layout is not known, or cannot take that calibration or rate.
     """
-    dataset = recognise_layout(folder, _asked_kind(overrides))
-    if _asked(overrides, "dataset.fps") and "fps" not in _fields(dataset["kind"]):
+    asked = {key.strip(): value.strip() for key, _, value in (o.partition("=") for o in overrides)}
+    kind = asked.get("dataset.kind")
+    if kind is not None and kind not in LAYOUTS:
         raise ConfigError(
-            f"{folder}: {LAYOUTS[dataset['kind']].name} states its own times; leave --fps out, "
-            "--stride uses fewer frames"
+            f"dataset.kind={kind} is no layout of a folder of images; use one of "
+            f"{', '.join(LAYOUTS)}"
+        )
+    dataset = recognise_layout(folder, kind)
+    name, settings = LAYOUTS[dataset["kind"]].name, _SETTINGS[dataset["kind"]]
+    if "dataset.fps" in asked and "fps" not in settings.__dataclass_fields__:
+        raise ConfigError(
+            f"{folder}: {name} states its own times; leave --fps out, --stride uses fewer frames"
         )
     if camera is None:
         return dataset
-    if not issubclass(_SETTINGS[dataset["kind"]], CalibratedSettings):
-        raise ConfigError(
-            f"{folder}: {LAYOUTS[dataset['kind']].name} holds its own calibration; leave --camera "
-            "out"
-        )
+    if not issubclass(settings, CalibratedSettings):
+        raise ConfigError(f"{folder}: {name} holds its own calibration; leave --camera out")
     if not camera.exists():
         raise DatasetError(f"{camera}: no such calibration file; check --camera")
     return {**dataset, "camera_file": str(camera)}
 
 
-def _asked_kind(overrides: tuple[str, ...]) -> str | None:
-    """The layout that an override names; None where none does."""
-    asked = _asked(overrides, "dataset.kind")
-    if asked and asked[-1] not in LAYOUTS:
-        raise ConfigError(
-            f"dataset.kind={asked[-1]} is no layout of a folder of images; use one of "
-            f"{', '.join(LAYOUTS)}"
-        )
-    return asked[-1] if asked else None
-
-
-def _fields(kind: str) -> set[str]:
-    return {field.name for field in fields(_SETTINGS[kind])}
-
-
-def _asked(overrides: tuple[str, ...], key: str) -> list[str]:
-    """Values that overrides give to a key."""
-    pairs = [override.partition("=") for override in overrides]
-    return [value.strip() for name, _, value in pairs if name.strip() == key]
-
-
-def _said(config: ExperimentConfig, sequence: ImageSequence, more: str) -> str:
-    rig, stamps = sequence.rig, sequence.timestamps
-    duration = float(stamps[-1] - stamps[0])
-    rate = f" at {(len(stamps) - 1) / duration:.3g} Hz" if duration > 0.0 else ""
-    lenses = ", unrectified" if getattr(sequence, "unrectified", False) else ""
-    motion = {"recorded": _odometry_in_words(sequence), "constant_velocity": "no odometry"}
-    truth = "" if sequence.ground_truth is None else "; truth, for evaluation only"
-    line = (
-        f"{sequence.name}: {LAYOUTS[config.dataset.kind].name}, {rig.cameras} cameras "
-        f"{rig.width}x{rig.height}{lenses}; {len(stamps)} frames{rate}; "
-        f"{motion.get(config.odometry.kind, config.odometry.kind)}{truth}; estimator "
-        f"{config.estimator.kind}"
-    )
-    return "\n".join(
-        (line, *(f"note: {note}" for note in (*sequence.notes, *filter(None, [more]))))
-    )
+# ------------------------------------------------------------------------------------------
+# Routes
 
 
 def teaching(
@@ -251,7 +216,7 @@ def teaching(
         )
     values = {
         "task": "teach",
-        "name": f"teach_{_named(recording)}",
+        "name": f"teach_{_name(recording)}",
         "dataset": _dataset(recording, camera),
         "route": str(route),
     }
@@ -268,7 +233,7 @@ def following(
     """
     values = {
         "task": "follow",
-        "name": f"follow_{_named(recording)}",
+        "name": f"follow_{_name(recording)}",
         "dataset": _dataset(recording, camera or "equirectangular"),
         "route": str(route),
         "taught_camera": camera is None,
@@ -280,7 +245,7 @@ def joining(routes: Sequence[Path], out: Path, overrides: Iterable[str] = ()) ->
     """The experiment that joins routes into the map ``out``. Raises ConfigError."""
     values = {
         "task": "join",
-        "name": f"join_{_named(out)}",
+        "name": f"join_{_name(out)}",
         "routes": [str(route) for route in routes],
         "map": str(out),
     }
@@ -321,7 +286,17 @@ def way_said(
         near = f"near {place.name}, {place.inliers} features in common"
         lines.append(f"{start}: {f'at {place.name}' if place.at else near}")
         way = joined.way(place, goal)
-    lines += [f"{len(way)} path images:", *_legs(joined, way.names)]
+    lines += [f"{len(way)} path images:", f"  {way.names[0]}"]
+    for before, name in pairwise(way.names):
+        link = joined.link(before, name)
+        if not link.support:
+            seen = "driven before, but without a homing vector"
+        elif isnan(link.direction):
+            seen = "the same place"
+        else:
+            at = round(degrees(link.direction))
+            seen = f"at {at} degrees, {link.support} features in common"
+        lines.append(f"  {name}: {seen}")
     if out is not None:
         way.save(out)
         lines.append(f"written as a route: {out}")
@@ -346,35 +321,12 @@ def _place(joined: RouteMap, picture: Path, camera: str | None) -> MapPlace:
     return place
 
 
-def _legs(joined: RouteMap, names: tuple[str, ...]) -> list[str]:
-    """A line for each path image: its name, and where it lies as seen from the one before."""
-    links = (joined.link(before, name) for before, name in pairwise(names))
-    return [
-        f"  {names[0]}",
-        *(f"  {name}: {_seen(link)}" for name, link in zip(names[1:], links, strict=True)),
-    ]
-
-
-def _seen(link: Link) -> str:
-    if not link.support:
-        return "driven before, but without a homing vector"
-    if isnan(link.direction):
-        return "the same place"
-    return f"at {round(degrees(link.direction))} degrees, {link.support} features in common"
-
-
-def _named(recording: Path) -> str:
-    return _NOT_IN_NAMES.sub("_", recording.resolve().stem).strip("_") or "recording"
-
-
 def _dataset(recording: Path, camera: str) -> dict[str, Any]:
     from fgslam.cameras.omni_files import camera_keys  # loads arrays
 
     if not recording.exists():
         raise DatasetError(f"{recording}: no such film or folder; check the path")
     keys = camera_keys(camera)
-    panoramas = keys["kind"] == "equirectangular"
-    kind = "panoramas" if panoramas else "omni_path"
-    if recording.is_file():
-        kind = "omni_video"
+    panoramas = "panoramas" if keys["kind"] == "equirectangular" else "omni_path"
+    kind = "omni_video" if recording.is_file() else panoramas
     return {"kind": kind, "path": str(recording), "camera": keys}
