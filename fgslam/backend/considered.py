@@ -99,7 +99,7 @@ class ErrorColumns:
 
     # ----------------------------------------------------------------------------------------
 
-    def _append(self, values: StateArrays) -> None:
+    def append(self, values: StateArrays) -> None:
         """Landmarks (k,) that are not there yet; their identities ascend."""
         ids = values["ids"]
         if not len(ids):
@@ -124,7 +124,7 @@ class ErrorColumns:
         places = np.minimum(np.searchsorted(have, ids), len(have) - 1)
         return places, np.asarray(have[places] == ids)
 
-    def _rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
+    def rows(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
         """(k,) rows of landmarks in the map, and which of them are there."""
         places, known = self._places(ids)
         return (self._order["row"][places] if known.any() else places), known
@@ -133,11 +133,11 @@ class ErrorColumns:
         """(k, 3, m) columns of landmarks, as far as they are reported."""
         if self._held:
             return np.zeros((len(ids), *self._map["gain"].shape[1:]))
-        return self._of("gain", ids)
+        return self.kept("gain", ids)
 
-    def _of(self, name: str, ids: IntArray) -> FloatArray:
+    def kept(self, name: str, ids: IntArray) -> FloatArray:
         """(k, ...) what is kept of landmarks under a name; zero of unknown ones."""
-        rows, known = self._rows(ids)
+        rows, known = self.rows(ids)
         kept = self._map[name]
         out = np.zeros((len(ids), *kept.shape[1:]))
         out[known] = kept[rows[known]]
@@ -249,7 +249,7 @@ class ConsiderCovariance(ErrorColumns):
         kept = increment.observations.select(~increment.rejected)
         near = kept.measurement[:, 2] > _LEAST_DISPARITY_PX
         seen = _Linearised.of(rig, self._terms, kept.select(near), wTc)
-        rows, known = self._rows(seen.ids)
+        rows, known = self.rows(seen.ids)
         if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
             basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
             self._gain = seen.select(known).pose_gain(*self._at(rows[known]), basis)
@@ -276,7 +276,7 @@ class ConsiderCovariance(ErrorColumns):
         covariance = self._terms.covariance
         if covariance is None or self._held:
             return known
-        gain = self._of("gain", known.ids)
+        gain = self.kept("gain", known.ids)
         more = gain @ covariance @ np.swapaxes(gain, 1, 2)
         return dataclasses.replace(known, covariances=known.covariances + more)
 
@@ -306,7 +306,7 @@ class ConsiderCovariance(ErrorColumns):
         if len(seen.ids):
             gain = np.linalg.solve(seen.by_point, seen.off(self._gain))
             information = seen.landmark_information()[1]
-            self._append({"ids": seen.ids, "gain": gain, "information": information})
+            self.append({"ids": seen.ids, "gain": gain, "information": information})
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -513,10 +513,10 @@ class SampledErrors(ErrorColumns):
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
         moved = carried @ self._gain
-        moved[:, self._count :] += _root(noise) @ self._signs(1, 6)[0]
-        columns = self._columns(wTc, problem)
+        moved[:, self._count :] += symmetric_root(noise) @ self._signs(1, 6)[0]
+        columns = self.linearised(wTc, problem)
         self._enter(used.ids, columns, problem.point_covariances, moved)
-        rows, _ = self._rows(used.ids)
+        rows, _ = self.rows(used.ids)
         self._seen = rows, columns, self._map["gain"][rows].astype(np.float64)
         self._gain = self._on_floor(wTc, moved)
         if step.measured:
@@ -537,8 +537,8 @@ class SampledErrors(ErrorColumns):
             points = transform_to_camera(wTc, placed.points)
             near = in_front(points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
             gain = np.zeros((len(ids), 3, self._count + SAMPLES))
-            gain[near] = self._columns(wTc, placed.select(near)).placed(self._gain)
-            self._append({"ids": ids, "gain": gain})
+            gain[near] = self.linearised(wTc, placed.select(near)).placed(self._gain)
+            self.append({"ids": ids, "gain": gain})
 
     def close(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, moved: Moved
@@ -553,7 +553,7 @@ class SampledErrors(ErrorColumns):
         """
         if self._off:
             return
-        rows, known = self._rows(landmarks.ids)
+        rows, known = self.rows(landmarks.ids)
         self._map["gain"][rows[known]] = moved.rotations[known] @ self._map["gain"][rows[known]]
         apart = adjoint(wTc) @ (self._gain - self._returned(loop, landmarks, wTc, moved.homes))
         self._gain = self._on_floor(
@@ -603,7 +603,8 @@ class SampledErrors(ErrorColumns):
 
     # ----------------------------------------------------------------------------------------
 
-    def _columns(self, wTc: FloatArray, seen: PoseProblem) -> ObservedColumns:
+    def linearised(self, wTc: FloatArray, seen: PoseProblem) -> ObservedColumns:
+        """Matches of a frame at ``wTc``, with the columns of the measurements' errors."""
         points = transform_to_camera(wTc, seen.points)
         projection = projection_jacobian(self._sensor, points)
         shift = np.zeros((len(seen), 3, self._count + SAMPLES))
@@ -632,35 +633,35 @@ class SampledErrors(ErrorColumns):
 
         Their map was made with the same rig: its terms have them where the pose does.
         """
-        new = ~self._rows(ids)[1]
+        new = ~self.rows(ids)[1]
         if new.any():
             gain = columns.select(new).placed(pose)
             gain[:, :, self._count :] = self._drawn(covariances[new])
-            self._append({"ids": ids[new], "gain": gain})
+            self.append({"ids": ids[new], "gain": gain})
 
     def _returned(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, homes: IntArray
     ) -> FloatArray:
         """Errors (6, m) of the newest pose, at ``wTc``, by the landmarks of an old place."""
         seen = loop.observations
-        seen = seen.select(self._rows(seen.ids)[1] & np.isin(seen.ids, landmarks.ids))
+        seen = seen.select(self.rows(seen.ids)[1] & np.isin(seen.ids, landmarks.ids))
         problem = PoseProblem.of(landmarks, seen)
         ahead = in_front(transform_to_camera(wTc, problem.points))
         if ahead.sum() < _LEAST_PLACING:
             gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
-            gain[:, self._count :] += _root(loop.covariance) @ self._signs(1, 6)[0]
+            gain[:, self._count :] += symmetric_root(loop.covariance) @ self._signs(1, 6)[0]
             return gain
         problem = problem.select(ahead)
-        columns = self._columns(wTc, problem)
+        columns = self.linearised(wTc, problem)
         by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
-        return columns.following(by_measurement, self._of("gain", seen.ids[ahead]))
+        return columns.following(by_measurement, self.kept("gain", seen.ids[ahead]))
 
     def _of_place(self, frame: int, landmarks: LandmarkMap, homes: IntArray) -> FloatArray:
         """Errors (6, m) of a frame's place as a motion of the world, by landmarks first seen there.
 
         Weighted least squares over those whose first frames are nearest; zero where there are none.
         """
-        have = np.flatnonzero(self._rows(landmarks.ids)[1] & (homes >= 0))
+        have = np.flatnonzero(self.rows(landmarks.ids)[1] & (homes >= 0))
         nearest = have[np.argsort(np.abs(homes[have] - frame), kind="stable")][:_PLACE]
         near = landmarks.select(np.sort(nearest))
         by_motion = np.concatenate(
@@ -669,7 +670,7 @@ class SampledErrors(ErrorColumns):
         weights = np.asarray(np.linalg.inv(near.covariances + lacking(near.covariances)))
         turned = np.swapaxes(by_motion, 1, 2) @ weights
         information = (turned @ by_motion).sum(axis=0)
-        pull = (turned @ self._of("gain", near.ids)).sum(axis=0)
+        pull = (turned @ self.kept("gain", near.ids)).sum(axis=0)
         return np.asarray(np.linalg.pinv(information, hermitian=True) @ pull)
 
     def _on_floor(self, wTc: FloatArray, columns: FloatArray) -> FloatArray:
@@ -704,7 +705,7 @@ def lacking(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.where(flat, _PADDING * trace, 0.0)[:, None, None] * np.eye(3))
 
 
-def _root(covariance: FloatArray) -> FloatArray:
+def symmetric_root(covariance: FloatArray) -> FloatArray:
     """(6, 6) symmetric root of a covariance of any rank: it follows rounding as little."""
     variances, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.asarray((directions * np.sqrt(np.maximum(variances, 0.0))) @ directions.T)

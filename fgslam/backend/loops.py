@@ -237,7 +237,7 @@ def _inverses(poses: FloatArray) -> FloatArray:
     return out
 
 
-def _motions(twists: FloatArray) -> FloatArray:
+def rigid_motions(twists: FloatArray) -> FloatArray:
     """Rigid motions (n, 4, 4) of tangent vectors (n, 6), as ``se3_exp`` of each."""
     angle = np.linalg.norm(twists[:, :3], axis=1)[:, None, None]
     cross = skew(twists[:, :3])
@@ -277,7 +277,7 @@ def _between(
     else:
         spread = np.cumsum(errors[1:], axis=0)
         shares = spread @ np.linalg.solve(spread[-1], change)
-        out = begun @ _motions(np.concatenate([np.zeros((1, 6)), shares])) @ poses
+        out = begun @ rigid_motions(np.concatenate([np.zeros((1, 6)), shares])) @ poses
     out[0], out[-1] = first, last
     return np.asarray(out)
 

@@ -444,10 +444,6 @@ def _call_violation(node: ast.Call) -> str | None:
 PRIVATE_IN_TESTS = frozenset(
     {
         "tests/integration/test_lab_sequence.py",
-        "tests/unit/backend/test_error_columns.py",
-        "tests/unit/backend/test_rig_doubt.py",
-        "tests/unit/backend/test_sampled_errors.py",
-        "tests/unit/backend/test_submaps.py",
         "tests/unit/runs/test_sweep_grid.py",
     }
 )

@@ -216,7 +216,7 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
     moved = first.measurement + shifts(RIG, first.measurement, field=True) @ by
     before, after = g.triangulate(RIG, first.measurement), g.triangulate(RIG, moved)
     turned = (after - before) @ drawn(3, frames=12).poses[0][:3, :3].T
-    gain = driven(1)._map["gain"][..., : len(SHARED)] @ by[OF_SHARED]
+    gain = state_of(driven(1))["map/gain"][..., : len(SHARED)] @ by[OF_SHARED]
     np.testing.assert_allclose(gain, turned, rtol=1e-3, atol=1e-4 * np.abs(turned).max())
 
 

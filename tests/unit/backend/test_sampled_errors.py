@@ -19,10 +19,11 @@ from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.sensors import Increment
+from fgslam.core.store import restore, state_of
 from fgslam.core.types import LandmarkMap, Prediction
 from fgslam.evaluation.statistics import landmark_nees, nees, pose_errors, pose_nees, within
 from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import PoseProblem
+from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 FIRST = Prediction(np.eye(4), np.zeros((6, 6)))
 UPDATES = ("pixel", "world", "running_mean", "half")
@@ -133,7 +134,7 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
     update: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All samples are one known error of all measurements, none of the odometry."""
-    original = SampledErrors._columns
+    original = SampledErrors.linearised
 
     def known(
         self: SampledErrors, wTc: FloatArray, seen: PoseProblem
@@ -142,33 +143,35 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
         sights.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
         return sights
 
-    monkeypatch.setattr(SampledErrors, "_columns", known)
-    monkeypatch.setattr(considered, "_root", lambda covariance: np.zeros((6, 6)))
+    monkeypatch.setattr(SampledErrors, "linearised", known)
+    monkeypatch.setattr(considered, "symmetric_root", lambda covariance: np.zeros((6, 6)))
     increments = drawn(2, noise=0.0).increments
     size = 1e-4
     plain = played(increments, update=update)
     moved = played([with_pattern(each, size) for each in increments], update=update)
-    step = g.se3_log(g.inverse(plain._current.wTc) @ moved._current.wTc) / size
-    column = plain._errors._gain[:, -1]
+    step = g.se3_log(g.inverse(plain.predict(None).wTc) @ moved.predict(None).wTc) / size
+    state = state_of(plain)
+    column = state["errors/gain"][:, -1]
     np.testing.assert_allclose(column, step, rtol=0.0, atol=1e-2 * np.abs(step).max())
     before, after = plain.landmarks(), moved.landmarks()
     shift = (after.positions - before.positions) / size
-    columns = plain._errors._of("gain", before.ids)[:, :, -1]
+    np.testing.assert_array_equal(state["errors/order/ids"], before.ids)
+    columns = state["errors/map/gain"][state["errors/order/row"], :, -1]
     np.testing.assert_allclose(columns, shift, rtol=0.0, atol=1e-2 * np.abs(shift).max())
 
 
 def test_covariances_of_few_samples_are_stated_larger_so_that_the_nees_is_right(
     rng: np.random.Generator,
 ) -> None:
-    errors = SampledErrors(
-        LandmarkKalman(RIG, LandmarkKalmanSettings(), FIRST, FREE)._errors._solver
-    )
+    errors = SampledErrors(EgoMotionSolver(RIG, FREE))
+    state = state_of(errors)
     found = []
     for _ in range(400):
-        columns = np.zeros((6, errors._gain.shape[1]))
+        columns = np.zeros_like(state["gain"])
         columns[:, -SAMPLES:] = rng.standard_normal((6, SAMPLES))
         error = rng.standard_normal((1, 6))
-        found.append(nees(error, errors._covariances(columns, 6)[None]).values[0])
+        restore(errors, state | {"gain": columns})
+        found.append(nees(error, errors.pose(FIRST).covariance[None]).values[0])
     assert np.mean(found) / 6.0 == pytest.approx(1.0, abs=0.1)
 
 

@@ -14,11 +14,11 @@ from fgslam.backend.loops import (
     FREE,
     Chain,
     Constraint,
-    _motions,
     changes,
     corrected,
     home_changes,
     nearest_positive,
+    rigid_motions,
     rotated,
     transported,
 )
@@ -224,7 +224,7 @@ def test_many_motions_are_those_of_single_ones(rng: np.random.Generator) -> None
     sizes = np.array([0.0, 1e-9, 5e-4, 2e-3, 0.1, 1.0, 3.0])
     twists = sizes[:, None] * rng.standard_normal((7, 6))
     expected = np.array([g.se3_exp(twist) for twist in twists])
-    np.testing.assert_allclose(_motions(twists), expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(rigid_motions(twists), expected, rtol=0, atol=1e-13)
 
 
 def test_a_doubted_loop_is_overruled_by_loops_that_agree(rng: np.random.Generator) -> None:
