@@ -43,7 +43,6 @@ DEFAULTS: dict[str, EstimatorSettings] = {
 SETTINGS: dict[str, EstimatorSettings] = DEFAULTS | {
     "landmark_kalman_graph, world update": LandmarkKalmanGraphSettings(update="world"),
     "isam2, keyframes": Isam2Settings(keyframe_every=4),
-    "batch, steering": BatchSettings(solve_every=5),
     "batch, gnc": BatchSettings(method="gnc"),
     "landmark_kalman, world update": LandmarkKalmanSettings(update="world"),
     "landmark_kalman, running mean": LandmarkKalmanSettings(update="running_mean"),

@@ -1,19 +1,31 @@
-"""A rig calibrates itself: on a simulated road, with errors of calibration put into its pixels."""
+"""The rig's calibration from the drive."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
+from simulated import assert_same_bits
 
-from fgslam.backend.self_calibration import WINDOW, SelfCalibration, weighed
+from fgslam.backend.self_calibration import (
+    WINDOW,
+    FieldSize,
+    RigEvidence,
+    RigFilter,
+    SelfCalibration,
+    weighed,
+)
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.correction import (
     RigCorrection,
     displacements,
     early_terms,
+    field_displacements,
+    field_modes,
     prior_information,
     term_names,
 )
@@ -22,6 +34,7 @@ from fgslam.core.sensors import (
     CameraRig,
     Increment,
     Observations,
+    measurement_map,
     pixel_covariance,
     pixel_model,
     rig_map,
@@ -31,12 +44,151 @@ from fgslam.core.store import restore, state_of
 from fgslam.core.types import Features
 from fgslam.runs.tasks.slam_results import calibration_note
 
+# ------------------------------------------------------------------------------------------
+# A filter over a rig's correction whose windows all lean with the same field
+
+
+PAIR = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
+FIELD_PX = 0.3
+TERMS, MODES = len(prior_information(PAIR)), field_modes(PAIR)
+
+
+def window(rng: np.random.Generator) -> tuple[RigEvidence, FloatArray, FloatArray]:
+    """What it says, as half a Hessian of terms and modes, and where it would go."""
+    root = rng.standard_normal((TERMS + MODES, TERMS + MODES))
+    root[:, :TERMS] *= 3.0 * np.sqrt(np.diagonal(prior_information(PAIR)))
+    hessian, best = root.T @ root, rng.standard_normal(TERMS + MODES)
+    at = np.concatenate([1e-3 * rng.standard_normal(TERMS), np.zeros(MODES)])
+    score, t = hessian @ (best - at), slice(TERMS)
+    m = slice(TERMS, None)
+    said = RigEvidence(hessian[t, t], score[t], at[t], 50, hessian[t, m], hessian[m, m], score[m])
+    return said, hessian, hessian @ best
+
+
+def test_windows_and_drift_are_those_of_terms_and_modes_estimated_together() -> None:
+    rng, share = np.random.default_rng(0), 0.05
+    filtered = RigFilter.of(PAIR, np.ones(TERMS, np.bool_))
+    factor = filtered.noise_factor
+    prior = block_diag(prior_information(PAIR), np.eye(MODES) / FIELD_PX**2)
+    drift = block_diag(share * np.linalg.inv(prior_information(PAIR)), np.zeros((MODES, MODES)))
+    values, covariance = np.zeros(len(prior)), np.linalg.inv(prior)
+    for _ in range(4):
+        said, hessian, score = window(rng)
+        filtered = filtered.grown(share).after(said)
+        information = np.linalg.inv(covariance + drift)
+        pull = information @ values + score / factor
+        covariance = np.linalg.inv(information + hessian / factor)
+        values = covariance @ pull
+    found = filtered.under(FIELD_PX)
+    unit = found.sigmas
+    together = covariance[:TERMS, :TERMS]
+    np.testing.assert_allclose(found.values / unit, values[:TERMS] / unit, atol=1e-5)
+    np.testing.assert_allclose(
+        found.covariance / np.outer(unit, unit), together / np.outer(unit, unit), atol=1e-6
+    )
+    assert (found.sigmas > 1.05 * filtered.known.sigmas).any()
+    assert filtered.under(0.0) is filtered.known
+
+
+# ------------------------------------------------------------------------------------------
+# How large a field the images of a rig show against each other: fields drawn, and none
+
+
+THREE = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
+SIGMA_PX = 0.3
+FRAMES, LANDMARKS, SIGHTINGS = 30, 60, 5
+
+
+def frames(
+    rig: CameraRig, field_px: float, seed: int, terms: float = 0.0, lasting: float = 0.0
+) -> list[Observations]:
+    """Landmarks that cross the image in some frames, as a rig with a field sees them.
+
+    Args:
+        rig: the cameras.
+        field_px: deviation of the modes.
+        seed: of everything.
+        terms: what its correction is off by, over the prior's deviation.
+        lasting: share of the noise's variance that a landmark keeps.
+    """
+    rng = np.random.default_rng(seed)
+    ratio, cameras = vertical_to_horizontal(rig), rig.cameras
+    model, fuse = pixel_model(cameras, ratio), measurement_map("fused", cameras, ratio)
+    modes = field_px * rng.standard_normal(field_modes(rig))
+    root = np.linalg.cholesky(np.linalg.inv(prior_information(rig)))
+    wrong = terms * root @ rng.standard_normal(len(root))
+    count, size = FRAMES * LANDMARKS, np.array([rig.width, rig.height])
+    starts, moves = rng.uniform(0.0, size, (count, 2)), rng.normal(0.0, 0.03, (count, 2)) * size
+    disparity, born = rng.uniform(2.0, 30.0, count), np.arange(count) // LANDMARKS
+    own = np.sqrt(lasting) * rng.standard_normal((count, 2 * cameras))
+    out = []
+    for frame in range(FRAMES):
+        ids = np.flatnonzero((born <= frame) & (born > frame - SIGHTINGS))
+        places = starts[ids] + (frame - born[ids])[:, None] * moves[ids]
+        exact = np.column_stack([places, disparity[ids]]) @ model.T
+        at = exact.reshape(len(ids), cameras, 2)
+        new = np.sqrt(1.0 - lasting) * rng.standard_normal(exact.shape)
+        moved = exact + field_displacements(rig, at) @ modes + displacements(rig, at) @ wrong
+        moved += SIGMA_PX * (own[ids] + new)
+        pixels = np.full((len(ids), 3, 2), np.nan)
+        pixels[:, :cameras] = moved.reshape(at.shape)
+        noise = np.tile(np.eye(3), (len(ids), 1, 1))
+        out.append(Observations(ids, moved @ fuse.T, noise, pixels, born[ids] == frame))
+    return out
+
+
+def after(rig: CameraRig, seen: list[Observations]) -> FieldSize:
+    size = FieldSize(rig, SIGMA_PX)
+    for each in seen:
+        size.observe(each)
+    return size
+
+
+@pytest.mark.parametrize("rig", [PAIR, THREE], ids=["pair", "three"])
+def test_a_field_is_found_as_large_as_it_is(rig: CameraRig) -> None:
+    found = [after(rig, frames(rig, 0.4, seed)).px for seed in range(3)]
+    assert np.sqrt(np.mean(np.square(found))) == pytest.approx(0.4, rel=0.3), found
+
+
+@pytest.mark.parametrize(
+    ("terms", "lasting"), [(0.0, 0.0), (1.0, 0.0), (0.0, 0.9)], ids=["exact", "turned", "lasting"]
+)
+def test_neither_noise_nor_what_terms_follow_is_a_field(terms: float, lasting: float) -> None:
+    """Noise is one landmark's, even if it lasts; two standard errors are passed by 1 in 20."""
+    found = [after(PAIR, frames(PAIR, 0.0, seed, terms, lasting)).px for seed in range(5)]
+    assert np.sort(found)[-2] == 0.0, found
+    assert np.max(found) < 0.1
+
+
+def test_little_is_no_evidence_and_a_state_continues_to_the_same_bits() -> None:
+    seen = frames(PAIR, 0.4, 1)
+    assert after(PAIR, seen[:5]).px == 0.0
+    whole, first, second = after(PAIR, seen), after(PAIR, seen[:20]), FieldSize(PAIR, SIGMA_PX)
+    restore(second, state_of(first))
+    for each in seen[20:]:
+        second.observe(each)
+    assert whole.px > 0.0
+    assert second.px == whole.px
+    assert_same_bits(state_of(second), state_of(whole))
+
+
+def test_what_not_all_images_show_says_nothing() -> None:
+    seen = frames(THREE, 0.4, 1)
+    blocked = [each.pixels.copy() for each in seen]
+    for pixels in blocked:
+        pixels[:, 2] = np.nan
+    partly = [dataclasses.replace(s, pixels=p) for s, p in zip(seen, blocked, strict=True)]
+    assert after(THREE, partly).px == 0.0
+
+
+# ------------------------------------------------------------------------------------------
+# A rig calibrates itself: on a simulated road, with errors of calibration put into its pixels
+
+
 RIG = CameraRig(620, 190, 360.0, 360.0, 310.0, 92.0, 0.54, None, np.eye(4))
 PATCHES = replace(RIG, places="reference")
 """The same as the default front-end measures with it: by patches of the right image."""
-THREE = CameraRig(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, 0.1, np.eye(4))
 RIGS = {"two cameras": RIG, "patches": PATCHES, "three cameras": THREE}
-SIGMA_PX = 0.3
 NEAR_M, FAR_M = 4.0, 60.0
 
 

@@ -1,0 +1,173 @@
+"""Odometry alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from simulated import RIG, Drive, Simulation, play, play_directly, simulate, tracked_at
+
+from fgslam.backend.filters.dead_reckoning import DeadReckoning
+from fgslam.core import geometry as g
+from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import EstimatorError
+from fgslam.core.types import Prediction
+from fgslam.evaluation.statistics import judge, nees, pose_nees
+
+DRIVE = Drive(frames=10, points=60, odometry_sigma=(1e-3,) * 3 + (2e-3,) * 3)
+PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2
+NO_PRIOR = np.zeros((6, 6))
+
+
+def at(covariance: FloatArray) -> DeadReckoning:
+    return DeadReckoning(RIG, Prediction(np.eye(4), covariance))
+
+
+def drawn(seed: int) -> Simulation:
+    return simulate(DRIVE, np.random.default_rng(seed))
+
+
+def test_the_pose_is_the_product_of_the_motions() -> None:
+    simulation = drawn(1)
+    estimator = at(NO_PRIOR)
+    play(estimator, simulation.increments)
+    expected = np.eye(4)
+    for increment, wTc in zip(
+        simulation.increments, estimator.estimate().trajectory.poses, strict=True
+    ):
+        if increment.odometry is not None:
+            expected = expected @ increment.odometry.motion
+        np.testing.assert_allclose(wTc, expected, rtol=0, atol=1e-12)
+
+
+def test_the_covariance_is_that_of_many_drawn_drives() -> None:
+    """300 drives: NEES of the last pose, which all of them share the truth of."""
+    errors = []
+    estimator = at(NO_PRIOR)
+    for seed in range(300):
+        simulation = simulate(
+            dataclasses.replace(DRIVE, points=1, frames=8), np.random.default_rng(seed)
+        )
+        estimator = at(NO_PRIOR)
+        play(estimator, simulation.increments)
+        estimate = estimator.estimate()
+        errors.append(
+            pose_nees(
+                estimate.trajectory.poses[-1:], estimate.covariances[-1:], simulation.poses[-1:]
+            )
+        )
+    found = judge(errors)
+    assert found is not None
+    assert found.verdict == "consistent", found
+
+
+def joint_error(estimator: DeadReckoning, simulation: Simulation, ids: FloatArray) -> FloatArray:
+    estimate = estimator.estimate()
+    pose = g.se3_log(g.inverse(estimate.trajectory.poses[-1]) @ simulation.poses[-1])
+    landmarks = estimate.landmarks
+    offsets = simulation.points_by_id[ids] - landmarks.positions[landmarks.rows(ids)]
+    return np.concatenate([pose, offsets.ravel()])
+
+
+@pytest.mark.slow
+def test_the_joint_covariance_is_that_of_many_drawn_drives() -> None:
+    """Pose and landmarks of several frames at once: their shared past must be in it."""
+    drive = dataclasses.replace(DRIVE, points=12, miss_rate=0.0, sigma_px=(0.05, 0.05, 0.02))
+    found = []
+    for seed in range(120):
+        rng = np.random.default_rng(1000)  # the points
+        simulation = simulate(dataclasses.replace(drive, noise=0.0), rng)
+        rng = np.random.default_rng(seed)
+        noisy = [
+            dataclasses.replace(
+                increment,
+                odometry=increment.odometry
+                and dataclasses.replace(
+                    increment.odometry,
+                    motion=increment.odometry.motion
+                    @ g.se3_exp(np.array(drive.odometry_sigma) * rng.standard_normal(6)),
+                ),
+                observations=dataclasses.replace(
+                    increment.observations,
+                    measurement=increment.observations.measurement
+                    + np.array(drive.sigma_px)
+                    * rng.standard_normal(increment.observations.measurement.shape),
+                ),
+            )
+            for increment in simulation.increments
+        ]
+        estimator = at(NO_PRIOR)
+        play_directly(estimator, noisy)
+        ids = estimator.landmarks().ids[::3]
+        covariance = estimator.joint_covariance(ids)
+        error = joint_error(estimator, simulation, ids)
+        found.append(nees(error[None], covariance[None]))
+    verdict = judge(found)
+    assert verdict is not None
+    assert verdict.verdict == "consistent", verdict
+
+
+def test_the_joint_covariance_agrees_with_the_marginals_and_is_positive() -> None:
+    estimator = at(PRIOR)
+    simulation = drawn(2)
+    play(estimator, simulation.increments)
+    ids = estimator.landmarks().ids[::-4].copy()  # any order
+    joint = estimator.joint_covariance(ids)
+    np.testing.assert_array_equal(joint, joint.T)
+    last = estimator.estimate().covariances[-1]
+    np.testing.assert_allclose(joint[:6, :6], last, rtol=0, atol=1e-15)
+    for i, block in enumerate(estimator.landmark_covariances(ids)):
+        at_i = slice(6 + 3 * i, 9 + 3 * i)
+        np.testing.assert_array_equal(joint[at_i, at_i], block)
+    assert np.linalg.eigvalsh(joint).min() > 0.0
+    with pytest.raises(KeyError):
+        estimator.joint_covariance(np.array([10**6]))
+
+
+def test_landmarks_stay_where_they_were_first_seen_until_pruned() -> None:
+    simulation = simulate(
+        dataclasses.replace(DRIVE, prune_after=1, miss_rate=0.3), np.random.default_rng(3)
+    )
+    estimator = at(NO_PRIOR)
+    first: dict[int, FloatArray] = {}
+    gone = 0
+    for increment in simulation.increments:
+        play(estimator, [increment])
+        landmarks = estimator.landmarks()
+        for identity, position in zip(landmarks.ids.tolist(), landmarks.positions, strict=True):
+            np.testing.assert_array_equal(first.setdefault(identity, position), position)
+        assert not np.isin(increment.pruned_ids, landmarks.ids).any()
+        gone += len(increment.pruned_ids)
+    assert gone > 5
+
+
+def test_tracked_pose_is_ignored() -> None:
+    simulation = drawn(4)
+    a, b = at(NO_PRIOR), at(NO_PRIOR)
+    play(a, simulation.increments)
+    far = [dataclasses.replace(i, rejected=~i.rejected) for i in simulation.increments]
+    play_directly(b, far)
+    np.testing.assert_array_equal(a.estimate().trajectory.poses, b.estimate().trajectory.poses)
+
+
+def test_a_point_at_infinity_is_no_landmark() -> None:
+    increment = drawn(5).increments[0]
+    measurement = increment.observations.measurement.copy()
+    measurement[0, 2], measurement[1, 2] = 0.0, -0.4
+    seen = dataclasses.replace(increment.observations, measurement=measurement)
+    estimator = at(NO_PRIOR)
+    play(estimator, [dataclasses.replace(increment, observations=seen)])
+    np.testing.assert_array_equal(estimator.landmarks().ids, seen.ids[2:])
+    assert np.isfinite(estimator.landmarks().positions).all()
+
+
+def test_a_frame_without_any_motion_is_refused_and_changes_nothing() -> None:
+    increments = drawn(6).increments
+    estimator = at(NO_PRIOR)
+    play(estimator, increments[:3])
+    blind = dataclasses.replace(increments[3], odometry=None)
+    prediction = estimator.predict(None)
+    with pytest.raises(EstimatorError, match="frame 6: neither odometry nor"):
+        estimator.update(blind, tracked_at(prediction, 0))
+    assert len(estimator.estimate().trajectory) == 3
