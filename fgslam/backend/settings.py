@@ -138,12 +138,7 @@ class FixedLagSettings(GraphSettings):
 
     kind: Literal["fixed_lag"] = "fixed_lag"
     kernel: KernelSettings = KernelSettings("huber", 4.0)
-    lag_frames: Count | None = Field(
-        default=10, description="lag in frames; null: the lag is given in seconds"
-    )
-    lag_s: Positive | None = Field(
-        default=None, description="lag in seconds; used where lag_frames is null"
-    )
+    lag_frames: Count = Field(default=10, description="lag in frames")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -190,9 +185,6 @@ class BatchSettings(GraphSettings):
         default="levenberg_marquardt",
         description="Levenberg-Marquardt with the kernel, or graduated non-convexity "
         "(truncated least squares) without",
-    )
-    solve_every: Index = Field(
-        default=0, description="live: frames between solutions; 0: at the end only"
     )
 
 

@@ -99,10 +99,6 @@ class PermanenceSettings:
     hits: Count = Field(
         default=5, description="least hits of a permanent landmark, and valid_hits (6.1)"
     )
-    when: Literal["running", "saved"] = Field(
-        default="running",
-        description="flag set with the hit (`running`), or on saving (`saved`, 6.2)",
-    )
     blind_below: Share = Field(
         default=0.05, description="below this share of expected landmarks a frame counts no misses"
     )

@@ -46,19 +46,14 @@ class BatchSolver(WholeGraphSolver):
         super().__init__(problem.builder, problem.floor, kernel)
         self._settings = settings
 
-    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+    def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Takes in a frame's initial values; the builder keeps its factors."""
         self.values.insert(new.values)
         self._answer = None
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
-        """The minimum after every `solve_every` frames."""
-        every = self._settings.solve_every
-        if not every or (frame + 1) % every:
-            return None
-        answer = self.solution()
-        self.values.update(self.refined().values)
-        return Smoothed(self.values, Prediction(answer.poses[-1], answer.pose_covariances[-1]))
+        """Never: the minimum is found at loops, and for the answer."""
+        return None
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""

@@ -21,9 +21,9 @@ from fgslam.backend.smoothers.elimination import (
     BlockCholesky,
     Border,
     Bordered,
-    EliminatedBorder,
     GraphMarginals,
     LinearSystem,
+    SolvedSystem,
     block_diagonal,
     reduced,
     with_border,
@@ -753,7 +753,7 @@ class Descent:
         return _after(graph, state, solved)
 
 
-def _after(graph: WholeGraph, state: State, solved: EliminatedBorder) -> tuple[float, State]:
+def _after(graph: WholeGraph, state: State, solved: SolvedSystem) -> tuple[float, State]:
     ahead = state.moved(solved.step())
     return graph.cost(ahead), ahead
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import cho_solve, cho_solve_banded, cholesky_banded, lapack, solve_triangular
@@ -26,7 +26,7 @@ from fgslam.factors.landmark import summed
 # ------------------------------------------------------------------------------------------
 # Sparse systems of poses in blocks of 6 x 6: solved, and inverted where poses are linked
 
-_UNDETERMINED = "the measurements do not determine all variables; no covariances"
+UNDETERMINED = "the measurements do not determine all variables; no covariances"
 _SPARE = 0.3  # of a group's blocks may be zeros that a smaller group would not hold
 
 
@@ -66,7 +66,7 @@ class BlockCholesky:
         n = matrix.shape[0] // 6
         diagonal = matrix.diagonal()
         if not (diagonal > 0.0).all():
-            raise EstimatorError(_UNDETERMINED)
+            raise EstimatorError(UNDETERMINED)
         self._scale = np.sqrt(diagonal).reshape(n, 6)
         links = csr_matrix((np.ones(len(matrix.indices)), matrix.indices, matrix.indptr), (n, n))
         self._place = least_degree(links)
@@ -119,7 +119,7 @@ class BlockCholesky:
                 flat[among[:, None], among] += update
             own, status = lapack.dpotrf(flat[:size, :size], lower=1, clean=1)
             if status != 0:
-                raise EstimatorError(_UNDETERMINED)
+                raise EstimatorError(UNDETERMINED)
             below = flat[size:, :size]
             if len(group.rows):
                 below = solve_triangular(own, below.T, lower=True, check_finite=False).T
@@ -268,35 +268,6 @@ class Border:
         return replace(self, own=self.own + by * np.diag(np.diagonal(self.own)))
 
 
-class EliminatedBorder(Protocol):
-    """A solved system, landmarks (3m) before poses (6n)."""
-
-    @property
-    def system(self) -> Any:
-        """The normal equations (``LinearSystem``)."""
-        ...
-
-    def step(self) -> FloatArray:
-        """From where the graph was linearised to its minimum; (3m + 6n,), then a border."""
-        ...
-
-    def solve(self, gradients: FloatArray) -> FloatArray:
-        """The steps for other gradients (3m + 6n, c)."""
-        ...
-
-    def poses(self) -> FloatArray:
-        """(n, 6, 6) marginals."""
-        ...
-
-    def landmarks(self) -> FloatArray:
-        """(m, 3, 3) marginals."""
-        ...
-
-    def joint(self, pose: int, landmarks: IntArray) -> FloatArray:
-        """Joint covariance (6 + 3k, 6 + 3k) of one pose and landmarks."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Bordered:
     """A solved system with a border more.
@@ -309,13 +280,13 @@ class Bordered:
         moved: (p,) its step; zero of one that is considered, not estimated.
     """
 
-    held: EliminatedBorder
+    held: SolvedSystem
     gain: FloatArray
     covariance: FloatArray
     moved: FloatArray
 
     @staticmethod
-    def of(held: EliminatedBorder, gradient: FloatArray, border: Border) -> Bordered:
+    def of(held: SolvedSystem, gradient: FloatArray, border: Border) -> Bordered:
         """A solved system (its gradient (3m + 6n,)) with the border that was held.
 
         Raises:
@@ -366,7 +337,7 @@ class Bordered:
         return np.asarray(self.held.estimated + gain @ self.covariance @ gain.T)
 
     @property
-    def system(self) -> Any:
+    def system(self) -> LinearSystem:
         """The normal equations."""
         return self.held.system
 
@@ -379,7 +350,6 @@ class Bordered:
 # ------------------------------------------------------------------------------------------
 # Dense symmetric systems: a scaled Cholesky factor, and the inverse in its place
 
-UNDETERMINED = "the measurements do not determine all variables; no covariances"
 _ROUNDING = 16.0 * np.finfo(np.float64).eps  # a pivot that is nothing but rounding
 
 
@@ -772,7 +742,7 @@ class LinearSystem:
         return np.concatenate([self.landmark_gradient, self.pose_gradient])
 
 
-def reduced(system: LinearSystem) -> GraphMarginals | ChainMarginals | Bordered:
+def reduced(system: LinearSystem) -> SolvedSystem:
     """The system with one group of variables eliminated, whichever leaves less to do.
 
     Raises:
@@ -785,7 +755,7 @@ def reduced(system: LinearSystem) -> GraphMarginals | ChainMarginals | Bordered:
 
 def with_border(
     held: GraphMarginals | ChainMarginals,
-) -> GraphMarginals | ChainMarginals | Bordered:
+) -> SolvedSystem:
     """The system with its border, where it has one.
 
     Raises:
@@ -1034,3 +1004,7 @@ def block_diagonal(blocks: FloatArray) -> csr_matrix:
     if not m:
         return csr_matrix((0, 0))
     return bsr_matrix((blocks, np.arange(m), np.arange(m + 1)), (size * m, size * m)).tocsr()
+
+
+SolvedSystem: TypeAlias = GraphMarginals | ChainMarginals | Bordered
+"""A solved system, landmarks (3m) before poses (6n), then a border where it has one."""

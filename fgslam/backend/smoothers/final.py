@@ -25,7 +25,7 @@ from fgslam.backend.persistence import STATED, Fitted
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.bundle import Descent, State, WholeGraph
-from fgslam.backend.smoothers.elimination import Bordered, EliminatedBorder, reduced
+from fgslam.backend.smoothers.elimination import Bordered, SolvedSystem, reduced
 from fgslam.backend.smoothers.graph import (
     Acceptance,
     ClosedLoop,
@@ -299,7 +299,7 @@ class Refined:
         return out
 
     @cached_property
-    def marginals(self) -> EliminatedBorder:
+    def marginals(self) -> SolvedSystem:
         """Of all variables.
 
         Raises:

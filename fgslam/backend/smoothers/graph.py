@@ -626,13 +626,12 @@ class GraphSolver(Protocol):
         """What became of loops, and which landmarks were taken out, in words."""
         ...
 
-    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+    def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Takes in a frame's factors.
 
         Args:
             new: of the frame; the builder keeps them, too.
             landmarks: the tracker's map after that frame.
-            timestamp: of the frame, seconds.
         """
         ...
 

@@ -67,7 +67,7 @@ class Isam2Solver(WholeGraphSolver):
         self.new_values = gtsam.Values()
         self._updated = 0
 
-    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+    def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Keeps a frame's factors for the next update."""
         self._graph.push_back(new.graph)
         self._graph.push_back(self.builder.observation_factors(new.sightings))

@@ -68,13 +68,7 @@ from fgslam.factors.motion import pose_prior
 def fixed_lag_smoother(
     sensor: CameraRig, settings: FixedLagSettings, floor: Floor, prior: Prediction
 ) -> LagSmoother:
-    """Estimator of kind ``fixed_lag``, at the prior pose with an empty map.
-
-    Raises:
-        EstimatorError: neither lag is given.
-    """
-    if settings.lag_frames is None and settings.lag_s is None:
-        raise EstimatorError("fixed_lag: no lag; set estimator.lag_frames or estimator.lag_s")
+    """Estimator of kind ``fixed_lag``, at the prior pose with an empty map."""
     problem = GraphProblem.of(sensor, settings, floor, prior, remember=False)
     return LagSmoother(problem, FixedLagSolver(problem, settings))
 
@@ -87,23 +81,20 @@ class FixedLagSolver:
     def __init__(self, problem: GraphProblem, settings: FixedLagSettings) -> None:
         """An empty window."""
         self.builder, self._floor = problem.builder, problem.floor
-        self._in_seconds = settings.lag_frames is None
-        self._lag = float(settings.lag_frames or settings.lag_s or 0.0)
+        self._lag = settings.lag_frames
         self.window = Window(problem.sensor, problem.builder.kernel)
         self._solved: Solved | None = None
         self._oldest = 0
         self.poses: list[FloatArray] = []
         self._covariances: list[FloatArray] = []
-        self._clock: list[float] = []
         self.remarks: list[str] = []
 
     def pose(self, frame: int) -> Prediction:
         """A frame's pose; final before the lag."""
         return Prediction(self.poses[frame], self._covariances[frame])
 
-    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+    def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Takes in a frame, and lets go what is older than the lag."""
-        self._clock.append(timestamp)
         self.poses.append(np.eye(4))
         self._covariances.append(np.full((6, 6), np.nan))
         self._take(new)
@@ -184,9 +175,6 @@ class FixedLagSolver:
 
     # ----------------------------------------------------------------------------------------
 
-    def _time(self, frame: int) -> float:
-        return self._clock[frame] if self._in_seconds else float(frame)
-
     def _take(self, new: NewFactors) -> None:
         """A frame's pose, landmarks and observations into the window."""
         pose = new.values.atPose3(pose_key(new.frame)).matrix()
@@ -223,9 +211,7 @@ class FixedLagSolver:
 
     def _move_window(self, known: LandmarkMap) -> None:
         """Notes which poses and landmarks have left; landmarks keep their last place."""
-        last = len(self.poses) - 1
-        while self._time(self._oldest) < self._time(last) - self._lag:
-            self._oldest += 1
+        self._oldest = max(self._oldest, len(self.poses) - 1 - self._lag)
         try:
             self.window.let_go_before(self._oldest)
         except (UndeterminedError, np.linalg.LinAlgError) as error:
@@ -345,7 +331,7 @@ class SlidingWindowSolver(WholeGraphSolver):
 
     # -- a frame -----------------------------------------------------------------------------
 
-    def add(self, new: NewFactors, landmarks: LandmarkMap, timestamp: float) -> None:
+    def add(self, new: NewFactors, landmarks: LandmarkMap) -> None:
         """Keeps a frame for the window's next solution."""
         self._answer = None
         self._new.append(new)

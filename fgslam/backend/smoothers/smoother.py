@@ -416,8 +416,7 @@ class Smoother:
     def _add(self, frame: TrackedFrame) -> None:
         landmarks = self.tracker.landmarks()
         self._map.entered(frame.frame, frame.wTc)
-        timestamp = self.inputs[frame.frame].increment.timestamp
-        self.solver.add(self.builder.add(frame, landmarks), landmarks, timestamp)
+        self.solver.add(self.builder.add(frame, landmarks), landmarks)
 
     def _solve(self, entered: TrackedFrame, tracked: TrackedFrame, closes_loop: bool) -> None:
         smoothed = self.solver.solve_if_due(tracked.frame, closes_loop)

@@ -675,7 +675,7 @@ class LandmarkDatabase:
         self._pool.refresh(places, Views.of(features, which, directions, self._frame))
         self._places[rows] = places
         permanence = self._settings.permanence
-        if permanence is not None and permanence.when == "running":
+        if permanence is not None:
             counts = self.hits[rows], self.misses[rows]
             self.permanent[rows] |= self._reliable(*counts, permanence)
 
