@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -31,11 +31,14 @@ _LABEL_WIDTH = 12
 _WIDTH_OF_FILES = 120
 
 
-class Bars:
-    """A bar for each stage of the work, with the time left."""
+class Display:
+    """A bar for each stage of the work, with the time left, and below them a table.
 
-    def __init__(self, console: Console, begin: Callable[[], None] | None = None) -> None:
-        """``begin`` draws them first: not before there is one, as a mistake shall stand alone."""
+    Drawn from the first stage on: before, a mistake shall stand alone.
+    """
+
+    def __init__(self, console: Console) -> None:
+        """Draws on a console, once there is a stage."""
         columns = (
             TextColumn("{task.description:>10}"),
             BarColumn(),
@@ -43,43 +46,44 @@ class Bars:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.drawn = Progress(*columns, console=console)
-        self.tasks: dict[str, TaskID] = {}
-        self._begin = begin or self.drawn.start
+        self.bars = Progress(*columns, console=console)
+        self._live = Live(self.bars, console=console)
+        self._stages: dict[str, TaskID] = {}
 
     def tell(self, what: str, done: int, total: int) -> None:
-        """Shows how much of a stage is done; the first call of it draws its bar."""
-        if not self.tasks:
-            self._begin()
-        if what not in self.tasks:
-            self.tasks[what] = self.drawn.add_task(what, total=total)
-        self.drawn.update(self.tasks[what], completed=done, total=total)
+        """Shows how much of a stage is done."""
+        if not self._stages:
+            self._live.start()
+        if what not in self._stages:
+            self._stages[what] = self.bars.add_task(what, total=total)
+        self.bars.update(self._stages[what], completed=done, total=total)
+
+    def show_table(self, table: TextTable) -> None:
+        """Shows a table in place of the one before, while there is more to come."""
+        self._live.update(Group(self.bars, rich_table(table)))
+
+    def close(self) -> None:
+        """Leaves the bars as they stand, without the table."""
+        if self._stages:
+            self._live.update(self.bars)
+            self._live.stop()
+
+
+@contextmanager
+def display() -> Iterator[Display]:
+    """A display on standard error."""
+    found = Display(Console(stderr=True))
+    try:
+        yield found
+    finally:
+        found.close()
 
 
 @contextmanager
 def progress_bar() -> Iterator[Tell]:
     """A bar on standard error for each stage of the work."""
-    bars = Bars(Console(stderr=True))
-    try:
-        yield bars.tell
-    finally:
-        if bars.tasks:
-            bars.drawn.stop()
-
-
-@contextmanager
-def progress_with_table() -> Iterator[tuple[Tell, Callable[[TextTable], None]]]:
-    """Bars on standard error, and below them a table that changes while there is more to come."""
-    console = Console(stderr=True)
-    live = Live(console=console)
-    bars = Bars(console, live.start)
-    live.update(bars.drawn)
-    try:
-        yield bars.tell, lambda table: live.update(Group(bars.drawn, rich_table(table)))
-    finally:
-        if bars.tasks:
-            live.update(bars.drawn)
-            live.stop()
+    with display() as found:
+        yield found.tell
 
 
 def show(result: RunResult, resume: str = "") -> None:

@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,60 +14,50 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fgslam.cli import options, signals
-from fgslam.cli.calibrate import calibrate_app
-from fgslam.cli.calibrate import camera as camera_app
+from fgslam.cli.calibrate import calibrate_app, camera_app
+from fgslam.cli.options import FrameOptions, RecordingOptions, command
 from fgslam.cli.signals import Tell, stop_flag, stoppable
-from fgslam.core.errors import FgslamError, one_line
+from fgslam.core.errors import ConfigError, FgslamError, one_line
 from fgslam.core.memory import ShortageTold
 from fgslam.runs.named_experiments import experiment_names, find_experiment
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from fgslam.runs.config import Experiment
     from fgslam.runs.engine import RunResult
     from fgslam.runs.folder import ExistingFolder
-    from fgslam.runs.tasks.slam import Watch
+
+EXIT_FAULT = 1
+EXIT_USER = 2
+EXIT_NOT_LOCATED = 3
+
+app = typer.Typer(
+    name="fgslam",
+    help="Stereo, trinocular and omnidirectional SLAM: filters and smoothers on one log.",
+    pretty_exceptions_enable=False,
+)
+app.add_typer(camera_app, name="camera")
+app.add_typer(calibrate_app, name="calibrate")
 
 
-# ------------------------------------------------------------------------------------------
-# The command `fgslam film`
+def _version(wanted: bool) -> None:
+    if wanted:
+        from fgslam.core import __version__
+
+        typer.echo(f"fgslam {__version__}")
+        raise typer.Exit
 
 
-def film(
-    run_folder: options.RunToView,
-    out: Annotated[Path, typer.Argument(metavar="FILE", help="the film, .mp4 or .gif")],
-    estimator: Annotated[
-        str | None, typer.Option(help="whose path and map; default the one that steered")
-    ] = None,
-    taught: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="of a route that was followed: the run folder of fgslam teach (its --report), for "
-            "the pictures of path images",
-        ),
-    ] = None,
-    overwrite: options.Overwrite = False,
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="print it and exit")
+    ] = False,
 ) -> None:
-    """Make a film of a run: images with their matches, next to the map as it grows.
-
-    Of what fgslam follow wrote: images with the path image, its probability, the way home as an
-    arrow, and the command or why there is none.
-    """
-    from fgslam.cli.console import progress_bar
-    from fgslam.runs.view import film_of_run
-
-    with progress_bar() as progress:
-        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite)
-    typer.echo(line)
+    """Filters and smoothers on one measurement log."""
 
 
 # ------------------------------------------------------------------------------------------
 # What the commands that run something share: progress and stop flag, results, exit status
-
-EXIT_FAULT = 1
-EXIT_NOT_LOCATED = 3
 
 
 @contextmanager
@@ -77,18 +67,6 @@ def under_way() -> Iterator[tuple[Tell, Callable[[], bool]]]:
 
     with stop_flag() as stopped, progress_bar() as progress:
         yield stoppable(progress, stopped), stopped
-
-
-@contextmanager
-def watched_by(config: Experiment, live: bool, file: Path | None) -> Iterator[Watch | None]:
-    """What shows a run in the viewer, frame by frame; None without a viewer."""
-    if not live and file is None:
-        yield None
-        return
-    from fgslam.runs.view import watched
-
-    with watched(config, live, file) as watch:
-        yield watch
 
 
 def show_all(results: Sequence[RunResult], resume: str = "") -> None:
@@ -117,227 +95,28 @@ def same_with_resume() -> str:
 
 def existing_folder(overwrite: bool, resume: bool = False) -> ExistingFolder:
     """What to do with results that are there. Raises ConfigError where both were asked for."""
-    from fgslam.core.errors import ConfigError
-
     if overwrite and resume:
         raise ConfigError("--overwrite and --resume exclude each other; give one of them")
     return "resume" if resume else "overwrite" if overwrite else "refuse"
 
 
 # ------------------------------------------------------------------------------------------
-# Commands of routes: teach one from a recording, follow it with another, join several
-
-Recording = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RECORDING",
-        help="a film, or a folder of pictures, of an omnidirectional camera",
-    ),
-]
-OmniCamera = Annotated[
-    str | None,
-    typer.Option(
-        "--camera",
-        metavar="FILE",
-        help="calibration of its camera: OCamCalib, BloggieUnwarp, YAML; or `equirectangular` "
-        "for whole panoramas",
-    ),
-]
-Report = Annotated[
-    Path | None, typer.Option(metavar="DIR", help="the run folder itself; default runs/NAME")
-]
+# Recordings and experiments
 
 
-def teach(  # noqa: PLR0913 - each option is a parameter
-    recording: Recording,
-    out: Annotated[Path, typer.Option(metavar="ROUTE", help="the file to write, .fgpath")],
-    camera: OmniCamera = None,
-    poses: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="RUN/ESTIMATOR/final.tum of stereo SLAM on this drive: metres"
-        ),
-    ] = None,
-    report: Report = None,
-    start: options.Start = None,
-    stop: options.Stop = None,
-    stride: options.Stride = None,
-    overrides: options.Overrides = None,
-    overwrite: options.Overwrite = False,
-) -> None:
-    """Choose the path images of a drive, and write what is to be remembered of them.
-
-    Few images are chosen, each seen well from the one before; a table and the page say why each.
-    """
-    from fgslam.runs.bare import teaching
-
-    chosen = options.of_recording(start=start, stop=stop, stride=stride)
-    chosen += options.as_overrides({"poses": poses})
-    config = teaching(recording, camera, out, [*(overrides or ()), *chosen])
-    _perform(config, report, overwrite)
-
-
-def follow(  # noqa: PLR0913 - each option is a parameter
-    route: Annotated[
-        Path, typer.Argument(metavar="ROUTE", help="a route, as fgslam teach writes it")
-    ],
-    recording: Recording,
-    camera: OmniCamera = None,
-    out: Report = None,
-    start: options.Start = None,
-    stop: options.Stop = None,
-    stride: options.Stride = None,
-    overrides: options.Overrides = None,
-    overwrite: options.Overwrite = False,
-) -> None:
-    """Follow a route with another recording of the way: place, homing vector and command.
-
-    What a robot would be commanded at each image, by the same follower; refusals with their reason.
-    Exits with 1 where no image is recognised. Without --camera it is the route's own.
-    """
-    from fgslam.runs.bare import following
-
-    chosen = options.of_recording(start=start, stop=stop, stride=stride)
-    config = following(route, recording, camera, [*(overrides or ()), *chosen])
-    _perform(config, out, overwrite)
-
-
-def join(
-    routes: Annotated[
-        list[Path], typer.Argument(metavar="ROUTE...", help="routes, as fgslam teach writes them")
-    ],
-    out: Annotated[Path, typer.Option(metavar="MAP", help="the file to write, .fgmap")],
-    report: Report = None,
-    overrides: options.Overrides = None,
-    overwrite: options.Overwrite = False,
-) -> None:
-    """Join routes where their views match: one map, with crossroads.
-
-    A place is called after its route's file and its image: monday/12. Routes may have been taught
-    on different days; where they have nothing in common they stay apart, and that is reported.
-    """
-    from fgslam.runs.bare import joining
-
-    config = joining(routes, out, overrides or ())
-    _perform(config, report, overwrite)
-
-
-def route(
-    stored: Annotated[
-        Path, typer.Argument(metavar="MAP", help="routes, as fgslam join writes them")
-    ],
-    start: Annotated[
-        str,
-        typer.Option(
-            "--from", metavar="IMAGE", help="a picture from where the robot is, or a place's name"
-        ),
-    ],
-    goal: Annotated[
-        str, typer.Option("--to", metavar="PLACE", help="a place's name; of a route: its end")
-    ],
-    camera: OmniCamera = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="ROUTE", help="write the way as a route, to be followed")
-    ] = None,
-    overwrite: options.Overwrite = False,
-) -> None:
-    """Say the shortest way on a map of routes, and write it as a route of its own.
-
-    Without --camera the picture is of the routes' own. Exits with 2 where there is no way.
-    """
-    from fgslam.runs.bare import way_said
-
-    for line in way_said(stored, start, goal, camera, out, overwrite):
-        typer.echo(line)
-
-
-def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:
-    from fgslam.runs.run import require_outputs, run_experiment
-
-    place, existing = folder or Path("runs") / config.name, existing_folder(overwrite)
-    require_outputs(config, place, existing)
-    with under_way() as (progress, stopped):
-        result = run_experiment(config, place, existing, progress, stopped)
-    show_all([result], "the same command with --overwrite")
-    exit_as([result])
-
-
-# ------------------------------------------------------------------------------------------
-# The command `fgslam sweep`
-
-
-def sweep(  # noqa: PLR0913 - each option is a parameter
-    experiments: options.Sources,
-    axes: options.Axes = None,
-    estimators: options.SweptEstimators = None,
-    metric: options.Metric = None,
-    jobs: options.Workers = None,
-    scheduler: options.Scheduler = None,
-    out: options.SweepFolder = None,
-    overwrite: options.Overwrite = False,
-    resume: options.ResumeSweep = False,
-) -> None:
-    """Run experiments over settings, recordings, estimators and seeds, on many workers.
-
-    One Parquet table holds every case, a page curves and paired tests over the seeds. Ctrl-C ends
-    it early with the table so far; the same command with --resume does what is missing.
-    """
-    from fgslam.cli.console import progress_with_table
-    from fgslam.runs.sweep import make_plan, run_sweep, workers_of
-
-    existing = existing_folder(overwrite, resume)
-    plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
-    folder = out or plan.default_folder
-    with stop_flag() as stopped, progress_with_table() as (progress, shown):
-        tell, pool = stoppable(progress, stopped), workers_of(jobs, scheduler)
-        result = run_sweep(plan, folder, pool, existing, metric, (tell, stopped, shown))
-    show_all([result], same_with_resume())
-    exit_as([result])
-
-
-EXIT_USER = 2
-# Typer exports only the child; its parent's home differs from one Typer to the next.
-_UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
-_OF_TYPER = 130  # what it makes of any KeyboardInterrupt; no command of ours returns it
-_CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
-
-app = typer.Typer(
-    name="fgslam",
-    help="Stereo, trinocular and omnidirectional SLAM: filters and smoothers on one log.",
-    pretty_exceptions_enable=False,
-)
-
-
-app.add_typer(camera_app, name="camera")
-app.add_typer(calibrate_app, name="calibrate")
-
-
-@app.callback()
-def _root(version: options.Version = False) -> None:
-    """Filters and smoothers on one measurement log."""
-
-
-@app.command(epilog=f"Experiments that come with fgslam: {', '.join(experiment_names())}.")
+@command(app, f"Experiments that come with fgslam: {', '.join(experiment_names())}.")
 def run(  # noqa: PLR0913 - each option is a parameter
     config: options.Experiment,
-    out: options.RunFolder = None,
-    camera: options.Camera = None,
-    start: options.Start = None,
-    stop: options.Stop = None,
-    stride: options.Stride = None,
-    fps: options.Fps = None,
-    scale: options.Scale = None,
-    unit: options.Unit = None,
-    topics: options.Topics = None,
-    estimator: options.Estimator = None,
-    overrides: options.Overrides = None,
-    overwrite: options.Overwrite = False,
-    resume: options.Resume = False,
-    map_in: options.MapIn = None,
-    map_out: options.MapOut = None,
-    camera_out: options.CameraOut = None,
-    live: options.Live = False,
-    save_rrd: options.SaveRrd = None,
+    recording: RecordingOptions,
+    out: Path | None = None,
+    estimator: str | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    map_in: Path | None = None,
+    map_out: Path | None = None,
+    camera_out: Path | None = None,
+    live: bool = False,
+    save_rrd: Path | None = None,
 ) -> None:
     """Map a recording, or run an experiment: images in, run folder out.
 
@@ -347,16 +126,26 @@ def run(  # noqa: PLR0913 - each option is a parameter
     With --map-in it begins in a saved map: map.start is where, map.extend whether it changes it.
 
     Ctrl-C ends it early with all files valid; --resume goes on from there.
+
+    Args:
+        config (RECORDING|EXPERIMENT): a recording: its folder, file or a pattern of files; or an
+            experiment: a .yaml file, or the name of one that comes with fgslam, e.g. lab_loop
+        out: the run folder itself; default runs/NAME
+        estimator (KIND): which estimator steers; sets estimator.kind
+        overwrite: replace an earlier one
+        resume: continue an interrupted run to the same bytes
+        map_in (MAP): saved map to go on with; sets map.load
+        map_out (MAP): where to save the map; sets map.save
+        camera_out (FILE): where to save the calibration as the drive corrected it, for --camera
+        live: show the run in the rerun viewer; pip install 'fgslam[viewer]' provides it
+        save_rrd (FILE.rrd): write what --live shows; needs no screen
+        recording: of a recording: which frames, and how it is read
     """
     from fgslam.runs.bare import experiment_of
 
     existing = existing_folder(overwrite, resume)
-    chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
-    )
     steered = {"estimator.kind": estimator, "map.load": map_in, "map.save": map_out}
-    chosen += options.as_overrides(steered)
-    settings, about = experiment_of(config, camera, [*(overrides or ()), *chosen])
+    settings, about = experiment_of(config, recording.camera, recording.as_overrides(steered))
     if about:
         typer.echo(about)
     folder = out or Path("runs") / settings.name
@@ -369,7 +158,13 @@ def run(  # noqa: PLR0913 - each option is a parameter
     require_outputs(settings, folder, existing, (camera_out, save_rrd), config)
     if camera_out is not None:
         require_self_calibration(settings)
-    with watched_by(settings, live, save_rrd) as watch, under_way() as (progress, stopped):
+    with ExitStack() as stack:
+        watch = None
+        if live or save_rrd is not None:
+            from fgslam.runs.view import watched
+
+            watch = stack.enter_context(watched(settings, live, save_rrd))
+        progress, stopped = stack.enter_context(under_way())
         result = run_experiment(settings, folder, existing, progress, stopped, watch)
     show_all([result], resume_command(folder))
     if camera_out is not None:
@@ -377,54 +172,77 @@ def run(  # noqa: PLR0913 - each option is a parameter
     exit_as([result])
 
 
-@app.command()
-def init(  # noqa: PLR0913 - each option is a parameter
+@command(app)
+def init(
     recording: options.BareRecording,
-    camera: options.Camera = None,
-    start: options.Start = None,
-    stop: options.Stop = None,
-    stride: options.Stride = None,
-    fps: options.Fps = None,
-    scale: options.Scale = None,
-    unit: options.Unit = None,
-    topics: options.Topics = None,
-    estimator: options.Estimator = None,
-    overrides: options.Overrides = None,
+    chosen: RecordingOptions,
+    estimator: str | None = None,
 ) -> None:
-    """Print the short configuration that repeats `fgslam run RECORDING`, as YAML."""
+    """Print the short configuration that repeats `fgslam run RECORDING`, as YAML.
+
+    Args:
+        recording (RECORDING): its folder, file or a pattern of files
+        estimator (KIND): which estimator steers; sets estimator.kind
+        chosen: which frames, and how they are read
+    """
     from fgslam.runs.bare import short_config
 
-    chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
-    )
-    chosen += options.as_overrides({"estimator.kind": estimator})
-    typer.echo(short_config(recording, camera, [*(overrides or ()), *chosen]), nl=False)
+    overrides = chosen.as_overrides({"estimator.kind": estimator})
+    typer.echo(short_config(recording, chosen.camera, overrides), nl=False)
 
 
-@app.command()
-def demo(
-    out: Annotated[
-        Path, typer.Option(help="the run folder; replaced where it is there already")
-    ] = Path("runs/demo"),
-) -> None:
+@command(app)
+def demo(out: Path = Path("runs/demo")) -> None:
     """Drive the paper's loop through the rendered lab: the experiment lab_loop, in a minute.
 
     Needs no recording. The page it ends with, report.html, shows path, map and numbers.
+
+    Args:
+        out: the run folder; replaced where it is there already
     """
-    run(find_experiment(Path("lab_loop")), out, overwrite=True)
+    run(find_experiment(Path("lab_loop")), RecordingOptions(), out, overwrite=True)
 
 
-@app.command()
+@command(app)
+def inspect(
+    recording: options.Recording,
+    chosen: RecordingOptions,
+    frames: Annotated[int, typer.Option(min=1)] = 12,
+) -> None:
+    """Say what is in a recording, and what is wrong with it, in words.
+
+    Exits with 0 whatever the report finds, with 2 where the recording cannot be opened at all.
+
+    Args:
+        recording (RECORDING): a recording: its folder, file or a pattern of files; or an
+            experiment, .yaml or name, for its data set
+        frames: in how many frames, evenly spread, features are matched
+        chosen: which frames, and how they are read
+    """
+    from fgslam.runs.inspect import inspect_recording
+
+    with under_way() as (progress, _):
+        report = inspect_recording(
+            recording, chosen.as_overrides(), frames, progress, chosen.camera
+        )
+    typer.echo(report)
+
+
+# ------------------------------------------------------------------------------------------
+# Estimators side by side, and many runs
+
+
+@command(app)
 def compare(  # noqa: PLR0913 - each option is a parameter
     runs: options.Runs,
-    estimators: options.Estimators = None,
-    overrides: options.EstimatorOverrides = None,
-    out: options.Out = None,
-    overwrite: options.OverwriteResults = False,
-    resume: options.ResumeResults = False,
-    jobs: options.Jobs = 1,
-    trials: options.TrialCount = None,
-    seed: options.FirstSeed = None,
+    estimators: str | None = None,
+    overrides: list[str] | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    jobs: Annotated[int, typer.Option(min=1)] = 1,
+    trials: options.AtLeast1 = None,
+    seed: options.AtLeast0 = None,
 ) -> None:
     """Replay runs' measurements through estimators and set them side by side.
 
@@ -433,9 +251,21 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     paired tests say whether the smoothers beat the filters.
 
     Ctrl-C ends it early; the same command with --resume does what is left.
+
+    Args:
+        runs (RUN...): run folders; with --trials one run or experiment
+        estimators (A,B,C): which ones: kinds, or labels of the run's configuration; default those
+            that it compares, else every kind
+        overrides (--set A.B=VALUE): override one key of one estimator, estimators.NAME.KEY; with
+            --trials also any key of the experiment, e.g. dataset.stop; may be repeated
+        out: folder of the results; default RUN/compare or RUN/trials
+        overwrite: replace an earlier comparison
+        resume: go on with an interrupted one, to the same bytes
+        jobs: processes at a time, at most 4 a core; more than 1 disturbs times
+        trials: repeat over so many worlds of noise
+        seed: of the first trial; default the configuration's
     """
     from fgslam.cli.console import show_parts
-    from fgslam.core.errors import ConfigError
     from fgslam.runs.compare import Choice, ate_tables, compare_runs
     from fgslam.runs.trials import run_trials
 
@@ -457,91 +287,116 @@ def compare(  # noqa: PLR0913 - each option is a parameter
     exit_as(results)
 
 
-app.command()(sweep)
-app.command()(teach)
-app.command()(follow)
-app.command()(join)
-app.command()(route)
+@command(app)
+def sweep(  # noqa: PLR0913 - each option is a parameter
+    experiments: options.Experiments,
+    axes: list[str] | None = None,
+    estimators: str | None = None,
+    metric: str | None = None,
+    jobs: options.AtLeast1 = None,
+    scheduler: str | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+) -> None:
+    """Run experiments over settings, recordings, estimators and seeds, on many workers.
+
+    One Parquet table holds every case, a page curves and paired tests over the seeds. Ctrl-C ends
+    it early with the table so far; the same command with --resume does what is missing.
+
+    Args:
+        experiments (RECORDING|EXPERIMENT...): experiments, .yaml or names, and recordings' folders
+        axes (--set A.B=VALUES): values of one key, with commas, or FIRST:END[:STEP] without END;
+            every combination of several is a case. estimators.NAME.KEY is of one estimator
+        estimators (A,B,C): kinds, or labels of the configuration; default those of the
+            configuration
+        metric: column that curves and tests are of; default ate_final_m, where it is known
+        jobs: workers of this machine, at most 4 a core; default one a core
+        scheduler (ADDRESS): of a Dask scheduler whose workers do it, tcp://HOST:PORT; anyone who
+            reaches that address runs code as its workers' user
+        out: folder of the results; default runs/NAME_sweep
+        overwrite: replace an earlier one
+        resume: do what has no result yet; axes may have become longer
+    """
+    from fgslam.cli.console import display
+    from fgslam.runs.sweep import make_plan, run_sweep, workers_of
+
+    existing = existing_folder(overwrite, resume)
+    plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
+    folder = out or plan.default_folder
+    with stop_flag() as stopped, display() as shown:
+        watch = (stoppable(shown.tell, stopped), stopped, shown.show_table)
+        result = run_sweep(plan, folder, workers_of(jobs, scheduler), existing, metric, watch)
+    show_all([result], same_with_resume())
+    exit_as([result])
 
 
-@app.command()
-def localize(  # noqa: PLR0913 - each option is a parameter
+# ------------------------------------------------------------------------------------------
+# Maps and runs: locate, merge, hand over, look at
+
+
+@command(app)
+def localize(
     map_file: options.SavedMap,
     recording: options.Recording,
-    camera: options.Camera = None,
-    start: options.Start = None,
-    stop: options.Stop = None,
-    stride: options.Stride = None,
-    fps: options.Fps = None,
-    scale: options.Scale = None,
-    unit: options.Unit = None,
-    topics: options.Topics = None,
-    frame: Annotated[
-        int | None,
-        typer.Option(min=0, help="the recording's frame to locate; default all, one by one"),
-    ] = None,
-    frames: Annotated[
-        int, typer.Option(min=1, max=100, help="locate a submap of so many frames, ending there")
-    ] = 1,
-    overrides: options.Overrides = None,
-    out: Annotated[
-        Path | None, typer.Option(help="folder for table, numbers, picture and page; default none")
-    ] = None,
-    overwrite: options.Overwrite = False,
+    chosen: RecordingOptions,
+    frame: options.AtLeast0 = None,
+    frames: Annotated[int, typer.Option(min=1, max=100)] = 1,
+    out: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Where in a map were these frames taken? Without any prior.
 
     A pose is given only where it is certain, with the reasons. Exits with 3 where fewer than
     half of the queries were answered, with 2 where map or recording cannot be used.
+
+    Args:
+        map_file (MAP): a saved map
+        recording (RECORDING): a recording: its folder, file or a pattern of files; or an
+            experiment, .yaml or name, for its data set
+        frame: the recording's frame to locate; default all, one by one
+        frames: locate a submap of so many frames, ending there
+        out: folder for table, numbers, picture and page; default none
+        overwrite: replace an earlier one
+        chosen: which frames, and how they are read
     """
     from fgslam.runs.tasks.localisation import Wanted
     from fgslam.runs.tasks.localisation import localize as locate
 
-    chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
-    )
-    wanted = Wanted(
-        map_file, recording, (*(overrides or ()), *chosen), frame, frames, out,
-        existing_folder(overwrite), camera,
-    )  # fmt: skip
+    overrides, existing = tuple(chosen.as_overrides()), existing_folder(overwrite)
+    wanted = Wanted(map_file, recording, overrides, frame, frames, out, existing, chosen.camera)
     with under_way() as (progress, stopped):
         result = locate(wanted, progress, stopped)
     show_all([result])
     exit_as([result])
 
 
-@app.command()
+@command(app)
 def export(  # noqa: PLR0913 - each option is a parameter
-    run_folder: options.RunOrMap,
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="landmarks as .ply or .pcd")
-    ] = None,
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(help="camera poses as .tum, .kitti, .csv (EuRoC) or .mcap (ROS 2)"),
-    ] = None,
-    graph: Annotated[
-        Path | None,
-        typer.Option(help="measurements, poses and landmarks as .g2o, for other solvers"),
-    ] = None,
-    images: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="images, poses and points, for COLMAP"),
-    ] = None,
-    estimator: Annotated[
-        str | None, typer.Option(help="which estimator's; default the one that steered")
-    ] = None,
-    valid_only: Annotated[
-        bool, typer.Option("--valid-only", help="landmarks seen in at least three frames")
-    ] = False,
-    colour: Annotated[
-        bool, typer.Option("--colour", help="--map in the images' colours, with normals")
-    ] = False,
-    overwrite: options.Overwrite = False,
+    run_folder: options.RunFolderOrMap,
+    map_file: Path | None = None,
+    trajectory: Path | None = None,
+    graph: Path | None = None,
+    images: Path | None = None,
+    estimator: str | None = None,
+    valid_only: bool = False,
+    colour: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Hand a run's map, trajectory and measurements to other tools; or those of a saved map.
 
     Of a saved map alone it lists what is in it.
+
+    Args:
+        run_folder (RUN|MAP): a run folder, or a saved map
+        map_file (--map): landmarks as .ply or .pcd
+        trajectory: camera poses as .tum, .kitti, .csv (EuRoC) or .mcap (ROS 2)
+        graph: measurements, poses and landmarks as .g2o, for other solvers
+        images (DIR): images, poses and points, for COLMAP
+        estimator: which estimator's; default the one that steered
+        valid_only: landmarks seen in at least three frames
+        colour: --map in the images' colours, with normals
+        overwrite: replace an earlier one
     """
     from fgslam.runs.export import Wanted, export_run
 
@@ -559,68 +414,200 @@ def export(  # noqa: PLR0913 - each option is a parameter
         typer.echo(line)
 
 
-app.command()(film)
-
-
-@app.command()
-def merge(
-    first: options.FirstMap,
-    second: options.SecondMap,
-    out: Annotated[Path, typer.Option(metavar="MAP", help="where to write both as one")],
-    overwrite: options.Overwrite = False,
+@command(app)
+def film(
+    run_folder: options.RunFolder,
+    out: Annotated[Path, typer.Argument()],
+    estimator: str | None = None,
+    taught: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """Make two saved maps of one place into one; refuses what does not surely overlap."""
+    """Make a film of a run: images with their matches, next to the map as it grows.
+
+    Of what fgslam follow wrote: images with the path image, its probability, the way home as an
+    arrow, and the command or why there is none.
+
+    Args:
+        run_folder (RUN): a run folder
+        out (FILE): the film, .mp4 or .gif
+        estimator: whose path and map; default the one that steered
+        taught (DIR): of a route that was followed: the run folder of fgslam teach (its --report),
+            for the pictures of path images
+        overwrite: replace an earlier one
+    """
+    from fgslam.cli.console import progress_bar
+    from fgslam.runs.view import film_of_run
+
+    with progress_bar() as progress:
+        line = film_of_run(run_folder, out, estimator, taught, progress, overwrite)
+    typer.echo(line)
+
+
+@command(app)
+def merge(
+    first: options.SavedMap, second: options.SavedMap, out: Path, overwrite: bool = False
+) -> None:
+    """Make two saved maps of one place into one; refuses what does not surely overlap.
+
+    Args:
+        first (MAP): the map whose world it will be
+        second (MAP): the map to lay onto it
+        out (--out MAP): where to write both as one
+        overwrite: replace an earlier one
+    """
     from fgslam.runs.session import merge_files
 
     for line in merge_files(first, second, out, overwrite):
         typer.echo(line)
 
 
-@app.command()
-def view(
-    run_folder: options.RunToView,
-    save: Annotated[
-        Path | None, typer.Option(help="write an .rrd file for the viewer instead of a window")
-    ] = None,
-    overwrite: options.Overwrite = False,
-) -> None:
-    """Open a run in the rerun viewer, where that extra is installed."""
+@command(app)
+def view(run_folder: options.RunFolder, save: Path | None = None, overwrite: bool = False) -> None:
+    """Open a run in the rerun viewer, where that extra is installed.
+
+    Args:
+        run_folder (RUN): a run folder
+        save: write an .rrd file for the viewer instead of a window
+        overwrite: replace an earlier one
+    """
     from fgslam.runs.view import view_run
 
     typer.echo(view_run(run_folder, save, overwrite))
 
 
-@app.command()
-def inspect(  # noqa: PLR0913 - each option is a parameter
-    recording: options.Recording,
-    camera: options.Camera = None,
-    start: options.Start = None,
-    stop: options.Stop = None,
-    stride: options.Stride = None,
-    fps: options.Fps = None,
-    scale: options.Scale = None,
-    unit: options.Unit = None,
-    topics: options.Topics = None,
-    overrides: options.Overrides = None,
-    frames: Annotated[
-        int, typer.Option(min=1, help="in how many frames, evenly spread, features are matched")
-    ] = 12,
+# ------------------------------------------------------------------------------------------
+# Routes: teach one from a recording, follow it with another, join several
+
+
+def _perform(config: Experiment, folder: Path | None, overwrite: bool) -> None:
+    from fgslam.runs.run import require_outputs, run_experiment
+
+    place, existing = folder or Path("runs") / config.name, existing_folder(overwrite)
+    require_outputs(config, place, existing)
+    with under_way() as (progress, stopped):
+        result = run_experiment(config, place, existing, progress, stopped)
+    show_all([result], "the same command with --overwrite")
+    exit_as([result])
+
+
+@command(app)
+def teach(
+    recording: Path,
+    out: Path,
+    frames: FrameOptions,
+    camera: str | None = None,
+    poses: Path | None = None,
+    report: Path | None = None,
+    overwrite: bool = False,
 ) -> None:
-    """Say what is in a recording, and what is wrong with it, in words.
+    """Choose the path images of a drive, and write what is to be remembered of them.
 
-    Exits with 0 whatever the report finds, with 2 where the recording cannot be opened at all.
+    Few images are chosen, each seen well from the one before; a table and the page say why each.
+
+    Args:
+        recording (RECORDING): a film, or a folder of pictures, of an omnidirectional camera
+        out (--out ROUTE): the file to write, .fgpath
+        camera (FILE): calibration of its camera: OCamCalib, BloggieUnwarp, YAML; or
+            `equirectangular` for whole panoramas
+        poses (FILE): RUN/ESTIMATOR/final.tum of stereo SLAM on this drive: metres
+        report (DIR): the run folder itself; default runs/NAME
+        overwrite: replace an earlier one
+        frames: which are used
     """
-    from fgslam.cli.console import progress_bar
-    from fgslam.runs.inspect import inspect_recording
+    from fgslam.runs.bare import teaching
 
-    chosen = options.of_recording(
-        topics, start=start, stop=stop, stride=stride, fps=fps, scale=scale, unit_m=unit
-    )
-    given = [*(overrides or ()), *chosen]
-    with stop_flag() as stopped, progress_bar() as progress:
-        watched = stoppable(progress, stopped)
-        report = inspect_recording(recording, given, frames, watched, camera)
-    typer.echo(report)
+    config = teaching(recording, camera, out, frames.as_overrides({"poses": poses}))
+    _perform(config, report, overwrite)
+
+
+@command(app)
+def follow(
+    route: Path,
+    recording: Path,
+    frames: FrameOptions,
+    camera: str | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Follow a route with another recording of the way: place, homing vector and command.
+
+    What a robot would be commanded at each image, by the same follower; refusals with their reason.
+    Exits with 1 where no image is recognised. Without --camera it is the route's own.
+
+    Args:
+        route (ROUTE): a route, as fgslam teach writes it
+        recording (RECORDING): a film, or a folder of pictures, of an omnidirectional camera
+        camera (FILE): calibration of its camera: OCamCalib, BloggieUnwarp, YAML; or
+            `equirectangular` for whole panoramas
+        out (DIR): the run folder itself; default runs/NAME
+        overwrite: replace an earlier one
+        frames: which are used
+    """
+    from fgslam.runs.bare import following
+
+    _perform(following(route, recording, camera, frames.as_overrides()), out, overwrite)
+
+
+@command(app)
+def join(
+    routes: list[Path],
+    out: Path,
+    report: Path | None = None,
+    overrides: list[str] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Join routes where their views match: one map, with crossroads.
+
+    A place is called after its route's file and its image: monday/12. Routes may have been taught
+    on different days; where they have nothing in common they stay apart, and that is reported.
+
+    Args:
+        routes (ROUTE...): routes, as fgslam teach writes them
+        out (--out MAP): the file to write, .fgmap
+        report (DIR): the run folder itself; default runs/NAME
+        overrides (--set A.B=VALUE): override one key of the experiment; may be repeated
+        overwrite: replace an earlier one
+    """
+    from fgslam.runs.bare import joining
+
+    _perform(joining(routes, out, overrides or ()), report, overwrite)
+
+
+@command(app)
+def route(
+    stored: Path,
+    start: str,
+    goal: str,
+    camera: str | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Say the shortest way on a map of routes, and write it as a route of its own.
+
+    Without --camera the picture is of the routes' own. Exits with 2 where there is no way.
+
+    Args:
+        stored (MAP): routes, as fgslam join writes them
+        start (--from IMAGE): a picture from where the robot is, or a place's name
+        goal (--to PLACE): a place's name; of a route: its end
+        camera (FILE): calibration of its camera: OCamCalib, BloggieUnwarp, YAML; or
+            `equirectangular` for whole panoramas
+        out (ROUTE): write the way as a route, to be followed
+        overwrite: replace an earlier one
+    """
+    from fgslam.runs.bare import way_said
+
+    for line in way_said(stored, start, goal, camera, out, overwrite):
+        typer.echo(line)
+
+
+# ------------------------------------------------------------------------------------------
+# The entry point
+
+# Typer exports only the child; its parent's home differs from one Typer to the next.
+_UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
+_OF_TYPER = 130  # what it makes of any KeyboardInterrupt; no command of ours returns it
+_CLOSE_OPTIONS = 0.6  # typer offers --out for --foo
 
 
 def _keep_close_options(error: Exception) -> None:

@@ -1,11 +1,18 @@
-"""Arguments and options of the commands; paths are checked before anything slow is imported."""
+"""Commands made of functions, and the options that several have; paths are checked at once.
+
+Nothing slow is imported: a wrong path is answered within a moment.
+"""
 
 from __future__ import annotations
 
+import copy
+import inspect
 import json
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -15,19 +22,97 @@ from fgslam.datasets.layouts import fitting_layouts, is_recording
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
 
+# --------------------------------------------------------------------------------------------
+# A command is a function: its help is the docstring
+
+Function = TypeVar("Function", bound=Callable[..., None])
+_ITEM = re.compile(r"    (\w+)(?: \((.+?)\))?: (.*)")
+
+
+def command(app: typer.Typer, epilog: str | None = None) -> Callable[[Function], Function]:
+    """Makes a function a command of an app; it can still be called as it is.
+
+    Its docstring is the help of the command and, below `Args:`, of the parameters, one a line:
+    `name (METAVAR): help`, or `name (--flag METAVAR): help` for another name at the command line.
+    A parameter without a default is an argument, unless it has a flag. One whose type is a
+    dataclass stands for all options that are its fields, described below its `Attributes:`.
+    """
+
+    def add(function: Function) -> Function:
+        groups: dict[str, Any] = {}
+        shown: list[inspect.Parameter] = []
+        about, described = _read_help(function, "Args")
+        hints = get_type_hints(function, include_extras=True)
+        for name, parameter in inspect.signature(function).parameters.items():
+            if not is_dataclass(hints[name]):
+                shown.append(_declare(name, hints[name], parameter.default, described[name]))
+                continue
+            groups[name] = kind = hints[name]
+            _, own = _read_help(kind, "Attributes")
+            types = get_type_hints(kind, include_extras=True)
+            for field in fields(kind):
+                default = getattr(kind, field.name, inspect.Parameter.empty)
+                shown.append(_declare(field.name, types[field.name], default, own[field.name]))
+
+        def called(**given: Any) -> None:
+            for name, kind in groups.items():
+                own = {field.name: given.pop(field.name) for field in fields(kind)}
+                given[name] = kind(**own)
+            function(**given)
+
+        called.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        app.command(function.__name__, help=about, epilog=epilog)(called)
+        return function
+
+    return add
+
+
+def _read_help(thing: object, heading: str) -> tuple[str, dict[str, tuple[str, str]]]:
+    """The text of a docstring before a heading, and below it notation and text of each name."""
+    about, _, rest = (inspect.getdoc(thing) or "").partition(f"\n{heading}:\n")
+    found: dict[str, tuple[str, str]] = {}
+    name = ""
+    for line in rest.splitlines():
+        if item := _ITEM.match(line):
+            name, notation, text = item.groups("")
+            found[name] = notation, text
+        elif line.strip():
+            notation, text = found[name]
+            found[name] = notation, f"{text} {line.strip()}"
+    return about.strip(), found
+
+
+def _declare(name: str, hint: Any, default: Any, described: tuple[str, str]) -> inspect.Parameter:
+    """The parameter as Typer reads it: with flags, placeholder and help."""
+    notation, text = described
+    flags = [word for word in notation.split() if word.startswith("--")]
+    kind, *declared = get_args(hint) if get_origin(hint) is Annotated else (hint,)
+    is_option = flags or default is not inspect.Parameter.empty
+    info = copy.copy(declared[0]) if declared else typer.Option() if is_option else typer.Argument()
+    if kind is bool and not flags:  # Typer would offer the contrary as well
+        flags = [f"--{name.replace('_', '-')}"]
+    if flags:
+        info.param_decls = tuple(flags)
+    info.metavar = " ".join(word for word in notation.split() if word not in flags) or None
+    info.help = re.sub(r"\[(?=[a-z])", r"\\[", text)  # of an extra: rich would take it for a style
+    own = Annotated[kind, info]  # type: ignore[valid-type]
+    only = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, only, default=default, annotation=own)
+
+
+# --------------------------------------------------------------------------------------------
+# Paths of arguments, checked
+
 YAML_ENDINGS = (".yaml", ".yml")
 
 
-def names_beginning_with(incomplete: str) -> list[str]:
-    """For shell completion: experiments of the package; files the shell completes by itself."""
+def _complete(incomplete: str) -> list[str]:
+    """Experiments of the package; files the shell completes by itself."""
     return [name for name in experiment_names() if name.startswith(incomplete)]
 
 
-def experiment(given: str) -> Path:
-    """An experiment's file, given as a path or by name, or a recording's folder.
-
-    Raises FgslamError.
-    """
+def _experiment(given: str) -> Path:
+    """An experiment's file, given as a path or by name, or a recording's folder."""
     path = find_experiment(Path(given))
     if path.suffix.lower() not in YAML_ENDINGS and (path.exists() or is_recording(path)):
         fitting_layouts(path)
@@ -36,22 +121,24 @@ def experiment(given: str) -> Path:
     return path
 
 
-def bare_recording(given: str) -> Path:
-    """Folder of a recording in a known layout. Raises DatasetError."""
+def _bare_recording(given: str) -> Path:
     fitting_layouts(Path(given))
     return Path(given)
 
 
-def recording(given: str) -> Path:
-    """Folder of a recording in a known layout, or an experiment's file. Raises FgslamError."""
+def _folder_or_experiment(given: str) -> Path:
+    """A folder of that name goes before the experiment of that name."""
+    return Path(given) if Path(given).exists() else find_experiment(Path(given))
+
+
+def _recording(given: str) -> Path:
     path = _folder_or_experiment(given)
     if path.suffix.lower() not in YAML_ENDINGS:
         fitting_layouts(path)
     return path
 
 
-def run_folder(given: str) -> Path:
-    """Folder of a run. Raises DatasetError."""
+def _run_folder(given: str) -> Path:
     path = Path(given)
     if not path.exists():
         raise DatasetError(f"{path}: no such folder; give a run folder, as fgslam run writes it")
@@ -62,15 +149,13 @@ def run_folder(given: str) -> Path:
     return path
 
 
-def run_folder_or_map(given: str) -> Path:
-    """Folder of a run, or a file. Raises DatasetError."""
-    return Path(given) if Path(given).is_file() else run_folder(given)
+def _run_folder_or_map(given: str) -> Path:
+    return Path(given) if Path(given).is_file() else _run_folder(given)
 
 
-def run_folder_or_experiment(given: str) -> Path:
-    """Folder of a run, or an experiment's file. Raises DatasetError."""
+def _run_folder_or_experiment(given: str) -> Path:
     path = _folder_or_experiment(given)
-    return path if path.is_file() else run_folder(given)
+    return path if path.is_file() else _run_folder(given)
 
 
 def saved_map(given: str) -> Path:
@@ -82,286 +167,77 @@ def saved_map(given: str) -> Path:
     return path
 
 
-def _folder_or_experiment(given: str) -> Path:
-    """A folder of that name goes before the experiment of that name."""
-    return Path(given) if Path(given).exists() else find_experiment(Path(given))
+Experiment = Annotated[Path, typer.Argument(parser=_experiment, autocompletion=_complete)]
+Experiments = Annotated[list[Path], typer.Argument(parser=_experiment, autocompletion=_complete)]
+BareRecording = Annotated[Path, typer.Argument(parser=_bare_recording)]
+Recording = Annotated[Path, typer.Argument(parser=_recording, autocompletion=_complete)]
+RunFolder = Annotated[Path, typer.Argument(parser=_run_folder)]
+RunFolderOrMap = Annotated[Path, typer.Argument(parser=_run_folder_or_map)]
+Runs = Annotated[list[Path], typer.Argument(parser=_run_folder_or_experiment)]
+SavedMap = Annotated[Path, typer.Argument(parser=saved_map)]
+AtLeast0: TypeAlias = Annotated[int | None, typer.Option(min=0)]
+AtLeast1: TypeAlias = Annotated[int | None, typer.Option(min=1)]
+
+# --------------------------------------------------------------------------------------------
+# Options of a recording
+
+_KEYS = {"unit": "unit_m"}
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
-        from fgslam.core import __version__
+@dataclass(frozen=True)
+class FrameOptions:
+    """Which frames of a recording are used.
 
-        typer.echo(f"fgslam {__version__}")
-        raise typer.Exit
-
-
-def as_overrides(given: Mapping[str, str | float | Path | None]) -> list[str]:
-    """``a.b=value`` of the options that were given, by the key that each sets."""
-    return [
-        f"{key}={value if isinstance(value, int | float) else json.dumps(str(value))}"
-        for key, value in given.items()
-        if value is not None
-    ]
-
-
-def of_recording(topics: str | None = None, **given: str | float | None) -> list[str]:
-    """Overrides of the options of a recording: which frames, how fast, how large, and so on.
-
-    Args:
-        topics: of a bag, names between commas.
-        given: the other options, each by its name, which is the data set's key.
+    Attributes:
+        start: first frame used, from 0; sets dataset.start
+        stop: frame before which to stop; sets dataset.stop
+        stride: use every n-th; sets dataset.stride
+        overrides (--set A.B=VALUE): override one key of the experiment; may be repeated
     """
-    chosen = as_overrides({f"dataset.{key}": value for key, value in given.items()})
-    if topics is None:
-        return chosen
-    names = [name.strip() for name in topics.split(",")]
-    return [*chosen, f"dataset.topics={json.dumps(names)}"]
+
+    start: AtLeast0 = None
+    stop: AtLeast1 = None
+    stride: AtLeast1 = None
+    overrides: list[str] | None = None
+
+    def as_overrides(self, others: Mapping[str, str | Path | None] | None = None) -> list[str]:
+        """``a.b=value`` of --set, then of the options, and of ``others`` by the key of each."""
+        values: dict[str, Any] = {
+            f"dataset.{_KEYS.get(name, name)}": value
+            for name, value in vars(self).items()
+            if name not in ("camera", "overrides")
+        }
+        if (topics := values.get("dataset.topics")) is not None:
+            values["dataset.topics"] = [name.strip() for name in topics.split(",")]
+        texts = [
+            f"{key}={value if isinstance(value, int | float) else json.dumps(value, default=str)}"
+            for key, value in (values | dict(others or {})).items()
+            if value is not None
+        ]
+        return [*(self.overrides or ()), *texts]
 
 
-# --------------------------------------------------------------------------------------------
-# All commands
+@dataclass(frozen=True)
+class RecordingOptions(FrameOptions):
+    """Which frames of a recording are used, and how it is read.
 
-Version = Annotated[
-    bool, typer.Option("--version", callback=_version, is_eager=True, help="print it and exit")
-]
-Overrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set", metavar="A.B=VALUE", help="override one key of the experiment; may be repeated"
-    ),
-]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace an earlier one")]
+    Attributes:
+        start: first frame used, from 0; sets dataset.start
+        stop: frame before which to stop; sets dataset.stop
+        stride: use every n-th; sets dataset.stride
+        overrides (--set A.B=VALUE): override one key of the experiment; may be repeated
+        camera (FILE): calibration of a recording, in place of its own
+        fps (RATE): frames a second of images or a film that state no times; sets dataset.fps
+        scale (FACTOR): make the images smaller, 0.5 by half, and the calibration with them; sets
+            dataset.scale
+        unit (METRES): one unit of the calibration's lengths, 0.001: millimetres; sets
+            dataset.unit_m
+        topics (LEFT,RIGHT[,ODOMETRY]): of a ROS bag: which topics, where their names do not tell;
+            of three cameras in the order of --camera FILE; sets dataset.topics
+    """
 
-# --------------------------------------------------------------------------------------------
-# run
-
-Experiment = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RECORDING|EXPERIMENT",
-        parser=experiment,
-        autocompletion=names_beginning_with,
-        help="a recording: its folder, file or a pattern of files; or an experiment: a .yaml file, "
-        "or the name of one that comes with fgslam, e.g. lab_loop",
-    ),
-]
-Camera = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera", metavar="FILE", help="calibration of a recording, in place of its own"
-    ),
-]
-Start = Annotated[
-    int | None, typer.Option(min=0, help="first frame used, from 0; sets dataset.start")
-]
-Stop = Annotated[
-    int | None, typer.Option(min=1, help="frame before which to stop; sets dataset.stop")
-]
-Stride = Annotated[int | None, typer.Option(min=1, help="use every n-th; sets dataset.stride")]
-Fps = Annotated[
-    float | None,
-    typer.Option(
-        metavar="RATE",
-        help="frames a second of images or a film that state no times; sets dataset.fps",
-    ),
-]
-Scale = Annotated[
-    float | None,
-    typer.Option(
-        metavar="FACTOR",
-        help="make the images smaller, 0.5 by half, and the calibration with them; sets "
-        "dataset.scale",
-    ),
-]
-Unit = Annotated[
-    float | None,
-    typer.Option(
-        metavar="METRES",
-        help="one unit of the calibration's lengths, 0.001: millimetres; sets dataset.unit_m",
-    ),
-]
-Topics = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LEFT,RIGHT[,ODOMETRY]",
-        help="of a ROS bag: which topics, where their names do not tell; of three cameras in the "
-        "order of --camera FILE; sets dataset.topics",
-    ),
-]
-Estimator = Annotated[
-    str | None, typer.Option(metavar="KIND", help="which estimator steers; sets estimator.kind")
-]
-RunFolder = Annotated[Path | None, typer.Option(help="the run folder itself; default runs/NAME")]
-Resume = Annotated[
-    bool, typer.Option("--resume", help="continue an interrupted run to the same bytes")
-]
-MapIn = Annotated[
-    Path | None,
-    typer.Option("--map-in", metavar="MAP", help="saved map to go on with; sets map.load"),
-]
-MapOut = Annotated[
-    Path | None,
-    typer.Option("--map-out", metavar="MAP", help="where to save the map; sets map.save"),
-]
-CameraOut = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera-out",
-        metavar="FILE",
-        help="where to save the calibration as the drive corrected it, for --camera",
-    ),
-]
-
-Live = Annotated[
-    bool,
-    typer.Option(
-        "--live",
-        help="show the run in the rerun viewer; pip install 'fgslam\\[viewer]' provides it",
-    ),
-]
-SaveRrd = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.rrd", help="write what --live shows; needs no screen"),
-]
-
-# --------------------------------------------------------------------------------------------
-# inspect, localize, init
-
-BareRecording = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RECORDING", parser=bare_recording, help="its folder, file or a pattern of files"
-    ),
-]
-Recording = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RECORDING",
-        parser=recording,
-        autocompletion=names_beginning_with,
-        help="a recording: its folder, file or a pattern of files; or an experiment, .yaml or "
-        "name, for its data set",
-    ),
-]
-
-# --------------------------------------------------------------------------------------------
-# Runs and maps
-
-RunToView = Annotated[Path, typer.Argument(metavar="RUN", parser=run_folder, help="a run folder")]
-RunOrMap = Annotated[
-    Path,
-    typer.Argument(
-        metavar="RUN|MAP",
-        parser=run_folder_or_map,
-        help="a run folder, or a saved map",
-    ),
-]
-SavedMap = Annotated[Path, typer.Argument(metavar="MAP", parser=saved_map, help="a saved map")]
-FirstMap = Annotated[
-    Path,
-    typer.Argument(metavar="MAP", parser=saved_map, help="the map whose world it will be"),
-]
-SecondMap = Annotated[
-    Path,
-    typer.Argument(metavar="MAP", parser=saved_map, help="the map to lay onto it"),
-]
-
-# --------------------------------------------------------------------------------------------
-# compare
-
-Runs = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="RUN...",
-        parser=run_folder_or_experiment,
-        help="run folders; with --trials one run or experiment",
-    ),
-]
-Estimators = Annotated[
-    str | None,
-    typer.Option(
-        metavar="A,B,C",
-        help="which ones: kinds, or labels of the run's configuration; default those that it "
-        "compares, else every kind",
-    ),
-]
-EstimatorOverrides = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="A.B=VALUE",
-        help="override one key of one estimator, estimators.NAME.KEY; with --trials also any key "
-        "of the experiment, e.g. dataset.stop; may be repeated",
-    ),
-]
-Out = Annotated[
-    Path | None, typer.Option(help="folder of the results; default RUN/compare or RUN/trials")
-]
-OverwriteResults = Annotated[
-    bool, typer.Option("--overwrite", help="replace an earlier comparison")
-]
-ResumeResults = Annotated[
-    bool, typer.Option("--resume", help="go on with an interrupted one, to the same bytes")
-]
-Jobs = Annotated[
-    int,
-    typer.Option(min=1, help="processes at a time, at most 4 a core; more than 1 disturbs times"),
-]
-TrialCount = Annotated[
-    int | None, typer.Option("--trials", min=1, help="repeat over so many worlds of noise")
-]
-FirstSeed = Annotated[
-    int | None, typer.Option(min=0, help="of the first trial; default the configuration's")
-]
-Sources = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="RECORDING|EXPERIMENT...",
-        parser=experiment,
-        autocompletion=names_beginning_with,
-        help="experiments, .yaml or names, and recordings' folders",
-    ),
-]
-Axes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="A.B=VALUES",
-        help="values of one key, with commas, or FIRST:END[:STEP] without END; every combination "
-        "of several is a case. estimators.NAME.KEY is of one estimator",
-    ),
-]
-SweptEstimators = Annotated[
-    str | None,
-    typer.Option(
-        "--estimators",
-        metavar="A,B,C",
-        help="kinds, or labels of the configuration; default those of the configuration",
-    ),
-]
-Metric = Annotated[
-    str | None,
-    typer.Option(
-        help="column that curves and tests are of; default ate_final_m, where it is known"
-    ),
-]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        "--jobs", min=1, help="workers of this machine, at most 4 a core; default one a core"
-    ),
-]
-Scheduler = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="of a Dask scheduler whose workers do it, tcp://HOST:PORT; anyone who reaches that "
-        "address runs code as its workers' user",
-    ),
-]
-SweepFolder = Annotated[
-    Path | None, typer.Option(help="folder of the results; default runs/NAME_sweep")
-]
-ResumeSweep = Annotated[
-    bool, typer.Option("--resume", help="do what has no result yet; axes may have become longer")
-]
+    camera: Path | None = None
+    fps: float | None = None
+    scale: float | None = None
+    unit: float | None = None
+    topics: str | None = None

@@ -6,18 +6,28 @@ import io
 
 from rich.console import Console
 
-from fgslam.cli.console import Bars
+from fgslam.cli.console import Display
+from fgslam.report.content import Column, TextTable
 
 
 def test_progress_says_how_many_cases_are_done_and_the_time_left() -> None:
     now, out = [100.0], io.StringIO()
-    console = Console(file=out, force_terminal=True, width=120, get_time=lambda: now[0])
-    bars = Bars(console, begin=lambda: None)
+    console = Console(file=out, width=120, get_time=lambda: now[0])
+    shown = Display(console)
     for done in range(5):
-        bars.tell("cases", done, 20)
+        shown.tell("cases", done, 20)
         now[0] += 30.0
-    console.print(bars.drawn)
+    table = TextTable("means", "Means", "variant", (Column("ATE", ""),), (("ekf", ("1.25",)),))
+    shown.show_table(table)
+    shown.close()
     # 30 seconds a case, 16 are left: 8 minutes.
-    said = Console(width=120).render_str(out.getvalue()).plain
+    said = out.getvalue()
     assert "4/20" in said
     assert "0:08:00" in said
+    assert "1.25" not in said  # gone with the work
+
+
+def test_nothing_is_drawn_without_a_stage() -> None:
+    out = io.StringIO()
+    Display(Console(file=out)).close()
+    assert not out.getvalue()

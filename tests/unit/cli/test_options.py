@@ -6,9 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from fgslam.cli.main import app
 from fgslam.cli.options import saved_map
 from fgslam.core.errors import DatasetError, MapError
 from fgslam.core.files import as_path
@@ -51,8 +49,3 @@ def test_what_is_no_path_is_refused_in_one_line(given: object, what: str) -> Non
 def test_a_path_that_does_not_exist_is_a_path() -> None:
     assert as_path("absent/file", MapError) == Path("absent/file")
     assert as_path(Path("absent"), MapError) == Path("absent")
-
-
-def test_the_help_of_the_viewer_names_the_package_whole() -> None:
-    said = CliRunner().invoke(app, ["run", "--help"], env={"COLUMNS": "200"}).stdout
-    assert "pip install 'fgslam[viewer]' provides it" in said
