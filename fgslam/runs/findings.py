@@ -41,6 +41,11 @@ class Finding:
         return FINDINGS[self.code][2].format(**self.values)
 
 
+def finding(code: str, **values: Any) -> Finding:
+    """The finding of a code, with the values of its sentence."""
+    return Finding(code, values)
+
+
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """The findings, the worst first, otherwise in their order."""
     return tuple(sorted(findings, key=lambda found: list(Level).index(found.level)))

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
+import pandas as pd
 from numpy.lib.stride_tricks import sliding_window_view
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import DatasetError, FrameError
 from fgslam.core.geometry import inverse, se3_log, so3_log
-from fgslam.core.log import Frame, ImageSequence
+from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import kitti_drives
@@ -33,6 +33,7 @@ from fgslam.runs.findings import (
     Finding,
     Level,
     by_severity,
+    finding,
     first_of,
     share,
 )
@@ -96,7 +97,7 @@ def check_sequence(
     """
     return by_severity(
         (
-            *(Finding("note", {"text": note}) for note in sequence.notes),
+            *(finding("note", text=note) for note in sequence.notes),
             *check_calibration(sequence.rig),
             *check_timing(sequence.timestamps),
             *check_images(sequence, samples, progress),
@@ -135,29 +136,6 @@ _WIDEST_DEG = 140.0  # of usual fields of view
 _GAP_FACTOR = 1.8
 
 
-@dataclass(frozen=True, slots=True)
-class _FrameContent:
-    """Of one frame per camera its kind, mean grey value, and equality to the right.
-
-    The images are not kept: a long recording would fill the memory.
-    """
-
-    index: int
-    kinds: tuple[str, ...]
-    means: tuple[float, ...]
-    copies: tuple[bool, ...]
-
-    @staticmethod
-    def of(frame: Frame) -> _FrameContent:
-        """What is kept of a frame."""
-        return _FrameContent(
-            frame.index,
-            tuple(_kind(image) for image in frame.images),
-            tuple(float(image.mean()) for image in frame.images),
-            tuple(np.array_equal(frame.images[0], image) for image in frame.images),
-        )
-
-
 def _kind(image: Image) -> str:
     """``black``, ``white``, ``flat`` or ``good``."""
     low, high = np.percentile(image, [1.0, 99.0])
@@ -178,35 +156,44 @@ def check_images(
     Reads up to ``samples`` frames, evenly spread, with the first and the last.
     """
     chosen = spread_over(sequence, samples)
-    seen: list[_FrameContent] = []
     unreadable: list[str] = []
+    # Of every image frame, camera, kind, mean grey value, and equality to the right one: the images
+    # of a long recording would fill the memory.
+    rows: list[tuple[int, int, str, float, bool]] = []
     for done, i in enumerate(chosen, 1):
         try:
-            seen.append(_FrameContent.of(sequence.frame(i)))
+            frame = sequence.frame(i)
         except FrameError as error:
             unreadable.append(str(error))
+        else:
+            for c, image in enumerate(frame.images):
+                same = np.array_equal(frame.images[0], image)
+                rows.append((frame.index, c, _kind(image), float(image.mean()), same))
         progress(done, len(chosen))
     found: list[Finding] = []
     if unreadable:
         part = share(len(unreadable), len(chosen))
-        found.append(Finding("unreadable", {"share": part, "first": unreadable[0]}))
+        found.append(finding("unreadable", share=part, first=unreadable[0]))
+    seen = pd.DataFrame(rows, columns=["frame", "camera", "kind", "mean", "same"])
+    right = seen[seen.camera == 0]
     for kind, meaning in _KINDS.items():
         for c, camera in enumerate(CAMERA_NAMES):
-            bad = [each.index for each in seen if kind in each.kinds[c : c + 1]]
+            bad = seen[(seen.kind == kind) & (seen.camera == c)].frame.tolist()
             values = {"camera": camera, "kind": kind, "meaning": meaning}
-            values |= {"share": share(len(bad), len(seen)), "frames": first_of(bad)}
-            found += [Finding("uninformative", values)] if bad else []
+            values |= {"share": share(len(bad), len(right)), "frames": first_of(bad)}
+            found += [finding("uninformative", **values)] if bad else []
     for c, camera in enumerate(CAMERA_NAMES[1:], 1):
+        both = seen[seen.camera == c].merge(right, on="frame", suffixes=("", "_right"))
         # Images without content are reported already; they are all equal.
-        both = [e for e in seen if c < len(e.kinds) and e.kinds[0] == e.kinds[c] == "good"]
-        if not both:
+        both = both[(both.kind == "good") & (both.kind_right == "good")]
+        if both.empty:
             continue
-        if copies := sum(each.copies[c] for each in both):
+        if copies := int(both.same.sum()):
             part = share(copies, len(both))
-            found.append(Finding("copies", {"camera": camera, "share": part}))
-        ratio = float(np.median([(e.means[0] + 1.0) / (e.means[c] + 1.0) for e in both]))
+            found.append(finding("copies", camera=camera, share=part))
+        ratio = float(np.median((both.mean_right + 1.0) / (both["mean"] + 1.0)))
         if max(ratio, 1.0 / ratio) > _MAX_BRIGHTNESS_RATIO:
-            found.append(Finding("brightness", {"camera": camera, "ratio": ratio}))
+            found.append(finding("brightness", camera=camera, ratio=ratio))
     return tuple(found)
 
 
@@ -214,23 +201,23 @@ def check_calibration(rig: CameraRig) -> tuple[Finding, ...]:
     """Values that a calibration may have but hardly ever does."""
     found = []
     if not (0.0 < rig.cx < rig.width and 0.0 < rig.cy < rig.height):
-        found.append(Finding("principal_point", {"rig": rig}))
+        found.append(finding("principal_point", rig=rig))
     if not 0.95 < rig.fx / rig.fy < 1.05:
-        found.append(Finding("focal_lengths", {"rig": rig}))
+        found.append(finding("focal_lengths", rig=rig))
     view = rig.angles_deg[0]
     if not 15.0 < view < _WIDEST_DEG:
-        found.append(Finding("field_of_view", {"view": view}))
+        found.append(finding("field_of_view", view=view))
     baselines = {"baseline": rig.baseline, "vertical baseline": rig.vertical_baseline}
     for name, value in baselines.items():
         if value is not None and not 0.002 < value < 3.0:
-            found.append(Finding("baseline", {"name": name, "value": value}))
+            found.append(finding("baseline", name=name, value=value))
     return tuple(found)
 
 
 def check_timing(stamps: FloatArray) -> tuple[Finding, ...]:
     """Gaps between frames: steps longer than 1.8 median ones. Stamps (n,) in seconds."""
     if len(stamps) < 3:
-        return (Finding("few_frames", {"count": len(stamps)}),)
+        return (finding("few_frames", count=len(stamps)),)
     steps = np.diff(stamps)
     median = float(np.median(steps))
     long = np.flatnonzero(steps > _GAP_FACTOR * median)
@@ -238,7 +225,7 @@ def check_timing(stamps: FloatArray) -> tuple[Finding, ...]:
         return ()
     worst = int(long[np.argmax(steps[long])])
     values = {"long": len(long), "steps": len(steps), "factor": _GAP_FACTOR, "median": median}
-    return (Finding("gaps", {**values, "longest": steps[worst], "worst": worst}),)
+    return (finding("gaps", **values, longest=steps[worst], worst=worst),)
 
 
 # --------------------------------------------------------------------------------------------
@@ -262,15 +249,15 @@ def check_odometry(sequence: ImageSequence) -> tuple[Finding, ...]:
     try:
         given = [sequence.odometry(i) for i in range(1, len(sequence))]
     except DatasetError as error:
-        return (Finding("odometry_malformed", {"text": str(error)}),)
+        return (finding("odometry_malformed", text=str(error)),)
     missing = [i for i, step in enumerate(given, 1) if step is None]
     if len(missing) == len(given):
-        return (Finding("no_odometry", {}),)
-    covers = Finding("odometry_covers", {"share": share(len(given) - len(missing), len(given))})
+        return (finding("no_odometry"),)
+    covers = finding("odometry_covers", share=share(len(given) - len(missing), len(given)))
     if missing:
-        return covers, Finding("odometry_gaps", {"frames": first_of(missing)})
+        return covers, finding("odometry_gaps", frames=first_of(missing))
     if all(s is not None and np.abs(s.motion - np.eye(4)).max() <= _NO_MOTION for s in given):
-        return covers, Finding("odometry_frozen", {"steps": len(given)})
+        return covers, finding("odometry_frozen", steps=len(given))
     return (covers,)
 
 
@@ -278,14 +265,14 @@ def check_truth(sequence: ImageSequence) -> tuple[Finding, ...]:
     """Whether ground truth covers the frames, its length, and jumps in it."""
     truth = sequence.ground_truth
     if truth is None or len(truth) == 0:
-        return (Finding("no_truth", {}),)
+        return (finding("no_truth"),)
     matched = int((rows_at(truth.timestamps, sequence.timestamps, _STAMP_TOLERANCE_S) >= 0).sum())
     length = float(np.linalg.norm(np.diff(truth.poses[:, :3, 3], axis=0), axis=1).sum())
-    covers = Finding("truth_covers", {"share": share(matched, len(sequence)), "length": length})
+    covers = finding("truth_covers", share=share(matched, len(sequence)), length=length)
     jumps = _jumps(truth)
     if not jumps:
         return (covers,)
-    return covers, Finding("truth_jumps", {"poses": first_of(jumps), "factor": _MAX_JUMP})
+    return covers, finding("truth_jumps", poses=first_of(jumps), factor=_MAX_JUMP)
 
 
 def _jumps(truth: Trajectory) -> list[int]:
@@ -329,9 +316,9 @@ def check_odometry_against_truth(sequence: ImageSequence) -> tuple[Finding, ...]
     spread = 1.4826 * np.median(np.abs(errors), axis=0)
     ratio = spread / np.median(sigmas, axis=0)
     values = {"yaw_deg": np.degrees(spread[2]), "forward_cm": 100.0 * spread[3]}
-    found = [Finding("odometry_error", {**values, "steps": len(errors)})]
+    found = [finding("odometry_error", **values, steps=len(errors))]
     for k in np.flatnonzero(ratio > _MAX_NOISE_RATIO):
-        found.append(Finding("odometry_noise", {"name": _TANGENT_NAMES[k], "ratio": ratio[k]}))
+        found.append(finding("odometry_noise", name=_TANGENT_NAMES[k], ratio=ratio[k]))
     return tuple(found)
 
 
@@ -390,7 +377,7 @@ def check_clock(sequence: ImageSequence) -> tuple[Finding, ...]:
     if errors[best] > _CLEAR_GAIN * now or now - errors[best] < _SIGNIFICANT_RAD:
         return ()
     degrees = {"best": np.degrees(errors[best]), "now": np.degrees(now)}
-    return (Finding("odometry_clock", {"shift": shifts[best], **degrees}),)
+    return (finding("odometry_clock", shift=shifts[best], **degrees),)
 
 
 # --------------------------------------------------------------------------------------------

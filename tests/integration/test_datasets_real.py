@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -28,7 +29,7 @@ from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.findings import Level
 from fgslam.runs.inspect import check_sequence
-from fgslam.runs.inspect_matches import check_epipolar
+from fgslam.runs.inspect_matches import LEFT_RIGHT, Matches, check_pair
 from fgslam.slam.build import make_extractor
 from scripts.convert.light_field import convert
 
@@ -179,12 +180,12 @@ def matched(a: np.ndarray, b: np.ndarray) -> tuple[FloatArray, FloatArray, list[
 def test_matches_tell_sound_swapped_and_shifted_cameras(shared_data: Path, name: str) -> None:
     frame = open_recording(folder(shared_data, name)).frame(10)
     on_right, on_left, _ = matched(*frame.images)
-    rows, disparities = on_left[:, 1] - on_right[:, 1], on_left[:, 0] - on_right[:, 0]
-    sound = check_epipolar(rows, disparities)
-    assert [f for f in sound if f.level is Level.PROBLEM] == []
-    swapped = check_epipolar(-rows, -disparities)
+    frame, (along, across) = np.zeros(len(on_left), np.int64), (on_left - on_right).T
+    sound = Matches(frame, np.arange(len(frame)), across, along, on_right)
+    assert all(f.level is not Level.PROBLEM for f in check_pair(sound, frame[:1], LEFT_RIGHT))
+    swapped = check_pair(replace(sound, across=-across, along=-along), frame[:1], LEFT_RIGHT)
     assert any("cameras look swapped" in f.text for f in swapped)
-    shifted = check_epipolar(rows + 2.0, disparities)
+    shifted = check_pair(replace(sound, across=across + 2.0), frame[:1], LEFT_RIGHT)
     assert any("rows disagree" in f.text for f in shifted)
 
 

@@ -289,6 +289,7 @@ def test_featureless_recording_is_reported_not_crashed(tmp_path: Path) -> None:
     smooth: Change = lambda image: np.tile(np.linspace(0, 255, WIDTH), (HEIGHT, 1)).astype(np.uint8)  # noqa: E731
     report = inspected(write(tmp_path, TRIPLE, dict.fromkeys(TRIPLE, smooth)))
     assert "only 0 matches between left and right" in report
+    assert "4 of 4 frames have fewer than 15 matches: 0, 1, 3, 5" in report
     assert "depth unknown: too few matches" in report
 
 

@@ -32,7 +32,6 @@ from fgslam.runs.inspect import (
     check_truth,
     facts_of,
 )
-from fgslam.runs.inspect_matches import check_epipolar
 
 
 def opened(root: Path, **settings: object) -> Recording:
@@ -278,50 +277,3 @@ def scaled(column: int, factor: float) -> np.ndarray:
     out = np.ones((4, 4))
     out[0, column] = factor
     return out
-
-
-# --------------------------------------------------------------------------------------------
-# Matches
-
-
-def matches(rng: np.random.Generator, wrong: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
-    """Row offsets and disparities of 400 matches, a share of them wrong."""
-    rows, disparities = rng.normal(0.0, 0.25, 400), rng.uniform(1.0, 40.0, 400)
-    bad = rng.random(400) < wrong
-    rows[bad], disparities[bad] = rng.uniform(-90, 90, bad.sum()), rng.uniform(-90, 90, bad.sum())
-    return rows, disparities
-
-
-def test_sound_matches(rng: np.random.Generator) -> None:
-    found = check_epipolar(*matches(rng))
-    assert texts(found) == ""
-    assert "rows of 400 matches differ by" in texts(found, Level.INFO)
-
-
-def test_swapped_cameras_are_reported(rng: np.random.Generator) -> None:
-    rows, disparities = matches(rng)
-    found = texts(check_epipolar(rows, -disparities), Level.PROBLEM)
-    assert "cameras look swapped: 9" in found
-    assert "swap left and right" in found
-
-
-def test_unrectified_pairs_are_reported(rng: np.random.Generator) -> None:
-    rows, disparities = matches(rng)
-    found = texts(check_epipolar(rows + 2.3, disparities), Level.PROBLEM)
-    assert "rows disagree by +2.3 px" in found
-    tilted = rows + rng.uniform(-6.0, 6.0, 400)
-    assert "rows scatter by" in texts(check_epipolar(tilted, disparities), Level.PROBLEM)
-
-
-def test_negative_disparities_short_of_a_swap(rng: np.random.Generator) -> None:
-    rows, disparities = matches(rng, 0.0)
-    disparities[:120] *= -1.0
-    found = check_epipolar(rows, disparities)
-    assert texts(found, Level.PROBLEM) == ""
-    assert "30 % of matches have negative disparity" in texts(found)
-
-
-def test_too_few_matches_to_judge() -> None:
-    found = texts(check_epipolar(np.zeros(19), -np.ones(19)))
-    assert "only 19 matches" in found
-    assert "swapped" not in found
