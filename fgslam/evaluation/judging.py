@@ -215,11 +215,10 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "landmark_truth_sigma_m": truth.landmark_sigma_m,
             **_innovations(answer),
             "update_growth": _as_json(time_growth(answer.update_ms)),
-            "last_pose_sigma": _last_pose_sigma(answer.estimate),
+            **_claims(answer.estimate),
             # Se et al. (5) measure by it how well a loop closes.
             "end_against_start": _as_json(end_pose(final)),
             "noise_factor": answer.estimate.noise_factor,
-            **_gyroscope(answer.estimate),
             "remarks": list(answer.estimate.remarks),
         },
     )
@@ -339,29 +338,22 @@ def _innovations(answer: Answer) -> dict[str, JsonValue]:
     return {"nis_per_dof": _per_dof(found), "nis": _as_json(found)}
 
 
-def _last_pose_sigma(estimate: Estimate) -> JsonValue:
-    """Standard deviations of the last pose as claimed: roots of the traces of its two blocks."""
-    if not len(estimate.covariances) or not np.isfinite(estimate.covariances[-1]).all():
-        return None
-    variances = np.maximum(np.diagonal(estimate.covariances[-1]), 0.0)
-    return {
-        "rotation_deg": float(np.degrees(np.sqrt(variances[:3].sum()))),
-        "position_m": float(np.sqrt(variances[3:].sum())),
-    }
-
-
-def _gyroscope(estimate: Estimate) -> dict[str, JsonValue]:
-    """Bias of the gyroscope at the end, about the axes of the body; nothing where there is none."""
-    found = estimate.gyroscope
-    if found is None:
-        return {}
-    sigmas = np.sqrt(np.diagonal(found.covariance))
-    return {
-        "gyroscope_bias_dps": {
-            "rates": np.degrees(found.rates).tolist(),
+def _claims(estimate: Estimate) -> dict[str, JsonValue]:
+    """What the estimate states of itself at the end: of its last pose, and of the gyroscope."""
+    out: dict[str, JsonValue] = {"last_pose_sigma": None}
+    if len(estimate.covariances) and np.isfinite(estimate.covariances[-1]).all():
+        variances = np.maximum(np.diagonal(estimate.covariances[-1]), 0.0)
+        out["last_pose_sigma"] = {  # roots of the traces of its two blocks
+            "rotation_deg": float(np.degrees(np.sqrt(variances[:3].sum()))),
+            "position_m": float(np.sqrt(variances[3:].sum())),
+        }
+    if estimate.gyroscope is not None:
+        sigmas = np.sqrt(np.diagonal(estimate.gyroscope.covariance))
+        out["gyroscope_bias_dps"] = {  # about the axes of the body
+            "rates": np.degrees(estimate.gyroscope.rates).tolist(),
             "sigmas": np.degrees(sigmas).tolist(),
         }
-    }
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -686,44 +678,29 @@ def judge_closures(
         online: poses after them.
         truth: true poses, in any world.
     """
-    true_poses = _true_poses(online, truth)
+    true_poses = np.full((len(online), 4, 4), np.nan)  # in the estimate's world
+    matched = None if truth is None else to_estimate_world(online, truth)
+    if matched is not None:
+        true_poses[matched[0]] = matched[1]
     errors = position_errors(online.poses, true_poses)
     tracked_errors = position_errors(tracked, true_poses)
     out = []
     for at, closure, taken in closures:
         true = inverse(true_poses[closure.frame]) @ true_poses[at]
         off = inverse(true) @ closure.oTc
+        step = online.poses[at, :3, 3] - tracked[at, :3, 3]
         out.append(
             JudgedClosure(
                 at=at,
                 to=closure.frame,
                 matches=len(closure.observations),
                 merged=len(closure.merged) if taken else 0,
-                correction_m=_distance(online.poses[at], tracked[at]) if taken else np.nan,
+                correction_m=float(np.linalg.norm(step)) if taken else np.nan,
                 error_m=float(np.linalg.norm(off[:3, 3])),
-                error_deg=_degrees(off),
+                error_deg=float(np.rad2deg(rotation_angles(off[None, :3, :3])[0])),
                 before_m=float(tracked_errors[at]),
                 after_m=float(errors[at]) if taken else np.nan,
                 taken=taken,
             )
         )
     return out
-
-
-def _distance(a: FloatArray, b: FloatArray) -> float:
-    return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
-
-
-def _true_poses(online: Trajectory, truth: Trajectory | None) -> FloatArray:
-    """(n, 4, 4) true poses in the estimate's world; NaN where unknown."""
-    out = np.full((len(online), 4, 4), np.nan)
-    found = None if truth is None else to_estimate_world(online, truth)
-    if found is not None:
-        out[found[0]] = found[1]
-    return out
-
-
-def _degrees(aTb: FloatArray) -> float:
-    if not np.isfinite(aTb).all():
-        return float("nan")
-    return float(np.rad2deg(rotation_angles(aTb[None, :3, :3])[0]))

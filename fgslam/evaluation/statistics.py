@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
+from fgslam.core.arrays import FloatArray, IntArray, chi_square_quantile
 from fgslam.core.geometry import inverse, pose, se3_log, yaw_pitch_roll
 from fgslam.core.types import Trajectory
 
@@ -226,20 +226,24 @@ def evaluate_trajectory(
     if len(rows) == 0 or not (np.isfinite(estimated).all() and np.isfinite(true).all()):
         return TrajectoryError(alignment, len(rows))
     tTe = align(estimated, true, alignment)
-    ate = None if tTe is None else position_errors(moved(tTe, estimated), true)
-    rpe_trans, rpe_rot = _rpe_rmse(estimated, true, tTe)
-    length, drift, end_m, end_deg = _end_errors(estimated, true)
+    aligned = None if tTe is None else moved(tTe, estimated)
+    ate = None if aligned is None else position_errors(aligned, true)
+    steps = None if aligned is None or len(rows) < 2 else relative_errors(aligned, true)
+    # A drift is measured from the start: with the first pose aligned.
+    end = inverse(inverse(true[0]) @ true[-1]) @ inverse(estimated[0]) @ estimated[-1]
+    end_m = float(np.linalg.norm(end[:3, 3]))
+    length = path_length(true)
     return TrajectoryError(
         alignment=alignment,
         matched_poses=len(rows),
         ate_rmse_m=None if ate is None else _rmse(ate),
         ate_max_m=None if ate is None else float(ate.max()),
-        rpe_trans_m=rpe_trans,
-        rpe_rot_deg=rpe_rot,
+        rpe_trans_m=None if steps is None else _rmse(steps[0]),
+        rpe_rot_deg=None if steps is None else float(np.degrees(_rmse(steps[1]))),
         path_length_m=length,
-        drift_percent=drift,
+        drift_percent=100.0 * end_m / length if length > 0.0 else None,
         end_error_m=end_m,
-        end_error_deg=end_deg,
+        end_error_deg=float(np.degrees(rotation_angles(end[None, :3, :3])[0])),
     )
 
 
@@ -279,27 +283,6 @@ def estimate_from_truth(estimate: Trajectory, truth: Trajectory) -> FloatArray |
 
 def _rmse(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _rpe_rmse(
-    estimate: FloatArray, truth: FloatArray, tTe: FloatArray | None
-) -> tuple[float | None, float | None]:
-    if tTe is None or len(estimate) <= 1:
-        return None, None
-    translation, rotation = relative_errors(moved(tTe, estimate), truth)
-    return _rmse(translation), float(np.degrees(_rmse(rotation)))
-
-
-def _end_errors(
-    estimate: FloatArray, truth: FloatArray
-) -> tuple[float, float | None, float, float]:
-    """Path length, drift in percent, end error in metres and degrees; first pose aligned."""
-    error = inverse(inverse(truth[0]) @ truth[-1]) @ inverse(estimate[0]) @ estimate[-1]
-    end_m = float(np.linalg.norm(error[:3, 3]))
-    end_deg = float(np.degrees(rotation_angles(error[None, :3, :3])[0]))
-    length = path_length(truth)
-    drift = 100.0 * end_m / length if length > 0.0 else None
-    return length, drift, end_m, end_deg
 
 
 ConsistencyVerdict: TypeAlias = Literal["consistent", "overconfident", "conservative"]
@@ -381,18 +364,15 @@ def within(errors: FloatArray, covariances: FloatArray, sigmas: float = 2.0) -> 
     largest = variances.max(axis=1, initial=0.0, keepdims=True)
     known = np.isfinite(errors).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     counted = np.asarray(known)[:, None] & (variances > _RELATIVE_RANK_TOLERANCE * largest)
-    counted &= _in_support(np.where(counted.any(axis=1)[:, None, None], covariances, 0.0))
+    # Axes that lie in the uncertain subspace, and not just next to it.
+    given = np.where(counted.any(axis=1)[:, None, None], covariances, 0.0)
+    spread, directions = np.linalg.eigh(0.5 * (given + np.swapaxes(given, 1, 2)))
+    supported = spread > _RELATIVE_RANK_TOLERANCE * spread[:, -1:]
+    counted &= np.einsum("nij,nj->ni", directions**2, supported) > _LEAST_SHARE
     held = counted & (errors**2 <= sigmas**2 * np.where(counted, variances, 0.0))
     number = counted.sum(axis=0)
     shares = np.full(len(number), np.nan)
     return np.asarray(np.divide(held.sum(axis=0), number, out=shares, where=number > 0))
-
-
-def _in_support(covariances: FloatArray) -> BoolArray:
-    """(n, d) axes that lie in the subspace of covariances (n, d, d), and not just beside it."""
-    variances, directions = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, 1, 2)))
-    supported = variances > _RELATIVE_RANK_TOLERANCE * variances[:, -1:]
-    return np.asarray(np.einsum("nij,nj->ni", directions**2, supported) > _LEAST_SHARE)
 
 
 def pose_errors(estimate: FloatArray, truth: FloatArray) -> FloatArray:
@@ -467,15 +447,10 @@ def judge(
     independent = items if items_independent else informative_runs
     lower, upper = chi_square_band(total * independent / items, probability)
     per_dof = float(values.sum()) / total
-    return Consistency(
-        per_dof, lower, upper, probability, items, independent, _verdict(per_dof, lower, upper)
-    )
-
-
-def _verdict(per_dof: float, lower: float, upper: float) -> ConsistencyVerdict:
-    if per_dof > upper:
-        return "overconfident"
-    return "conservative" if per_dof < lower else "consistent"
+    verdict: ConsistencyVerdict = "overconfident" if per_dof > upper else "consistent"
+    if per_dof < lower:
+        verdict = "conservative"
+    return Consistency(per_dof, lower, upper, probability, items, independent, verdict)
 
 
 JsonValue: TypeAlias = (
@@ -531,22 +506,9 @@ class EstimatorMetrics:
 
     def as_json(self) -> dict[str, JsonValue]:
         """Every name of the contract, then the further ones."""
-        update = self.update_ms
-        out: dict[str, JsonValue] = {
-            "ate_rmse_m": self.ate_rmse_m,
-            "rpe_trans_m": self.rpe_trans_m,
-            "rpe_rot_deg": self.rpe_rot_deg,
-            "drift_percent": self.drift_percent,
-            "end_error_m": self.end_error_m,
-            "end_error_deg": self.end_error_deg,
-            "landmarks": self.landmarks,
-            "nees_pose_per_dof": self.nees_pose_per_dof,
-            "nees_landmark_per_dof": self.nees_landmark_per_dof,
-            "update_ms": {"median": update.median, "p95": update.p95, "max": update.max},
-            "peak_memory_mb": self.peak_memory_mb,
-        }
-        clash = sorted(out.keys() & self.more.keys())
-        if clash:
+        out: dict[str, JsonValue] = asdict(self)
+        del out["more"]
+        if clash := sorted(out.keys() & self.more.keys()):
             raise ValueError(f"metric '{clash[0]}' is a name of the contract, not a further one")
         return out | dict(self.more)
 
