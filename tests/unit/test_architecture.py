@@ -75,7 +75,6 @@ def test_a_lawful_package_passes(tmp_path: Path) -> None:
         "slam/pipeline.py": "from fgslam.backend import isam2\nfrom fgslam.datasets import lab\n",
         "cli/main.py": "def main():\n    from fgslam.slam import pipeline\n    return pipeline\n",
         "__main__.py": "from fgslam.cli.main import main\n",
-        "core/atomic.py": "try:\n    x = 1\nexcept BaseException:\n    x = 2\n    raise\n",
     }
     assert findings(tmp_path, files) == []
 
@@ -146,10 +145,6 @@ LIBRARY_CASES = {
         "def f():\n    import open3d\n",
         "'open3d' only in report, worlds",
     ),
-    "open3d at module level": ("worlds/a.py", "import open3d as o3d\n", "inside a function"),
-    "pickle": ("core/log.py", "import pickle\n", "'pickle' is banned"),
-    "joblib": ("backend/c.py", "from joblib import dump\n", "'joblib' is banned"),
-    "global randomness": ("worlds/b.py", "import random\n", "'random' is banned"),
 }
 
 
@@ -162,15 +157,6 @@ def test_library_violations(tmp_path: Path, case: str) -> None:
 
 
 STATEMENT_CASES = {
-    "bare except": "try:\n    x = 1\nexcept:\n    x = 2\n",
-    "broad except": "try:\n    x = 1\nexcept Exception:\n    x = 2\n",
-    "broad except in a tuple": "try:\n    x = 1\nexcept (OSError, Exception) as e:\n    x = 2\n",
-    "broad except raising another": "try:\n    x = 1\nexcept BaseException:\n    raise OSError\n",
-    "eval": "\n\nx = eval('1')\n",
-    "exec": "\n\nexec('x = 1')\n",
-    "yaml.load": "import yaml\n\nx = yaml.load('a: 1', Loader=None)\n",
-    "yaml.unsafe_load": "import yaml\n\nx = yaml.unsafe_load('a: 1')\n",
-    "from yaml import load": "\n\nfrom yaml import load, safe_load\n",
     "allow_pickle": "import numpy as np\n\nx = np.load('a', allow_pickle=True)\n",
     "unseeded generator": "import numpy as np\n\nx = np.random.default_rng()\n",
     "computed import": "import importlib\n\nx = importlib.import_module('a' + 'b')\n",
@@ -186,12 +172,7 @@ def test_statement_violations_are_on_their_line(tmp_path: Path, case: str) -> No
 
 def test_lawful_statements_pass(tmp_path: Path) -> None:
     source = (
-        "import yaml\nimport numpy as np\n"
-        "x = yaml.safe_load('a: 1')\n"
-        "g = np.random.default_rng(7)\n"
-        "y = np.load('a', allow_pickle=False)\n"
-        "class Model:\n    def eval(self): return 1\n"
-        "z = Model().eval()\n"
+        "import numpy as np\ng = np.random.default_rng(7)\ny = np.load('a', allow_pickle=False)\n"
     )
     assert findings(tmp_path, {"frontend/good.py": source}) == []
 
