@@ -15,7 +15,7 @@ from homing_pages import FEATURES, drive, estimates, page, truth
 from reports import HOSTILE
 
 from fgslam.core.arrays import FloatArray
-from fgslam.report.content import SIGMAS, Column, Figure, TextTable, outlines
+from fgslam.report.content import Figure
 from fgslam.report.homing_figures import (
     MAX_MOMENTS,
     Links,
@@ -44,14 +44,6 @@ def moments(figure: Figure) -> list[str]:
 
 def names(figure: Figure) -> list[str]:
     return [t.name for t in figure.drawing.data]
-
-
-def test_an_ellipse_lies_at_its_deviations() -> None:
-    covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
-    outline = outlines(np.array([[1.0, -1.0]]), covariance[None])[0] - [1.0, -1.0]
-    distance = np.einsum("ni,ij,nj->n", outline, np.linalg.inv(covariance), outline)
-    np.testing.assert_allclose(distance, SIGMAS**2, rtol=1e-12)
-    assert np.isnan(outlines(np.zeros((1, 2)), np.full((1, 2, 2), np.nan))).all()
 
 
 def test_a_lost_feature_becomes_a_star_where_it_was_last() -> None:
@@ -120,11 +112,6 @@ def test_distribution_counts_missing_answers() -> None:
 
 def test_no_answer_draws_no_cloud() -> None:
     assert not claimed_against_true({"a": np.zeros(0)}, {"a": np.zeros(0)}).has_numbers
-
-
-def test_a_ragged_table_is_refused() -> None:
-    with pytest.raises(ValueError, match="2 values in a table of 1 columns"):
-        TextTable("k", "h", "f", (Column("a", "b"),), (("row", ("1", "2")),))
 
 
 def test_the_page_is_whole_repeatable_and_small(tmp_path: Path) -> None:
