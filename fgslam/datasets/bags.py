@@ -98,8 +98,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         (side, view, found.stamps[view])
         for side, view in zip(("left", "top"), views[1:], strict=False)
     ]
-    tolerance = 1e-3 * settings.pairing_tolerance_ms
-    rows, unpaired = pair_stamps(found.stamps[chosen.right], others, tolerance, chosen.right)
+    rows, unpaired = pair_stamps(found.stamps[chosen.right], others, chosen.right)
     places = np.column_stack([found.places[v][rows[:, k]] for k, v in enumerate(views)])
     right, size, sigma = places[:, 0].tolist(), rig.image_size, None
     bits, held = bits_held(len(right), lambda k: bag.read(right[k], messages.stored_of))

@@ -173,7 +173,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
     require_one_camera(settings)
     camera, known = _camera(root, settings, size)
-    odometry_file = find_odometry(root, settings.odometry_file)
+    odometry_file = find_odometry(root)
     rig, mounting = on_wheels(mounted(depth_rig(camera), settings), settings, odometry_file)
     scale, reported = _scale(root, pairs, settings, size)
 
@@ -226,25 +226,22 @@ def _pairs(
     lists = (root / "rgb.txt", root / "depth.txt")
     if all(path.is_file() for path in lists):
         (colour_at, colours), (depth_at, depths) = (_listed(path) for path in lists)
-        tolerance = 1e-3 * settings.pairing_tolerance_ms
         others = [("left", str(lists[1]), depth_at)]
-        rows, notes = pair_stamps(colour_at, others, tolerance, str(lists[0]))
+        rows, notes = pair_stamps(colour_at, others, str(lists[0]))
         pairs = tuple((colours[i], depths[j]) for i, j in rows.tolist())
         stamps = NANOSECONDS * colour_at[rows[:, 0]].astype(np.float64)
         return pairs, stamps, colour_and_depth_notes(notes), lists
-    folders, mixed = colour_and_depth(root), None
-    if folders is None:
-        mixed = colour_and_depth_files(root)
-        if mixed is None:
-            raise DatasetError(f"{root} has no folders of colour and depth images (rgb/, depth/)")
-    else:
+    if (folders := colour_and_depth(root)) is not None:
         mixed = images_in(folders[0]), images_in(folders[1])
-        for folder, images in zip(folders, mixed, strict=True):
-            if not images:
-                raise DatasetError(f"{folder} holds no image; restore it")
+        if empty := [str(f) for f, images in zip(folders, mixed, strict=True) if not images]:
+            raise DatasetError(f"{empty[0]} holds no image; restore it")
+    elif (found_mixed := colour_and_depth_files(root)) is not None:
+        mixed = found_mixed
+    else:
+        raise DatasetError(f"{root} has no folders of colour and depth images (rgb/, depth/)")
     colour_files, depth_files = map(tuple, mixed)
     cameras = CameraFiles(depth_files, colour_files, root, interleaved=False)
-    pairs, notes = pair_files(cameras, settings.pairing_tolerance_ms)
+    pairs, notes = pair_files(cameras)
     used = [colour for colour, _ in pairs]
     stamps, assumed, found = stamps_of(used, (used[0].parent, root), None, colour_files)
     return pairs, stamps, (*colour_and_depth_notes(notes), *assumed), found
@@ -285,53 +282,50 @@ def _scale(
     settings: RgbdSettings,
     size: tuple[int, int],
 ) -> tuple[float, tuple[str, ...]]:
-    """Units a metre, and the depth that follows from it in words. Raises DatasetError."""
+    """Units a metre, and the depth that follows from it in words.
+
+    Where nothing states it, TUM's or millimetres, whichever a depth camera can have seen. Motion
+    does not decide it: all that is seen is the same in a world of another size. Where both or
+    neither can be, it is the layout's own.
+
+    Raises:
+        DatasetError: no depth camera sees as far.
+    """
     seen, of_integers = _some_depths(root, pairs, size)
     stated = settings.depth_scale or _stated_scale(root, settings)
-    guessed = stated is None and of_integers
-    scale, caveat = _assumed_scale(root, seen) if guessed else (stated or 1.0, ())
+    caveat: tuple[str, ...] = ()
+    if stated is None and of_integers:
+        of_tum = (root / "depth.txt").is_file()
+        own, other = (_TUM_SCALE, _MILLIMETRES) if of_tum else (_MILLIMETRES, _TUM_SCALE)
+        near, far = np.percentile(seen, _ENDS)
+        nearest = {_TUM_SCALE: _NEAREST_OF_TUM_M, _MILLIMETRES: _NEAREST_M}
+        possible = {
+            scale: near > nearest[scale] * scale and far < _FARTHEST_GUESSED_M * scale
+            for scale in (own, other)
+        }
+        refused = float(np.median(seen)) >= _FARTHEST_GUESSED_M * own  # it may be a third unit
+        certain = possible[own] and not possible[other]
+        if possible[other] and not possible[own] and not refused:
+            own, other = other, own
+        if not certain:
+            caveat = (
+                "nothing states the unit of depth, and the size of the map depends on it: at "
+                f"{own:g} units a metre it is {near / own:.2g} to {far / own:.2g} m, at {other:g} "
+                f"{near / other:.2g} to {far / other:.2g} m; say which: "
+                f"--set dataset.depth_scale={other:g} or {own:g}",
+            )
+        scale, farthest, assumed = own, _FARTHEST_GUESSED_M, ", which nothing states"
+    else:
+        scale, farthest, assumed = stated or 1.0, _FARTHEST_M, ""
     median = float(np.median(seen)) / scale
-    if not _NEAREST_M < median < (_FARTHEST_GUESSED_M if guessed else _FARTHEST_M):
+    if not _NEAREST_M < median < farthest:
         raise DatasetError(
             f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
             "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, "
             "10000 for tenths of them, 5000 as in TUM's, 1 for metres"
         )
-    assumed = ", which nothing states" if guessed else ""
-    reported = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
-    return scale, (*caveat, reported)
-
-
-def _assumed_scale(root: Path, seen: FloatArray) -> tuple[float, tuple[str, ...]]:
-    """TUM's units a metre or millimetres, whichever a depth camera can have seen; caveat in words.
-
-    Motion does not decide it: all that is seen is the same in a world of another size. Where both
-    or neither can be, it is the layout's own.
-
-    Args:
-        root: the recording, in TUM's layout or another.
-        seen: (n,) depths in units.
-    """
-    near, far = np.percentile(seen, _ENDS)
-    own, other = _MILLIMETRES, _TUM_SCALE
-    if (root / "depth.txt").is_file():
-        own, other = other, own
-    nearest = {_TUM_SCALE: _NEAREST_OF_TUM_M, _MILLIMETRES: _NEAREST_M}
-    possible = {
-        scale: near > nearest[scale] * scale and far < _FARTHEST_GUESSED_M * scale
-        for scale in (own, other)
-    }
-    if possible[own] and not possible[other]:
-        return own, ()
-    refused = float(np.median(seen)) >= _FARTHEST_GUESSED_M * own  # it may be a third unit
-    if possible[other] and not possible[own] and not refused:
-        own, other = other, own
-    return own, (
-        f"nothing states the unit of depth, and the size of the map depends on it: at {own:g} "
-        f"units a metre it is {near / own:.2g} to {far / own:.2g} m, at {other:g} "
-        f"{near / other:.2g} to {far / other:.2g} m; say which: "
-        f"--set dataset.depth_scale={other:g} or {own:g}",
-    )
+    taken = f"depth is taken as {scale:g} units a metre{assumed}: its median is {median:.3g} m"
+    return scale, (*caveat, taken)
 
 
 def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:

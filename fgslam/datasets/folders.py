@@ -17,7 +17,7 @@ from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
-from fgslam.datasets.layouts import files_of, find_cameras, layout_hint
+from fgslam.datasets.layouts import files_of, find_cameras
 from fgslam.datasets.odometry import file_odometry, find_odometry
 from fgslam.datasets.recording import (
     Recording,
@@ -65,14 +65,14 @@ def open_loose_images(
             "right/, or names such as *_left.png and *_right.png; one camera alone is not enough"
         )
     root = cameras.folder
-    pairs, unpaired = pair_files(cameras, settings.pairing_tolerance_ms)
+    pairs, unpaired = pair_files(cameras)
     right = [pair[0] for pair in pairs]
     own = right[0].parent
     stamps, assumed, lists = stamps_of(right, (own, own.parent, root), settings.fps, cameras.right)
     rig = calibrated_rig(settings, root, first_size(right))
     rig = numbered(rig) if cameras.numbered else rig
     images, noticed = open_frames(pairs, rig, root)
-    odometry_file = find_odometry(root, settings.odometry_file)
+    odometry_file = find_odometry(root)
     rig, mounting = on_wheels(rig, settings, odometry_file)
     also = ", ".join(" with ".join(pair) for pair in cameras.others)
     others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
@@ -115,7 +115,7 @@ def open_image_folder(
     rig = _folder_rig(root, settings, calibration, cameras)
     numbers, stamps = _read_times(root / "times.txt")
     images, noticed = open_frames(_frames(cameras, numbers), rig, root)
-    odometry_file = find_odometry(root, settings.odometry_file)
+    odometry_file = find_odometry(root)
     rig, mounting = on_wheels(rig, settings, odometry_file)
     known = set(numbers.tolist())
     unlisted = {folder.name: len(found.keys() - known) for folder, found in cameras.items()}
@@ -154,11 +154,11 @@ def _numbered_images(root: Path, use_top: bool) -> dict[Path, dict[int, Path]]:
     folders = [root / "right", root / "left"]
     absent = [folder.name for folder in folders if not folder.is_dir()]
     if absent:
-        other = layout_hint(root, "image_folder") or (
-            "a recording of one camera cannot be used, a stereo pair (left/ and right/) is the "
-            "least; check dataset.path"
+        raise DatasetError(
+            f"{root} has no folder {' and no folder '.join(absent)}; a recording of one camera "
+            "cannot be used, a stereo pair (left/ and right/) is the least; check dataset.path, "
+            "and dataset.kind where it has another layout"
         )
-        raise DatasetError(f"{root} has no folder {' and no folder '.join(absent)}; {other}")
     if use_top and (root / "top").is_dir():
         folders.append(root / "top")
     cameras = {folder: list_numbered_images(folder) for folder in folders}

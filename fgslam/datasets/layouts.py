@@ -104,20 +104,6 @@ def files_of(given: Path) -> list[Path]:
     return sorted((path for path in found if not path.name.startswith(".")), key=natural)
 
 
-def layout_hint(folder: Path, kind: str) -> str:
-    """What to set where the folder has another layout than that of ``kind``; else empty."""
-    try:
-        found = recognise_layout(folder)
-    except DatasetError:
-        return ""
-    if found["kind"] == kind:
-        return ""
-    changed = {key: value for key, value in found.items() if value != str(folder)}
-    keys = " ".join(f"--set dataset.{key}={value}" for key, value in changed.items())
-    name = LAYOUTS[found["kind"]].name
-    return f"this is {'an' if name[0] in 'aeiouE' else 'a'} {name} folder: {keys}"
-
-
 def _fitting_files(given: Path) -> tuple[str, ...]:
     files = files_of(given)
     if not files or not all(file.exists() for file in files):

@@ -32,7 +32,7 @@ from fgslam.core.log import (
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry, measurement_map
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import require_folder
-from fgslam.datasets.recording import select_of
+from fgslam.datasets.recording import select_frames
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     MeasurementFilesSettings,
@@ -72,7 +72,7 @@ def open_measurement_files(
         root / name for name in (LOG_FILE, GROUND_TRUTH_FILE, LANDMARK_TRUTH_FILE)
     )
     log = MeasurementLog.load(path)
-    count = len(select_of(len(log), settings, str(path)))
+    count = len(select_frames(len(log), settings, str(path)))
     log = make_log(log.rig, list(log)[:count], odometry)
     poses = Trajectory.load(truth) if truth.is_file() else None
     if poses is not None:
@@ -213,7 +213,7 @@ def open_stereo_tracks(
     tracks = read_table(files.tracks, _COLUMNS)
     rows, notes = _usable(tracks)
     numbers = np.unique(tracks.values[rows, 0]).astype(np.int64)
-    numbers = numbers[select_of(len(numbers), settings, str(files.tracks))]
+    numbers = numbers[select_frames(len(numbers), settings, str(files.tracks))]
     rig = _read_rig(files.calibration, tracks.values[rows])
     truth = _read_poses(files.poses, rig, numbers)
     if truth is not None:

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias
 
@@ -21,8 +22,7 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import DatasetError, OdometryError
 from fgslam.core.files import read_lines
 from fgslam.core.geometry import inverse, rotation_angle, se3_exp
-from fgslam.core.log import Frame, ImageSequence
-from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
+from fgslam.core.sensors import BiasEffect, Odometry
 from fgslam.core.types import Trajectory
 from fgslam.datasets.settings import RecordedOdometrySettings, SyntheticOdometrySettings
 from fgslam.datasets.times import (
@@ -65,11 +65,6 @@ _NAMES = {
     "w_rs_s_x",
     "rate_y": "wy w_y omega_y angular_y angular_velocity_y gyro_y gy gyr_y rotation_rate_y "
     "w_rs_s_y",
-    "left_speed": "v_left left_speed speed_left left_velocity velocity_left vl v_l",
-    "right_speed": "v_right right_speed speed_right right_velocity velocity_right vr v_r",
-    "left_ticks": "left_ticks ticks_left left_encoder encoder_left left_count count_left left",
-    "right_ticks": "right_ticks ticks_right right_encoder encoder_right right_count count_right "
-    "right",
     **{axis: f"{axis} p{axis} pos_{axis} position_{axis} pose_{axis} t{axis}" for axis in "xyz"},
     "yaw": "yaw theta heading phi",
     **{f"q{axis}": f"q{axis} q_{axis} orientation_{axis}" for axis in "xyzw"},
@@ -95,29 +90,22 @@ _UNITS = {
 _SLOWEST_S, _SLOWEST_GYROSCOPE_S = 1.0, 0.1  # between two samples: what makes a unit plausible
 
 
-def find_odometry(root: Path, name: str | None) -> Path | None:
-    """The file of odometry in a recording's folder: the named one, else the only one there is.
+def find_odometry(root: Path) -> Path | None:
+    """The only file of odometry in a recording's folder; None where it has none.
 
     Without any, the only file of a gyroscope, imu*.csv or gyro*.csv.
 
     Raises:
-        DatasetError: it is not there, or there are several.
+        DatasetError: there are several.
     """
-    if name is not None:
-        if not (root / name).is_file():
-            raise DatasetError(
-                f"dataset.odometry_file {root / name} does not exist; correct the name, or leave "
-                "it out"
-            )
-        return root / name
     named = (root / "odometry.txt", root / "odom.txt")  # the second of OpenLORIS
     found = [path for path in (*named, *sorted(root.glob("odom*.csv"))) if path.is_file()]
     # Wheels measure more than a gyroscope.
     found = found or [path for path in sorted(root.glob("*.csv")) if is_of_gyroscope(path)]
     if len(found) > 1:
         raise DatasetError(
-            f"{root} has several odometry files ({', '.join(p.name for p in found)}); name "
-            "one in dataset.odometry_file"
+            f"{root} has several odometry files ({', '.join(p.name for p in found)}); keep one "
+            "there"
         )
     return found[0] if found else None
 
@@ -260,7 +248,7 @@ def motions_of(
     bRs: FloatArray | None = None,
     noise: GyroscopeNoise | None = None,
 ) -> OdometrySource:
-    """Body motions by the best columns that a table has: poses, ticks, speeds, or a gyroscope's.
+    """Body motions by the best columns that a table has: poses, speeds, or a gyroscope's.
 
     Args:
         table: columns by their roles, as :func:`read_columns` gives them.
@@ -286,13 +274,6 @@ def motions_of(
                 f"{values[bad[0]]:.4g} {unit} is absurd (limit {limit:g}){hint}; correct the line"
             )
 
-    def track() -> float:
-        if settings.track_m is None:
-            raise OdometryError(
-                f"{path} gives both wheels; say their distance: --set odometry.track_m=..."
-            )
-        return settings.track_m
-
     if len(table) < 2:
         raise OdometryError(
             f"{path} holds {len(table)} samples, at least 2 are needed; restore the file, or "
@@ -302,20 +283,12 @@ def motions_of(
     stamps, none = time + settings.time_offset_s, np.zeros(len(time))
     are_degrees = ", radians are expected: are these degrees?"
     if has("x", "y", "qx", "qy", "qz", "qw"):
-        position = [columns["x"], columns["y"], columns.get("z", none)]
         quaternion = [columns[name] for name in ("qx", "qy", "qz", "qw")]
-    elif has("x", "y", "yaw") or has("left_ticks", "right_ticks"):
-        if has("x", "y", "yaw"):
-            position, yaw = [columns["x"], columns["y"], columns.get("z", none)], columns["yaw"]
-        else:
-            *position, yaw = _arcs_of_ticks(path, columns, track, settings.metres_per_tick)
+    elif has("x", "y", "yaw"):
+        yaw = columns["yaw"]
         quaternion = [none, none, np.sin(0.5 * yaw), np.cos(0.5 * yaw)]
-    elif has("speed", "yaw_rate") or has("left_speed", "right_speed"):
-        if has("speed", "yaw_rate"):
-            speed, yaw_rate = columns["speed"], columns["yaw_rate"]
-        else:
-            left, right = columns["left_speed"], columns["right_speed"]
-            speed, yaw_rate = 0.5 * (left + right), (right - left) / track()
+    elif has("speed", "yaw_rate"):
+        speed, yaw_rate = columns["speed"], columns["yaw_rate"]
         require_sane(speed, _MAX_SPEED_MPS, "forward speed, m/s")
         require_sane(np.degrees(yaw_rate), _MAX_TURN_DPS, "yaw rate, degrees/s", are_degrees)
         return lambda frames: speed_motions(stamps, speed, yaw_rate, frames, settings)
@@ -328,13 +301,13 @@ def motions_of(
     else:
         raise OdometryError(
             f"{path}: columns {', '.join(sorted(columns))} were understood; needed are time with "
-            "speed and yaw_rate, left_speed and right_speed, left_ticks and right_ticks, x, y and "
-            "yaw (or qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z; name the columns so"
+            "speed and yaw_rate, x, y and yaw (or qx, qy, qz, qw), or gyro_x, gyro_y and gyro_z; "
+            "name the columns so"
         )
     from scipy.spatial.transform import Rotation  # slow to load, and not all have odometry
 
-    xyz, xyzw = np.column_stack(position), np.column_stack(quaternion)
-    poses = poses_of(table, xyz, xyzw, OdometryError)
+    xyz = np.column_stack([columns["x"], columns["y"], columns.get("z", none)])
+    poses = poses_of(table, xyz, np.column_stack(quaternion), OdometryError)
     motions, duration = inverse(poses[:-1]) @ poses[1:], np.diff(time)
     pace = np.linalg.norm(motions[:, :3, 3], axis=1) / duration
     require_sane(pace, _MAX_SPEED_MPS, "speed, m/s")
@@ -343,32 +316,11 @@ def motions_of(
     return lambda frames: pose_motions(Trajectory(stamps, poses), frames, settings)
 
 
-def _arcs_of_ticks(
-    path: Path,
-    columns: dict[str, FloatArray],
-    track: Callable[[], float],
-    metres_per_tick: float | None,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """x, y, z and yaw (n,) by exact arcs between the samples of two wheels' counters."""
-    if metres_per_tick is None:
-        raise OdometryError(
-            f"{path} counts ticks; say how far one goes: --set odometry.metres_per_tick=..."
-        )
-    left, right = (
-        metres_per_tick * np.diff(columns[name], prepend=columns[name][:1])
-        for name in ("left_ticks", "right_ticks")
-    )
-    length, turn = 0.5 * (left + right), (right - left) / track()
-    yaw = np.cumsum(turn)
-    # The chord of an arc, at the mean of both headings.
-    chord = length * np.sinc(turn / (2.0 * np.pi))
-    middle = yaw - 0.5 * turn
-    x, y = np.cumsum(chord * np.cos(middle)), np.cumsum(chord * np.sin(middle))
-    return x, y, np.zeros_like(x), yaw
-
-
 # --------------------------------------------------------------------------------------------
 # Motions between frames
+
+
+_MAX_GAP_S = 0.5  # between samples of speed, or poses, that is bridged
 
 
 def steps_covered(stamps: FloatArray, frames: FloatArray, max_gap: float, hold: float) -> BoolArray:
@@ -432,7 +384,7 @@ def speed_motions(
     translation = (settings.speed_sigma_mps, _LATERAL_SIGMA_MPS, _VERTICAL_SIGMA_MPS)
     rates = np.concatenate([np.radians(rotation), translation])
     covariances = [np.diag((rates * dt) ** 2) for dt in np.diff(frames)]
-    known = steps_covered(stamps, frames, settings.max_gap_s, settings.max_gap_s)
+    known = steps_covered(stamps, frames, _MAX_GAP_S, _MAX_GAP_S)
     return _steps(poses, covariances, known)
 
 
@@ -447,7 +399,7 @@ def pose_motions(log: Trajectory, frames: FloatArray, settings: RecordedOdometry
     motions = inverse(poses[:-1]) @ poses[1:]
     covariances = [pose_noise(motion, settings) for motion in motions]
     # Unlike a speed, a pose cannot be held beyond the log's ends: that would say "no motion".
-    known = steps_covered(log.timestamps, frames, settings.max_gap_s, _POSE_HOLD_S)
+    known = steps_covered(log.timestamps, frames, _MAX_GAP_S, _POSE_HOLD_S)
     return _steps(poses, covariances, known)
 
 
@@ -464,8 +416,8 @@ def pose_noise(motion: FloatArray, settings: RecordedOdometrySettings) -> FloatA
 # BMI055 and BMI160, Analog Devices ADIS16448). EuRoC's is 4.5 degrees/s off.
 _START_BIAS_DPS = 3.0
 _TURN_SIGMA_FRACTION = 0.013  # sensitivity 1 %, alignment of its axes half a degree
-_MAX_GAP_S = 0.1  # over which the angular velocity is taken as linear
-_HOLD_S = 0.02  # beyond the first and last sample
+_MAX_RATE_GAP_S = 0.1  # over which the angular velocity is taken as linear
+_RATE_HOLD_S = 0.02  # beyond the first and last sample
 
 
 def gyroscope_motions(
@@ -475,7 +427,7 @@ def gyroscope_motions(
 
     docs/derivations/motion.md.
     """
-    known = steps_covered(stamps, frames, _MAX_GAP_S, _HOLD_S)
+    known = steps_covered(stamps, frames, _MAX_RATE_GAP_S, _RATE_HOLD_S)
     rotations, jacobians = integrate_rates(stamps, rates, frames)
     start = float(np.radians(_START_BIAS_DPS)) ** 2
     steps: list[Odometry | None] = []
@@ -527,101 +479,42 @@ def integrate_rates(
 # Synthetic odometry
 
 
-_STAMP_TOLERANCE_S = 1e-6
+STAMP_TOLERANCE_S = 1e-6
+"""Within which a frame has a true pose."""
+
 # Least noise per axis and step: a covariance of a standing robot must be invertible.
 _SYNTHETIC_FLOOR_M, _SYNTHETIC_FLOOR_DEG = 0.001, 0.01
 
 
-class SyntheticOdometry:
-    """A recording whose odometry is its ground truth with noise drawn from a seed.
+def synthetic_motions(
+    truth: Trajectory,
+    bTc: FloatArray,
+    settings: SyntheticOdometrySettings,
+    seed: int,
+    frames: FloatArray,
+) -> Steps:
+    """Motions of the body between frames (m,): the truth with noise drawn from a seed.
 
-    The motion of step ``i`` is ``M = M_true * Exp(xi)``, ``xi`` normal with the covariance that is
-    reported with it, independent per body axis and step. Each step has its own generator, seeded
-    from (seed, numbers of its two frames), so that any part of a recording repeats the same noise.
+    The motion of a step is ``M = M_true * Exp(xi)``, ``xi`` normal with the covariance that is
+    reported with it, independent per body axis and step; None where the truth has a gap. Each step
+    has its own generator, seeded from (seed, numbers of its two frames), so that any part of a
+    recording repeats the same noise.
     """
-
-    def __init__(
-        self, sequence: ImageSequence, settings: SyntheticOdometrySettings, seed: int
-    ) -> None:
-        """Wrap ``sequence``.
-
-        Raises:
-            DatasetError: the recording has no ground truth.
-        """
-        if sequence.ground_truth is None or len(sequence.ground_truth) == 0:
-            raise DatasetError(
-                f"odometry.kind is synthetic but {sequence.name} has no ground truth to make it "
-                "from; choose recorded or constant_velocity"
-            )
-        self._sequence = sequence
-        self._settings = settings
-        self._seed = seed
-        self._truth = sequence.ground_truth
-        # Row of the truth at each frame, -1 where there is none.
-        self._rows = rows_at(
-            sequence.ground_truth.timestamps, sequence.timestamps, _STAMP_TOLERANCE_S
-        )
-
-    @property
-    def name(self) -> str:
-        """Name of the wrapped recording."""
-        return self._sequence.name
-
-    @property
-    def rig(self) -> CameraRig:
-        """Cameras of the wrapped recording."""
-        return self._sequence.rig
-
-    @property
-    def timestamps(self) -> FloatArray:
-        """(n,) seconds."""
-        return self._sequence.timestamps
-
-    @property
-    def identity(self) -> str:
-        """Digest of the wrapped recording; the noise is set by the configuration and its seed."""
-        return self._sequence.identity
-
-    def __len__(self) -> int:
-        return len(self._sequence)
-
-    def frame(self, i: int) -> Frame:
-        """Images of frame ``i``, as recorded."""
-        return self._sequence.frame(i)
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """True poses, as recorded."""
-        return self._truth
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes of the recording, and that the odometry is synthetic, with its noise."""
-        note = (
-            "the odometry is synthetic: ground truth plus noise of "
-            f"{100.0 * self._settings.translation_sigma_fraction:g} % of the step and "
-            f"{self._settings.rotation_sigma_deg:g} degrees per axis (seed {self._seed})"
-        )
-        without = int((self._rows < 0).sum())
-        partial = (f"{without} frames have no ground truth, so no odometry",) if without else ()
-        return (*self._sequence.notes, note, *partial)
-
-    def odometry(self, i: int) -> Odometry | None:
-        """Noisy body motion from frame ``i - 1`` to ``i``; None where truth has a gap."""
-        if not 1 <= i < len(self):
-            raise IndexError(f"step {i} of {self.name}: expected 1 to {len(self) - 1}")
-        before, after = self._rows[i - 1], self._rows[i]
+    steps: list[Odometry | None] = []
+    # Stamps identify frames whatever the selection; microseconds are what files keep.
+    marks = np.round(frames * 1e6).astype(np.int64)
+    rows = rows_at(truth.timestamps, frames, STAMP_TOLERANCE_S)
+    for i, (before, after) in enumerate(pairwise(rows.tolist())):
         if before < 0 or after < 0:
-            return None
-        bTc = self.rig.bTc
-        camera = inverse(self._truth.poses[before]) @ self._truth.poses[after]
+            steps.append(None)
+            continue
+        camera = inverse(truth.poses[before]) @ truth.poses[after]
         motion = bTc @ camera @ inverse(bTc)
-        settings, length = self._settings, float(np.linalg.norm(motion[:3, 3]))
+        length = float(np.linalg.norm(motion[:3, 3]))
         rotation = np.radians(max(settings.rotation_sigma_deg, _SYNTHETIC_FLOOR_DEG))
         translation = max(settings.translation_sigma_fraction * length, _SYNTHETIC_FLOOR_M)
         sigmas = np.repeat([rotation, translation], 3)
-        # Stamps identify frames whatever the selection; microseconds are what files keep.
-        pair = np.round(self.timestamps[i - 1 : i + 1] * 1e6).astype(np.int64)
-        generator = np.random.default_rng([self._seed, *(int(t) % 2**63 for t in pair)])
+        generator = np.random.default_rng([seed, *(int(t) % 2**63 for t in marks[i : i + 2])])
         noise = generator.standard_normal(6) * sigmas
-        return Odometry(motion @ se3_exp(noise), np.diag(sigmas**2))
+        steps.append(Odometry(motion @ se3_exp(noise), np.diag(sigmas**2)))
+    return tuple(steps)

@@ -115,7 +115,7 @@ def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
     """
     root = Path(settings.path)
     paths = pictures_in(root, settings.pattern)
-    chosen = select_frames(len(paths), settings)
+    chosen = select_frames(len(paths), settings, settings.path)
     first = read_colour_image(paths[int(chosen[0])])
     recording = OmniRecording(
         name=root.resolve().name,
@@ -139,12 +139,11 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
     """
     path = Path(settings.path)
     frames = VideoFrames(path)
-    rate = settings.frame_rate_hz or frames.rate
-    if not 0.0 < rate < np.inf:
-        raise DatasetError(f"{path} states no frame rate; give dataset.frame_rate_hz")
-    chosen = select_frames(frames.count, settings)
+    if not 0.0 < frames.rate < np.inf:
+        raise DatasetError(f"{path} states no frame rate; convert it to a file that does")
+    chosen = select_frames(frames.count, settings, settings.path)
     first = frames.load(int(chosen[0]))
-    moments = moments_of([frames], rate, settings.frame_rate_hz is not None)
+    moments = moments_of([frames], frames.rate, stated=False)
     recording = OmniRecording(
         name=path.stem,
         identity=recording_identity([path], []),
@@ -243,7 +242,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
         paths = [_listed_picture(root, place) for place in places]
     else:
         paths = pictures_in(pictures if pictures.is_dir() else root)
-    chosen = select_frames(len(paths), settings)
+    chosen = select_frames(len(paths), settings, settings.path)
     first = read_colour_image(paths[int(chosen[0])])
     size = reduced = (first.shape[1], first.shape[0])
     if settings.width is not None and settings.width != size[0]:

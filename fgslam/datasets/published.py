@@ -5,6 +5,7 @@ docs/datasets/published.md.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +31,6 @@ from fgslam.datasets.images import first_size, list_numbered_images, open_frames
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
 from fgslam.datasets.odometry import (
     SPEED_COLUMNS,
-    OdometrySource,
     gyroscope_odometry,
     motions_of,
     recorded_motions,
@@ -87,8 +87,7 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
     rig = _euroc_rig(settings, root, first_size(cameras[0].paths))
     right, left = (cameras[k] for k in rig.sources[:2])
     others = [("left", str(left.paths[0].parent), left.stamps)]
-    tolerance = 1e-3 * settings.pairing_tolerance_ms
-    rows, paired = pair_stamps(right.stamps, others, tolerance, str(right.paths[0].parent))
+    rows, paired = pair_stamps(right.stamps, others, str(right.paths[0].parent))
     paths = [(right.paths[i], left.paths[j]) for i, j in rows.tolist()]
     images, noticed = open_frames(paths, rig, root)
     sensors = [*folders, root / "imu0"]
@@ -106,11 +105,14 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         identity,
         (*noticed, *paired),
     )
-    return replace(
-        recording,
-        ground_truth=_euroc_truth(root, rig, recording.timestamps),
-        odometry_source=_euroc_gyroscope(root, odometry),
-    )
+    recording = replace(recording, ground_truth=_euroc_truth(root, rig, recording.timestamps))
+    gyroscope, own = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
+    if not gyroscope.is_file():
+        return recording
+    noise = next((p for p in (own, root.parent / "dso" / "imu_config.yaml") if p.is_file()), None)
+    mounting = own if own.is_file() else None
+    source = gyroscope_odometry(gyroscope, mounting, noise, odometry)
+    return replace(recording, odometry_source=source)
 
 
 def _euroc_rig(settings: EurocSettings, root: Path, size: tuple[int, int] | None) -> StereoRig:
@@ -127,15 +129,6 @@ def _euroc_rig(settings: EurocSettings, root: Path, size: tuple[int, int] | None
             "there; restore one, or give a calibration by --camera FILE"
         )
     return mounted(loaded_rig(settings, *given, size=size), settings)
-
-
-def _euroc_gyroscope(root: Path, settings: RecordedOdometrySettings) -> OdometrySource | None:
-    """Turns by imu0, read when they are first needed; None where there is none."""
-    path, own = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
-    if not path.is_file():
-        return None
-    noise = next((p for p in (own, root.parent / "dso" / "imu_config.yaml") if p.is_file()), None)
-    return gyroscope_odometry(path, own if own.is_file() else None, noise, settings)
 
 
 def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
@@ -164,24 +157,26 @@ def read_camera_frames(folder: Path) -> CameraFrames:
         DatasetError: the file is missing, empty or malformed, or stamps do not increase.
     """
     path = folder / "data.csv"
+    lines = read_lines(path)
+    if lines and not re.search(r"\d", lines[0][1].partition(",")[0]):
+        lines = lines[1:]  # names of columns
     stamps: list[int] = []
     paths: list[Path] = []
-    for number, (line, text) in enumerate(read_lines(path)):
-        words = [word.strip() for word in text.split(",")]
-        if number == 0 and not any(digit in words[0] for digit in "0123456789"):
-            continue  # names of columns
-        if len(words) < 2 or not words[0].isdecimal() or not words[1]:
+    for line, text in lines:
+        stamp, _, rest = text.partition(",")
+        stamp, name = stamp.strip(), rest.partition(",")[0].strip()
+        if not stamp.isdecimal() or not name:
             raise DatasetError(
                 f"{path}, line {line}: expected a stamp in whole nanoseconds and a file name; "
                 "correct the line, or all stamps (seconds: times 1e9)"
             )
-        if stamps and int(words[0]) <= stamps[-1]:
+        if stamps and int(stamp) <= stamps[-1]:
             raise DatasetError(
-                f"{path}, line {line}: stamp {words[0]} does not come after {stamps[-1]}; put the "
+                f"{path}, line {line}: stamp {stamp} does not come after {stamps[-1]}; put the "
                 "lines in time order and remove duplicates"
             )
-        stamps.append(int(words[0]))
-        paths.append(folder / "data" / words[1])
+        stamps.append(int(stamp))
+        paths.append(folder / "data" / name)
     if not stamps:
         raise DatasetError(f"{path} lists no image; restore the file")
     found = np.array(stamps, np.int64)
@@ -336,10 +331,11 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     recording = image_recording(settings, name, rig, stamps, images.load, identity, notes)
     if oxts is None:
         return recording
-    recording = replace(recording, odometry_source=oxts.odometry(odometry))
+    source = recorded_motions(str(oxts.speeds.path), lambda: motions_of(oxts.speeds, odometry))
+    recording = replace(recording, odometry_source=source)
     if iTc is None:
         return recording
-    unit = trajectory_at_frames(oxts.poses(), recording.timestamps, _MAX_TRUTH_GAP_S)
+    unit = trajectory_at_frames(oxts.poses, recording.timestamps, _MAX_TRUTH_GAP_S)
     return replace(recording, ground_truth=Trajectory(unit.timestamps, unit.poses @ iTc))
 
 
@@ -384,31 +380,10 @@ _EARTH_RADIUS_M = 6_378_137.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Oxts:
-    """Rows (n, k) of the files' numbers at stamps (n,) in seconds."""
+    """Poses of the unit (x ahead, y left, z up; world with x east), and a table of its speeds."""
 
-    folder: Path
-    stamps: FloatArray
-    rows: FloatArray
-
-    def odometry(self, settings: RecordedOdometrySettings) -> OdometrySource:
-        """Motions of the unit by its forward speed and yaw rate."""
-        values = np.column_stack([self.stamps, self.rows[:, [_FORWARD_SPEED, _YAW_RATE]]])
-        table = Table(self.folder, values, np.arange(1, len(values) + 1), SPEED_COLUMNS)
-        return recorded_motions(str(self.folder), lambda: motions_of(table, settings))
-
-    def poses(self) -> Trajectory:
-        """Poses of the unit (x ahead, y left, z up) in a world with x east, z up."""
-        from scipy.spatial.transform import Rotation
-
-        latitude, longitude = np.radians(self.rows[:, [_LATITUDE, _LONGITUDE]]).T
-        scale = np.cos(latitude[0]) * _EARTH_RADIUS_M  # of the Mercator projection
-        poses = np.tile(np.eye(4), (len(self.rows), 1, 1))
-        north = np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
-        where = np.column_stack([scale * longitude, scale * north, self.rows[:, _ALTITUDE]])
-        poses[:, :3, 3] = where - where[0]
-        angles = self.rows[:, [_YAW, _PITCH, _ROLL]]
-        poses[:, :3, :3] = Rotation.from_euler("ZYX", angles).as_matrix()
-        return Trajectory(self.stamps, poses)
+    poses: Trajectory
+    speeds: Table
 
 
 def read_oxts(drive: Path) -> Oxts | None:
@@ -418,15 +393,26 @@ def read_oxts(drive: Path) -> Oxts | None:
         DatasetError: a file or the list of times is malformed.
     """
     folder = drive / "oxts"
-    if not (folder / "data").is_dir():
-        return None
-    files = sorted((p for p in shown_in(folder / "data") if p.suffix == ".txt"), key=natural)
+    files = shown_in(folder / "data") if (folder / "data").is_dir() else []
+    files = sorted((p for p in files if p.suffix == ".txt"), key=natural)
     if not files:
         return None
     found = written_stamps(files, (folder,)) if (folder / "timestamps.txt").is_file() else None
     if found is None:
         raise DatasetError(f"{folder} has no timestamps.txt; restore it, or remove the folder")
-    return Oxts(folder, found[0], np.array([_oxts_row(path) for path in files]))
+    rows = np.array([_oxts_row(path) for path in files])
+    from scipy.spatial.transform import Rotation
+
+    latitude, longitude = np.radians(rows[:, [_LATITUDE, _LONGITUDE]]).T
+    scale = np.cos(latitude[0]) * _EARTH_RADIUS_M  # of the Mercator projection
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    north = np.log(np.tan(0.25 * np.pi + 0.5 * latitude))
+    where = np.column_stack([scale * longitude, scale * north, rows[:, _ALTITUDE]])
+    poses[:, :3, 3] = where - where[0]
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", rows[:, [_YAW, _PITCH, _ROLL]]).as_matrix()
+    speeds = np.column_stack([found[0], rows[:, [_FORWARD_SPEED, _YAW_RATE]]])
+    table = Table(folder, speeds, np.arange(1, len(rows) + 1), SPEED_COLUMNS)
+    return Oxts(Trajectory(found[0], poses), table)
 
 
 def _oxts_row(path: Path) -> list[float]:

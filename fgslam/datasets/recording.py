@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeAlias, TypeVar
 
@@ -22,8 +22,18 @@ from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
-from fgslam.datasets.odometry import OdometrySource, is_of_gyroscope
-from fgslam.datasets.settings import CalibratedSettings, RecordingSettings
+from fgslam.datasets.odometry import (
+    STAMP_TOLERANCE_S,
+    OdometrySource,
+    is_of_gyroscope,
+    synthetic_motions,
+)
+from fgslam.datasets.settings import (
+    CalibratedSettings,
+    RecordingSettings,
+    SyntheticOdometrySettings,
+)
+from fgslam.datasets.times import rows_at
 
 Rig = TypeVar("Rig", bound=CameraRig)
 
@@ -130,13 +140,39 @@ def image_recording(
     Raises:
         DatasetError: no frame is selected.
     """
-    indices = select_frames(len(stamps), settings)
+    indices = select_frames(len(stamps), settings, settings.path)
     plain, rectifier = rig, None
     if isinstance(rig, StereoRig):
         plain, rectifier, notes = rig.plain(), rig.rectifier, (*rig.remarks, *notes)
     return Recording(
         name, plain, stamps[indices], identity, notes, indices, load_images, rectifier=rectifier
     )
+
+
+def with_synthetic_odometry(
+    recording: Recording, settings: SyntheticOdometrySettings, seed: int
+) -> Recording:
+    """The recording with its ground truth and noise in place of odometry, which a note states.
+
+    Raises:
+        DatasetError: the recording has no ground truth.
+    """
+    truth = recording.ground_truth
+    if truth is None or len(truth) == 0:
+        raise DatasetError(
+            f"odometry.kind is synthetic but {recording.name} has no ground truth to make it "
+            "from; choose recorded or constant_velocity"
+        )
+    notes = [
+        "the odometry is synthetic: ground truth plus noise of "
+        f"{100.0 * settings.translation_sigma_fraction:g} % of the step and "
+        f"{settings.rotation_sigma_deg:g} degrees per axis (seed {seed})"
+    ]
+    rows = rows_at(truth.timestamps, recording.timestamps, STAMP_TOLERANCE_S)
+    if without := int((rows < 0).sum()):
+        notes.append(f"{without} frames have no ground truth, so no odometry")
+    source = partial(synthetic_motions, truth, recording.rig.bTc, settings, seed)
+    return replace(recording, odometry_source=source, notes=(*recording.notes, *notes))
 
 
 def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
@@ -150,12 +186,7 @@ def recording_identity(contents: Iterable[Path], listed: Iterable[Path]) -> str:
     return digest.hexdigest()
 
 
-def select_frames(count: int, settings: RecordingSettings) -> IntArray:
-    """:func:`select_of` the frames in a recording's folder."""
-    return select_of(count, settings, settings.path)
-
-
-def select_of(count: int, settings: FrameSelection, name: str) -> IntArray:
+def select_frames(count: int, settings: FrameSelection, name: str) -> IntArray:
     """Indices (m,) of the chosen ones of ``count`` frames, increasing, at least one.
 
     ``name`` is what messages call the recording.

@@ -24,12 +24,7 @@ from fgslam.worlds.settings import SimulatedMeasurementsSettings as SimulatedMea
 
 Vector3: TypeAlias = tuple[float, float, float]
 PositiveVector3: TypeAlias = tuple[Positive, Positive, Positive]
-OdometryFile: TypeAlias = Annotated[
-    str | None,
-    Field(description="odometry inside the folder; null: odometry.txt, odom.txt or odom*.csv"),
-]
 FramesASecond: TypeAlias = Annotated[float, Field(gt=0.0, le=1e4)]
-Milliseconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1000.0)]
 
 # --------------------------------------------------------------------------------------------
 # Images on disk
@@ -83,26 +78,16 @@ class CalibratedSettings(RecordingSettings):
     )
 
 
-@dataclass(frozen=True, config=STRICT, kw_only=True)
-class PairedSettings(CalibratedSettings):
-    """What a recording has whose images of one moment are found by their times."""
-
-    pairing_tolerance_ms: Milliseconds = Field(
-        default=20.0, description="largest time between the two images of a pair, ms"
-    )
-
-
 @dataclass(frozen=True, config=STRICT)
 class ImageFolderSettings(CalibratedSettings):
     """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/images.md."""
 
     kind: Literal["image_folder"] = "image_folder"
     use_top: bool = Field(default=True, description="use the third camera where the folder has one")
-    odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class LooseImagesSettings(PairedSettings):
+class LooseImagesSettings(CalibratedSettings):
     """Folders of images with any names, with or without times (docs/datasets/images.md)."""
 
     path: str = Field(min_length=1, description="the folder, or a pattern of file names in it")
@@ -110,25 +95,21 @@ class LooseImagesSettings(PairedSettings):
     fps: FramesASecond | None = Field(
         default=None, description="frames a second; null: by the list of times or by names, else 10"
     )
-    odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class VideoSettings(PairedSettings):
+class VideoSettings(CalibratedSettings):
     """Stereo films: one of both views, or one a camera (docs/datasets/images.md)."""
 
     path: str = Field(min_length=1, description="the film, a folder of one to three, or a pattern")
     kind: Literal["video"] = "video"
-    views: Literal["side_by_side", "over_under"] | None = Field(
-        default=None, description="how one film shows both views; null: by its size"
-    )
     fps: FramesASecond | None = Field(
         default=None, description="frames a second, in place of the film's own rate"
     )
 
 
 @dataclass(frozen=True, config=STRICT)
-class RgbdSettings(PairedSettings):
+class RgbdSettings(CalibratedSettings):
     """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/images.md)."""
 
     kind: Literal["rgbd"] = "rgbd"
@@ -137,11 +118,10 @@ class RgbdSettings(PairedSettings):
         description="depth units in a metre; null: by the calibration's file, else 5000 (TUM), "
         "1000 (16 bits), 1 (floats)",
     )
-    odometry_file: OdometryFile = None
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class BagSettings(PairedSettings):
+class BagSettings(CalibratedSettings):
     """ROS 1 and ROS 2 bags: .bag, .db3, .mcap (docs/datasets/bags.md)."""
 
     path: str = Field(min_length=1, description="the bag, its folder, or a pattern of file names")
@@ -170,16 +150,10 @@ class KittiSettings(RecordingSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
-class EurocSettings(PairedSettings):
+class EurocSettings(CalibratedSettings):
     """EuRoC MAV in its native layout, rectified on reading (docs/datasets/published.md)."""
 
     kind: Literal["euroc"] = "euroc"
-    pairing_tolerance_ms: float = Field(
-        default=2.0,
-        ge=0.0,
-        le=50.0,
-        description="largest time between the two images of a pair, ms",
-    )
 
 
 FileRecordingSettings: TypeAlias = (
@@ -270,9 +244,6 @@ class OmniVideoSettings(RecordingSettings):
 
     kind: Literal["omni_video"] = "omni_video"
     camera: OmniCameraSettings = BloggieSettings()
-    frame_rate_hz: float | None = Field(
-        default=None, gt=0.0, le=1000.0, description="frames a second; null: as the file states"
-    )
 
 
 OmniDatasetSettings: TypeAlias = Annotated[
@@ -326,15 +297,6 @@ class RecordedOdometrySettings:
     )
     time_offset_s: float = Field(
         default=0.0, ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds"
-    )
-    max_gap_s: Positive = Field(
-        default=0.5, description="longest gap in the odometry that is bridged"
-    )
-    track_m: Positive | None = Field(
-        default=None, description="speeds or ticks of two wheels: their distance, m"
-    )
-    metres_per_tick: Positive | None = Field(
-        default=None, description="ticks of two wheels: how far one of them goes, m"
     )
     speed_sigma_mps: Positive = Field(
         default=0.10, description="speed and yaw rate: noise of the forward speed, m/s"

@@ -221,6 +221,9 @@ def trajectory_at_frames(
 AnyStamps = TypeVar("AnyStamps", FloatArray, IntArray)
 """Stamps in seconds, or in whole nanoseconds, which are compared without rounding."""
 
+TOLERANCE_S = 0.02
+"""Largest difference in time of the images of one moment."""
+
 _NAMED_SKEW_S = 1e-3  # what synchronised cameras differ by at most
 
 
@@ -235,7 +238,6 @@ def nearest_rows(stamps: AnyStamps, at: AnyStamps) -> IntArray:
 def pair_stamps(
     reference: IntArray,
     others: Sequence[tuple[str, str, IntArray]],
-    tolerance: float,
     name: str,
 ) -> tuple[IntArray, tuple[str, ...]]:
     """Rows (n, 1 + others) of images that are each other's nearest in time, and notes.
@@ -243,7 +245,6 @@ def pair_stamps(
     Args:
         reference: stamps of the right camera in nanoseconds, increasing.
         others: side, name and stamps of each other camera.
-        tolerance: largest difference in seconds from the reference.
         name: of the right camera, in messages.
 
     Returns:
@@ -260,17 +261,17 @@ def pair_stamps(
         partner = nearest_rows(stamps, right)
         mutual = nearest_rows(right, stamps)[partner] == np.arange(len(right))
         skew = NANOSECONDS * np.abs(stamps[partner] - right).astype(np.float64)
-        kept = np.flatnonzero(mutual & (skew <= tolerance + 0.5 * NANOSECONDS))
+        kept = np.flatnonzero(mutual & (skew <= TOLERANCE_S + 0.5 * NANOSECONDS))
         if len(kept) == 0:
             spans = [f"{NANOSECONDS * s[0]:.3f} to {NANOSECONDS * s[-1]:.3f} s"
                      for s in (right, stamps)]  # fmt: skip
             raise DatasetError(
                 f"no image of {name} ({spans[0]}) has a partner in {other} ({spans[1]}) "
-                f"within {1e3 * tolerance:g} ms, the nearest differ by {1e3 * skew.min():.4g} ms; "
-                "raise dataset.pairing_tolerance_ms or restore the stamps"
+                f"within {1e3 * TOLERANCE_S:g} ms, the nearest differ by {1e3 * skew.min():.4g} "
+                "ms; restore the stamps"
             )
         notes += [
-            f"{n} {camera} images have no partner within {1e3 * tolerance:g} ms and are left out"
+            f"{n} {camera} images have no partner within {1e3 * TOLERANCE_S:g} ms and are left out"
             for camera, n in (("right", len(right) - len(kept)), (side, len(stamps) - len(kept)))
             if n
         ]
@@ -503,12 +504,12 @@ Pairs: TypeAlias = tuple[tuple[tuple[Path, Path], ...], tuple[str, ...]]
 """Files (right, left) of each moment, and notes on what is left out."""
 
 
-def pair_files(found: CameraFiles, tolerance_ms: float | None = 20.0) -> Pairs:
+def pair_files(found: CameraFiles, at_once: bool = True) -> Pairs:
     """Pairs (right, left) in natural order, and notes on what is left out.
 
     Files are paired by their names without the side; where those do not match, by the times that
-    the names are, at most ``tolerance_ms`` apart; else by their order. None as tolerance: images
-    that were not taken at once, as of a board that stands still; times say nothing then.
+    the names are; else by their order. Not ``at_once`` are images of a board that stands still:
+    times say nothing then.
 
     Raises:
         DatasetError: names do not match, and the cameras have different numbers of images, or names
@@ -523,8 +524,8 @@ def pair_files(found: CameraFiles, tolerance_ms: float | None = 20.0) -> Pairs:
     )  # fmt: skip
     if right is None or left is None:
         named = _by_names(found, _MOMENTS)
-    elif tolerance_ms is not None:
-        named = _by_time(found, right, left, 1e-3 * tolerance_ms)
+    elif at_once:
+        named = _by_time(found, right, left)
     return _by_order(found) if named is None else named
 
 
@@ -571,14 +572,14 @@ def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pair
     return pairs, (f"left and right images are paired by their order: {why}",)
 
 
-def _by_time(found: CameraFiles, right: IntArray, left: IntArray, tolerance: float) -> Pairs:
+def _by_time(found: CameraFiles, right: IntArray, left: IntArray) -> Pairs:
     """The nearest in time; by order where each camera has a clock of its own that goes alike."""
     try:
         others = [("left", f"{found.folder}, left", left)]
-        rows, notes = pair_stamps(right, others, tolerance, f"{found.folder}, right")
+        rows, notes = pair_stamps(right, others, f"{found.folder}, right")
     except DatasetError:
         apart = NANOSECONDS * (left - right) if len(left) == len(right) else np.array([np.inf])
-        if not np.ptp(apart) <= tolerance:
+        if not np.ptp(apart) <= TOLERANCE_S:
             raise
         away = abs(float(np.median(apart)))
         return _by_order(found, f"the times that their names are lie {away:.6g} s apart throughout")

@@ -8,10 +8,9 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TypeAlias
@@ -36,8 +35,8 @@ from fgslam.datasets.recording import (
 from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
 from fgslam.datasets.times import NANOSECONDS, pair_stamps
 
-_VIEWS = {"side_by_side": (2, 1), "over_under": (1, 2)}
-"""Views next to each other and above each other."""
+_VIEWS = {"side by side": (2, 1), "over under": (1, 2)}
+"""Columns and rows of views that one film shows."""
 
 _USUAL_SHAPE = 1.5  # width over height of a camera's image
 
@@ -65,8 +64,7 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
     if not 0.0 < rate < np.inf:
         raise DatasetError(f"{paths[0]} states no frame rate; say it: --fps RATE")
     views, rig, assumed = _views(settings, films, paths[0].parent)
-    tolerance = 1e-3 * settings.pairing_tolerance_ms
-    moments = moments_of(films, rate, settings.fps is not None, tolerance)
+    moments = moments_of(films, rate, settings.fps is not None)
     size = rig.image_size
 
     def load(index: int, colour: bool) -> tuple[Image, ...]:
@@ -111,7 +109,7 @@ def _views(
     shape = {name: width * rows / (height * columns) for name, (columns, rows) in _VIEWS.items()}
     by_shape = sorted(_VIEWS, key=lambda name: abs(math.log(shape[name] / _USUAL_SHAPE)))
     fault: CalibrationError | None = None
-    for name in [settings.views] if settings.views else by_shape:
+    for name in by_shape:
         columns, rows = _VIEWS[name]
         size = (width // columns, height // rows)
         try:
@@ -119,8 +117,12 @@ def _views(
         except CalibrationError as error:
             fault = fault or error
             continue
-        reported = () if settings.views else (f"the film is taken as {name.replace('_', ' ')}",)
-        return partial(_halves, film, size), rig, (*assumed, *reported)
+
+        def halves(number: int, w: int = size[0], h: int = size[1]) -> tuple[Image, ...]:
+            image = film.load(number)
+            return image[-h:, -w:], image[:h, :w]
+
+        return halves, rig, (*assumed, f"the film is taken as {name}")
     with suppress(CalibrationError):
         calibrated_rig(settings, folder, (width, height))
         raise DatasetError(
@@ -129,12 +131,6 @@ def _views(
             "stretched back to twice the width (side by side) or height"
         )
     raise fault or DatasetError(f"{folder}: no film")
-
-
-def _halves(film: VideoFrames, size: tuple[int, int], number: int) -> tuple[Image, Image]:
-    """Right and left view of a frame that shows both."""
-    image = film.load(number)
-    return image[-size[1] :, -size[0] :], image[: size[1], : size[0]]
 
 
 def _films_of_cameras(
@@ -201,8 +197,6 @@ def _rig(
 
 _UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that count milliseconds
 
-_SIDES = ("right", "third")  # of the films after the first one
-
 _LASTING = 15  # frames over which films part, not only jitter: at most half of the film
 
 
@@ -221,16 +215,13 @@ class Moments:
     notes: tuple[str, ...]
 
 
-def moments_of(
-    films: list[VideoFrames], rate: float, stated: bool, tolerance: float = 0.0
-) -> Moments:
+def moments_of(films: list[VideoFrames], rate: float, stated: bool) -> Moments:
     """Frames of one film, or of several those of one number, or of one time where that is another.
 
     Args:
         films: one, or those of the left and of the right camera, and of a third one.
         rate: frames a second of the first.
         stated: that rate is the user's, in place of each film's own times.
-        tolerance: largest time between frames of two films, seconds.
 
     Raises:
         DatasetError: no two frames are shown at one time.
@@ -243,12 +234,19 @@ def moments_of(
     if stated or len(known) < len(films) or not any(_part(known[0], its) for its in known[1:]):
         how, moments = "number", _by_number(films, own, rate)
     else:
-        how, moments = "time", _by_time(films, known, tolerance)
+        how, moments = "time", _by_time(films, known)
     count, all_ = ("two", "both") if len(films) == 2 else ("three", "all")
-    how = f"frames of the {count} films are paired by their {how}: {all_} must begin at one time"
-    differ = (note for film, side in zip(films[1:], _SIDES, strict=False)
-              for note in _differences(films[0], film, side))  # fmt: skip
-    return replace(moments, notes=(how, *differ, *moments.notes))
+    notes = [
+        f"frames of the {count} films are paired by their {how}: {all_} must begin at one time"
+    ]
+    left = films[0]
+    for film, side in zip(films[1:], ("right", "third"), strict=False):
+        if left.count != film.count:
+            notes.append(f"the left film has {left.count} frames, the {side} one {film.count}")
+        if abs(left.rate - film.rate) > 1e-3 * left.rate:
+            text = f"the left film has {left.rate:g} frames a second, the {side} {film.rate:g}"
+            notes.append(text)
+    return replace(moments, notes=(*notes, *moments.notes))
 
 
 def _part(left: FloatArray, right: FloatArray) -> bool:
@@ -264,22 +262,12 @@ def _part(left: FloatArray, right: FloatArray) -> bool:
     return bool(np.abs(np.median(apart, axis=1)).max() > 0.5 * step)
 
 
-def _differences(left: VideoFrames, right: VideoFrames, side: str) -> tuple[str, ...]:
-    """What two films that should run together differ in."""
-    notes = []
-    if left.count != right.count:
-        notes.append(f"the left film has {left.count} frames, the {side} one {right.count}")
-    if abs(left.rate - right.rate) > 1e-3 * left.rate:
-        notes.append(f"the left film has {left.rate:g} frames a second, the {side} {right.rate:g}")
-    return tuple(notes)
-
-
-def _by_time(films: list[VideoFrames], known: list[FloatArray], tolerance: float) -> Moments:
+def _by_time(films: list[VideoFrames], known: list[FloatArray]) -> Moments:
     """Frames of the films that are each other's nearest."""
     left, right, *third = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
     sides = zip(("left", "third"), (films[0], *films[2:]), (left, *third), strict=False)
     others = [(side, film.name, stamps) for side, film, stamps in sides]
-    rows, notes = pair_stamps(right, others, tolerance, films[1].name)
+    rows, notes = pair_stamps(right, others, films[1].name)
     numbers = rows[:, [1, 0, *range(2, len(films))]]
     return Moments(numbers, known[0][numbers[:, 0]], notes)
 
@@ -335,7 +323,15 @@ class VideoFrames:
         self.count = stated if stated > 0 and self._reaches(stated) else self._counted()
         if self.count < 1:
             raise DatasetError(f"{path} holds no frame; give a video file")
-        self.notes: tuple[str, ...] = tuple(self._noticed(stated))
+        notes = []
+        if self.count < stated:
+            notes.append(f"{path.name} is cut off: {self.count} of {stated} frames can be read")
+        if turn := round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)):
+            notes.append(
+                f"{path.name} states that it is to be turned by {turn} degrees, and is read so: "
+                "the calibration must be of images turned so"
+            )
+        self.notes = tuple(notes)
         self._next = 0
         self._kept: OrderedDict[int, Image] = OrderedDict()
 
@@ -376,29 +372,19 @@ class VideoFrames:
                     f"{self.count} is missing: it is truncated; restore it, or set dataset.stop"
                 )
             self._next += 1
-            if index - self._next < _KEPT:
-                self._keep(self._next - 1, index)
-
-    def _keep(self, number: int, wanted: int) -> None:
-        decoded, frame = self._capture.retrieve()
-        if decoded and frame is not None:
-            self._kept[number] = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
-        elif number == wanted:
-            raise FrameError(
-                f"video {self._path}: frame {number} cannot be decoded; leave it out with "
-                "dataset.start, stop or stride"
-            )
-
-    def _noticed(self, stated: int) -> Iterator[str]:
-        if self.count < stated:
-            yield f"{self.name} is cut off: {self.count} of {stated} frames can be read"
-        if turn := round(self._capture.get(cv2.CAP_PROP_ORIENTATION_META)):
-            yield (
-                f"{self.name} states that it is to be turned by {turn} degrees, and is read so: "
-                "the calibration must be of images turned so"
-            )
+            if index - self._next >= _KEPT:
+                continue
+            decoded, frame = self._capture.retrieve()
+            if decoded and frame is not None:
+                image = np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+                self._kept[self._next - 1] = image
+                while len(self._kept) > _KEPT:
+                    self._kept.popitem(last=False)
+            elif self._next > index:
+                raise FrameError(
+                    f"video {self._path}: frame {index} cannot be decoded; leave it out with "
+                    "dataset.start, stop or stride"
+                )
 
     def _reaches(self, stated: int) -> bool:
         """Whether the last frame that the file states is there."""

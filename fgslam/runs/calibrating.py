@@ -200,7 +200,7 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
                 f"{folders[0]}: images of two cameras are not told apart there; name them left and "
                 "right, or give a folder for each"
             )
-        pairs, notes = pair_files(found, tolerance_ms=None)
+        pairs, notes = pair_files(found, at_once=False)
         return [(left, right) for right, left in pairs], notes
     listed = [images_in(folder) for folder in folders]
     counts = [len(images) for images in listed]

@@ -445,7 +445,7 @@ class Experiment(BaseModel):
         return ""
 
 
-_PATHS = ("path", "file", "camera_file", "odometry_file", "load", "poses", "routes")
+_PATHS = ("path", "file", "camera_file", "load", "poses", "routes")
 """Keys of files and folders that are read, in the experiments of all tasks."""
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.log import ImageSequence
-from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
+from fgslam.datasets.recording import with_synthetic_odometry
 from fgslam.datasets.settings import (
     MeasurementDatasetSettings,
     OdometrySettings,
@@ -30,24 +30,28 @@ def open_sequence(
         from fgslam.datasets.rendered import RenderedLabSequence  # the world and its textures
 
         _require_own_noise(config.odometry)
-        sequence: ImageSequence = RenderedLabSequence(
+        return RenderedLabSequence(
             dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
         )
-    elif isinstance(dataset, MeasurementDatasetSettings):
+    if isinstance(dataset, MeasurementDatasetSettings):
         raise ConfigError(
             f"dataset.kind {dataset.kind} holds measurements, no images; choose a recording of "
             "images here"
         )
-    else:
-        noise = config.odometry if isinstance(config.odometry, RecordedOdometrySettings) else None
-        sequence = open_recording(dataset, noise)
+    noise = config.odometry if isinstance(config.odometry, RecordedOdometrySettings) else None
+    recording = open_recording(dataset, noise)
     if isinstance(config.odometry, SyntheticOdometrySettings):
-        return SyntheticOdometry(sequence, config.odometry, config.seed)
-    return sequence
+        return with_synthetic_odometry(recording, config.odometry, config.seed)
+    return recording
 
 
 def _require_own_noise(odometry: OdometrySettings) -> None:
     """The rendered robot's odometry has its noise among the data set's keys: no key may be idle."""
+    if isinstance(odometry, SyntheticOdometrySettings):
+        raise ConfigError(
+            "odometry.kind synthetic is for recordings; the rendered lab has wheels of its own: "
+            "choose recorded or constant_velocity"
+        )
     if not isinstance(odometry, RecordedOdometrySettings):
         return
     if odometry != RecordedOdometrySettings(gap=odometry.gap):

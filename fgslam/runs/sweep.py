@@ -85,7 +85,7 @@ _FAILURES_ON_PAGE = 20
 SEED = "seed"
 MOST_CASES = 1_000_000
 _RANGE = re.compile(r"\s*(\d+):(\d+)(?::(\d+))?\s*")
-_PATHS = ("path", "camera_file", "odometry_file", "load")
+_PATHS = ("path", "camera_file", "load")
 _VALUES_NAMED = 20
 
 

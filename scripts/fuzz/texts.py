@@ -98,8 +98,7 @@ def trajectory(rng: Rng, folder: Path) -> Path:
 
 _TABLES = (
     "time,speed,yaw_rate\n1.0,0.1,0.2\n1.1,0.1,0.2\n1.2,0.1,0.2\n",
-    "stamp_ns;left_speed_mps;right_speed_mps\n1000000000;0.1;0.2\n1100000000;0.1;0.2\n",
-    "t,left_ticks,right_ticks\n1.0,10,20\n1.1,20,30\n1.2,30,40\n",
+    "stamp_ns;v_mps;gyro_z\n1000000000;0.1;0.2\n1100000000;0.1;0.2\n",
     "time x y yaw_deg\n1.0 0.1 0.2 3.0\n1.1 0.11 0.2 3.1\n1.2 0.12 0.2 3.2\n",
     "time,x,y,z,qx,qy,qz,qw\n1.0,0.1,0,0,0,0,0,1\n1.1,0.11,0,0,0,0,0,1\n1.2,0.12,0,0,0,0,0,1\n",
 )
@@ -113,7 +112,7 @@ def odometry_table(rng: Rng, folder: Path) -> Path:
 
 def read_odometry(path: Path) -> None:
     """Motions of the table's body at three times."""
-    motions = file_odometry(path, RecordedOdometrySettings(track_m=0.5, metres_per_tick=0.01))
+    motions = file_odometry(path, RecordedOdometrySettings())
     if motions is not None:
         motions(np.array([1.0, 1.05, 1.1]))
 

@@ -12,9 +12,8 @@ import pytest
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
-from fgslam.datasets.odometry import SyntheticOdometry
 from fgslam.datasets.opening import open_recording
-from fgslam.datasets.recording import Recording
+from fgslam.datasets.recording import Recording, with_synthetic_odometry
 from fgslam.datasets.settings import (
     BagSettings,
     EurocSettings,
@@ -135,7 +134,7 @@ def test_default_noise_covers_the_real_errors(shared_data: Path) -> None:
 
 def test_synthetic_odometry_of_the_indoor_flight(shared_data: Path) -> None:
     recording = open_recording(folder(shared_data, "euroc_v101_kf100"))
-    synthetic = SyntheticOdometry(recording, SyntheticOdometrySettings(), 7)
+    synthetic = with_synthetic_odometry(recording, SyntheticOdometrySettings(), 7)
     steps = [synthetic.odometry(i) for i in range(1, 100)]
     assert all(step is not None for step in steps)
 

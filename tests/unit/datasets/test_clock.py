@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,10 +15,10 @@ from fgslam.core.sensors import CameraRig
 from fgslam.datasets.clock import (
     FrameFeatures,
     Judged,
-    SampledFeatures,
     SeenTurns,
     judged,
     judged_turns,
+    stereo_features,
     turn_between,
 )
 from fgslam.datasets.odometry import (
@@ -103,13 +101,6 @@ def test_images_whose_matches_lie_in_one_place_say_no_turn() -> None:
     assert turn_between(look, look, camera) is None
 
 
-class Found(SampledFeatures):
-    """Features instead of images."""
-
-    def _found(self, image: Any) -> Any:
-        return image
-
-
 def test_turns_are_seen() -> None:
     rig = CameraRig(
         400, 300, 120.0, 120.0, 199.5, 149.5, 0.1, None, BODY_FORWARD_LEFT_UP_FROM_CAMERA
@@ -122,10 +113,9 @@ def test_turns_are_seen() -> None:
     for at in (points, points @ so3_exp(turn)):
         measured = project(rig, at)
         left = np.column_stack([measured[:, 0] + measured[:, 2], measured[:, 1]])
-        frames.append(SimpleNamespace(images=((measured[:, :2], looks), (left, looks))))
-    found = Found(cast(Any, SimpleNamespace(rig=rig, frame=frames.__getitem__)))
+        frames.append(stereo_features(rig, (measured[:, :2], looks), (left, looks)))
     camera = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
-    assert turn_between(found.at(0), found.at(1), camera) == pytest.approx(turn, abs=1e-6)
+    assert turn_between(*frames, camera) == pytest.approx(turn, abs=1e-6)
 
 
 @pytest.mark.data

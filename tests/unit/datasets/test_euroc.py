@@ -168,7 +168,7 @@ def test_images_without_partner_are_left_out_and_noted(tmp_path: Path) -> None:
     path.write_text("\n".join([*lines[:2], *lines[3:]]))
     recording = opened(root)
     assert len(recording) == 3
-    assert recording.notes == ("1 right images have no partner within 2 ms and are left out",)
+    assert recording.notes == ("1 right images have no partner within 20 ms and are left out",)
     assert recording.frame(1).index == 1
     np.testing.assert_allclose(np.diff(recording.timestamps), [0.1, 0.05], atol=1e-6)
 
@@ -252,7 +252,7 @@ BAD = [
     (text("cam0/data.csv", "12.5,a.png\n"), DatasetError, ["line 1", "nanoseconds", "times 1e9"]),
     (text("cam0/data.csv", "1000,a.png\n51000,b.png\n"), DatasetError, ["50000 ns apart", "micro"]),
     (text("cam0/data.csv", "#\n20,a.png\n20,b.png\n"), DatasetError, ["line 3", "time order"]),
-    (shifted_stamps, DatasetError, ["no image", "partner", "2 ms", "pairing_tolerance_ms"]),
+    (shifted_stamps, DatasetError, ["no image", "partner", "20 ms", "restore the stamps"]),
 ]
 
 

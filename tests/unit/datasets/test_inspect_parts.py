@@ -75,23 +75,6 @@ def test_half_an_image_folder_gets_its_readers_message(tmp_path: Path) -> None:
         inspect_recording(tmp_path)
 
 
-def test_image_folder_reader_names_the_layout_that_it_finds_instead(tmp_path: Path) -> None:
-    cameras = (pose(AHEAD, np.zeros(3)), pose(AHEAD, np.array([0.0, -0.1, 0.0])))
-    flying = euroc(tmp_path / "drone", cameras)
-    driving, _ = kitti(tmp_path / "car", 3, "06")
-    (tmp_path / "nothing").mkdir()
-    expected = {
-        flying: r"no folder left; this is an EuRoC native folder: --set dataset\.kind=euroc$",
-        driving: r"this is a KITTI odometry folder: --set dataset\.kind=kitti "
-        r"--set dataset\.sequence=06$",
-        driving / "sequences" / "06": r"--set dataset\.kind=kitti --set dataset\.path=.*/car",
-        tmp_path / "nothing": "no folder left; a recording of one camera cannot be used",
-    }
-    for folder, words in expected.items():
-        with pytest.raises(DatasetError, match=words):
-            open_recording(ImageFolderSettings(path=str(folder)))
-
-
 @pytest.mark.parametrize("inside", [".", "images", "cam0/data"])
 def test_images_of_one_camera_are_called_so(tmp_path: Path, inside: str) -> None:
     (tmp_path / "gyro.csv").write_text("time,gyro_x,gyro_y,gyro_z\n0,0,0,0\n", encoding="utf-8")

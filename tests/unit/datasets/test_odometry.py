@@ -25,12 +25,10 @@ from fgslam.core.geometry import (
     so3_exp,
     so3_log,
 )
-from fgslam.core.log import ImageSequence
 from fgslam.core.sensors import Odometry
 from fgslam.datasets.odometry import (
     GyroscopeNoise,
     Steps,
-    SyntheticOdometry,
     file_odometry,
     gyroscope_motions,
     integrate_rates,
@@ -40,7 +38,7 @@ from fgslam.datasets.odometry import (
     steps_covered,
 )
 from fgslam.datasets.opening import open_recording
-from fgslam.datasets.recording import Recording
+from fgslam.datasets.recording import Recording, with_synthetic_odometry
 from fgslam.datasets.settings import (
     BagSettings,
     EurocSettings,
@@ -75,11 +73,10 @@ def test_constant_speed_and_turn_give_the_exact_arc(rate: float) -> None:
 
 
 def test_linear_speed_between_samples_is_integrated_exactly() -> None:
-    log = np.array([0.0, 1.0, 3.0]), np.array([1.0, 2.0, 0.0]), np.zeros(3)
-    settings = RecordedOdometrySettings(max_gap_s=5.0)
-    (step,) = known(speed_motions(*log, np.array([0.5, 2.0]), settings))
-    # From 1.5 to 2 m/s in half a second, then from 2 to 1 m/s in one second.
-    np.testing.assert_allclose(step.motion[:3, 3], [0.875 + 1.5, 0.0, 0.0], atol=1e-12)
+    log = np.array([0.0, 0.5, 1.0, 1.5]), np.array([1.0, 2.0, 1.0, 0.0]), np.zeros(4)
+    (step,) = known(speed_motions(*log, np.array([0.25, 1.0]), DEFAULT))
+    # From 1.5 to 2 m/s in a quarter of a second, then from 2 to 1 m/s in half a second.
+    np.testing.assert_allclose(step.motion[:3, 3], [0.4375 + 0.75, 0.0, 0.0], atol=1e-12)
 
 
 @given(
@@ -88,15 +85,14 @@ def test_linear_speed_between_samples_is_integrated_exactly() -> None:
 )
 def test_motions_compose_whatever_frames_are_chosen(seed: int, cuts: list[float]) -> None:
     rng = np.random.default_rng(seed)
-    stamps = np.sort(rng.uniform(0.0, 5.0, 60))
+    stamps = np.linspace(0.0, 5.0, 60) + rng.uniform(-0.04, 0.04, 60)
     stamps[[0, -1]] = [0.0, 5.0]
     log = stamps, rng.uniform(0, 9, 60), rng.uniform(-0.6, 0.6, 60)
     frames = np.array([0.0, *sorted(cuts), 5.0])
-    wide = RecordedOdometrySettings(max_gap_s=5.0)
     composed = np.eye(4)
-    for step in known(speed_motions(*log, frames, wide)):
+    for step in known(speed_motions(*log, frames, DEFAULT)):
         composed = composed @ step.motion
-    (whole,) = known(speed_motions(*log, frames[[0, -1]], wide))
+    (whole,) = known(speed_motions(*log, frames[[0, -1]], DEFAULT))
     np.testing.assert_allclose(composed, whole.motion, atol=1e-9)
 
 
@@ -262,16 +258,13 @@ def test_log_of_another_clock(tmp_path: Path) -> None:
         opened(tmp_path).odometry(1)
 
 
-def test_ambiguous_and_absent_odometry_files(tmp_path: Path) -> None:
+def test_several_files_of_odometry_are_refused(tmp_path: Path) -> None:
     root = with_speeds(tmp_path)
-    with pytest.raises(DatasetError, match=r"odometry_file .*lost.csv does not exist"):
-        opened(root, odometry_file="lost.csv")
     write_tum(root / "odometry.txt", 0.1 * np.arange(6), curve(6))
     with pytest.raises(
-        DatasetError, match=r"several odometry files \(odometry.txt, odom_car.csv\)"
+        DatasetError, match=r"several odometry files \(odometry.txt, odom_car.csv\); keep one"
     ):
         opened(root)
-    assert opened(root, odometry_file="odom_car.csv").odometry(1) is not None
 
 
 # --------------------------------------------------------------------------------------------
@@ -279,7 +272,7 @@ def test_ambiguous_and_absent_odometry_files(tmp_path: Path) -> None:
 
 
 TIMES = 0.1 * np.arange(11)
-SPEED, YAW_RATE, TRACK = 0.8, 0.5, 0.4
+SPEED, YAW_RATE = 0.8, 0.5
 
 
 def table(path: Path, columns: dict[str, Any], separator: str = ",") -> Path:
@@ -289,9 +282,9 @@ def table(path: Path, columns: dict[str, Any], separator: str = ",") -> Path:
     return path
 
 
-def step_of(path: Path, **settings: Any) -> Odometry:
+def step_of(path: Path) -> Odometry:
     """From 0.2 to 0.6 s."""
-    source = file_odometry(path, RecordedOdometrySettings(**settings))
+    source = file_odometry(path, DEFAULT)
     assert source is not None
     found = source(np.array([0.2, 0.6]))[0]
     assert found is not None
@@ -304,67 +297,42 @@ def arc() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 X, Y, YAW = arc()
-WHEELS = (SPEED - 0.5 * YAW_RATE * TRACK, SPEED + 0.5 * YAW_RATE * TRACK)
 ONES = np.ones(11)
-TABLES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "speeds": ({"time": TIMES, "speed": SPEED * ONES, "yaw_rate": YAW_RATE * ONES}, {}),
-    "speeds as ROS names them, among others": (
-        {
-            "seq": ONES,
-            "twist.angular.z": YAW_RATE * ONES,
-            "twist.linear.x": SPEED * ONES,
-            "t": TIMES,
-        },
-        {},
-    ),
-    "units in the names": (
-        {
-            "timestamp_ms": 1e3 * TIMES,
-            "v [km/h]": 3.6 * SPEED * ONES,
-            "omega (deg/s)": np.degrees(YAW_RATE) * ONES,
-        },
-        {},
-    ),
-    "nanoseconds without a word": (
-        {"stamp": 1e9 * TIMES, "vx": SPEED * ONES, "wz": YAW_RATE * ONES},
-        {},
-    ),
-    "wheels": (
-        {"time": TIMES, "v_left": WHEELS[0] * ONES, "v_right": WHEELS[1] * ONES},
-        {"track_m": TRACK},
-    ),
-    "ticks": (
-        {
-            "time": TIMES,
-            "left_ticks": 7 + 1e6 * WHEELS[0] * TIMES,
-            "right_ticks": 1e6 * WHEELS[1] * TIMES,
-        },
-        {"track_m": TRACK, "metres_per_tick": 1e-6},
-    ),
-    "planar poses": ({"time": TIMES, "x": X, "y": Y, "theta": YAW}, {}),
-    "poses": (
-        {
-            "t": TIMES,
-            "x_m": X,
-            "y_m": Y,
-            "z_m": 0 * X,
-            "qx": 0 * X,
-            "qy": 0 * X,
-            "qz": np.sin(YAW / 2),
-            "qw": np.cos(YAW / 2),
-        },
-        {},
-    ),
+TABLES: dict[str, dict[str, Any]] = {
+    "speeds": {"time": TIMES, "speed": SPEED * ONES, "yaw_rate": YAW_RATE * ONES},
+    "speeds as ROS names them, among others": {
+        "seq": ONES,
+        "twist.angular.z": YAW_RATE * ONES,
+        "twist.linear.x": SPEED * ONES,
+        "t": TIMES,
+    },
+    "units in the names": {
+        "timestamp_ms": 1e3 * TIMES,
+        "v [km/h]": 3.6 * SPEED * ONES,
+        "omega (deg/s)": np.degrees(YAW_RATE) * ONES,
+    },
+    "nanoseconds without a word": {"stamp": 1e9 * TIMES, "vx": SPEED * ONES, "wz": YAW_RATE * ONES},
+    "planar poses": {"time": TIMES, "x": X, "y": Y, "theta": YAW},
+    "poses": {
+        "t": TIMES,
+        "x_m": X,
+        "y_m": Y,
+        "z_m": 0 * X,
+        "qx": 0 * X,
+        "qy": 0 * X,
+        "qz": np.sin(YAW / 2),
+        "qw": np.cos(YAW / 2),
+    },
 }
 
 
 @pytest.mark.parametrize("separator", [",", ";", " "])
 @pytest.mark.parametrize("name", TABLES)
 def test_every_table_gives_the_same_arc(tmp_path: Path, name: str, separator: str) -> None:
-    columns, settings = TABLES[name]
+    columns = TABLES[name]
     if separator == " ":
         columns = {key.replace(" ", "_"): value for key, value in columns.items()}
-    motion = step_of(table(tmp_path / "odom.csv", columns, separator), **settings).motion
+    motion = step_of(table(tmp_path / "odom.csv", columns, separator)).motion
     turn = 0.4 * YAW_RATE
     expected = SPEED / YAW_RATE * np.array([np.sin(turn), 1.0 - np.cos(turn)])
     assert np.allclose(motion[:2, 3], expected, rtol=0.0, atol=2e-6)
@@ -376,8 +344,6 @@ def test_every_table_gives_the_same_arc(tmp_path: Path, name: str, separator: st
     [
         ({"time": TIMES, "speed": ONES}, "columns speed, time were understood; needed are time"),
         ({"speed": ONES, "yaw_rate": ONES}, "no column is named time"),
-        ({"time": TIMES, "v_left": ONES, "v_right": ONES}, r"--set odometry\.track_m="),
-        ({"time": TIMES, "left_ticks": ONES, "right_ticks": ONES}, r"odometry\.metres_per_tick="),
         ({"time": 0 * TIMES, "v": ONES, "w": ONES}, "line 3: time 0.000000 s does not come after"),
         ({"time": TIMES, "v": ONES, "w": 30 * ONES}, "absurd .* are these degrees"),
     ],
@@ -599,13 +565,13 @@ def mounted(root: Path, **settings: object) -> Recording:
     return open_recording(ImageFolderSettings(path=str(root), **mounting, **settings))  # type: ignore[arg-type]
 
 
-def synthetic_step(sequence: SyntheticOdometry, i: int) -> Odometry:
+def synthetic_step(sequence: Recording, i: int) -> Odometry:
     odometry = sequence.odometry(i)
     assert odometry is not None
     return odometry
 
 
-def whitened_errors(sequence: SyntheticOdometry) -> FloatArray:
+def whitened_errors(sequence: Recording) -> FloatArray:
     """Whitened error (n, 6) of every step against the truth, in the body's tangent space."""
     truth = sequence.ground_truth
     assert truth is not None
@@ -622,8 +588,7 @@ def whitened_errors(sequence: SyntheticOdometry) -> FloatArray:
 
 def test_synthetic_odometry_is_a_sequence_and_noted_as_synthetic(folder: Path) -> None:
     recording = mounted(folder)
-    sequence = SyntheticOdometry(recording, SETTINGS, 3)
-    assert isinstance(sequence, ImageSequence)
+    sequence = with_synthetic_odometry(recording, SETTINGS, 3)
     assert (sequence.name, sequence.identity) == (recording.name, recording.identity)
     assert len(sequence) == FRAMES
     np.testing.assert_array_equal(sequence.timestamps, recording.timestamps)
@@ -633,7 +598,7 @@ def test_synthetic_odometry_is_a_sequence_and_noted_as_synthetic(folder: Path) -
 
 def test_noise_is_the_stated_one(folder: Path) -> None:
     """Sound statistics: each axis' whitened errors are standard normal, uncorrelated."""
-    white = whitened_errors(SyntheticOdometry(mounted(folder), SETTINGS, 11))
+    white = whitened_errors(with_synthetic_odometry(mounted(folder), SETTINGS, 11))
     n = len(white)
     low, high = stats.chi2.ppf([0.001, 0.999], n) / n
     power = (white**2).mean(axis=0)
@@ -644,7 +609,7 @@ def test_noise_is_the_stated_one(folder: Path) -> None:
 
 
 def test_standard_deviations_follow_the_settings(folder: Path) -> None:
-    sequence = SyntheticOdometry(mounted(folder), SETTINGS, 1)
+    sequence = with_synthetic_odometry(mounted(folder), SETTINGS, 1)
     truth = sequence.ground_truth
     assert truth is not None
     bTc = sequence.rig.bTc
@@ -656,7 +621,7 @@ def test_standard_deviations_follow_the_settings(folder: Path) -> None:
 
 def test_without_noise_but_the_floor_it_is_the_truth(folder: Path) -> None:
     still = SyntheticOdometrySettings(translation_sigma_fraction=0.0, rotation_sigma_deg=0.0)
-    sequence = SyntheticOdometry(mounted(folder), still, 1)
+    sequence = with_synthetic_odometry(mounted(folder), still, 1)
     truth = sequence.ground_truth
     assert truth is not None
     for i in range(1, 8):
@@ -670,7 +635,7 @@ def test_without_noise_but_the_floor_it_is_the_truth(folder: Path) -> None:
 
 def test_seeds_repeat_and_differ(folder: Path) -> None:
     recording = mounted(folder)
-    first, again, other = (SyntheticOdometry(recording, SETTINGS, seed) for seed in (5, 5, 6))
+    first, again, other = (with_synthetic_odometry(recording, SETTINGS, seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(synthetic_step(first, 9).motion, synthetic_step(again, 9).motion)
     assert not np.allclose(
         synthetic_step(first, 9).motion, synthetic_step(other, 9).motion, atol=1e-6
@@ -681,8 +646,8 @@ def test_seeds_repeat_and_differ(folder: Path) -> None:
 
 
 def test_a_part_of_the_recording_repeats_the_same_noise(folder: Path) -> None:
-    whole = SyntheticOdometry(mounted(folder), SETTINGS, 5)
-    part = SyntheticOdometry(mounted(folder, start=100, stop=200), SETTINGS, 5)
+    whole = with_synthetic_odometry(mounted(folder), SETTINGS, 5)
+    part = with_synthetic_odometry(mounted(folder, start=100, stop=200), SETTINGS, 5)
     for i in (1, 50, 99):
         np.testing.assert_array_equal(
             synthetic_step(part, i).motion, synthetic_step(whole, 100 + i).motion
@@ -690,7 +655,7 @@ def test_a_part_of_the_recording_repeats_the_same_noise(folder: Path) -> None:
 
 
 def test_order_of_asking_does_not_matter(folder: Path) -> None:
-    sequence = SyntheticOdometry(mounted(folder), SETTINGS, 5)
+    sequence = with_synthetic_odometry(mounted(folder), SETTINGS, 5)
     forwards = [synthetic_step(sequence, i).motion for i in (1, 2, 3)]
     backwards = [synthetic_step(sequence, i).motion for i in (3, 2, 1)][::-1]
     np.testing.assert_array_equal(forwards, backwards)
@@ -699,7 +664,7 @@ def test_order_of_asking_does_not_matter(folder: Path) -> None:
 def test_needs_ground_truth(tmp_path: Path) -> None:
     recording = mounted(image_folder(tmp_path))
     with pytest.raises(DatasetError, match=r"no ground truth.*choose recorded") as error:
-        SyntheticOdometry(recording, SETTINGS, 1)
+        with_synthetic_odometry(recording, SETTINGS, 1)
     assert "\n" not in str(error.value)
 
 
@@ -707,7 +672,7 @@ def test_gap_in_the_truth_leaves_the_step_without_odometry(tmp_path: Path) -> No
     root = image_folder(tmp_path)
     keep = [0, 1, 4, 5]
     write_tum(root / "gt_right_cam.txt", 0.1 * np.array(keep), curve(6)[keep])
-    sequence = SyntheticOdometry(mounted(root), SETTINGS, 1)
+    sequence = with_synthetic_odometry(mounted(root), SETTINGS, 1)
     got = [sequence.odometry(i) is not None for i in range(1, 6)]
     assert got == [True, False, False, False, True]
     assert "2 frames have no ground truth, so no odometry" in sequence.notes

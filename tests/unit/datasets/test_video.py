@@ -126,7 +126,6 @@ def test_frames_of_two_films_that_drift_apart_are_paired_by_time(tmp_path: Path)
     assert np.abs(levels(recording, 1) - [160, 50]).max() <= _NEAR
     left_out = "3 {} images have no partner within 20 ms and are left out"
     assert {left_out.format("right"), left_out.format("left")} <= set(recording.notes)
-    assert len(opened(tmp_path, pairing_tolerance_ms=40.0)) > 3
 
 
 @pytest.mark.parametrize("missed", [False, True])

@@ -60,7 +60,7 @@ def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
         (MINIMAL, "frontend.shift", "sift"),
         (MINIMAL, "frontend.sift.max_feature", "max_features"),
         (MINIMAL, "frontend.ego_motion.min_match", "min_matches"),
-        (MINIMAL, "odometry.max_gaps", "max_gap_s"),
+        (MINIMAL, "odometry.time_offset", "time_offset_s"),
         (MINIMAL, "estimator.updates", "update"),
         (MINIMAL, "output.picture", "pictures"),
         (LAB, "dataset.rig.baseline", "baseline_m"),
