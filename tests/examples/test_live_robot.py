@@ -10,12 +10,13 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import bags
 import numpy as np
 import pytest
+import textured_wall
 
 import fgslam as fg
 from fgslam.core.sensors import CameraRig
-from tests import bags, textured_wall
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "live_robot.py"
 HANGS_AFTER_S = 300.0

@@ -17,10 +17,10 @@ import pytest
 from recordings import experiment
 from running import HANGS_AFTER_S, main, run_values
 from test_resume_run import write_config
+from textured_room import SMALL_CAMERA_FILE, folder_of
 
 from fgslam.runs.config import make_experiment
 from fgslam.runs.run import run_experiment
-from tests.textured_room import SMALL_CAMERA_FILE, folder_of
 
 pytestmark = pytest.mark.slow
 

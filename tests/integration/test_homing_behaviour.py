@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from landmark_world import drive_path, winding_path
 
 from fgslam.core.geometry import compose
 from fgslam.homing.closed_loop import (
@@ -13,7 +14,6 @@ from fgslam.homing.closed_loop import (
     slope_by_leg,
     truly_arrived,
 )
-from tests.landmark_world import drive_path, winding_path
 
 LEGS = 10
 SEEDS = 20

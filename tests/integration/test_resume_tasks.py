@@ -32,6 +32,7 @@ import yaml
 from killing import REFUSED, Server, server
 from PIL import Image as PictureFile
 from recordings import experiment
+from textured_room import SMALL_CAMERA, folder_of
 
 from fgslam.core import files
 from fgslam.core.errors import ConfigError, OutputError
@@ -42,7 +43,6 @@ from fgslam.runs.folder import ExistingFolder, create_folder
 from fgslam.runs.run import run_experiment
 from fgslam.runs.tables import write_comparison_csv
 from fgslam.runs.trials import run_trials
-from tests.textured_room import SMALL_CAMERA, folder_of
 
 QUIET = {"pictures": False, "report": False, "checkpoint_seconds": 0.0}
 SILENT = {"pictures": 1, "report": False}

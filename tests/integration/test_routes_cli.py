@@ -11,8 +11,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import textured_room
 from PIL import Image as PictureFile
 from running import main
+from textured_room import SMALL_CAMERA_FILE, folder_of, seen_at
 
 import fgslam as fg
 from fgslam.core.sensors import CameraRig
@@ -21,8 +23,6 @@ from fgslam.homing.route import PathMemory
 from fgslam.runs.bare import teaching
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.run import run_experiment
-from tests import textured_room
-from tests.textured_room import SMALL_CAMERA_FILE, folder_of, seen_at
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 from running import ROOT, Patch, main
+from textured_room import SMALL_CAMERA_FILE, folder_of
 
 import fgslam as fg
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.geometry import se3_exp
 from scripts import make_tutorial_pictures as pictures
-from tests.textured_room import SMALL_CAMERA_FILE, folder_of
 
 TUTORIALS = ROOT / "docs" / "tutorials"
 FRAMES = 12

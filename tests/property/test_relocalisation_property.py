@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from known_places import RIG, error, floor, planar, room, seen
 
 from fgslam.frontend.places import relocalisation as relocaliser
 from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import RelocalisationSettings
-from tests.known_places import RIG, error, floor, planar, room, seen
 
 SETTINGS = RelocalisationSettings(map_sigma_m=0.001)
 

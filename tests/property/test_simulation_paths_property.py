@@ -3,10 +3,10 @@
 import numpy as np
 from hypothesis import assume, given, reject
 from hypothesis import strategies as st
+from simulated import plan_drive
 
 from fgslam.core.errors import ConfigError
 from fgslam.worlds.settings import LabDriveSettings
-from tests.simulated import plan_drive
 
 coordinate = st.floats(-3.5, 3.5, allow_nan=False, width=32)
 points = st.lists(st.tuples(coordinate, coordinate), min_size=3, max_size=6)

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import textured_wall
 from dataset_builders import write_calibration
 
 import fgslam as fg
@@ -27,7 +28,6 @@ from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import OmniVideoSettings, VideoSettings
 from fgslam.datasets.video import VideoFrames
 from fgslam.runs.bare import bare_experiment
-from tests import textured_wall
 
 SIZE = (64, 48)
 _NEAR = 3  # grey levels that the codec may change in even areas

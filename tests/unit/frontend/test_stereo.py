@@ -9,6 +9,8 @@ from typing import Literal, get_args
 import numpy as np
 import pytest
 from simulated import RIG, assert_same_bits
+from textured_wall import HERE, WALL_M, pictures
+from textured_wall import RIG as WALL_RIG
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.correction import RigCorrection, term_names
@@ -23,8 +25,6 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
 from fgslam.frontend.stereo import PatchStereo, StereoMatcher, measurement_map
 from fgslam.slam.build import as_measured, make_describer, make_stereo
-from tests.textured_wall import HERE, WALL_M, pictures
-from tests.textured_wall import RIG as WALL_RIG
 
 # ------------------------------------------------------------------------------------------
 # Matching over the rig (Se et al. 2.2)

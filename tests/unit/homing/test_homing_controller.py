@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from homing import make_matches
+from landmark_world import DARK, Setting, drive_path, make_follower, winding_path
 
 from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.settings import (
@@ -60,8 +62,6 @@ from fgslam.homing.settings import (
     HomingControlSettings,
 )
 from fgslam.homing.steering import Command, Drive, HomingState, RangeScan
-from tests.homing import make_matches
-from tests.landmark_world import DARK, Setting, drive_path, make_follower, winding_path
 
 SETTINGS = HomingControlSettings()
 POINTS = 3.0 * unit(np.linspace(-3.0, 3.0, 20)) * np.linspace(0.6, 1.4, 20)[:, None]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import textured_room
 
 import fgslam as fg
 from fgslam.cameras.omni import (
@@ -34,7 +35,6 @@ from fgslam.homing.places import (
 from fgslam.homing.route import MetricPoses, PathMemory
 from fgslam.homing.settings import DRIVING
 from fgslam.homing.steering import PathPlace
-from tests import textured_room
 
 ALONG = ((540, 278, 5, 0, 5, 33), (388, 380, 49, 0, 78, 87), (239, 418, 85, 54, 219, 137),
          (0, 0, 276, 449, 152, 60), (0, 82, 273, 294, 410, 170), (89, 186, 115, 79, 322, 275),
@@ -295,7 +295,7 @@ def test_what_is_not_known_has_no_metres(target: int, left: float) -> None:
 
 
 def test_poses_survive_the_route_s_file_and_damage_is_refused(tmp_path: Path) -> None:
-    from tests.landmark_world import landmark_features
+    from landmark_world import landmark_features
 
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-3, 3, (60, 2)), np.full(60, 0.5)])

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import textured_room
+from landmark_world import no_columns
 
 import fgslam as fg
 from fgslam.cameras.omni import (
@@ -49,8 +51,6 @@ from fgslam.homing.route import (
 )
 from fgslam.homing.settings import DRIVING
 from fgslam.homing.steering import HomingState
-from tests import textured_room
-from tests.landmark_world import no_columns
 
 FINE = textured_room.CAMERA
 CAMERA = Equirectangular(301, 91, FINE.top_elevation, FINE.bottom_elevation)

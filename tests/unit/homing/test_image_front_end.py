@@ -6,12 +6,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from homing import two_views
 
 from fgslam.cameras.omni import Equirectangular
 from fgslam.core.bearings import FeatureKind, Refusal, RefusalReason
 from fgslam.homing.front_end import ImageFrontEnd, mixed_with_wrong, surest_all_around
 from fgslam.homing.settings import FrontEndSettings
-from tests.homing import two_views
 
 
 def front_end() -> ImageFrontEnd:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from landmark_world import drive_path, ray_ranges, winding_path
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import to_robot, wrap
@@ -27,7 +28,6 @@ from fgslam.homing.steering import (
     clear_ways,
     make_avoider,
 )
-from tests.landmark_world import drive_path, ray_ranges, winding_path
 
 SETTINGS = SteeringSettings()
 DT = 0.1

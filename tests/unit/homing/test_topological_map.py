@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import textured_room
+from landmark_world import landmark_features, match_landmarks, numbers
 
 import fgslam as fg
 from fgslam.cameras.omni import Equirectangular
@@ -45,8 +47,6 @@ from fgslam.homing.topological_map import (
     map_of_answers,
     route_of,
 )
-from tests import textured_room
-from tests.landmark_world import landmark_features, match_landmarks, numbers
 
 SETTINGS = TopologicalMapSettings()
 NONE = Refusal(RefusalReason.TOO_FEW_MATCHES, "3 matches, of 8 needed")

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import textured_room
 
 from fgslam.cameras.omni import HyperbolicMirror, MirrorFrame
 from fgslam.cameras.settings import (
@@ -21,7 +22,6 @@ from fgslam.core.arrays import Image
 from fgslam.datasets.omni_checks import camera_notes, open_checked
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniPathSettings, PanoramasSettings
-from tests import textured_room
 
 SIZE = (320, 240)
 CENTRE = (162.0, 118.0)

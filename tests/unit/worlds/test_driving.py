@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from simulated import plan_drive
 
 from fgslam.core import geometry
 from fgslam.core.errors import ConfigError
@@ -22,7 +23,6 @@ from fgslam.worlds.settings import (
     LabDriveSettings,
     WheelOdometrySettings,
 )
-from tests.simulated import plan_drive
 
 SQUARE = ((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))
 

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from simulated import plan_drive
 
 from fgslam.worlds.lab import make_rig
 from fgslam.worlds.patches import stack
 from fgslam.worlds.people import Walk, Walker, make_walk, person
 from fgslam.worlds.settings import LabEffectsSettings, LabRigSettings, LabSettings
-from tests.simulated import plan_drive
 
 RIG = make_rig(LabRigSettings())
 DRIVE = plan_drive(LabSettings().drive)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from simulated import plan_drive
 
 from fgslam.worlds import places
 from fgslam.worlds.lab import PlaceChoice, build_place, make_rig
@@ -14,7 +15,6 @@ from fgslam.worlds.places import HOUSE, FloorPlan, Place, build_corridors, build
 from fgslam.worlds.renderer import Layer, Renderer, bake, pinhole_view
 from fgslam.worlds.settings import LabDriveSettings, LabRigSettings
 from fgslam.worlds.textures import GreyBank
-from tests.simulated import plan_drive
 
 RIG = make_rig(LabRigSettings(width=80, height=60))
 ROOMS = PlaceChoice("rooms")

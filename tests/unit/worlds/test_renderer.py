@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omni_house import PANORAMA, plain, room
 from scipy import ndimage
 
 from fgslam.cameras.omni import HyperbolicMirror, OmniCamera
@@ -34,7 +35,6 @@ from fgslam.worlds.renderer import (
     visible,
 )
 from fgslam.worlds.textures import ColourBank, GreyBank
-from tests.omni_house import PANORAMA, plain, room
 
 HEIGHT, WIDTH = 48, 64
 FOCAL, CX, CY = 60.0, 31.5, 23.5

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from known_places import blurred, looks
 
 from fgslam.core.arrays import ByteArray
 from fgslam.frontend.features import matching as descriptor_index
 from fgslam.frontend.features.matching import AppearanceIndex, Neighbours
 from fgslam.frontend.tracking import landmarks as views_module
 from fgslam.frontend.tracking.landmarks import ViewPool, Views
-from tests.known_places import blurred, looks
 
 
 def _truth(asked: ByteArray, held: ByteArray) -> np.ndarray:

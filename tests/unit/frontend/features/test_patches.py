@@ -7,11 +7,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from textured_room import TEXTURE
 
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.frontend.features.patches import View, align, anchor, crowding
 from fgslam.frontend.features.sift import FineImage
-from tests.textured_room import TEXTURE
 
 # ------------------------------------------------------------------------------------------
 # Values between pixels, and how exactly patches are aligned by them

@@ -5,7 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from homing import make_matches
 from scipy import ndimage
+from textured_room import CAMERA, angles, hits, picture
 
 from fgslam.cameras.omni import Equirectangular
 from fgslam.core.arrays import FloatArray, Image
@@ -26,8 +28,6 @@ from fgslam.frontend.homing.tracking import (
     ReplenishedTracker,
     move_to_trackable,
 )
-from tests.homing import make_matches
-from tests.textured_room import CAMERA, angles, hits, picture
 
 _MODULE = "fgslam.frontend.homing.tracking"
 START = np.array([-1.2, 0.4, 0.3])

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from homing import TwoViews, make_matches, two_views
 from scipy.stats import chi2, norm
 
 from fgslam.core.arrays import FloatArray
@@ -45,7 +46,6 @@ from fgslam.frontend.homing.vector import (
     pair_generator,
     vector_between,
 )
-from tests.homing import TwoViews, make_matches, two_views
 
 HALF_DEGREE = np.deg2rad(0.5)
 SETTINGS = HomingVectorSettings()

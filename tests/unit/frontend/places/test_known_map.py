@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from known_places import RIG, looks, planar
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import project, transform_to_camera
 from fgslam.core.types import LandmarkAppearances, LandmarkMap
 from fgslam.frontend.places.known_map import KnownMap
-from tests.known_places import RIG, looks, planar
 
 SIGMA_M = 0.02
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from known_places import RIG, Place, error, floor, planar, room, seen, things
 from rings import drive, error_m, on_ring, pipeline_of
 from rings import seen as seen_on_ring
 from simulated import RIG as SIMULATED_RIG
@@ -43,7 +44,6 @@ from fgslam.frontend.settings import FrontendSettings, RelocalisationSettings
 from fgslam.frontend.tracking.ego_motion import align, align_in_space, rigid
 from fgslam.slam.build import make_motion, make_places
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from tests.known_places import RIG, Place, error, floor, planar, room, seen, things
 
 # ------------------------------------------------------------------------------------------
 # Closed-form alignment, residuals and least squares of relocalisation against exact truth

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from textured_wall import HERE, RIG, WALL_M, pictures
 
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.geometry import project
@@ -38,7 +39,6 @@ from fgslam.frontend.tracking.key_frames import (
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.frontend.tracking.map_matching import ExpectedLandmarks, MapMatches
 from fgslam.frontend.tracking.tracker import Association, Tracked
-from tests.textured_wall import HERE, RIG, WALL_M, pictures
 
 # ------------------------------------------------------------------------------------------
 # Landmarks carried over the images of a textured wall, whose projections are known exactly
