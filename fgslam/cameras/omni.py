@@ -810,13 +810,6 @@ class OCamCalibration:
         inner, outer = ring or self.ring or (0.0, _largest_circle(frame))
         return OCamCamera(frame, inner, outer, direct=self.direct)
 
-    def disagreement(self, ring: tuple[float, float]) -> float:
-        """How far the file's inverse polynomial is off over a ring, pixels."""
-        radius = np.linspace(*ring, 200)
-        angle = np.arctan2(polynomial.polyval(radius, np.array(self.direct)), radius)
-        found = polynomial.polyval(angle, np.array(self.inverse))
-        return float(np.abs(found - radius).max())
-
 
 def _largest_circle(frame: MirrorFrame) -> float:
     column, row = frame.centre
@@ -837,118 +830,92 @@ def read_ocamcalib(path: Path) -> OCamCalibration:
     Raises:
         CalibrationError: with file and line, for anything missing, malformed or contradictory.
     """
-    entries = _entries(path)
+    entries, comment = [], ""  # lines of numbers, each with the comment before it
+    text = read_text(path, CalibrationError, "give OCamCalib's calib_results.txt")
+    for number, line in enumerate(text.splitlines(), 1):
+        values, _, beside = line.replace("%", "#").partition("#")  # MATLAB's comments, too
+        words = values.replace(",", " ").split()
+        if words:
+            entries.append((f"{path}, line {number}", comment, words))
+        comment = "" if words else beside.strip(" \t#") or comment
     if len(entries) < 5:
         raise CalibrationError(
             f"{path} has {len(entries)} entries, an OCamCalib result has 5 (two polynomials, "
             "centre, affine parameters, size): it is truncated or another kind of file; export it "
             "again"
         )
-    direct = _polynomial(path, entries[0], "direct")
-    inverse = _polynomial(path, entries[1], "inverse")
-    row, column = _numbers(path, entries[2], 2, "centre (row, column)")
-    c, d, e = _numbers(path, entries[3], 3, "affine parameters (c, d, e)")
-    height, width = _wholes(path, entries[4], "size (height, width)")
+    direct, inverse = (
+        _polynomial(f"{where}: {which} polynomial", words)
+        for which, (where, _, words) in zip(("direct", "inverse"), entries[:2], strict=True)
+    )
+    (at_centre, _, centre), (at_affine, _, affine), (at_size, _, size), *extras = entries[2:]
+    row, column = _numbers(f"{at_centre}: centre (row, column)", centre, 2)
+    c, d, e = _numbers(f"{at_affine}: affine parameters (c, d, e)", affine, 3)
+    height, width = _wholes(f"{at_size}: size (height, width)", size)
     calibration = OCamCalibration(
         str(path), direct, inverse, (row, column), (c, d, e), width, height
     )
-    for entry in entries[5:]:
-        calibration = _with_extra(path, entry, calibration)
-    _require_sense(path, calibration)
-    return calibration
-
-
-@dataclass(frozen=True, slots=True)
-class _Entry:
-    line: int
-    comment: str
-    words: list[str]
-
-
-def _entries(path: Path) -> list[_Entry]:
-    """Lines of numbers, each with the comment before it."""
-    text = read_text(path, CalibrationError, "give OCamCalib's calib_results.txt")
-    entries, comment = [], ""
-    for number, line in enumerate(text.splitlines(), 1):
-        values, _, beside = line.replace("%", "#").partition("#")  # MATLAB's comments, too
-        words = values.replace(",", " ").split()
-        if words:
-            entries.append(_Entry(number, comment, words))
-        comment = "" if words else beside.strip(" \t#") or comment
-    return entries
-
-
-def _floats(path: Path, entry: _Entry, what: str) -> tuple[float, ...]:
-    values = []
-    for word in entry.words:
-        try:
-            value = float(word)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
+    for where, comment, words in extras:
+        if "roi" in comment.lower() and "radius" in comment.lower():
+            outer, inner = _numbers(f"{where}: ring (largest, smallest radius)", words, 2)
+            if not 0.0 <= inner < outer:
+                raise CalibrationError(
+                    f"{where}: ring: largest radius {outer:g} and smallest {inner:g}; the first "
+                    "must be larger"
+                )
+            calibration = replace(calibration, ring=(inner, outer))
+        elif "crop" in comment.lower():
+            cropped = _wholes(f"{where}: cropped columns (left, right)", words)
+            calibration = replace(calibration, cropped=cropped)
+        else:
             raise CalibrationError(
-                f"{path}, line {entry.line}: {what}: {word!r} is no finite number; correct it"
+                f"{where}: an entry that is not known ({comment or 'without a comment'}); remove it"
             )
-        values.append(value)
-    return tuple(values)
-
-
-def _numbers(path: Path, entry: _Entry, count: int, what: str) -> tuple[float, ...]:
-    values = _floats(path, entry, what)
-    if len(values) != count:
-        raise CalibrationError(
-            f"{path}, line {entry.line}: {what}: {len(values)} numbers, expected {count}; correct "
-            "the line"
-        )
-    return values
-
-
-def _wholes(path: Path, entry: _Entry, what: str) -> tuple[int, int]:
-    first, second = _numbers(path, entry, 2, what)
-    if first != int(first) or second != int(second) or first < 0 or second < 0:
-        raise CalibrationError(
-            f"{path}, line {entry.line}: {what}: {first:g} and {second:g}, expected whole numbers "
-            "of pixels; correct the line"
-        )
-    return int(first), int(second)
-
-
-def _polynomial(path: Path, entry: _Entry, which: str) -> tuple[float, ...]:
-    count, *coefficients = _floats(path, entry, f"{which} polynomial")
-    if count != len(coefficients) or not 2 <= count <= _MAX_TERMS:
-        raise CalibrationError(
-            f"{path}, line {entry.line}: {which} polynomial: states {count:g} coefficients (2 to "
-            f"{_MAX_TERMS}) and has {len(coefficients)}; correct the line"
-        )
-    return tuple(coefficients)
-
-
-def _with_extra(path: Path, entry: _Entry, calibration: OCamCalibration) -> OCamCalibration:
-    comment = entry.comment.lower()
-    if "roi" in comment and "radius" in comment:
-        outer, inner = _numbers(path, entry, 2, "ring (largest, smallest radius)")
-        if not 0.0 <= inner < outer:
-            raise CalibrationError(
-                f"{path}, line {entry.line}: ring: largest radius {outer:g} and smallest "
-                f"{inner:g}; the first must be larger"
-            )
-        return replace(calibration, ring=(inner, outer))
-    if "crop" in comment:
-        return replace(calibration, cropped=_wholes(path, entry, "cropped columns (left, right)"))
-    raise CalibrationError(
-        f"{path}, line {entry.line}: an entry that is not known "
-        f"({entry.comment or 'without a comment'}); remove it"
-    )
-
-
-def _require_sense(path: Path, calibration: OCamCalibration) -> None:
     try:
         camera = calibration.camera()
     except CalibrationError as cause:
         raise CalibrationError(f"{path}: {cause}") from cause
-    apart = calibration.disagreement((camera.inner_radius, camera.outer_radius))
+    radius = np.linspace(camera.inner_radius, camera.outer_radius, 200)
+    angle = np.arctan2(polynomial.polyval(radius, np.array(direct)), radius)
+    apart = float(np.abs(polynomial.polyval(angle, np.array(inverse)) - radius).max())
     if not apart <= _MAX_DISAGREEMENT_PX:
         raise CalibrationError(
             f"{path}: the inverse polynomial is {apart:.3g} px off the direct one, at most "
             f"{_MAX_DISAGREEMENT_PX:g} px are credible: one of the two is damaged; export it again"
         )
+    return calibration
+
+
+def _numbers(where: str, words: list[str], count: int | None = None) -> tuple[float, ...]:
+    values = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            values.append(math.nan)
+        if not math.isfinite(values[-1]):
+            raise CalibrationError(f"{where}: {word!r} is no finite number; correct it")
+    if count not in (None, len(values)):
+        raise CalibrationError(
+            f"{where}: {len(values)} numbers, expected {count}; correct the line"
+        )
+    return tuple(values)
+
+
+def _wholes(where: str, words: list[str]) -> tuple[int, int]:
+    first, second = _numbers(where, words, 2)
+    if first != int(first) or second != int(second) or first < 0 or second < 0:
+        raise CalibrationError(
+            f"{where}: {first:g} and {second:g}, expected whole numbers of pixels; correct the line"
+        )
+    return int(first), int(second)
+
+
+def _polynomial(where: str, words: list[str]) -> tuple[float, ...]:
+    count, *coefficients = _numbers(where, words)
+    if count != len(coefficients) or not 2 <= count <= _MAX_TERMS:
+        raise CalibrationError(
+            f"{where}: states {count:g} coefficients (2 to {_MAX_TERMS}) and has "
+            f"{len(coefficients)}; correct the line"
+        )
+    return tuple(coefficients)

@@ -71,25 +71,18 @@ def find_mirror_circle(
     """
     grey = _grey(image)
     height, width = grey.shape
-    centre = near[0] if near else ((width - 1) / 2.0, (height - 1) / 2.0)
-    limits = _near_limits(near[1]) if near else (0.2 * min(grey.shape), 0.75 * width)
+    centre, limits = ((width - 1) / 2.0, (height - 1) / 2.0), (0.2 * min(grey.shape), 0.75 * width)
+    if near is not None:
+        centre, limits = near[0], ((1.0 - _NEAR) * near[1], (1.0 + _NEAR) * near[1])
     edges = _falling_edges(grey, centre, limits)
     seed = _search_circle(edges, np.array(centre), limits, 0.25 * min(grey.shape), rng)
     circle = None if seed is None else _refined(grey, seed)
-    if circle is None or not _credible(circle, limits):
+    if circle is None or not limits[0] < circle.radius < limits[1] or circle.support < _MIN_SUPPORT:
         raise CalibrationError(
             "no mirror's circle is found in the picture: it must be brighter inside than outside, "
             f"on at least {_MIN_SUPPORT:.0%} of its circumference"
         )
     return circle
-
-
-def _credible(circle: MirrorCircle, limits: tuple[float, float]) -> bool:
-    return limits[0] < circle.radius < limits[1] and circle.support >= _MIN_SUPPORT
-
-
-def _near_limits(radius: float) -> tuple[float, float]:
-    return (1.0 - _NEAR) * radius, (1.0 + _NEAR) * radius
 
 
 def mirror_offset(
@@ -156,18 +149,25 @@ def _peaks(slopes: FloatArray | Float32, least: float) -> tuple[FloatArray, Floa
 
 
 def _falling_edges(
-    grey: Float32, centre: tuple[float, float], limits: tuple[float, float]
+    grey: Float32,
+    centre: tuple[float, float],
+    limits: tuple[float, float],
+    outermost: bool = True,
 ) -> FloatArray:
     """(n, 2) points at which the picture gets darker outward.
 
-    In each direction the strongest and the outermost one: within the mirror there are many more.
+    In each direction the strongest and, where it is asked for, the outermost one: within the mirror
+    there are many more.
     """
     radii, angles, profiles = _radial_profiles(grey, centre, limits)
     ray, place, height = _peaks(-_slopes(profiles), _LEAST_CONTRAST)
-    last = np.flatnonzero(np.append(np.diff(ray) > 0, True)[: len(ray)])
-    chosen = np.union1d(_strongest_of(ray, height), last)
+    chosen = _strongest_of(ray, height)
+    if outermost:
+        last = np.flatnonzero(np.append(np.diff(ray) > 0, True)[: len(ray)])
+        chosen = np.union1d(chosen, last)
     radius = radii[0] + place[chosen] * _STEP_PX
-    return _points(centre, radius, angles[ray[chosen].astype(np.int64)])
+    angle = angles[ray[chosen].astype(np.int64)]
+    return np.column_stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)])
 
 
 def _strongest_of(ray: FloatArray, height: FloatArray) -> IntArray:
@@ -175,10 +175,6 @@ def _strongest_of(ray: FloatArray, height: FloatArray) -> IntArray:
     order = np.lexsort((-height, ray))
     _, first = np.unique(ray[order], return_index=True)
     return np.asarray(order[first], np.int64)
-
-
-def _points(centre: tuple[float, float], radius: FloatArray, angle: FloatArray) -> FloatArray:
-    return np.column_stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)])
 
 
 def _search_circle(
@@ -202,16 +198,11 @@ def _search_circle(
     for centre, radius in zip(centres[good], radii[good], strict=True):
         away = points - centre
         on = np.abs(np.hypot(*away.T) - radius) < _CIRCLE_TOLERANCE * radius
-        part = _directions_seen(away[on])
+        sectors = ((np.arctan2(away[on, 1], away[on, 0]) / (2.0 * np.pi)) % 1.0) * _DIRECTIONS
+        part = len(np.unique(sectors.astype(np.int64))) / _DIRECTIONS  # of all directions
         if part > most:
             best, most = (centre, float(radius)), part
     return best
-
-
-def _directions_seen(away: FloatArray) -> float:
-    """Part of all directions in which there is a point."""
-    sectors = ((np.arctan2(away[:, 1], away[:, 0]) / (2.0 * np.pi)) % 1.0) * _DIRECTIONS
-    return len(np.unique(sectors.astype(np.int64))) / _DIRECTIONS
 
 
 def _circles(triples: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -233,24 +224,13 @@ def _refined(grey: Float32, circle: tuple[FloatArray, float]) -> MirrorCircle:
         width = max(2.0 * _CIRCLE_TOLERANCE * radius / (1 + step), 3.0)
         limits = (max(radius - width - 2.0, 1.0), radius + width + 2.0)
         around = (float(centre[0]), float(centre[1]))
-        edges = _strongest(grey, around, limits)
+        edges = _falling_edges(grey, around, limits, outermost=False)
         if len(edges) < 3:
             break
         centre, radius, residuals = _fit_circle(edges)
     support = len(residuals) / _DIRECTIONS
     spread = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else np.inf
     return MirrorCircle((float(centre[0]), float(centre[1])), radius, support, spread)
-
-
-def _strongest(
-    grey: Float32, centre: tuple[float, float], limits: tuple[float, float]
-) -> FloatArray:
-    """(n, 2) the strongest falling edge in each direction."""
-    radii, angles, profiles = _radial_profiles(grey, centre, limits)
-    ray, place, height = _peaks(-_slopes(profiles), _LEAST_CONTRAST)
-    chosen = _strongest_of(ray, height)
-    radius = radii[0] + place[chosen] * _STEP_PX
-    return _points(centre, radius, angles[ray[chosen].astype(np.int64)])
 
 
 def _fit_circle(points: FloatArray) -> tuple[FloatArray, float, FloatArray]:

@@ -1,7 +1,8 @@
-"""Single wide cameras found from a board: drawn views against the truth, within their sigmas."""
+"""Cameras found from corners of a board: simulated ones against the truth, within their sigmas."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -9,25 +10,168 @@ import numpy as np
 import pytest
 
 from fgslam.cameras import calibrate as module
-from fgslam.cameras.boards import Board, Corners, find_corners
+from fgslam.cameras.boards import Board, Corners
 from fgslam.cameras.calibrate import (
     BoardCalibration,
     View,
     board_pose,
     calibrate,
+    coverage,
     coverage_of_circle,
     farthest_from_axis,
+    held_out,
     held_out_alone,
+    judged,
 )
 from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.geometry import so3_exp
+from fgslam.core.geometry import inverse, se3_exp, so3_exp
 from fgslam.runs.calibrating import wide_verdict
 
 BOARD = Board("chessboard", 9, 6, 0.04)
+SIZE = (640, 480)
 NOISE_PX = 0.1
+PARAMETERS = {
+    "radtan": np.array([-0.3, 0.1, 0.001, -0.0005, -0.01]),
+    "equidistant": np.array([0.02, -0.01, 0.004, -0.001]),
+}
+POSES = (
+    np.zeros(6),
+    np.array([0.01, -0.02, 0.015, 0.1, 0.002, 0.001]),
+    np.array([-0.02, 0.01, 0.0, 0.05, -0.09, 0.0]),
+)
+
+
+def rig(model: str, cameras: int) -> list[RawCamera]:
+    focal = 450.0 if model == "radtan" else 210.0
+    return [
+        RawCamera(
+            *SIZE,
+            np.array([[focal + k, 0.0, 320.0 + 5 * k], [0.0, focal - k, 240.0], [0, 0, 1.0]]),
+            PARAMETERS[model],
+            se3_exp(turn),
+            model=model,
+        )
+        for k, turn in enumerate(POSES[:cameras])
+    ]
+
+
+def seen_by(cameras: list[RawCamera], rng: np.random.Generator, count: int = 14) -> list[View]:
+    """Boards at random before the cameras; corners outside an image are not seen by it."""
+    views: list[View] = []
+    centred = BOARD.points - BOARD.points.mean(axis=0)
+    while len(views) < count:
+        away = np.array([*rng.uniform(-0.25, 0.25, 2), rng.uniform(0.3, 0.7)])
+        points = centred @ so3_exp(rng.uniform(-0.5, 0.5, 3)).T + away
+        views.append(tuple(_corners(camera, points, rng) for camera in cameras))
+    return views
+
+
+def _corners(camera: RawCamera, points: FloatArray, rng: np.random.Generator) -> Corners | None:
+    cTf = inverse(camera.bTc)
+    pixels = camera.project(points @ cTf[:3, :3].T + cTf[:3, 3])
+    inside = ((pixels >= 0) & (pixels <= np.array(SIZE) - 1)).all(axis=1)
+    if inside.sum() < 20:
+        return None
+    noisy = pixels + rng.normal(0.0, NOISE_PX, pixels.shape)
+    return Corners(np.flatnonzero(inside), noisy[inside])
+
+
+def normalised_error(found: BoardCalibration, true: list[RawCamera]) -> float:
+    """Mean squared error over the stated variance, of all intrinsics and positions."""
+    parts = []
+    for k, (camera, exact) in enumerate(zip(found.cameras, true, strict=True)):
+        rows = ((0, 0), (1, 1), (0, 2), (1, 2))
+        intrinsics = [camera.matrix[at] - exact.matrix[at] for at in rows]
+        off = np.concatenate([intrinsics, camera.distortion - exact.distortion])
+        parts.append(off / found.sigmas[k])
+        if k:
+            shift = inverse(camera.bTc)[:3, 3] - inverse(exact.bTc)[:3, 3]
+            parts.append(shift / found.turn_sigmas[k, 3:])
+    return float(np.mean(np.concatenate(parts) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("model", "cameras"),
+    [pytest.param("radtan", 3, marks=pytest.mark.slow), ("equidistant", 2)],
+)
+def test_cameras_are_found_and_their_uncertainty_is_honest(model: str, cameras: int) -> None:
+    errors = []
+    for seed in range(6):
+        true = rig(model, cameras)
+        views = seen_by(true, np.random.default_rng(seed))
+        found = calibrate(BOARD, views, SIZE, model)
+        assert found.rms == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.1)
+        assert found.left_out == 0
+        errors.append(normalised_error(found, true))
+    assert 0.6 < np.mean(errors) < 1.6  # 130 to 200 numbers, of which those of a lens correlate
+
+
+def test_corners_that_were_found_wrongly_are_left_out() -> None:
+    rng = np.random.default_rng(3)
+    true = rig("radtan", 2)
+    views = seen_by(true, rng)
+    spoilt = 0
+    for k in range(0, 14, 2):
+        corners = views[k][1]
+        if corners is None:
+            continue
+        pixels = corners.pixels.copy()
+        pixels[:4] += 5.0
+        spoilt += 4
+        views[k] = (views[k][0], Corners(corners.ids, pixels))
+    assert spoilt >= 12
+    found = calibrate(BOARD, views, SIZE, "radtan")
+    assert spoilt <= found.left_out <= spoilt + 3
+    assert normalised_error(found, true) < 2.0
+
+
+def test_held_out_images_show_rows_and_squares() -> None:
+    true = rig("radtan", 2)
+    views = seen_by(true, np.random.default_rng(5), count=20)
+    held = held_out(BOARD, views, SIZE, "radtan")
+    assert held is not None
+    assert held.rows_px == pytest.approx(np.sqrt(2.0) * NOISE_PX, rel=0.3)
+    assert held.square == pytest.approx(0.04, rel=2e-3)
+    found = calibrate(BOARD, views, SIZE, "radtan")
+    turned = replace(
+        found.cameras[1], bTc=found.cameras[1].bTc @ se3_exp(np.array([0.01, 0, 0, 0, 0, 0]))
+    )
+    knocked = judged(BOARD, replace(found, cameras=(found.cameras[0], turned)), views, 1)
+    assert knocked is not None
+    assert knocked.rows_px > 10 * held.rows_px
+    assert 0.5 < coverage(views, 0, SIZE) <= 1.0
+
+
+def test_too_few_images_and_cameras_that_never_see_the_board_together_are_refused() -> None:
+    views = seen_by(rig("radtan", 2), np.random.default_rng(0))
+    with pytest.raises(CalibrationError, match="the left camera shows the board in 4 images"):
+        calibrate(BOARD, views[:4], SIZE, "radtan")
+    apart: list[View] = [(a, None) if k % 2 else (None, b) for k, (a, b) in enumerate(views)]
+    with pytest.raises(CalibrationError, match="never see the board at the same time"):
+        calibrate(BOARD, apart, SIZE, "radtan")
+
+
+def test_boards_that_no_camera_saw_are_refused_in_one_line() -> None:
+    """Corners at perspectives of which no two have the same focal length."""
+    rng = np.random.default_rng(6)
+    flat = (BOARD.points[None, :, :2] * 1000.0 + 100.0).astype(np.float32)
+    edge = np.array([[0, 0], [400, 0], [400, 320], [0, 320]], np.float32)
+    views: list[View] = []
+    for _ in range(8):
+        there = edge + rng.uniform(-40.0, 40.0, (4, 2)).astype(np.float32)
+        pixels = cv2.perspectiveTransform(flat, cv2.getPerspectiveTransform(edge, there))
+        views.append((Corners(np.arange(len(BOARD.points)), pixels[0].astype(np.float64)),))
+    with pytest.raises(CalibrationError, match="off what radtan cameras show of a flat board"):
+        calibrate(BOARD, views, SIZE, "radtan")
+
+
+# --------------------------------------------------------------------------------------------
+# Single wide cameras, drawn
+
+
 SEEDS = range(4)
 FISHEYE_F = 480.0 / np.radians(92.5)  # 185 degrees over the picture
 
@@ -220,86 +364,3 @@ def test_a_board_beside_the_camera_has_a_pose() -> None:
     assert cTb is not None
     np.testing.assert_allclose(cTb[:3, 3], expected, rtol=0, atol=1e-6)
     np.testing.assert_allclose(cTb[:3, :3], rotation, rtol=0, atol=1e-6)
-
-
-# --------------------------------------------------------------------------------------------
-# ChArUco boards, drawn through a known camera
-
-
-CHARUCO = Board("charuco", 7, 5, 0.05, dictionary="DICT_5X5_100")
-_CELL = 60  # pixels of a square of the print
-
-
-def print_of_charuco() -> np.ndarray:
-    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
-    print_ = cv2.aruco.CharucoBoard((7, 5), 0.05, 0.0375, markers)
-    return np.asarray(print_.generateImage((7 * _CELL, 5 * _CELL), marginSize=0))
-
-
-def rays_of_all(seen_by: RawCamera) -> FloatArray:
-    columns, rows = np.meshgrid(np.arange(seen_by.width), np.arange(seen_by.height))
-    return seen_by.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
-
-
-def drawn(
-    rays: FloatArray, size: tuple[int, int], turn: FloatArray, away: FloatArray
-) -> np.ndarray:
-    """The printed board as a camera sees it, by the ray of every pixel."""
-    width, height = size
-    normal = turn[:, 2]
-    depth = (normal @ away) / (rays @ normal)
-    depth = np.where(depth > 0.0, depth, np.nan)
-    flat = (rays * depth[:, None] - away) @ turn
-    # Half a square's corner: the print's pixels are at their centres.
-    at = ((flat[:, :2] + CHARUCO.square) / CHARUCO.square * _CELL - 0.5).astype(np.float32)
-    maps = np.nan_to_num(at, nan=-1e4).reshape(height, width, 2)
-    image = cv2.remap(
-        print_of_charuco(), maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=150
-    )
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7), np.uint8)
-
-
-def charuco_images(seen_by: RawCamera, count: int) -> list[np.ndarray]:
-    rng, rays = np.random.default_rng(4), rays_of_all(seen_by)
-    images = []
-    for _ in range(count):
-        turn = so3_exp(rng.uniform(-0.5, 0.5, 3))
-        away = np.array([*rng.uniform(-0.12, 0.12, 2), rng.uniform(0.3, 0.42)])
-        images.append(drawn(rays, seen_by.size, turn, away - turn @ CHARUCO.points.mean(axis=0)))
-    return images
-
-
-PERSPECTIVE = camera("radtan", (640, 480), [450, 452, 325, 236, -0.2, 0.05, 0.001, 0.0, 0.0])
-
-
-def test_a_charuco_board_gives_the_camera_that_drew_it() -> None:
-    images = charuco_images(PERSPECTIVE, 12)
-    views: list[View] = [(find_corners(CHARUCO, image),) for image in images]
-    found = calibrate(CHARUCO, views, PERSPECTIVE.size, "radtan")
-    assert sum(len(corners) for (corners,) in views if corners is not None) > 12 * 20
-    assert found.rms < 0.2
-    numbers = numbers_of(found.cameras[0])[:4]
-    np.testing.assert_allclose(numbers, [450, 452, 325, 236], rtol=0, atol=1.0)
-    columns, rows = np.meshgrid(np.arange(20.0, 640, 40), np.arange(20.0, 480, 40))
-    pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    off = found.cameras[0].project(PERSPECTIVE.unproject(pixels)) - pixels
-    # What all have in common is a turn of the camera, of which boards say little.
-    assert np.median(np.linalg.norm(off - off.mean(axis=0), axis=1)) < 0.1
-
-
-def test_a_charuco_board_is_read_in_a_mirror() -> None:
-    (image,) = charuco_images(PERSPECTIVE, 1)
-    reflected = np.ascontiguousarray(image[:, ::-1])
-    direct, found = find_corners(CHARUCO, image), find_corners(CHARUCO, reflected, mirrored=True)
-    assert find_corners(CHARUCO, reflected) is None
-    assert direct is not None
-    assert found is not None
-    np.testing.assert_array_equal(found.ids, direct.ids)
-    expected = np.column_stack([639.0 - direct.pixels[:, 0], direct.pixels[:, 1]])
-    np.testing.assert_allclose(found.pixels, expected, rtol=0, atol=1e-3)
-
-
-def test_markers_of_an_unknown_dictionary_are_refused() -> None:
-    unknown = Board("charuco", 7, 5, 0.05, dictionary="DICT_9X9")
-    with pytest.raises(CalibrationError, match="markers 'DICT_9X9' are not known to OpenCV"):
-        find_corners(unknown, np.zeros((48, 64), np.uint8))
