@@ -1,21 +1,20 @@
-"""Features of many images as the arrays of a file, each number as coarse as it may be.
+"""Features of images as a file keeps them, each number as coarse as it may be.
 
-Version 2: angles in steps of a ten-thousandth of a radian, a fiftieth of a feature's own deviation;
+Angles in steps of a ten-thousandth of a radian, a fiftieth of a feature's own deviation;
 deviations and sizes as bytes on a logarithmic scale, 3 % of themselves; colours, 1 %; column
-descriptors, which are compared in steep combinations, with 13 bits of mantissa. Version 1 had
-float32 throughout. SIFT descriptors are bytes in both. Where a feature lay in the image is not
-kept: it is NaN after reading.
+descriptors, which are compared in steep combinations, with 13 bits of mantissa. Where a
+feature lay in the image is not kept: it is NaN after reading.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from fgslam.core.arrays import ByteArray, FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.bearings import (
     BearingMatches,
     ColumnSegments,
@@ -23,40 +22,9 @@ from fgslam.core.bearings import (
     OmniFeatures,
     UprightFeatures,
 )
-from fgslam.core.errors import StoredMapError
-from fgslam.core.store import ArrayFile, joined, of_rows, offsets, require_finite, split
-
-VERSIONS = (2,)
-"""Of files that hold features."""
-
-_FEATURES = ArrayFile(
-    name="fgslam features",
-    versions=VERSIONS,
-    error=StoredMapError,
-    give="give a file that holds some",
-    again="write the file again",
-)
 
 Array: TypeAlias = np.ndarray[Any, Any]
-_Arrays: TypeAlias = dict[str, tuple[type, tuple[int, ...]]]
-"""Arrays by what their first axis counts, with type and the shape of an item."""
 
-_SIFT: _Arrays = {
-    "sift_bearing": (np.int16, ()),
-    "sift_elevation": (np.int16, ()),
-    "sift_spread": (np.uint8, (2,)),
-    "sift_correlation": (np.int8, ()),
-    "sift_scale": (np.uint8, ()),
-    "sift_descriptors": (np.uint8, (128,)),
-    "sift_colour": (np.float16, (3,)),
-}
-_COLUMNS: _Arrays = {
-    "column_bearing": (np.int16, ()),
-    "column_sigma_bearing": (np.uint8, ()),
-    "column_tangents": (np.float32, (2,)),
-    "column_sigma_tangents": (np.uint8, (2,)),
-    "column_descriptors": (np.float32, (11,)),
-}
 _ANGLE = 32767.0 / np.pi
 _LEAST, _MOST = 1e-5, 10.0  # of what is kept as a byte, radians
 _BYTE = 255.0 / np.log(_MOST / _LEAST)
@@ -64,111 +32,133 @@ _CORRELATION = 127.0
 _MANTISSA = 10  # bits of 23 that are dropped
 
 
-def pack_features(images: Sequence[OmniFeatures]) -> StateArrays:
-    """All features of images, in their order, as the arrays of a file."""
-    out: StateArrays = {
-        "sift_start": offsets([len(i.sift) for i in images]),
-        "column_start": offsets([len(i.columns) for i in images]),
-    }
-    sift = [_sift_arrays(i.sift) for i in images]
-    columns = [_column_arrays(i.columns) for i in images]
-    for specification, parts in ((_SIFT, sift), (_COLUMNS, columns)):
-        for name, (kind, item) in specification.items():
-            out[name] = joined([p[name].astype(kind) for p in parts], item, kind)
-    return out
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseSift:
+    """SIFT features of one image as a file keeps them.
 
-
-def unpack_features(arrays: Mapping[str, Any], where: str) -> tuple[OmniFeatures, ...]:
-    """The features back.
-
-    Args:
-        arrays: as :func:`pack_features` made them; others among them are passed over.
-        where: the file's name, for messages.
-
-    Raises:
-        StoredMapError: an array is absent or damaged.
+    Attributes:
+        bearing, elevation: (n,) int16.
+        spread: (n, 2) uint8, deviations of both; correlation: (n,) int8, between them.
+        scale: (n,) uint8.
+        descriptors: (n, 128) uint8.
+        colour: (n, 3) float16.
     """
-    sift = _split(arrays, "sift_start", _SIFT, where)
-    columns = _split(arrays, "column_start", _COLUMNS, where)
-    if len(sift) != len(columns):
-        raise _FEATURES.damaged("column_start", where)
-    return tuple(
-        OmniFeatures(_sift_of(s), _columns_of(c)) for s, c in zip(sift, columns, strict=True)
-    )
+
+    bearing: npt.NDArray[np.int16]
+    elevation: npt.NDArray[np.int16]
+    spread: ByteArray
+    correlation: npt.NDArray[np.int8]
+    scale: ByteArray
+    descriptors: ByteArray
+    colour: npt.NDArray[np.float16]
+
+    @staticmethod
+    def of(features: UprightFeatures) -> CoarseSift:
+        """The features, rounded."""
+        deviations = np.sqrt(features.covariance[:, [0, 1], [0, 1]])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            correlation = features.covariance[:, 0, 1] / deviations.prod(axis=1)
+        correlation = np.clip(np.nan_to_num(correlation), -1, 1)
+        return CoarseSift(
+            bearing=_steps(features.bearing),
+            elevation=_steps(features.elevation),
+            spread=_bytes(deviations),
+            correlation=np.round(_CORRELATION * correlation).astype(np.int8),
+            scale=_bytes(features.scale),
+            descriptors=features.descriptors,
+            colour=_coarse(features.colour),
+        )
+
+    def features(self) -> UprightFeatures:
+        """The features back; their places in the image are NaN."""
+        n, sigmas = len(self.bearing), _of_bytes(self.spread)
+        covariance = np.empty((n, 2, 2))
+        covariance[:, [0, 1], [0, 1]] = sigmas**2
+        covariance[:, 0, 1] = covariance[:, 1, 0] = (
+            sigmas[:, 0] * sigmas[:, 1] * (self.correlation / _CORRELATION)
+        )
+        return UprightFeatures(
+            pixels=np.full((n, 2), np.nan),
+            bearing=self.bearing / _ANGLE,
+            elevation=self.elevation / _ANGLE,
+            covariance=covariance,
+            scale=_of_bytes(self.scale),
+            descriptors=self.descriptors,
+            colour=self.colour.astype(np.float64),
+        )
 
 
-def _split(
-    arrays: Mapping[str, Any], start: str, specification: _Arrays, where: str
-) -> list[dict[str, Array]]:
-    rows = _FEATURES.require_offsets(arrays, start, None, where)
-    kinds = {name: (np.dtype(kind).kind, item) for name, (kind, item) in specification.items()}
-    _FEATURES.require(arrays, of_rows(rows, kinds), where)
-    _require_values(arrays, specification, where)
-    whole = {name: split(arrays[name], arrays[start]) for name in specification}
-    return [
-        {name: parts[k] for name, parts in whole.items()} for k in range(len(arrays[start]) - 1)
-    ]
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseColumns:
+    """Column segments of one image as a file keeps them.
+
+    Attributes:
+        bearing: (n,) int16; sigma_bearing: (n,) uint8.
+        tangents: (n, 2) float32; sigma_tangents: (n, 2) uint8.
+        descriptors: (n, 11) float32.
+    """
+
+    bearing: npt.NDArray[np.int16]
+    sigma_bearing: ByteArray
+    tangents: npt.NDArray[np.float32]
+    sigma_tangents: ByteArray
+    descriptors: npt.NDArray[np.float32]
+
+    @staticmethod
+    def of(segments: ColumnSegments) -> CoarseColumns:
+        """The segments, rounded."""
+        return CoarseColumns(
+            bearing=_steps(segments.bearing),
+            sigma_bearing=_bytes(segments.sigma_bearing),
+            tangents=_shortened(segments.tangents),
+            sigma_tangents=_bytes(segments.sigma_tangents),
+            descriptors=_shortened(segments.descriptors),
+        )
+
+    def segments(self) -> ColumnSegments:
+        """The segments back."""
+        return ColumnSegments(
+            bearing=self.bearing / _ANGLE,
+            sigma_bearing=_of_bytes(self.sigma_bearing),
+            tangents=self.tangents.astype(np.float64),
+            sigma_tangents=_of_bytes(self.sigma_tangents),
+            descriptors=self.descriptors.astype(np.float64),
+        )
 
 
-_CODES: dict[str, float] = {
-    "sift_bearing": np.pi * _ANGLE,
-    "sift_elevation": 0.5 * np.pi * _ANGLE + 1.0,
-    "sift_correlation": _CORRELATION,
-    "column_bearing": np.pi * _ANGLE,
-}
-"""Largest whole numbers that features are kept as, of either sign."""
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseFeatures:
+    """Features of one image as a file keeps them."""
+
+    sift: CoarseSift
+    columns: CoarseColumns
+
+    @staticmethod
+    def of(image: OmniFeatures) -> CoarseFeatures:
+        """The features, rounded."""
+        return CoarseFeatures(CoarseSift.of(image.sift), CoarseColumns.of(image.columns))
+
+    def features(self) -> OmniFeatures:
+        """The features back."""
+        return OmniFeatures(self.sift.features(), self.columns.segments())
 
 
-def _require_values(arrays: Mapping[str, Any], specification: _Arrays, where: str) -> None:
-    """Raises StoredMapError for what no image's features are."""
-    for name, (kind, _) in specification.items():
-        if np.dtype(kind).kind == "f":
-            require_finite(_FEATURES, arrays, (name,), where)
-        elif name in _CODES and (np.abs(arrays[name].astype(np.int64)) > _CODES[name]).any():
-            raise _FEATURES.damaged(name, where)
-
-
-# --------------------------------------------------------------------------------------------
-# One image to its arrays
-
-
-def _sift_arrays(features: UprightFeatures) -> dict[str, Array]:
-    deviations = np.sqrt(features.covariance[:, [0, 1], [0, 1]])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        correlation = features.covariance[:, 0, 1] / deviations.prod(axis=1)
-    return {
-        "sift_bearing": _steps(features.bearing),
-        "sift_elevation": _steps(features.elevation),
-        "sift_spread": _bytes(deviations),
-        "sift_correlation": np.round(_CORRELATION * np.clip(np.nan_to_num(correlation), -1, 1)),
-        "sift_scale": _bytes(features.scale),
-        "sift_descriptors": features.descriptors,
-        "sift_colour": _coarse(features.colour),
-    }
-
-
-def _column_arrays(segments: ColumnSegments) -> dict[str, Array]:
-    return {
-        "column_bearing": _steps(segments.bearing),
-        "column_sigma_bearing": _bytes(segments.sigma_bearing),
-        "column_tangents": _shortened(segments.tangents),
-        "column_sigma_tangents": _bytes(segments.sigma_tangents),
-        "column_descriptors": _shortened(segments.descriptors),
-    }
-
-
-def _steps(angle: FloatArray) -> FloatArray:
+def _steps(angle: FloatArray) -> npt.NDArray[np.int16]:
     """Angles in [-pi, pi] as whole numbers."""
-    return np.asarray(np.round(_ANGLE * angle))
+    return np.round(_ANGLE * angle).astype(np.int16)
 
 
-def _bytes(values: FloatArray) -> FloatArray:
+def _bytes(values: FloatArray) -> ByteArray:
     """Positive values on a logarithmic scale as whole numbers, 0 to 255."""
     inside = np.clip(values, _LEAST, _MOST)
-    return np.asarray(np.round(_BYTE * np.log(inside / _LEAST)))
+    return np.asarray(np.round(_BYTE * np.log(inside / _LEAST)), np.uint8)
 
 
-def _shortened(values: FloatArray) -> Array:
+def _of_bytes(codes: ByteArray) -> FloatArray:
+    return np.asarray(_LEAST * np.exp(codes / _BYTE))
+
+
+def _shortened(values: FloatArray) -> npt.NDArray[np.float32]:
     """Values as float32 that end in zeros, which a file's compression takes away."""
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     half = np.uint32(1 << (_MANTISSA - 1))
@@ -176,49 +166,10 @@ def _shortened(values: FloatArray) -> Array:
     return kept.view(np.float32)
 
 
-def _coarse(values: FloatArray) -> Array:
+def _coarse(values: FloatArray) -> npt.NDArray[np.float16]:
     """Values as float16 with six bits of mantissa: 0.8 % of themselves."""
     bits = np.ascontiguousarray(values, np.float16).view(np.uint16)
     return ((bits + np.uint16(8)) & np.uint16(0xFFF0)).view(np.float16)
-
-
-# --------------------------------------------------------------------------------------------
-# And back
-
-
-def _of_bytes(codes: Array) -> FloatArray:
-    return np.asarray(_LEAST * np.exp(codes / _BYTE))
-
-
-def _sift_of(part: Mapping[str, Array]) -> UprightFeatures:
-    n = len(part["sift_bearing"])
-    sigmas, correlation = _of_bytes(part["sift_spread"]), part["sift_correlation"] / _CORRELATION
-    covariance = np.empty((n, 2, 2))
-    covariance[:, [0, 1], [0, 1]] = sigmas**2
-    covariance[:, 0, 1] = covariance[:, 1, 0] = sigmas[:, 0] * sigmas[:, 1] * correlation
-    return UprightFeatures(
-        pixels=np.full((n, 2), np.nan),
-        bearing=part["sift_bearing"] / _ANGLE,
-        elevation=part["sift_elevation"] / _ANGLE,
-        covariance=covariance,
-        scale=_of_bytes(part["sift_scale"]),
-        descriptors=part["sift_descriptors"],
-        colour=_doubles(part["sift_colour"]),
-    )
-
-
-def _columns_of(part: Mapping[str, Array]) -> ColumnSegments:
-    return ColumnSegments(
-        bearing=part["column_bearing"] / _ANGLE,
-        sigma_bearing=_of_bytes(part["column_sigma_bearing"]),
-        tangents=_doubles(part["column_tangents"]),
-        sigma_tangents=_of_bytes(part["column_sigma_tangents"]),
-        descriptors=_doubles(part["column_descriptors"]),
-    )
-
-
-def _doubles(array: Array) -> FloatArray:
-    return array.astype(np.float64)
 
 
 # --------------------------------------------------------------------------------------------

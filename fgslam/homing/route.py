@@ -15,30 +15,22 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
 
 from fgslam.cameras.omni import OmniCamera
 from fgslam.cameras.omni_files import camera_of, camera_values
-from fgslam.core.arrays import FloatArray, Image, StateArrays
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
-from fgslam.core.errors import CalibrationError, StoredMapError
-from fgslam.core.files import as_path
+from fgslam.core.errors import StoredMapError
 from fgslam.core.geometry import circular_median, is_rigid, wrap
-from fgslam.core.store import (
-    ArrayFile,
-    Items,
-    by_field,
-    fields_from,
-    of_rows,
-    require_covariances,
-    write_arrays,
-)
+from fgslam.core.store import FileKind, require_covariances
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator
 from fgslam.homing.active import parallax
-from fgslam.homing.features import VERSIONS, Votes, compacted, pack_features, unpack_features
+from fgslam.homing.features import CoarseFeatures, Votes, compacted
 from fgslam.homing.front_end import compare_views, unusable
 from fgslam.homing.settings import FrontEndSettings
 
@@ -347,19 +339,6 @@ def with_neighbours_votes(
 # A path as it is remembered: the features of its images, in order, and nothing else
 
 
-FILE = ArrayFile(
-    name="fgslam path memory",
-    versions=VERSIONS,
-    error=StoredMapError,
-    give="give a file that holds one, as fgslam teach writes it",
-    again="write it again",
-)
-
-
-_METRIC = "metric_"
-_PER_POSE: Items = {f"{_METRIC}poses": ("f", (4, 4)), f"{_METRIC}covariances": ("f", (6, 6))}
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MetricPoses:
     """Poses of path images, as SLAM on the same drive found them.
@@ -427,7 +406,7 @@ class PathMemory:
             OutputError: it cannot be written.
             CalibrationError: the camera is a model of the user's own.
         """
-        return save_images(FILE, path, self)
+        return FILE.save(path, StoredPath.of(self)) / 1000.0 / max(len(self), 1)
 
     @staticmethod
     def load(path: str | Path) -> PathMemory:
@@ -436,60 +415,54 @@ class PathMemory:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        return load_images(FILE, path)[0]
+        return FILE.load(path).memory(str(path))
 
 
-# --------------------------------------------------------------------------------------------
-# Files of named images
+@dataclass(frozen=True, slots=True, eq=False)
+class StoredPath:
+    """A path memory as files keep it."""
+
+    images: tuple[CoarseFeatures, ...]
+    names: tuple[str, ...]
+    camera: dict[str, Any] | None
+    metric: MetricPoses | None
+
+    @staticmethod
+    def of(memory: PathMemory) -> StoredPath:
+        """The memory, rounded. Raises CalibrationError: the camera is a user's own model."""
+        camera = None if memory.camera is None else camera_values(memory.camera)
+        images = tuple(CoarseFeatures.of(image) for image in memory.images)
+        return StoredPath(images, memory.names, camera, memory.metric)
+
+    def memory(self, where: str) -> PathMemory:
+        """The memory back; ``where`` names the file."""
+        camera = None if self.camera is None else camera_of(self.camera, where)
+        images = tuple(image.features() for image in self.images)
+        return PathMemory(images, self.names, camera, self.metric)
+
+    def require_sound(self) -> None:
+        """Raises ValueError for poses that SLAM does not find, or of other images."""
+        if self.metric is None:
+            return
+        poses, covariances, n = self.metric.poses, self.metric.covariances, len(self.images)
+        if poses.shape != (n, 4, 4) or covariances.shape != (n, 6, 6):
+            raise ValueError("metric poses: not one an image")
+        if not all(is_rigid(pose) for pose in poses if not np.isnan(pose).all()):
+            raise ValueError("metric poses: one is no rigid motion")
+        known = covariances[~np.isnan(covariances).all(axis=(1, 2))]
+        require_covariances("metric poses", known, definite=False)
 
 
-def save_images(
-    kind: ArrayFile, path: str | Path, memory: PathMemory, others: StateArrays | None = None
-) -> float:
-    """Writes features, names and camera of images atomically, and ``others`` beside them.
+PACKED = "biufU"
+"""Kinds of arrays that are compressed: floats, too, as theirs end in zeros."""
 
-    Returns:
-        Kilobytes (of 1000 bytes) an image.
-
-    Raises:
-        OutputError: the file cannot be written.
-        CalibrationError: the camera is a model of the user's own.
-    """
-    camera = None if memory.camera is None else camera_values(memory.camera)
-    header = kind.header(names=list(memory.names), camera=camera)
-    arrays = header | pack_features(memory.images) | (others or {})
-    if memory.metric is not None:
-        arrays |= by_field(memory.metric, _METRIC)
-    return write_arrays(Path(path), arrays, compressed=True) / 1000.0 / max(len(memory), 1)
-
-
-def load_images(kind: ArrayFile, path: str | Path) -> tuple[PathMemory, StateArrays]:
-    """Images of a file with names and camera, and all its arrays.
-
-    Raises:
-        StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
-    """
-    arrays = kind.load(as_path(path, StoredMapError))
-    header = kind.read_header(arrays, str(path))
-    images = unpack_features(arrays, str(path))
-    names, values = header.get("names"), header.get("camera")
-    if not isinstance(names, list) or len(names) != len(images):
-        raise StoredMapError(f"{path}: not one name an image; write the file again")
-    try:
-        camera = None if values is None else camera_of(values, str(path))
-    except CalibrationError as error:
-        raise StoredMapError(str(error)) from None
-    metric = _metric_of(kind, arrays, len(images), str(path))
-    return PathMemory(images, tuple(str(name) for name in names), camera, metric), arrays
-
-
-def _metric_of(kind: ArrayFile, arrays: StateArrays, count: int, where: str) -> MetricPoses | None:
-    if f"{_METRIC}poses" not in arrays:
-        return None
-    kind.require(arrays, of_rows(count, _PER_POSE), where)
-    metric = MetricPoses(**fields_from(MetricPoses, arrays, _METRIC))
-    if not all(is_rigid(pose) for pose in metric.poses if not np.isnan(pose).all()):
-        raise kind.damaged(f"{_METRIC}poses", where)
-    known = metric.covariances[~np.isnan(metric.covariances).all(axis=(1, 2))]
-    require_covariances(kind, f"{_METRIC}covariances", known, where, definite=False)
-    return metric
+FILE = FileKind(
+    StoredPath,
+    "fgslam path memory",
+    version=3,
+    error=StoredMapError,
+    give="give a file that holds one, as fgslam teach writes it",
+    again="write it again",
+    check=StoredPath.require_sound,
+    packed=PACKED,
+)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -13,15 +13,14 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from fgslam.cameras.omni import OmniCamera
-from fgslam.core.arrays import FloatArray, IntArray, StateArrays
+from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason
 from fgslam.core.errors import CalibrationError, StoredMapError
-from fgslam.core.store import ArrayFile, Items, of_rows, require_covariances, rows_of
+from fgslam.core.store import FileKind
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.sift import colour_image
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import pair_generator, vector_between
-from fgslam.homing.features import VERSIONS
 from fgslam.homing.front_end import unusable
 from fgslam.homing.links import (
     UNORDERED,
@@ -37,23 +36,9 @@ from fgslam.homing.links import (
     link_pairs,
     sift_inliers,
 )
-from fgslam.homing.route import PathMemory, load_images, save_images
+from fgslam.homing.route import PACKED, PathMemory, StoredPath
 from fgslam.homing.settings import DRIVING, TopologicalMapSettings
 
-FILE = ArrayFile(
-    name="fgslam topological map",
-    versions=VERSIONS,
-    error=StoredMapError,
-    give="give a file that holds one, as fgslam join writes it",
-    again="build it again",
-)
-_PER_LINK: Items = {
-    "link_support": ("i", ()),
-    "link_ends": ("i", (2,)),
-    "link_angles": ("f", (3,)),
-    "link_covariances": ("f", (2, 2, 2)),
-    "link_cost": ("f", ()),
-}
 _DOUBLING_SUPPORT = 25.0  # inliers at which an edge costs twice what many inliers cost
 _SIGMA_OF_ONE = np.deg2rad(5.0)  # direction's deviation that costs as much as a leg by itself
 
@@ -138,8 +123,8 @@ class TopologicalMap:
         Raises:
             OutputError: it cannot be written.
         """
-        links = _link_arrays(self.links, self.costs)
-        return save_images(FILE, path, self.memory, links)
+        stored = _StoredMap(StoredPath.of(self.memory), self.links, self.costs)
+        return FILE.save(path, stored) / 1000.0 / max(len(self), 1)
 
     @staticmethod
     def load(path: str | Path) -> TopologicalMap:
@@ -148,11 +133,42 @@ class TopologicalMap:
         Raises:
             StoredMapError: the file is missing, truncated, damaged, foreign or of another version.
         """
-        memory, arrays = load_images(FILE, path)
-        if len(set(memory.names)) < len(memory):
-            raise StoredMapError(f"{path}: two places have one name; {FILE.again}")
-        links, costs = _read_links(arrays, len(memory), str(path))
-        return TopologicalMap(memory.images, memory.names, links, costs, {}, memory.camera)
+        stored = FILE.load(path)
+        memory = stored.places.memory(str(path))
+        return TopologicalMap(
+            memory.images, memory.names, stored.links, stored.costs, {}, memory.camera
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _StoredMap:
+    """A topological map as files keep it."""
+
+    places: StoredPath
+    links: tuple[Link, ...]
+    costs: FloatArray
+
+    def require_sound(self) -> None:
+        """Raises ValueError where names are not unique, or links lead to no place of the map."""
+        n = len(self.places.images)
+        if len(set(self.places.names)) < n:
+            raise ValueError("two places have one name")
+        if not all(0 <= link.a < link.b < n for link in self.links):
+            raise ValueError("a link leads to no place")
+        if self.costs.shape != (len(self.links),) or not (self.costs > 0.0).all():
+            raise ValueError("not one cost a link")
+
+
+FILE = FileKind(
+    _StoredMap,
+    "fgslam topological map",
+    version=3,
+    error=StoredMapError,
+    give="give a file that holds one, as fgslam join writes it",
+    again="build it again",
+    check=_StoredMap.require_sound,
+    packed=PACKED,
+)
 
 
 # --------------------------------------------------------------------------------------------
@@ -218,70 +234,6 @@ def _graph(count: int, links: Sequence[Link], costs: FloatArray) -> csr_matrix:
     both = np.vstack([ends, ends[:, ::-1]])
     weights = np.concatenate([costs, costs])
     return coo_matrix((weights, (both[:, 0], both[:, 1])), shape=(count, count)).tocsr()
-
-
-# --------------------------------------------------------------------------------------------
-# Links in files
-
-
-def _link_arrays(links: Sequence[Link], costs: FloatArray) -> StateArrays:
-    m = len(links)
-    angles = [(link.direction, link.rotation, link.back) for link in links]
-    covariances = [(link.covariance, link.back_covariance) for link in links]
-    return {
-        "link_ends": np.array([(k.a, k.b) for k in links], dtype=np.int64).reshape(m, 2),
-        "link_angles": np.array(angles, dtype=np.float64).reshape(m, 3),
-        "link_covariances": np.array(covariances, dtype=np.float64).reshape(m, 2, 2, 2),
-        "link_support": np.array([k.support for k in links], dtype=np.int64),
-        "link_cost": np.asarray(costs, dtype=np.float64).reshape(m),
-    }
-
-
-def _read_links(
-    arrays: Mapping[str, Any], count: int, where: str
-) -> tuple[tuple[Link, ...], FloatArray]:
-    FILE.require(arrays, of_rows(rows_of(arrays, "link_support"), _PER_LINK), where)
-    support, ends, angles, covariances, costs = (arrays[name] for name in _PER_LINK)
-    _require_links(arrays, count, where)
-    links = tuple(
-        Link(
-            a=int(ends[k, 0]),
-            b=int(ends[k, 1]),
-            direction=float(angles[k, 0]),
-            rotation=float(angles[k, 1]),
-            back=float(angles[k, 2]),
-            covariance=covariances[k, 0],
-            back_covariance=covariances[k, 1],
-            support=int(support[k]),
-        )
-        for k in range(len(support))
-    )
-    return links, np.array(costs)
-
-
-def _require_links(arrays: Mapping[str, Any], count: int, where: str) -> None:
-    """Raises StoredMapError for links that no map has, of arrays of the right shapes.
-
-    A driven step without a homing vector has no inliers and knows no angle; images of one place
-    have a rotation alone.
-    """
-    support, ends, angles, covariances, costs = (arrays[name] for name in _PER_LINK)
-    step, turn = support == 0, np.isnan(angles[:, [0, 2]]).all(axis=1)
-    known = np.isfinite(angles)
-    wrong = {
-        "link_support": support < 0,
-        "link_ends": (ends < 0).any(axis=1)
-        | (ends >= count).any(axis=1)
-        | (ends[:, 0] >= ends[:, 1]),
-        "link_cost": ~((costs > 0.0) & np.isfinite(costs)),
-        "link_angles": ~(known.all(axis=1) | (turn & (known[:, 1] | step))),
-    }
-    for name, rows in wrong.items():
-        if rows.any():
-            raise FILE.damaged(name, where)
-    if len(np.unique(ends, axis=0)) < len(ends):
-        raise FILE.damaged("link_ends", where)
-    require_covariances(FILE, "link_covariances", covariances[~turn].reshape(-1, 2, 2), where)
 
 
 # --------------------------------------------------------------------------------------------

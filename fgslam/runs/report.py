@@ -372,7 +372,7 @@ def _up(log: Path | None) -> FloatArray:
     if log is None:
         return _UP
     try:
-        return vertical_of(MeasurementLog.load_sensor(log).bTc)
+        return vertical_of(MeasurementLog.load(log).rig.bTc)
     except FgslamError:  # the page shows results; a log that cannot be replayed is no reason not to
         return _UP
 

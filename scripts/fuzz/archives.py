@@ -16,7 +16,7 @@ import fgslam as fg
 from fgslam.core.bearings import BearingLog, HomingStart, TwoViewVector
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
-from fgslam.core.store import write_arrays
+from fgslam.core.store import pack, write_arrays
 from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector
@@ -146,10 +146,8 @@ def _saved(found: fg.Map | fg.PathMemory | fg.RouteMap) -> Arrays:
             return dict(archive)
 
 
-MEASUREMENTS = Archive(
-    ".npz", _measurement_log, MeasurementLog.load, lambda log: dict(log.to_arrays())
-)
-BEARINGS = Archive(".npz", _bearing_log, BearingLog.load, lambda log: dict(log.to_arrays()))
+MEASUREMENTS = Archive(".npz", _measurement_log, MeasurementLog.load, pack)
+BEARINGS = Archive(".npz", _bearing_log, BearingLog.load, pack)
 MAP = Archive(".fgmap", _map, fg.Map.load, _saved)
 ROUTE = Archive(".fgpath", _route, fg.PathMemory.load, _saved)
 ROUTE_MAP = Archive(".fgmap", _route_map, fg.RouteMap.load, _saved)

@@ -18,6 +18,7 @@ from fgslam.backend.protocol import Estimator
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
+from fgslam.core.store import pack
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
@@ -238,6 +239,14 @@ def assert_same_bits(first: object, second: object) -> None:
     for x, y in zip(a, b, strict=True):
         assert x.dtype == y.dtype
         np.testing.assert_array_equal(x, y)
+
+
+def assert_same_value(first: object, second: object) -> None:
+    """Both are packed to the same names, numbers and bits."""
+    a, b = pack(first), pack(second)
+    assert a.keys() == b.keys()
+    for name in a:
+        assert (a[name].dtype, a[name].tobytes()) == (b[name].dtype, b[name].tobytes()), name
 
 
 class FeatureWorld(feature_world.FeatureWorld):

@@ -134,7 +134,7 @@ def test_a_file_holds_what_was_packed(tmp_path_factory: Any, value: Everything) 
 
 
 def test_ten_thousand_poses_are_a_few_arrays() -> None:
-    poses = [Pose(k * np.eye(4), 0.1 * k, "") for k in range(10_000)]
+    poses = [Pose(k + np.arange(16.0).reshape(4, 4), 0.1 * k, "") for k in range(10_000)]
     packed = pack(poses)
     assert len(packed) < 5
     assert packed["matrix"].shape == (10_000, 4, 4)

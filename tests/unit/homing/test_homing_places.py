@@ -306,16 +306,15 @@ def test_poses_survive_the_route_s_file_and_damage_is_refused(tmp_path: Path) ->
     assert again.metric is not None
     np.testing.assert_array_equal(again.metric.poses, three_poses().poses)
     np.testing.assert_array_equal(again.metric.covariances, three_poses().covariances)
-    with np.load(tmp_path / "r.fgpath") as file:
-        arrays = dict(file)
-    for name, value in (("metric_poses", 2.0), ("metric_covariances", -1.0)):
-        spoiled = {**arrays, name: value * arrays[name]}
-        np.savez(tmp_path / "bad.npz", **spoiled)
-        with pytest.raises(StoredMapError, match=f"array {name}"):
+    poses, covariances = three_poses().poses, three_poses().covariances
+    for metric, words in (
+        (MetricPoses(2.0 * poses, covariances), "one is no rigid motion"),
+        (MetricPoses(poses, -covariances), "number 0 is no covariance"),
+        (MetricPoses(poses[:2], covariances[:2]), "not one an image"),
+    ):
+        PathMemory(images, ("a", "b", "c"), None, metric).save(tmp_path / "bad.npz")
+        with pytest.raises(StoredMapError, match=f"metric poses: {words}"):
             PathMemory.load(tmp_path / "bad.npz")
-    np.savez(tmp_path / "bad.npz", **{**arrays, "metric_poses": arrays["metric_poses"][:2]})
-    with pytest.raises(StoredMapError, match="metric_poses"):
-        PathMemory.load(tmp_path / "bad.npz")
 
 
 # --------------------------------------------------------------------------------------------

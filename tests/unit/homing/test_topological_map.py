@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -337,13 +336,6 @@ def test_map_survives_its_file(built: tuple[FloatArray, TopologicalMap], tmp_pat
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(StoredMapError, match="truncated"):
-        TopologicalMap.load(path)
-    path.write_bytes(whole)
-    with np.load(path) as file:
-        arrays = dict(file)
-    arrays["link_ends"] = arrays["link_ends"] + PLACES - 2
-    np.savez(path, **arrays)
-    with pytest.raises(StoredMapError, match="link_ends"):
         TopologicalMap.load(path)
 
 
@@ -687,31 +679,16 @@ def test_wrong_routes_and_places_are_refused(
         mixed.locate(picture(0.0, 0.0))
 
 
-SPOILED = [
-    ("link_cost", lambda a: a * np.nan, "array link_cost"),
-    ("link_cost", lambda a: -a, "array link_cost"),
-    ("link_support", lambda a: a - 10_000, "array link_support"),
-    ("link_ends", lambda a: a[:, ::-1].copy(), "array link_ends"),
-    ("link_ends", lambda a: np.repeat(a[:1], len(a), axis=0), "array link_ends"),
-    ("link_angles", lambda a: a * [1.0, np.nan, 1.0], "array link_angles"),
-    ("link_covariances", lambda a: -a, "array link_covariances, row 0, is no covariance"),
-    ("column_tangents", lambda a: a * np.float32(np.inf), "array column_tangents is not finite"),
-    ("sift_elevation", lambda a: np.full_like(a, 32767), "array sift_elevation"),
-]
-
-
-@pytest.mark.parametrize(("name", "spoil", "said"), SPOILED)
-def test_values_that_no_map_has_are_refused(
-    joined: RouteMap, tmp_path: Path, name: str, spoil: Callable[[Any], Any], said: str
-) -> None:
-    joined.save(tmp_path / "house.fgmap")
-    with np.load(tmp_path / "house.fgmap") as file:
-        arrays = dict(file)
-    with np.errstate(invalid="ignore"):
-        arrays[name] = spoil(arrays[name]).astype(arrays[name].dtype)
-    np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(StoredMapError, match=said):
-        RouteMap.load(tmp_path / "bad.npz")
+def test_values_that_no_map_has_are_refused(joined: RouteMap, tmp_path: Path) -> None:
+    topology, path = joined.topology, tmp_path / "bad.fgmap"
+    for other, words in (
+        (replace(topology, links=(topology.links[0].reversed(),)), "a link leads to no place"),
+        (replace(topology, costs=-topology.costs), "not one cost a link"),
+        (replace(topology, costs=topology.costs[1:]), "not one cost a link"),
+    ):
+        other.save(path)
+        with pytest.raises(StoredMapError, match=words):
+            RouteMap.load(path)
 
 
 def test_places_of_one_name_are_refused(joined: RouteMap, tmp_path: Path) -> None:
