@@ -22,7 +22,6 @@ from matplotlib.figure import Figure as Canvas
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
-from matplotlib.transforms import Bbox
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.files import replacing
@@ -536,7 +535,12 @@ def draw_sheet(path: Path, images: Sequence[Image], titles: Sequence[str]) -> No
             axes.set_visible(False)
 
 
+# --------------------------------------------------------------------------------------------
+# A calibration: where its boards were seen, and the cameras
+
 _CORNERS_INCHES = 4.5
+_COLOURS = (SKY, ORANGE, VERMILLION, INK)
+_PANEL_IN = 4.2
 
 
 def draw_corners(
@@ -561,12 +565,7 @@ def draw_corners(
             axes.plot(*pixels.T, ".", color=SKY, markersize=2.5)
             axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
             axes.set(title=f"{name}: {len(pixels)} corners", xticks=[], yticks=[])
-            for side in ("top", "right"):
-                axes.spines[side].set_visible(True)
-
-
-_COLOURS = (SKY, ORANGE, VERMILLION, INK)
-_PANEL_IN = 4.2
+            axes.spines[["top", "right"]].set_visible(True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -591,57 +590,67 @@ class CameraDrawing:
 
 
 def draw_cameras(path: Path, title: str, cameras: Sequence[CameraDrawing]) -> None:
-    """Writes the picture. Raises OutputError where it cannot be written."""
+    """Writes a picture of the cameras' images, and of the cameras from above.
+
+    From above: positions, axes and fields of view, x to the right and z ahead, in millimetres.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
     count = len(cameras) + 1
-    with picture(path, _PANEL_IN * count, _PANEL_IN) as canvas:
-        canvas.suptitle(title)
-        panels = canvas.subplots(1, count, squeeze=False)[0]
-        for k, (axes, camera) in enumerate(zip(panels, cameras, strict=False)):
-            _image(axes, camera, _COLOURS[k % len(_COLOURS)])
-        _from_above(panels[-1], cameras)
-
-
-def _image(axes: Axes, camera: CameraDrawing, colour: str) -> None:
-    width, height = camera.size
-    axes.add_patch(Rectangle((-0.5, -0.5), width, height, facecolor=FAINT, edgecolor=INK))
-    if len(camera.outline):
-        closed = np.concatenate([camera.outline, camera.outline[:1]])
-        axes.plot(*closed.T, color=colour, linewidth=2.0)
-    axes.plot(*camera.centre, marker="+", color=INK, markersize=12)
-    margin = 0.06 * max(width, height)
-    axes.set(xlim=(-margin, width + margin), ylim=(height + margin, -margin), aspect="equal")
-    axes.set_title(camera.name[-28:], fontsize=11.0)
-    axes.set_xlabel("raw image, px; outline: the rectified view" if len(camera.outline) else "px")
-
-
-def _from_above(axes: Axes, cameras: Sequence[CameraDrawing]) -> None:
-    """Positions, axes and fields of view, x to the right and z ahead, in millimetres."""
     places = np.array([1e3 * camera.place[:3, 3] for camera in cameras])
     reach = 0.6 * max(float(np.ptp(places[:, [0, 2]], axis=0).max()), 20.0)
-    for k, camera in enumerate(cameras):
-        x, _, z = places[k]
-        colour = _COLOURS[k % len(_COLOURS)]
-        half = min(camera.half_angle, np.radians(100.0))
-        turns = np.linspace(-half, half, 31)
-        rays = np.column_stack([np.sin(turns), np.zeros(31), np.cos(turns)])
-        rim = reach * (rays @ camera.place[:3, :3].T)[:, [0, 2]] + [x, z]
-        wedge = np.concatenate([[[x, z]], rim, [[x, z]]])
-        axes.fill(*wedge.T, color=colour, alpha=0.15)
-        axes.plot(*wedge.T, color=colour, linewidth=1.0)
-        axes.plot([x], [z], marker="o", color=colour)
-        axes.annotate(str(k), (x, z), textcoords="offset points", xytext=(0, -16), ha="center")
-    axes.set(aspect="equal", xlabel="right, mm", ylabel="ahead, mm")
-    axes.set_title("from above", fontsize=11.0)
-    axes.grid(visible=True)
+    with picture(path, _PANEL_IN * count, _PANEL_IN) as canvas:
+        canvas.suptitle(title)
+        *panels, above = canvas.subplots(1, count, squeeze=False)[0]
+        for k, (axes, camera) in enumerate(zip(panels, cameras, strict=True)):
+            colour, (width, height) = _COLOURS[k % len(_COLOURS)], camera.size
+            axes.add_patch(Rectangle((-0.5, -0.5), width, height, facecolor=FAINT, edgecolor=INK))
+            axes.set_xlabel("px")
+            if len(camera.outline):
+                closed = np.concatenate([camera.outline, camera.outline[:1]])
+                axes.plot(*closed.T, color=colour, linewidth=2.0)
+                axes.set_xlabel("raw image, px; outline: the rectified view")
+            axes.plot(*camera.centre, marker="+", color=INK, markersize=12)
+            margin = 0.06 * max(width, height)
+            axes.set(xlim=(-margin, width + margin), ylim=(height + margin, -margin))
+            axes.set_aspect("equal")
+            axes.set_title(camera.name[-28:], fontsize=11.0)
+            x, _, z = places[k]
+            half = min(camera.half_angle, np.radians(100.0))
+            turns = np.linspace(-half, half, 31)
+            rays = np.column_stack([np.sin(turns), np.zeros(31), np.cos(turns)])
+            rim = reach * (rays @ camera.place[:3, :3].T)[:, [0, 2]] + [x, z]
+            wedge = np.concatenate([[[x, z]], rim, [[x, z]]])
+            above.fill(*wedge.T, color=colour, alpha=0.15)
+            above.plot(*wedge.T, color=colour, linewidth=1.0)
+            above.plot([x], [z], marker="o", color=colour)
+            below = {"textcoords": "offset points", "xytext": (0, -16), "ha": "center"}
+            above.annotate(str(k), (x, z), **below)
+        above.set(aspect="equal", xlabel="right, mm", ylabel="ahead, mm")
+        above.set_title("from above", fontsize=11.0)
+        above.grid(visible=True)
 
 
-_FILM_INCHES = (12.8, 5.4)
-_FILM_DPI = 100  # 1280 x 540
+# --------------------------------------------------------------------------------------------
+# Frames of films, one after the other onto one canvas
+
+_FILM_INCHES, _ROUTE_INCHES = (12.8, 5.4), (12.8, 7.2)
+_FILM_DPI = 100  # 1280 x 540, and 1280 x 720
+_DOTS = "#8a939c"
+_styled = matplotlib.style.context(PICTURE_STYLE, after_reset=True)
+
+
+def _pixels(figure: Canvas) -> Image:
+    """What a canvas shows, (height, width, 3) in red, green, blue."""
+    agg: Any = figure.canvas
+    agg.draw()
+    return np.asarray(agg.buffer_rgba())[..., :3].copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """One frame.
+    """One frame of a drive.
 
     Attributes:
         image: what the reference camera saw; None where it cannot be read.
@@ -658,77 +667,62 @@ class Moment:
 
 
 class FilmCanvas:
-    """Draws moments one after the other onto one canvas.
+    """A drive: the image with its matches, next to the growing map."""
 
-    Args:
-        path: (n, 2) metres to the right and ahead, of all poses.
-        landmarks: (m, 2) all that will be drawn, for the limits.
-        truth: (k, 2) true path, or None.
-        title: above the map.
-    """
-
+    @_styled
     def __init__(
         self, path: FloatArray, landmarks: FloatArray, truth: FloatArray | None, title: str
     ) -> None:
-        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
-            self._figure = Canvas(figsize=_FILM_INCHES, dpi=_FILM_DPI)
-            self._canvas = FigureCanvasAgg(self._figure)
-            self._image, plan = self._figure.subplots(1, 2, width_ratios=(1.15, 1.0))
-            self._figure.subplots_adjust(0.02, 0.12, 0.98, 0.92, 0.13)
-            x, y = _filling(bulk_limits(path, landmarks), plan.get_window_extent())
-            plan.set(xlim=x, ylim=y, aspect="equal", title=title)
-            plan.set(xlabel="right (m)", ylabel="ahead (m)")
-            if truth is not None:
-                plan.plot(*truth.T, "--", color=INK, linewidth=1.0, label="truth")
-            (self._dots,) = plan.plot([], [], ".", color="#8a939c", markersize=2.0)
-            (self._path,) = plan.plot([], [], color=SKY, linewidth=2.2, label="estimate")
-            (self._here,) = plan.plot([], [], "o", color=ORANGE, markersize=7.0)
-            plan.legend(loc="upper right")
+        """Takes what does not change.
+
+        Args:
+            path: (n, 2) metres to the right and ahead, of all poses.
+            landmarks: (m, 2) all that will be drawn, for the limits.
+            truth: (k, 2) true path, or None.
+            title: above the map.
+        """
+        self._figure = Canvas(figsize=_FILM_INCHES, dpi=_FILM_DPI)
+        FigureCanvasAgg(self._figure)
+        self._image, plan = self._figure.subplots(1, 2, width_ratios=(1.15, 1.0))
+        self._figure.subplots_adjust(0.02, 0.12, 0.98, 0.92, 0.13)
+        # The shorter side is widened to the panel's shape.
+        limits, panel = np.array(bulk_limits(path, landmarks)), plan.get_window_extent()
+        size, room = np.diff(limits)[:, 0], np.array([panel.width, panel.height])
+        more = (room * np.max(size / room) - size) / 2.0
+        x, y = np.column_stack([limits[:, 0] - more, limits[:, 1] + more])
+        plan.set(xlim=x, ylim=y, aspect="equal", title=title)
+        plan.set(xlabel="right (m)", ylabel="ahead (m)")
+        if truth is not None:
+            plan.plot(*truth.T, "--", color=INK, linewidth=1.0, label="truth")
+        (self._dots,) = plan.plot([], [], ".", color=_DOTS, markersize=2.0)
+        (self._path,) = plan.plot([], [], color=SKY, linewidth=2.2, label="estimate")
+        (self._here,) = plan.plot([], [], "o", color=ORANGE, markersize=7.0)
+        plan.legend(loc="upper right")
         self._poses = path
 
+    @_styled
     def draw(self, moment: Moment, known: FloatArray, row: int) -> Image:
         """The frame (540, 1280, 3) in red, green, blue, at pose ``row`` with landmarks (l, 2)."""
-        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
-            self._image.clear()
-            if moment.image is None:
-                self._image.set_axis_off()
-                self._image.set_title(moment.title)
-            else:
-                show_image(self._image, moment.image, moment.title)
-                self._mark(moment)
-            self._dots.set_data(*known.T)
-            self._path.set_data(*self._poses[: row + 1].T)
-            self._here.set_data(*self._poses[row : row + 1].T)
-            return drawn(self._canvas)
-
-    def _mark(self, moment: Moment) -> None:
         axes = self._image
-        flow = np.stack([moment.before, moment.after], axis=1)
-        axes.add_collection(LineCollection(list(flow), linewidths=1.4, colors=SKY), autolim=False)
-        axes.plot(
-            *moment.after.T, "o", color=ORANGE, markersize=3.5, label="matched, with its motion"
-        )
-        axes.plot(*moment.new.T, "+", color=YELLOW, markersize=5.0, label="new landmark")
-        legend = axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=2)
-        legend.legend_handles[1].set_color(INK)  # yellow on white is hard to see
+        axes.clear()
+        if moment.image is None:
+            axes.set_axis_off()
+            axes.set_title(moment.title)
+        else:
+            show_image(axes, moment.image, moment.title)
+            flow = list(np.stack([moment.before, moment.after], axis=1))
+            axes.add_collection(LineCollection(flow, linewidths=1.4, colors=SKY), autolim=False)
+            matched = {"markersize": 3.5, "label": "matched, with its motion"}
+            axes.plot(*moment.after.T, "o", color=ORANGE, **matched)
+            axes.plot(*moment.new.T, "+", color=YELLOW, markersize=5.0, label="new landmark")
+            legend = axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.01), ncols=2)
+            legend.legend_handles[1].set_color(INK)  # yellow on white is hard to see
+        self._dots.set_data(*known.T)
+        self._path.set_data(*self._poses[: row + 1].T)
+        self._here.set_data(*self._poses[row : row + 1].T)
+        return _pixels(self._figure)
 
 
-def drawn(canvas: FigureCanvasAgg) -> Image:
-    """What a canvas shows, (height, width, 3) in red, green, blue."""
-    agg: Any = canvas
-    agg.draw()
-    return np.asarray(agg.buffer_rgba())[..., :3].copy()
-
-
-def _filling(limits: list[list[float]], panel: Bbox) -> FloatArray:
-    """Limits (2, 2) with the shorter side widened to the panel's shape."""
-    span = np.array(limits)
-    size, room = np.diff(span)[:, 0], np.array([panel.width, panel.height])
-    more = room * np.max(size / room) - size
-    return np.column_stack([span[:, 0] - more / 2.0, span[:, 1] + more / 2.0])
-
-
-_ROUTE_INCHES = (12.8, 7.2)
 _MOST_NAMED = 25  # path images whose numbers stand below the route
 _LINE = 26  # letters of a reason in a line
 _LINES = 5
@@ -753,7 +747,7 @@ class PathPicture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RouteMoment:
-    """One image, and what the robot is told at it.
+    """One image along a route, and the command that it gives.
 
     Attributes:
         image: as recorded; None where it cannot be read.
@@ -783,87 +777,55 @@ class RouteMoment:
 
 
 class RouteCanvas:
-    """Draws moments one after the other onto one canvas.
+    """A route that is followed: image, path image, homing vector and place."""
 
-    Args:
-        path: what is shown of each path image, in order.
-    """
-
+    @_styled
     def __init__(self, path: Sequence[PathPicture]) -> None:
+        """Takes what is shown of each path image, in order."""
         self._path = path
-        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
-            self._figure = Canvas(figsize=_ROUTE_INCHES, dpi=_FILM_DPI)
-            self._canvas = FigureCanvasAgg(self._figure)
-            grid = self._figure.add_gridspec(
-                3, 2, width_ratios=(1.75, 1.0), height_ratios=(1.0, 1.0, 0.16),
-                left=0.02, right=0.98, top=0.94, bottom=0.06, wspace=0.06, hspace=0.22,
-            )  # fmt: skip
-            self._image = self._figure.add_subplot(grid[:2, 0])
-            self._remembered = self._figure.add_subplot(grid[0, 1])
-            self._compass = self._figure.add_subplot(grid[1, 1])
-            self._route = self._figure.add_subplot(grid[2, :])
+        self._figure = Canvas(figsize=_ROUTE_INCHES, dpi=_FILM_DPI)
+        FigureCanvasAgg(self._figure)
+        grid = self._figure.add_gridspec(
+            3, 2, width_ratios=(1.75, 1.0), height_ratios=(1.0, 1.0, 0.16),
+            left=0.02, right=0.98, top=0.94, bottom=0.06, wspace=0.06, hspace=0.22,
+        )  # fmt: skip
+        places = (grid[:2, 0], grid[0, 1], grid[1, 1], grid[2, :])
+        self._panels = [self._figure.add_subplot(place) for place in places]
 
+    @_styled
     def draw(self, moment: RouteMoment) -> Image:
         """The frame (720, 1280, 3) in red, green, blue."""
-        with matplotlib.style.context(PICTURE_STYLE, after_reset=True):
-            for axes in (self._image, self._remembered, self._compass, self._route):
-                axes.clear()
-            _draw_image(self._image, moment)
-            self._draw_remembered(moment)
-            _draw_compass(self._compass, moment)
-            self._draw_route(moment)
-            return drawn(self._canvas)
-
-    def _draw_remembered(self, moment: RouteMoment) -> None:
-        axes = self._remembered
+        for axes in self._panels:
+            axes.clear()
+        image, remembered, compass, route = self._panels
+        if moment.image is None:
+            image.set_axis_off()
+            image.set_title(moment.title)
+        else:
+            show_image(image, moment.image, moment.title, "white: ahead, orange: home")
+            add_segments(image, moment.ahead[None], 1.2, color="white")
+            if np.isfinite(moment.beam).any():
+                add_segments(image, moment.beam[None], 2.5, color=ORANGE)
         if moment.nearest is None:
-            axes.set_axis_off()
-            axes.set_title("Path image: not known")
-            return
-        shown = self._path[moment.nearest]
-        title = f"Path image {moment.nearest}: {shorten(shown.name, 24, placeholder='...')}"
-        if shown.image is not None:
-            show_image(axes, shown.image, title)
-            return
-        columns, rows = shown.size
-        axes.plot(*shown.features.T, ".", color=SKY, markersize=3.0)
-        axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[])
-        axes.set(aspect="equal", facecolor="#f4f4f4", xlabel="its features: no picture is kept")
-        axes.set_title(title)
-
-    def _draw_route(self, moment: RouteMoment) -> None:
-        axes, last = self._route, len(self._path) - 1
-        axes.plot([0, last], [0, 0], color=FAINT, linewidth=3.0, zorder=1)
-        axes.plot(np.arange(last + 1), np.zeros(last + 1), "o", color="#8a939c", markersize=7.0)
-        said = "Place: not known"
-        if moment.nearest is not None:
-            axes.plot(moment.nearest, 0.0, "o", color=SKY, markersize=15.0)
-            said = (
-                f"Place: path image {moment.nearest}, probability {100 * moment.probability:.0f} %"
-            )
-        if moment.target not in (None, moment.nearest):
-            axes.plot(
-                moment.target, 0.0, "o", markersize=20.0, fillstyle="none", color=ORANGE,
-                markeredgewidth=2.5,
-            )  # fmt: skip
-            said += f"; next {moment.target}"
-        step = -(-(last + 1) // _MOST_NAMED)
-        axes.set(xlim=(-0.5, last + 0.5), ylim=(-1.0, 1.0), yticks=[])
-        axes.set_xticks(np.arange(0, last + 1, step))
-        axes.tick_params(length=0.0)
-        axes.spines[:].set_visible(False)
-        axes.set_title(said)
+            remembered.set_axis_off()
+            remembered.set_title("Path image: not known")
+        else:
+            _draw_remembered(remembered, self._path[moment.nearest], moment.nearest)
+        _draw_compass(compass, moment)
+        _draw_route(route, moment, len(self._path) - 1)
+        return _pixels(self._figure)
 
 
-def _draw_image(axes: Axes, moment: RouteMoment) -> None:
-    if moment.image is None:
-        axes.set_axis_off()
-        axes.set_title(moment.title)
+def _draw_remembered(axes: Axes, shown: PathPicture, number: int) -> None:
+    title = f"Path image {number}: {shorten(shown.name, 24, placeholder='...')}"
+    if shown.image is not None:
+        show_image(axes, shown.image, title)
         return
-    show_image(axes, moment.image, moment.title, "white: ahead, orange: home")
-    add_segments(axes, moment.ahead[None], 1.2, color="white")
-    if np.isfinite(moment.beam).any():
-        add_segments(axes, moment.beam[None], 2.5, color=ORANGE)
+    columns, rows = shown.size
+    axes.plot(*shown.features.T, ".", color=SKY, markersize=3.0)
+    axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), xticks=[], yticks=[])
+    axes.set(aspect="equal", facecolor="#f4f4f4", xlabel="its features: no picture is kept")
+    axes.set_title(title)
 
 
 def _draw_compass(axes: Axes, moment: RouteMoment) -> None:
@@ -886,3 +848,22 @@ def _draw_compass(axes: Axes, moment: RouteMoment) -> None:
     axes.set(xlim=(-1.2, 4.3), ylim=(-1.15, 1.3), aspect="equal", anchor="W")
     axes.set_axis_off()
     axes.set_title("Homing vector")
+
+
+def _draw_route(axes: Axes, moment: RouteMoment, last: int) -> None:
+    """The path images in a row; where the robot is, and where it goes next."""
+    axes.plot([0, last], [0, 0], color=FAINT, linewidth=3.0, zorder=1)
+    axes.plot(np.arange(last + 1), np.zeros(last + 1), "o", color=_DOTS, markersize=7.0)
+    title = "Place: not known"
+    if moment.nearest is not None:
+        axes.plot(moment.nearest, 0.0, "o", color=SKY, markersize=15.0)
+        share = 100 * moment.probability
+        title = f"Place: path image {moment.nearest}, probability {share:.0f} %"
+    if moment.target not in (None, moment.nearest):
+        ring: dict[str, Any] = {"fillstyle": "none", "color": ORANGE, "markeredgewidth": 2.5}
+        axes.plot(moment.target, 0.0, "o", markersize=20.0, **ring)
+        title += f"; next {moment.target}"
+    axes.set(xlim=(-0.5, last + 0.5), ylim=(-1.0, 1.0), yticks=[], title=title)
+    axes.set_xticks(np.arange(0, last + 1, -(-(last + 1) // _MOST_NAMED)))
+    axes.tick_params(length=0.0)
+    axes.spines[:].set_visible(False)
