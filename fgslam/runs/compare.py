@@ -1,7 +1,7 @@
 """`fgslam compare`: the logs of runs through other estimators, set side by side.
 
-What a replay is, how it is judged and which tables come of it, is the matter of
-:mod:`fgslam.runs.slam_comparison` and :mod:`fgslam.runs.homing_comparison`.
+How a log is replayed and judged: :mod:`fgslam.runs.slam_comparison`, and for homing
+:mod:`fgslam.runs.tasks.homing_replay`.
 """
 
 from __future__ import annotations
@@ -118,17 +118,29 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
     Raises:
         ConfigError: an unknown name, or an override that is no key of that estimator.
     """
-    variants: dict[str, Any] = dict(
+    known: dict[str, Any] = dict(
         HOMING_VARIANTS if isinstance(config, HomingExperiment) else all_kinds()
     )
-    variants = _of_one_noise(variants, config)
-    known = variants | {settings.title: settings for settings in config.estimators}
-    if choice.names is None:
-        own = [settings.title for settings in config.estimators]
-        chosen = own if getattr(config, "compare", ()) else list(known)
-    else:
+    # One log has one noise model: what the configuration does not name weighs it as what it does.
+    weights = [s.noise_factor for s in config.estimators if hasattr(s, "noise_factor")]
+    for title, settings in known.items():
+        if weights and hasattr(settings, "noise_factor"):
+            known[title] = dataclasses.replace(settings, noise_factor=weights[0])
+    own = {settings.title: settings for settings in config.estimators}
+    known |= own
+    if choice.names is not None:
         chosen = list(dict.fromkeys(name.strip() for name in choice.names if name.strip()))
-    chosen = _with_motion(config, choice, chosen, known)
+    else:
+        chosen = list(own if getattr(config, "compare", ()) else known)
+    if isinstance(config, ExperimentConfig):
+        slam = [known[title] for title in chosen if title in known]
+        still = [one.title for one in slam if one not in judged_apart(config, slam)]
+        if still and choice.names is not None:
+            raise ConfigError(
+                f"--estimators {still[0]}: the run had no odometry (odometry.kind "
+                "constant_velocity), so dead reckoning has no motion to add up; leave it out"
+            )
+        chosen = [title for title in chosen if title not in still]
     unknown = [name for name in chosen if name not in known]
     if unknown or not chosen:
         what = f"no estimator {unknown[0]!r}" if unknown else "no estimator named"
@@ -138,67 +150,37 @@ def choose(config: Experiment, choice: Choice) -> tuple[Any, ...]:
             f"--set {override}: what was measured stays as it is; estimators.NAME.key=value with "
             f"NAME one of {', '.join(chosen)}, or --trials to run the experiment again"
         )
-    for override in choice.overrides:
-        if not any(_addresses(override, title) for title in chosen):
+    overrides: dict[str, list[str]] = {title: [] for title in chosen}
+    for override in map(str.strip, choice.overrides):
+        addressed = [title for title in chosen if override.startswith(f"{_PREFIX}{title}.")]
+        if not addressed:
             raise ConfigError(
                 f"--set {override}: not of the form estimators.NAME.key=value with NAME one of "
                 f"{', '.join(chosen)}"
             )
-    return tuple(_with(known[title], config, choice.overrides) for title in chosen)
+        for title in addressed:
+            overrides[title].append(override)
+    return tuple(_override(known[title], config, given) for title, given in overrides.items())
 
 
-def _with_motion(
-    config: Experiment, choice: Choice, chosen: list[str], known: dict[str, Any]
-) -> list[str]:
-    """The titles without dead reckoning where there was no odometry.
-
-    Raises ConfigError where it is asked for by name.
-    """
-    if not isinstance(config, ExperimentConfig):
-        return chosen
-    slam = [known[title] for title in chosen if title in known]
-    kept = judged_apart(config, slam)
-    left_out = [one.title for one in slam if one not in kept]
-    if left_out and choice.names is not None:
-        raise ConfigError(
-            f"--estimators {left_out[0]}: the run had no odometry (odometry.kind constant_velocity)"
-            ", so dead reckoning has no motion to add up; leave it out"
-        )
-    return [title for title in chosen if title not in left_out]
-
-
-def _of_one_noise(variants: dict[str, Any], config: Experiment) -> dict[str, Any]:
-    """Estimators that the configuration does not name, with the noise model of those that it does.
-
-    Else a graph that weighs a log as its configuration says would be set beside one that does not.
-    """
-    stated = [s.noise_factor for s in config.estimators if hasattr(s, "noise_factor")]
-    if not stated:
-        return variants
-    return {
-        title: dataclasses.replace(settings, noise_factor=stated[0])
-        if hasattr(settings, "noise_factor")
-        else settings
-        for title, settings in variants.items()
-    }
-
-
-def _addresses(override: str, title: str) -> bool:
-    return override.strip().startswith(f"{_PREFIX}{title}.")
-
-
-def _with(settings: Any, config: Experiment, overrides: tuple[str, ...]) -> Any:
+def _override(settings: Any, config: Experiment, overrides: Sequence[str]) -> Any:
     """Settings with their own overrides, checked as those of a configuration."""
-    title = settings.title
-    own = [o.strip() for o in overrides if _addresses(o, title)]
-    if not own:
+    if not overrides:
         return settings
     values = config.model_copy(update={"estimator": settings}).as_values() | {"compare": []}
-    moved = [f"estimator{override[len(_PREFIX) + len(title) :]}" for override in own]
-    found = make_experiment(values, f"--set {own[0]}", moved).estimators[0]
+    before = len(_PREFIX) + len(settings.title)
+    moved = [f"estimator{override[before:]}" for override in overrides]
+    found = make_experiment(values, f"--set {overrides[0]}", moved).estimators[0]
     if found.kind != settings.kind:
-        raise ConfigError(f"--set {own[0]}: the kind is what names it; use --estimators")
+        raise ConfigError(f"--set {overrides[0]}: the kind is what names it; use --estimators")
     return found
+
+
+def with_estimators(config: Experiment, estimators: tuple[Any, ...]) -> Experiment:
+    """The configuration with these estimators alone; of SLAM next to the one that steers."""
+    if isinstance(config, ExperimentConfig):
+        return config.model_copy(update={"compare": estimators})
+    return config.model_copy(update={"estimator": estimators[0], "compare": estimators[1:]})
 
 
 # --------------------------------------------------------------------------------------------
@@ -232,41 +214,80 @@ def compare_runs(
         FgslamError: a run cannot be read, a name is unknown, what was begun is of other estimators
             or of another log, or the results cannot be written.
     """
-    configs = [load_run(run) for run in runs]
-    _require_one_kind(runs, configs)
+    configs = [_load_run(run) for run in runs]
+    slam = [isinstance(config, ExperimentConfig) for config in configs]
+    if len(set(slam)) > 1:
+        raise DatasetError(
+            f"{runs[slam.index(True)]}: is no homing run, others are; compare homing runs by "
+            "themselves"
+        )
     folders = _folders(runs, out)
-    opened = [_open(*run, choice) for run in zip(runs, configs, strict=True)]
+    opened: list[tuple[Experiment, Task[RunResult]]] = []
+    for run, config in zip(runs, configs, strict=True):
+        # One that cannot be judged is refused before anything is written.
+        estimators = choose(config, choice)
+        if isinstance(config, ExperimentConfig):
+            task = open_slam_comparison(config, run, estimators)
+        else:
+            task = open_homing_comparison(config, run, estimators)
+        opened.append((with_estimators(config, estimators), task))
     for run, folder in zip(runs, folders, strict=True):
         require_room(folder, run, existing)
     several_resumed = existing == "resume" and len(runs) > 1
-    if several_resumed:
-        for (config, task), folder in zip(opened, folders, strict=True):
-            _require_same_where_begun(config, task, folder)
+    for (now, task), folder in zip(opened, folders, strict=True):
+        if several_resumed and is_run_folder(folder):  # no table shall mix estimators or logs
+            require_same(now.resolved(), folder)
+            require_same_ground(task.provenance, folder)
     results = []
-    for (config, task), folder in zip(opened, folders, strict=True):
+    for (now, task), folder in zip(opened, folders, strict=True):
         begun = existing
         if several_resumed:
             begun = "resume" if is_run_folder(folder) else "refuse"
-            if begun == "resume" and is_finished(folder):
-                results.append(_had_finished(config, folder))
-                continue
-        results.append(
-            run_task(partial(_opened, task), config, folder, begun, progress, stopped, jobs)
+        if several_resumed and begun == "resume" and is_finished(folder):
+            result = RunResult(now, folder, "finished", (f"{folder}: had finished",))
+            found = result.metrics["estimators"].values()
+            failed = all(one.get("failure") for one in found)
+            results.append(dataclasses.replace(result, failed=failed))
+        else:
+            opener = partial(_give, task)
+            results.append(run_task(opener, now, folder, begun, progress, stopped, jobs))
+    if out is not None and len(runs) > 1 and slam[0]:
+        names = _distinct([one.config.name for one in results], results)
+        write_comparison_csv(
+            out / COMPARISON_FILE, list(zip(names, map(_values_of, results), strict=True))
         )
-    if out is not None and len(_of_slam(results)) > 1:
-        write_comparison_csv(out / COMPARISON_FILE, _of_slam(results))
     return results
+
+
+def _give(task: Task[RunResult], *_: object) -> Task[RunResult]:
+    """A task that is open already."""
+    return task
 
 
 def ate_tables(results: Sequence[RunResult]) -> tuple[TextTable, ...]:
     """Final ATE of each estimator on each run, where there are several runs of SLAM."""
-    slam = [one for one in results if isinstance(one.config, ExperimentConfig)]
-    names = _told_apart([named(one.config) for one in slam], slam)  # type: ignore[arg-type]
-    found = [values for _, values in _of_slam(results)]
-    return (ate_table(list(zip(names, found, strict=True))),) if len(found) > 1 else ()
+    configs = [one.config for one in results if isinstance(one.config, ExperimentConfig)]
+    if len(configs) < 2:
+        return ()
+    names = _distinct(list(map(named, configs)), results)
+    return (ate_table(list(zip(names, map(_values_of, results), strict=True))),)
 
 
-def load_run(run: Path) -> ExperimentConfig | HomingExperiment:
+def _values_of(result: RunResult) -> dict[str, Any]:
+    """The numbers of a run of SLAM."""
+    return with_odometry(result.config, result.metrics["estimators"])  # type: ignore[arg-type]
+
+
+def _distinct(names: Sequence[str], results: Sequence[RunResult]) -> list[str]:
+    """The runs' names; those that several have, as runs of one recording do, with the folder."""
+    folders = [r.folder.parent if r.folder.name == DEFAULT_FOLDER else r.folder for r in results]
+    return [
+        name if names.count(name) == 1 else f"{name}, {folder}"
+        for name, folder in zip(names, folders, strict=True)
+    ]
+
+
+def _load_run(run: Path) -> ExperimentConfig | HomingExperiment:
     """Configuration of a run folder.
 
     Raises:
@@ -289,66 +310,6 @@ def require_room(folder: Path, run: Path, existing: ExistingFolder) -> None:
     if existing == "refuse" and is_run_folder(folder):
         raise OutputError(
             f"{folder} holds results already; choose another --out, or add --overwrite or --resume"
-        )
-
-
-def _open(
-    run: Path, config: ExperimentConfig | HomingExperiment, choice: Choice
-) -> tuple[Experiment, Task[RunResult]]:
-    """The comparison of a run; one that cannot be judged is refused before anything is written."""
-    estimators = choose(config, choice)
-    if isinstance(config, ExperimentConfig):
-        now = config.model_copy(update={"compare": estimators})
-        return now, open_slam_comparison(config, run, estimators)
-    first, *others = estimators
-    chosen = config.model_copy(update={"estimator": first, "compare": tuple(others)})
-    return chosen, open_homing_comparison(config, run, estimators)
-
-
-def _require_same_where_begun(config: Experiment, task: Task[RunResult], folder: Path) -> None:
-    """Raises before anything is done where a table would mix estimators, logs or versions."""
-    if is_run_folder(folder):
-        require_same(config.resolved(), folder)
-        require_same_ground(task.provenance, folder)
-
-
-def _had_finished(config: Experiment, folder: Path) -> RunResult:
-    """What an earlier session has finished, as it stands."""
-    result = RunResult(config, folder, "finished", (f"{folder}: had finished",))
-    found = result.metrics["estimators"].values()
-    return dataclasses.replace(result, failed=all(one.get("failure") for one in found))
-
-
-def _opened(task: Task[RunResult], *_: object) -> Task[RunResult]:
-    """A task whose run was read already."""
-    return task
-
-
-def _of_slam(results: Sequence[RunResult]) -> list[tuple[str, dict[str, Any]]]:
-    """Name and numbers of each run, where they are of SLAM."""
-    slam = [one for one in results if isinstance(one.config, ExperimentConfig)]
-    names = _told_apart([one.config.name for one in slam], slam)
-    return [
-        (name, with_odometry(one.config, one.metrics["estimators"]))  # type: ignore[arg-type]
-        for name, one in zip(names, slam, strict=True)
-    ]
-
-
-def _told_apart(names: Sequence[str], results: Sequence[RunResult]) -> list[str]:
-    """The runs' names; those that several have, as runs of one recording do, with the folder."""
-    folders = [r.folder.parent if r.folder.name == DEFAULT_FOLDER else r.folder for r in results]
-    return [
-        name if names.count(name) == 1 else f"{name}, {folder}"
-        for name, folder in zip(names, folders, strict=True)
-    ]
-
-
-def _require_one_kind(runs: Sequence[Path], configs: Sequence[Experiment]) -> None:
-    homing = [isinstance(config, HomingExperiment) for config in configs]
-    if any(homing) and not all(homing):
-        raise DatasetError(
-            f"{runs[homing.index(False)]}: is no homing run, others are; compare homing runs by "
-            "themselves"
         )
 
 

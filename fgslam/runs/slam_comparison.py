@@ -20,7 +20,7 @@ from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import read_metrics, write_metrics
-from fgslam.report.formats import MapPoints, read_ply
+from fgslam.report.formats import read_ply
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, RunResult, Status, Task
 from fgslam.runs.folder import COMPARISON_FILE, LOG_FILE, METRICS_FILE, RUN_MARKER, digest_of
@@ -59,14 +59,29 @@ def open_slam_comparison(
     Raises:
         FgslamError: log or truth of the run cannot be read.
     """
-    log = load_log(run)
+    log = MeasurementLog.load(run / LOG_FILE)
+    if not len(log):
+        raise DatasetError(f"{run / LOG_FILE}: holds no frame; resume the run first")
     load_truth(run, log)
+    metrics_file = run / METRICS_FILE
+    notes = read_metrics(metrics_file).get("notes") if metrics_file.is_file() else None
+    about: dict[str, JsonValue] = {
+        "run": str(run),
+        "odometry": config.odometry.kind,
+        "remark": config.remark or None,
+        "notes": [str(note) for note in notes or ()],  # what was tolerated in the recording
+    }
+
+    def compare(context: Context) -> RunResult:
+        metrics = replay_apart(config, run, estimators, context)
+        return write_comparison(context, config, len(log), metrics, about, run)
+
     provenance = {
         "dataset": (config.provenance or {}).get("dataset"),
         "run": str(run),
         "log": digest_of([run / LOG_FILE]),
     }
-    return Task(provenance, lambda context: _compare(run, config, len(log), estimators, context))
+    return Task(provenance, compare)
 
 
 def named(config: ExperimentConfig) -> str:
@@ -116,7 +131,11 @@ def perform(task: ReplayTask) -> EstimatorMetrics:
     """
     log = MeasurementLog.load(task.run / LOG_FILE)
     result = replay(log, task.settings, task.ego_motion, arrival=arrival_of(task.run))
-    write_replay(task.out, result, log, task.remark, _look(task.run))
+    # The colours that the live front-end saw, where the run had images.
+    steered = load_config(task.run / RUN_MARKER).estimator.title
+    colours = task.run / steered / "map.ply"
+    look = read_ply(colours) if colours.is_file() else None
+    write_replay(task.out, result, log, task.remark, look)
     return judge_replay(result, load_truth(task.run, log)).metrics
 
 
@@ -156,31 +175,6 @@ def write_comparison(
     )
 
 
-def _compare(
-    run: Path,
-    config: ExperimentConfig,
-    frames: int,
-    estimators: Sequence[EstimatorSettings],
-    context: Context,
-) -> RunResult:
-    """One run's log through the estimators."""
-    metrics = replay_apart(config, run, estimators, context)
-    about: dict[str, JsonValue] = {
-        "run": str(run),
-        "odometry": config.odometry.kind,
-        "remark": config.remark or None,
-        "notes": _notes(run),
-    }
-    return write_comparison(context, config, frames, metrics, about, run)
-
-
-def _notes(run: Path) -> list[str]:
-    """What was tolerated in the recording, as the run wrote it down."""
-    path = run / METRICS_FILE
-    notes = read_metrics(path).get("notes") if path.is_file() else None
-    return [str(note) for note in notes or ()]
-
-
 # --------------------------------------------------------------------------------------------
 # What a run folder knows
 
@@ -199,23 +193,3 @@ def load_truth(run: Path, log: MeasurementLog) -> Truth:
     judged = seen_often(log, landmarks)
     own = sigma[np.isin(landmarks.ids, judged.ids)]
     return Truth(trajectory, judged, float(np.median(own)) if len(own) else None)
-
-
-def load_log(run: Path) -> MeasurementLog:
-    """The measurements of a run folder.
-
-    Raises:
-        DatasetError: it holds no frame.
-        MeasurementLogError: it cannot be read.
-    """
-    log = MeasurementLog.load(run / LOG_FILE)
-    if not len(log):
-        raise DatasetError(f"{run / LOG_FILE}: holds no frame; resume the run first")
-    return log
-
-
-def _look(run: Path) -> MapPoints | None:
-    """The colours that the live front-end saw; None where the run had no images."""
-    config = load_config(run / RUN_MARKER)
-    path = run / config.estimator.title / "map.ply"
-    return read_ply(path) if path.is_file() else None

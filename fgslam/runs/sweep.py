@@ -42,7 +42,7 @@ from fgslam.report.content import (
     write_parquet,
 )
 from fgslam.runs.bare import bare_experiment
-from fgslam.runs.compare import Choice, choose
+from fgslam.runs.compare import Choice, choose, with_estimators
 from fgslam.runs.config import Experiment, ExperimentConfig, make_experiment, read_mapping
 from fgslam.runs.engine import Opening, RunResult, run_task
 from fgslam.runs.folder import (
@@ -369,19 +369,11 @@ class Case:
 
     def key(self, identity: str, settled: Settled) -> str:
         """Digest of all that its numbers depend on; ``identity`` is the recording's."""
-        values = _with_estimators(*settled).as_values()
+        config, estimators = settled
+        values = (with_estimators(config, estimators) if estimators else config).as_values()
         values = {name: value for name, value in values.items() if name not in ("name", "output")}
         text = json.dumps([values, identity, dict(self.made_with)], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-def _with_estimators(config: Experiment, estimators: tuple[Any, ...]) -> Experiment:
-    """The configuration with these estimators alone."""
-    if not estimators:
-        return config
-    if isinstance(config, ExperimentConfig):
-        return config.model_copy(update={"compare": estimators})
-    return config.model_copy(update={"estimator": estimators[0], "compare": estimators[1:]})
 
 
 def perform_case(case: Case) -> CaseResult | Failed:
@@ -410,7 +402,7 @@ def _rows_of_case(config: Experiment, estimators: tuple[Any, ...]) -> Iterator[R
             times = {name: value_at(values, path) for name, path in TIME_COLUMNS}
             yield Row(title, numbers, times)
         return
-    config = _with_estimators(config, estimators)
+    config = with_estimators(config, estimators) if estimators else config
     with tempfile.TemporaryDirectory(prefix="fgslam-case-") as scratch:
         run = Path(scratch) / "run"
         run_task(opener_of(config), config, run, jobs=1, executor=InProcess())

@@ -22,7 +22,7 @@ from fgslam.datasets.settings import RenderedLabSettings, SimulatedMeasurementsS
 from fgslam.evaluation.judging import PairedTest, judge_replay, mean_interval, paired_test
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, Nees, judge, value_at
 from fgslam.report.content import write_metrics
-from fgslam.runs.compare import EVERY, Choice, choose, require_room
+from fgslam.runs.compare import EVERY, Choice, choose, require_room, with_estimators
 from fgslam.runs.config import (
     Experiment,
     ExperimentConfig,
@@ -151,16 +151,12 @@ def run_trials(
     require_room(folder, source, existing)
     if isinstance(seeds, int):
         seeds = range(config.seed, config.seed + seeds)
+    chosen = with_estimators(config, estimators)
     opener: Opener[RunResult] = open_trials
-    chosen: Experiment
     if isinstance(config, ExperimentConfig):
-        tasks = [TrialTask(config, seed, estimators) for seed in seeds]
-        opener = partial(_open, config, tasks)
-        chosen = config.model_copy(update={"compare": estimators})
+        opener = partial(_open, config, [TrialTask(config, seed, estimators) for seed in seeds])
     else:
-        changes: dict[str, Any] = {"trials": len(seeds), "seed": seeds.start}
-        changes |= {"estimator": estimators[0], "compare": estimators[1:]}
-        chosen = config.model_copy(update=changes)
+        chosen = chosen.model_copy(update={"trials": len(seeds), "seed": seeds.start})
     return run_task(opener, chosen, folder, existing, progress, stopped, jobs)
 
 
