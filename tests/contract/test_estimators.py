@@ -222,7 +222,7 @@ def test_time_must_increase(make: Callable[[], Estimator], world: World) -> None
     estimator = make()
     play(estimator, world.increments[:4])
     before = everything(estimator)
-    for timestamp in (1.5, 1.0):
+    for timestamp in (1.5, 1.0, -1.0, float("nan")):
         late = dataclasses.replace(world.increments[4], timestamp=timestamp)
         with pytest.raises(EstimatorError, match="time stamp"):
             estimator.update(late, perfect_tracking(late, world.poses[4]))
@@ -284,8 +284,9 @@ def test_an_unknown_landmark_is_a_key_error(make: Callable[[], Estimator], world
     play(estimator, world.increments[:9])
     some = estimator.landmarks().ids[[0, 4]]
     assert estimator.landmark_covariances(some).shape == (2, 3, 3)
-    with pytest.raises(KeyError):
-        estimator.landmark_covariances(np.array([PRUNED]))
+    for unknown in ([PRUNED], [some[0], 9999], [-1]):
+        with pytest.raises(KeyError):
+            estimator.landmark_covariances(np.array(unknown))
 
 
 def test_covariances_are_symmetric_and_positive(driven: Estimator) -> None:
@@ -335,9 +336,12 @@ def test_a_restored_state_continues_to_the_same_bits(
 ) -> None:
     first, second = make(), make()
     play(first, world.increments[:6])
-    # As a file does: plain arrays, copied.
-    state = {name: np.array(array) for name, array in state_of(first).items()}
+    # As a file does: plain arrays; what the first does later does not reach into them.
+    state = state_of(first)
+    kept = copy.deepcopy(state)
     assert all(array.dtype != np.object_ for array in state.values())
+    play(first, world.increments[6:])
+    assert_same_bits(state, kept)
     restore(second, state)
     play(second, world.increments[6:])
     assert_same_bits(everything(second), everything(driven))

@@ -61,7 +61,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import pose
 from fgslam.core.sensors import Increment, LoopClosure, Observations, Odometry
-from fgslam.core.store import pack, restore, state_of, unpack
+from fgslam.core.store import restore, state_of
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Estimate
 from fgslam.evaluation.statistics import pose_nees
 from fgslam.factors.graphs import landmark_key, poses_of_frame
@@ -222,17 +222,6 @@ def test_steps_between_some_frames_add_up(rng: np.random.Generator) -> None:
         for k in range(a + 1, b + 1):
             covariance = g.compose_covariance(STEP, covariance, chain.steps[k])
         np.testing.assert_allclose(found[i], covariance, rtol=1e-6, atol=1e-10)
-
-
-def test_a_chain_is_restored_to_the_bit(rng: np.random.Generator) -> None:
-    chain = Chain()
-    assert len(unpack(pack(chain), Chain)) == 0
-    for k in range(5):
-        chain.append(g.se3_exp(SIGMA * rng.standard_normal(6)), (k + 1.0) * np.diag(SIGMA))
-    chain.constraints.append(Constraint(1, 4, STEP, TIGHT))
-    back = unpack(pack(chain), Chain)
-    assert_same_bits(pack(back), pack(chain))
-    assert_same_bits(back.solve(back.constraints), chain.solve(chain.constraints))
 
 
 def test_points_move_with_the_frame_that_they_belong_to(rng: np.random.Generator) -> None:
@@ -505,15 +494,6 @@ def test_old_landmarks_stay_and_their_doubles_go(name: str) -> None:
     off = np.linalg.norm(landmarks.positions - drive.points_by_id[landmarks.ids], axis=1)
     old = landmarks.rows(np.unique(merged[:, 1]))
     assert np.median(off[old]) < 0.15
-
-
-@every
-def test_closure_is_reported(name: str) -> None:
-    reported = [
-        words for words in at_end(name, False)[1].remarks if "loop closure to frame" in words
-    ]
-    assert len(reported) == 1
-    assert f"frame {returned().increments[CLOSED].index}:" in reported[0]
 
 
 @every

@@ -120,13 +120,6 @@ def test_steps_that_a_map_in_doubt_has_leaned_are_put_right_by_the_smoothed_path
     assert found.power == pytest.approx(1.0, rel=0.3)
 
 
-def test_a_state_continues_to_the_byte() -> None:
-    whole, resumed = driven(1.0, kept=0.7, frames=60), driven(1.0, kept=0.7, frames=60, resumed=33)
-    assert (whole.spread, whole.power) == (resumed.spread, resumed.power)
-    for name, array in state_of(whole).items():
-        np.testing.assert_array_equal(array, state_of(resumed)[name], err_msg=name)
-
-
 @pytest.mark.parametrize("scale", [1.0, 4.0])
 def test_a_smoother_finds_the_noise_though_most_matches_lie_beyond_the_stated(scale: float) -> None:
     increments = []

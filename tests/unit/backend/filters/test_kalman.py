@@ -27,9 +27,7 @@ from fgslam.backend.filters.landmark_update import MISS_GROWTH_M
 from fgslam.backend.settings import LandmarkKalmanSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
-from fgslam.core.errors import EstimatorError
 from fgslam.core.sensors import Increment, Odometry
-from fgslam.core.store import restore, state_of
 from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.tracking.ego_motion import unmeasured
 
@@ -455,78 +453,11 @@ def test_first_frame_lies_in_the_map_frame(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(estimator.landmarks().positions, world, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("timestamp", [0.5, 0.4999, -1.0, float("nan")])
-def test_time_running_backwards_changes_nothing(timestamp: float, rng: np.random.Generator) -> None:
-    estimator, points = started(5, rng)
-    z = noisy(points, np.eye(4), rng)
-    estimator.update(frame(1, np.arange(5), z, False), at(np.eye(4), 5))
-    before = copy.deepcopy(state_of(estimator))
-    late = dataclasses.replace(frame(2, np.arange(5), z, False), timestamp=timestamp)
-    with pytest.raises(EstimatorError, match=r"frame 2: time stamp .* sort the measurements"):
-        estimator.update(late, at(nearby_pose(rng), 5))
-    assert_same_bits(state_of(estimator), before)
-
-
-@pytest.mark.parametrize("update", UPDATES)
-def test_inputs_stay_as_they_were(update: str, simulation: Simulation) -> None:
-    estimator = make(update=update)
-    for increment, wTc in zip(simulation.increments, simulation.poses, strict=True):
-        matched = int((~increment.observations.is_new).sum())
-        given = (increment, at(wTc, matched, UNCERTAIN))
-        kept = copy.deepcopy(given)
-        estimator.predict(increment.odometry)
-        estimator.update(*given)
-        assert_same_bits(given, kept)
-
-
 def test_the_prior_stays_as_it_was(simulation: Simulation) -> None:
     prior = Prediction(np.eye(4), EXACT.copy())
     kept = copy.deepcopy(prior)
     play(LandmarkKalman(RIG, LandmarkKalmanSettings(), prior), simulation.increments)
     assert_same_bits(prior, kept)
-
-
-@pytest.mark.parametrize("update", UPDATES)
-@pytest.mark.parametrize("cut", [1, 6, 13])
-def test_a_restored_filter_continues_to_the_same_bits(
-    update: str, cut: int, simulation: Simulation
-) -> None:
-    straight, first, second = make(update=update), make(update=update), make(update=update)
-    play(straight, simulation.increments)
-    play(first, simulation.increments[:cut])
-    state = state_of(first)
-    snapshot = copy.deepcopy(state)
-    play(first, simulation.increments[cut:])
-    # The state is a snapshot: what the first filter does later must not reach into it.
-    assert_same_bits(state, snapshot)
-    restore(second, state)
-    play(second, simulation.increments[cut:])
-    assert_same_bits(state_of(second), state_of(straight))
-    assert_same_bits(state_of(first), state_of(straight))
-    assert_same_bits(state, snapshot)
-
-
-def test_pruned_landmarks_are_gone_and_others_stay(simulation: Simulation) -> None:
-    estimator = make()
-    pruned: set[int] = set()
-    for increment in simulation.increments:
-        before = estimator.estimate().landmarks
-        play(estimator, [increment])
-        pruned |= set(increment.pruned_ids.tolist())
-        after = estimator.landmarks()
-        assert not pruned & set(after.ids.tolist())
-        assert set(before.ids.tolist()) - set(increment.pruned_ids.tolist()) <= set(
-            after.ids.tolist()
-        )
-        assert (np.diff(after.ids) > 0).all()
-    assert len(pruned) >= 5
-
-
-@pytest.mark.parametrize("unknown", [[99], [0, 99], [-1]])
-def test_unknown_landmarks_are_key_errors(unknown: list[int], rng: np.random.Generator) -> None:
-    estimator, _ = started(3, rng)
-    with pytest.raises(KeyError, match="not in the map"):
-        estimator.landmark_covariances(np.array(unknown))
 
 
 def test_estimate_is_the_history_of_updates(simulation: Simulation) -> None:

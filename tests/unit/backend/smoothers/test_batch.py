@@ -6,16 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated import assert_same_bits, play
 from smoothing import (
-    FREE,
     SMOOTHERS,
     answer,
     assert_consistent,
     assert_finite,
     ate,
     blackout,
-    build,
     counting,
     drawn,
     nees_of,
@@ -30,7 +27,6 @@ from fgslam.backend.smoothers import final as refinement
 from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
-from fgslam.core.store import restore, state_of
 from fgslam.evaluation.statistics import judge
 
 METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
@@ -131,17 +127,6 @@ def test_landmarks_lost_in_every_round_come_to_an_end(monkeypatch: pytest.Monkey
     found = estimator.estimate()
     assert_finite(found)
     assert len(found.remarks) == 5
-
-
-@METHODS
-def test_restored_smoother_continues_to_the_bit(name: str) -> None:
-    increments = drawn(9, frames=12).increments
-    straight, first, second = (build(SMOOTHERS[name]) for _ in range(3))
-    play(straight, increments, FREE)
-    play(first, increments[:7], FREE)
-    restore(second, {key: np.array(array) for key, array in state_of(first).items()})
-    play(second, increments[7:], FREE)
-    assert_same_bits(second.estimate(), straight.estimate())
 
 
 def test_the_solution_takes_one_blas_thread(monkeypatch: pytest.MonkeyPatch) -> None:

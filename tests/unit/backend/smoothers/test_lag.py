@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated import RIG, Simulation, assert_same_bits, play
+from simulated import RIG, Simulation, play
 from smoothing import (
     FREE,
     answer,
@@ -37,7 +37,6 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.correction import term_names
 from fgslam.core.errors import EstimatorError
 from fgslam.core.sensors import Increment
-from fgslam.core.store import restore, state_of
 from fgslam.core.types import LandmarkMap, Prediction
 from fgslam.evaluation.statistics import pose_nees
 
@@ -250,20 +249,6 @@ def test_failure_beyond_repair_is_one_clear_line(error: Exception) -> None:
         play(estimator, simulation.increments[9:10], FREE)
     assert "\n" not in str(e.value)
     assert "fgslam inspect" in str(e.value)
-
-
-@pytest.mark.parametrize("at", [3, 9])
-def test_restored_smoother_continues_to_the_bit(at: int) -> None:
-    increments = drawn(9, frames=14).increments
-    straight, first, second = smoother(), smoother(), smoother()
-    play(straight, increments, FREE)
-    play(first, increments[:at], FREE)
-    restore(second, {name: np.array(array) for name, array in state_of(first).items()})
-    play(second, increments[at:], FREE)
-    assert_same_bits(second.estimate(), straight.estimate())
-    held = [i for i, track in second.builder.admission.tracks.items() if track.variable >= 0][:2]
-    ids = np.array(held)
-    assert_same_bits(second.joint_covariance(ids), straight.joint_covariance(ids))
 
 
 def test_a_frame_located_without_a_prior_is_as_sure_as_the_map_around_it() -> None:
