@@ -10,10 +10,9 @@ import copy
 import dataclasses
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -24,7 +23,7 @@ from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphS
 from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
 from fgslam.core.errors import ConfigError, shortened
 from fgslam.core.settings import STRICT, Count, Degrees, Index, NonNegative, Positive
-from fgslam.core.yaml_text import composed, plain_values, read_yaml
+from fgslam.core.yaml_text import plain_values, read_yaml
 from fgslam.datasets.settings import (
     DatasetSettings,
     MeasurementDatasetSettings,
@@ -91,22 +90,15 @@ def parse(
     for group, kind in before.items():
         if _kind(plain, group) != kind and isinstance(plain[group], dict):
             known = _known_keys(model, [group, str(_kind(plain, group))])
-            kept = known.union(o.keys[1] for o in given if len(o.keys) > 1 and o.keys[0] == group)
-            plain[group] = {key: value for key, value in plain[group].items() if key in kept}
+            known |= {o.keys[1] for o in given if len(o.keys) > 1 and o.keys[0] == group}
+            plain[group] = {key: value for key, value in plain[group].items() if key in known}
     try:
         return model.model_validate(plain)
     except ValidationError as error:
-        wrong = {tuple(_followed(model, e["loc"])[0]): e for e in error.errors()}
+        wrong = error.errors()
+    texts = {tuple(_followed(model, e["loc"])[0]) for e in wrong if _wants_text(e)}
     for override in given:
-        at = {k: e for k, e in wrong.items() if _names(k, override.keys)}
-        if override.broken and any(not _wants_text(e) for e in at.values()):
-            raise ConfigError(f"--set {override.given}: the value is not valid YAML; quote it")
-        if override.keys in at and _wants_text(at[override.keys]):
-            override.apply(plain, override.text)
-        elif any(map(_wants_text, at.values())):
-            override.apply(plain, _texts(composed(override.text)))
-        else:
-            override.apply(plain, override.value)
+        override.apply(plain, override.text if override.keys in texts else override.value)
     try:
         return model.model_validate(plain)
     except ValidationError as error:
@@ -129,8 +121,7 @@ def with_default_kind(kind: str) -> Callable[[Any], Any]:
     return given
 
 
-@dataclass(frozen=True, slots=True)
-class Override:
+class Override(NamedTuple):
     """One dotted key and its value as typed, e.g. ``frontend.sift.max_features=500``.
 
     Attributes:
@@ -138,14 +129,12 @@ class Override:
         keys: from the top down.
         text: the value.
         value: of the text as YAML; the text itself where it is none, or plain text.
-        broken: whether it is no YAML.
     """
 
     given: str
     keys: tuple[str, ...]
     text: str
     value: Any
-    broken: bool
 
     @staticmethod
     def of(given: str) -> Override:
@@ -155,12 +144,11 @@ class Override:
         if not separator or not all(keys):
             raise ConfigError(f"--set {given}: not of the form a.b=value; e.g. --set seed=3")
         try:
-            value, broken = plain_values(text), False
+            value = plain_values(text)
         except yaml.YAMLError:
-            value, broken = text, True
-        if isinstance(value, str) and text[:1] not in ("'", '"'):
-            value = text  # a comment behind it belongs to it
-        return Override(given, keys, text, text if keys[-1] in ("kind", "task") else value, broken)
+            value = text
+        plain = isinstance(value, str) and text[:1] not in ("'", '"')  # with any comment behind it
+        return Override(given, keys, text, text if plain or keys[-1] in ("kind", "task") else value)
 
     def apply(self, values: dict[str, Any], value: Any) -> None:
         """Sets the key in place. Raises ConfigError where it leads through a value."""
@@ -179,21 +167,9 @@ def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> list[Ov
     return given
 
 
-def _texts(node: yaml.Node) -> Any:
-    """A YAML list's items as the texts that they are."""
-    if isinstance(node, yaml.SequenceNode):
-        return [_texts(item) for item in node.value]
-    return node.value
-
-
 def _kind(values: Mapping[str, Any], group: str) -> Any:
     inner = values.get(group)
     return inner.get("kind") if isinstance(inner, dict) else None
-
-
-def _names(keys: Sequence[str], given: Sequence[str]) -> bool:
-    """Whether a place in the configuration is a given key, or an item of it."""
-    return len(keys) == len(given) and ".".join(keys).partition("[")[0] == ".".join(given)
 
 
 def _wants_text(error: ErrorDetails) -> bool:
@@ -814,7 +790,8 @@ def make_config(
     values: Mapping[str, Any], where: str, overrides: Iterable[str] = ()
 ) -> ExperimentConfig:
     """As :func:`make_experiment`, of SLAM alone."""
-    _require_slam(values, where)
+    if "task" in values:  # before its keys are refused, which SLAM would not know
+        overrides = ()
     return as_task(ExperimentConfig, make_experiment(values, where, overrides), where)
 
 
@@ -842,25 +819,14 @@ def _model_of(values: Mapping[str, Any], where: str) -> type[Experiment]:
     return model
 
 
-def _require_slam(values: Mapping[str, Any], where: str) -> None:
-    """Refuses another task before its keys are: they would be unknown to SLAM."""
-    task = values.get("task")
-    if task == "localisation":
-        raise ConfigError(
-            f"{where}: task localisation drives nothing, and this needs an experiment of SLAM; "
-            "`fgslam run` takes both"
-        )
-    if task is not None:
-        raise ConfigError(
-            f"{where}: task {task} is a homing experiment, and this needs one of SLAM; `fgslam "
-            "run` and `fgslam compare` take both"
-        )
-
-
 def as_task(model: type[_Model], config: Experiment, where: str) -> _Model:
     """The experiment itself, if it is of this model. Raises ConfigError where it is not."""
     if isinstance(config, model):
         return config
-    if model is HomingExperiment and config.task_name is None:
-        raise ConfigError(f"{where}: has no task, so it is no homing experiment; give one")
-    raise ConfigError(f"{where}: task is {config.task_name}, which this does not take")
+    if config.task_name is None:
+        raise ConfigError(f"{where}: has no task, so it is an experiment of SLAM; give another")
+    what = "is a homing experiment" if isinstance(config, HomingExperiment) else "drives nothing"
+    needed = "SLAM" if model is ExperimentConfig else "another task"
+    raise ConfigError(
+        f"{where}: task {config.task_name} {what}, and this needs an experiment of {needed}"
+    )

@@ -251,7 +251,7 @@ def test_mistakes_of_a_film_of_a_route(
     assert "leave out --estimator" in mistake(capfd, monkeypatch, *film, "--estimator", "isam2")
     assert "give its --report" in mistake(capfd, monkeypatch, *film, "--taught", tmp_path)
     said = mistake(capfd, monkeypatch, *film, "--taught", followed)
-    assert "task is follow, which this does not take" in said
+    assert "task follow is a homing experiment" in said
     config = followed / RUN_MARKER
     kept, route = config.read_text(encoding="utf-8"), tmp_path / "other.fgpath"
     path = PathMemory.load(taught)

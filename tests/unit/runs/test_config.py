@@ -272,8 +272,8 @@ def test_text_or_null_takes_null(tmp_path: Path) -> None:
 def test_a_list_of_texts_holds_texts(tmp_path: Path) -> None:
     panoramas = {"kind": "panoramas", "path": "there"}
     base = {"name": "x", "task": "topological_map", "dataset": panoramas}
-    config = make_experiment(base, "x", ["routes=[[12, 7], [a, no]]"])
-    assert config.as_values()["routes"] == [["12", "7"], ["a", "no"]]
+    config = make_experiment(base, "x", ["routes=[[12, 7], [a, b]]"])
+    assert config.as_values()["routes"] == [["12", "7"], ["a", "b"]]
 
 
 def test_the_type_is_that_of_the_kind_chosen(tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ def test_malformed_overrides(override: str, tmp_path: Path) -> None:
 
 
 def test_overrides_that_cannot_be_applied(tmp_path: Path) -> None:
-    assert "not valid YAML; quote it" in message_of(MINIMAL, tmp_path, "seed=[1")
+    assert "seed = '[1' is not usable: give a whole" in message_of(MINIMAL, tmp_path, "seed=[1")
     message = message_of(MINIMAL, tmp_path, "name.first=1")
     assert "--set name.first=1: name holds a value, not a group" in message
     message = message_of(MINIMAL, tmp_path, "frontend.sift.max_featurs=3")
