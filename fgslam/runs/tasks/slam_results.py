@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from fgslam.backend.self_calibration import SelfCalibration
 from fgslam.cameras.calib_json import write_corrected
 from fgslam.cameras.rectify import Rectifier
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
-from fgslam.core.correction import IMPLAUSIBLE_PX, RigCorrection, term_names
+from fgslam.core.correction import IMPLAUSIBLE_PX, term_names
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
 from fgslam.core.files import make_subfolder, read_text, write_text
 from fgslam.core.geometry import inverse, transform_to_world
@@ -44,7 +44,7 @@ from fgslam.report.content import (
 )
 from fgslam.report.results import ReportData, judged_report, truth_in_their_world
 from fgslam.runs.config import Experiment, ExperimentConfig, parse
-from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE, LOG_FILE
+from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE, LOG_FILE, METRICS_FILE
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.report import (
     closures_of,
@@ -55,6 +55,7 @@ from fgslam.runs.report import (
     run_numbers,
     write_closures,
 )
+from fgslam.runs.results import PICTURES
 from fgslam.runs.session import map_points
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tables import NOISE_TABLE, picture_title, write_estimate, write_noise
@@ -169,16 +170,13 @@ def at_edges(depth: FloatArray, pixels: FloatArray) -> BoolArray:
     count = np.zeros((depth.shape[0] + 1, depth.shape[1] + 1), np.int64)
     count[1:, 1:] = jumps.cumsum(axis=0).cumsum(axis=1)
     column, row = np.rint(pixels).astype(np.int64).T
-    left, right = _within(column, depth.shape[1])
-    top, bottom = _within(row, depth.shape[0])
+    # The first pixel that a patch reaches in the image, and that after the last.
+    (left, right), (top, bottom) = (
+        (np.clip(middle - WHOLE_PX, 0, size), np.clip(middle + WHOLE_PX + 1, 0, size))
+        for middle, size in ((column, depth.shape[1]), (row, depth.shape[0]))
+    )
     near = count[bottom, right] - count[top, right] - count[bottom, left] + count[top, left]
     return np.asarray(near > 0)
-
-
-def _within(middle: IntArray, size: int) -> tuple[IntArray, IntArray]:
-    """The first pixel that a patch reaches in an image of this size, and that after the last."""
-    low = np.clip(middle - WHOLE_PX, 0, size)
-    return low, np.clip(middle + WHOLE_PX + 1, 0, size)
 
 
 def medians_of(
@@ -194,14 +192,12 @@ def medians_of(
     edges = np.add.reduceat(split[order].astype(np.int64), start) if len(start) else start
     kept = np.flatnonzero((times >= _LEAST_SIGHTINGS) & (2 * edges <= times)).tolist()
     medians = np.array([np.median(groups[k], axis=0) for k in kept]).reshape(-1, 3)
-    sigma = [_standard_error(groups[k], median) for k, median in zip(kept, medians, strict=True)]
+    sigma = []
+    for k, median in zip(kept, medians, strict=True):  # as a distance, robustly from the scatter
+        deviation = _NORMAL_MAD * np.median(np.abs(groups[k] - median), axis=0)
+        error = _MEDIAN_TO_MEAN * np.linalg.norm(deviation) / np.sqrt(len(groups[k]))
+        sigma.append(float(error))
     return LandmarkTruth(unique[kept], medians), np.array(sigma)
-
-
-def _standard_error(points: FloatArray, median: FloatArray) -> float:
-    """Of the median of points (n, 3), as a distance, robustly from their scatter."""
-    deviation = _NORMAL_MAD * np.median(np.abs(points - median), axis=0)
-    return float(_MEDIAN_TO_MEAN * np.linalg.norm(deviation) / np.sqrt(len(points)))
 
 
 _PRECISION_EVERY = 10  # frames between checks of stereo matches against rendered depth
@@ -255,20 +251,17 @@ class TrueSights:
         frontend: FrontendSettings,
     ) -> None:
         """Of ``landmarks``, those of the map that count; of a recording without depth nothing."""
-        self._sequence = sequence if isinstance(sequence, TrueDepth) else None
-        self._landmarks = landmarks
-        self._rig = sequence.rig
-        self._database: LandmarkDatabase | None = None
-        if self._sequence is not None:
-            largest = frontend.stereo.largest_disparity_px
-            self._database = LandmarkDatabase(sequence.rig, frontend.database, largest)
+        self._sequence, self._landmarks = sequence, landmarks
+        largest = frontend.stereo.largest_disparity_px
+        self._database = LandmarkDatabase(sequence.rig, frontend.database, largest)
+        if isinstance(sequence, TrueDepth):
             self._database.load(saved)
 
     def of(self, i: int, wTc: FloatArray) -> Sighted:
         """In the selected frame ``i``, whose true pose in the map's world is ``wTc``."""
-        if self._sequence is None or self._database is None or not np.isfinite(wTc).all():
+        if not isinstance(self._sequence, TrueDepth) or not np.isfinite(wTc).all():
             return Sighted()
-        rig, depth = self._rig, self._sequence.depth(i)
+        rig, depth = self._sequence.rig, self._sequence.depth(i)
         expected = self._database.expected(self._landmarks, wTc)
         column, row, disparity = expected.measurement.T
         rise = 0.0
@@ -398,18 +391,17 @@ def alignment_slack(aligned: FloatArray, own: FloatArray) -> float:
 # ------------------------------------------------------------------------------------------
 # What a run says of its rig's calibration: calibration.csv, numbers, one sentence
 
-_TOLD_SIGMAS = 3.0  # what is less than this many of its own is not told as a finding
-_TOLD_FIELD_PX = 0.1  # of a field that is told: recordings of good rigs show up to so much
-_DOUBT = (
-    ", more than calibrations leave: calibrate it anew, unless something large that moved was "
+_SURE_SIGMAS = 3.0  # a change of fewer of its own sigmas is not reported
+_LEAST_FIELD_PX = 0.1  # of a field that is reported: recordings of good rigs show up to so much
+_IMPLAUSIBLE = (
+    ", more than calibrations leave: calibrate it again, unless something large that moved was "
     "taken for the scene"
 )
-_UNITS = {"deg": "degrees", "percent": "%"}
-_WORDS = {
-    "yaw_deg": "turned by {} in yaw",
-    "pitch_deg": "turned by {} in pitch",
-    "roll_deg": "turned by {} in roll",
-    "focal_percent": "longer by {} in focal length",
+_CHANGES = {
+    "yaw_deg": "turned by {:.3f} degrees in yaw",
+    "pitch_deg": "turned by {:.3f} degrees in pitch",
+    "roll_deg": "turned by {:.3f} degrees in roll",
+    "focal_percent": "longer by {:.3f} % in focal length",
 }
 
 
@@ -471,44 +463,34 @@ def calibration_note(calibration: SelfCalibration | None, knocked: bool = False)
     """
     if calibration is None or not calibration.windows:
         return ""
-    found = calibration.found
-    knocks = f"; the rig moved {calibration.knocks} times on the way" * bool(calibration.knocks)
+    found, field = calibration.found, calibration.field_px
+    more = f"; the rig moved {calibration.knocks} times on the way" * bool(calibration.knocks)
+    # What no term of a correction follows, where that is more than usual.
+    if field >= _LEAST_FIELD_PX:
+        more += (
+            f"; {field:.2f} px (rms) of distortion in each image that no correction describes are "
+            "left"
+        )
     if found.probabilities["exact"] > 0.5:
-        if knocked:
-            return ""
-        return f"the drive agrees with the rig's calibration{knocks}{_field(calibration)}"
-    parts = [text for camera in ("left", "top") if (text := _told(found.estimated, camera))]
+        return "" if knocked else f"the drive agrees with the rig's calibration{more}"
+    cameras = []
+    for camera in ("left", "top"):
+        changes = {  # those that stand out of their uncertainty, the surest first
+            name.removeprefix(f"{camera}_"): (value, abs(value) / sigma)
+            for name, (value, sigma) in found.estimated.changes().items()
+            if name.startswith(camera) and abs(value) >= _SURE_SIGMAS * sigma
+        }
+        surest = sorted(changes.items(), key=lambda item: -item[1][1])
+        words = [
+            f"{_CHANGES[k].format(value)} ({sigmas:.0f} sigma)" for k, (value, sigmas) in surest
+        ]
+        cameras += [f"the {camera} camera is {', '.join(words)}"] * bool(words)
     rms = found.applied.rms_px()
-    what = "; ".join(parts) or "the cameras' lenses or axes differ"
     return (
-        f"{what} against the rig's calibration, corrected during the drive by {rms:.2f} px "
-        f"(rms over the images){_DOUBT * (rms > IMPLAUSIBLE_PX)}{knocks}{_field(calibration)}"
+        f"{'; '.join(cameras) or 'the lenses or axes of the cameras differ'} against the rig's "
+        f"calibration, corrected during the drive by {rms:.2f} px (rms over the images)"
+        f"{_IMPLAUSIBLE * (rms > IMPLAUSIBLE_PX)}{more}"
     )
-
-
-def _field(calibration: SelfCalibration) -> str:
-    """What no term of a correction follows, where that is more than usual."""
-    px = calibration.field_px
-    left = f"; {px:.2f} px (rms) of distortion in each image that no correction describes are left"
-    return left * (px >= _TOLD_FIELD_PX)
-
-
-def _told(known: RigCorrection, camera: str) -> str:
-    """One camera's changes that stand out of their uncertainty, the surest first."""
-    changes = {
-        name.removeprefix(f"{camera}_"): pair
-        for name, pair in known.changes().items()
-        if name.startswith(camera)
-    }
-    sure = sorted(changes, key=lambda name: -abs(changes[name][0]) / changes[name][1])
-    told = []
-    for name in sure:
-        value, sigma = changes[name]
-        if abs(value) >= _TOLD_SIGMAS * sigma:
-            unit = _UNITS[name.rsplit("_", 1)[1]]
-            size = f"{value:.3f} {unit}"
-            told.append(f"{_WORDS[name].format(size)} ({abs(value) / sigma:.0f} sigma)")
-    return f"the {camera} camera is {', '.join(told)}" if told else ""
 
 
 def require_self_calibration(config: Experiment) -> None:
@@ -578,7 +560,10 @@ class RunOutputs:
         self.recorder.log.save(self.folder / LOG_FILE)
         truth = self._write_truth(with_landmarks=status == "finished")
         self._write_estimate(estimate)
-        metrics = self._with_kind(estimator_metrics(estimate, truth, self.recorder))
+        metrics = estimator_metrics(estimate, truth, self.recorder)
+        taken = () if self.pipeline.places is None else self.pipeline.places.taken
+        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | closure_counts(taken)
+        metrics = dataclasses.replace(metrics, more=more)
         self.write_metrics({self.title: metrics}, status)
         self._write_timing(estimate.trajectory)
         if self.pipeline.calibration is not None:
@@ -589,30 +574,16 @@ class RunOutputs:
     def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:
         """metrics.json of the live estimator and of those that replayed its log."""
         about = self._about(status) | run_numbers(self.recorder)
-        if self._looks_for_places:
+        # Place recognition is asked for, or it joined parts of the map.
+        taken = () if self.pipeline.places is None else self.pipeline.places.taken
+        if self.config.frontend.loops or self.config.frontend.lost or taken:
             truth = load_truth(self.folder, self.recorder.log).trajectory
-            closures = closures_of(self.recorder, self._taken, truth)
+            closures = closures_of(self.recorder, taken, truth)
             write_closures(self.folder, self.recorder, closures)
             about["places"] = place_numbers(self.recorder, closures)
         if self.pipeline.calibration is not None:
             about["rig"] = calibration_numbers(self.pipeline.calibration)
-        write_metrics(self.folder / "metrics.json", len(self.recorder), estimators, about)
-
-    @property
-    def _taken(self) -> tuple[bool, ...]:
-        """Of all closures offered, whether the estimator took them."""
-        return () if self.pipeline.places is None else self.pipeline.places.taken
-
-    @property
-    def _looks_for_places(self) -> bool:
-        """Whether the configuration asks for place recognition, or it joined parts of the map."""
-        frontend = self.config.frontend
-        return frontend.loops or frontend.lost or bool(self._taken)
-
-    def _with_kind(self, metrics: EstimatorMetrics) -> EstimatorMetrics:
-        closures = closure_counts(self._taken)
-        more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | closures
-        return dataclasses.replace(metrics, more=more)
+        write_metrics(self.folder / METRICS_FILE, len(self.recorder), estimators, about)
 
     def _write_truth(self, with_landmarks: bool) -> Truth:
         """True path, and true landmarks where the recording is rendered and ``with_landmarks``.
@@ -638,35 +609,29 @@ class RunOutputs:
         write_noise(folder / NOISE_TABLE, online.timestamps, self.recorder.noise)
 
     def _write_timing(self, trajectory: Trajectory) -> None:
-        indices = self.recorder.log.numbers.tolist()
-        write_timing(
-            self.folder / "timing.csv",
-            [
-                StageTime(frame, timestamp, stage, milliseconds)
-                for frame, timestamp, row in zip(
-                    indices,
-                    trajectory.timestamps.tolist(),
-                    np.array(self.recorder.stage_ms).tolist(),
-                    strict=True,
-                )
-                for stage, milliseconds in zip(STAGES, row, strict=True)
-                if not math.isnan(milliseconds)  # of a session before
-            ],
-        )
+        stamps = trajectory.timestamps.tolist()
+        rows = zip(self.recorder.log.numbers.tolist(), stamps, self.recorder.stage_ms, strict=True)
+        times = [
+            StageTime(frame, timestamp, stage, milliseconds)
+            for frame, timestamp, row in rows
+            for stage, milliseconds in zip(STAGES, row.tolist(), strict=True)
+            if not math.isnan(milliseconds)  # of a session before
+        ]
+        write_timing(self.folder / "timing.csv", times)
 
     def remarks(self) -> tuple[str, ...]:
         """Notes on the recording, its cameras and its first images."""
-        of_cameras = camera_remarks(self.recorder, self.pipeline.watch)
-        of_images = stereo_remarks(self.recorder)
-        of_parts = part_remarks(self.recorder, self.pipeline.tracker.parts)
-        of_run = (*self.sequence.notes, *self.notes, *self._unlocated(), *of_parts)
-        return (*of_run, *of_cameras, *of_images, *self.pipeline.tracker.other_motion.remarks())
-
-    def _unlocated(self) -> tuple[str, ...]:
-        found = located(self.recorder)
-        if found.enough:
-            return ()
-        return (f"only {found} were located by landmarks; the rest of the path is predicted",)
+        tracker, share = self.pipeline.tracker, located(self.recorder)
+        few = f"only {share} were located by landmarks; the rest of the path is predicted"
+        return (
+            *self.sequence.notes,
+            *self.notes,
+            *(() if share.enough else (few,)),
+            *part_remarks(self.recorder, tracker.parts),
+            *camera_remarks(self.recorder, self.pipeline.watch),
+            *stereo_remarks(self.recorder),
+            *tracker.other_motion.remarks(),
+        )
 
     def _about(self, status: str) -> dict[str, JsonValue]:
         return {
@@ -686,42 +651,60 @@ _PROBLEMS_SHOWN = 5
 
 def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     """The numbers of the live estimator; a table of names and values without headings."""
-    numbers = run_numbers(outputs.recorder)
+    recorder, more = outputs.recorder, metrics.more
+    numbers: dict[str, Any] = run_numbers(recorder)
+    share = located(recorder)
+    first = in_first_map(recorder, outputs.pipeline.tracker.parts)
+    matches, nees = numbers["landmark_matches"], more.get("nees_pose")
+    bias, start = more.get("gyroscope_bias_dps"), more.get("end_against_start")
+    end = "unknown"
+    if metrics.end_error_m is not None and len(recorder) > 1:
+        end = f"{_metres(metrics.end_error_m)}, {_number('{:.3f} deg', metrics.end_error_deg)}"
+    rpe = f"{_metres(metrics.rpe_trans_m)}, {_number('{:.3f} deg', metrics.rpe_rot_deg)}"
+    rows = {
+        "frames": f"{len(recorder)} of {outputs.frames}",
+        "located by landmarks": f"{share}" + f", {first} in the first map" * (first < share.frames),
+        "pose found from": ", ".join(f"{k} {n}" for k, n in numbers["status_counts"].items()),
+        "landmarks": str(metrics.landmarks),
+        "landmarks matched, median (5 %)": "none"
+        if matches is None
+        else f"{matches['median']:.0f} ({matches['p05']:.0f})",
+        "ATE rms, SE3 aligned": _metres(metrics.ate_rmse_m),
+        "RPE a frame": rpe,
+        "end error, first pose aligned": end,
+        "end against start": "unknown",
+        "drift": _number("{:.2f} %", metrics.drift_percent),
+        "pose NEES per dof": "unknown",
+        "loop without SIFT, median": _number("{:.1f} ms", numbers["loop_ms"]["median"]),
+    }
+    if isinstance(start, dict) and len(recorder) > 1:
+        # Adding zero turns -0.00 into 0.00.
+        known = {name: round(value, 2) + 0.0 for name, value in start.items()}
+        rows["end against start"] = (
+            "{x_cm:.2f}, {y_cm:.2f}, {z_cm:.2f} cm\n"
+            "yaw {yaw_deg:.2f}, pitch {pitch_deg:.2f}, roll {roll_deg:.2f} deg".format(**known)
+        )
+    if isinstance(nees, dict):
+        band = f"(band {nees['lower']:.2f}-{nees['upper']:.2f})"
+        rows["pose NEES per dof"] = f"{nees['per_dof']:.1f}: {nees['verdict']} {band}"
+    if isinstance(bias, dict):
+        pairs = zip(bias["rates"], bias["sigmas"], strict=True)
+        words = ", ".join(f"{rate:.3f} +- {sigma:.3f}" for rate, sigma in pairs)
+        rows["gyroscope bias, x y z"] = f"{words} deg/s"
     remark = f"\n{outputs.remark}" if outputs.remark else ""
-    matches = numbers["landmark_matches"]
-    rows: list[tuple[str, object]] = [
-        ("frames", f"{len(outputs.recorder)} of {outputs.frames}"),
-        ("located by landmarks", _located(outputs)),
-        ("pose found from", _counts(numbers["status_counts"])),
-        ("landmarks", metrics.landmarks),
-        ("landmarks matched, median (5 %)", _spread(matches)),
-        ("ATE rms, SE3 aligned", _metres(metrics.ate_rmse_m)),
-        ("RPE a frame", f"{_metres(metrics.rpe_trans_m)}, {_degrees(metrics.rpe_rot_deg)}"),
-        ("end error, first pose aligned", _end(outputs, metrics)),
-        ("end against start", _start(outputs, metrics)),
-        ("drift", "unknown" if metrics.drift_percent is None else f"{metrics.drift_percent:.2f} %"),
-        ("pose NEES per dof", _nees(metrics)),
-        ("loop without SIFT, median", _milliseconds(numbers["loop_ms"])),
-        *_gyroscope(metrics.more.get("gyroscope_bias_dps")),
-    ]
     heading = f"{outputs.config.name}: {outputs.title}{remark}"
-    cells = tuple((name, (str(value),)) for name, value in rows)
+    cells = tuple((name, (value,)) for name, value in rows.items())
     return TextTable("summary", heading, "", (Column("", "of the run"),), cells)
 
 
-def _gyroscope(bias: object) -> list[tuple[str, object]]:
-    """Its bias in degrees/s; nothing where none was estimated."""
-    if not isinstance(bias, dict):
-        return []
-    pairs = zip(bias["rates"], bias["sigmas"], strict=True)
-    words = ", ".join(f"{rate:.3f} +- {sigma:.3f}" for rate, sigma in pairs)
-    return [("gyroscope bias, x y z", f"{words} deg/s")]
+def _number(text: str, value: float | None) -> str:
+    return "unknown" if value is None else text.format(value)
 
 
-def _located(outputs: RunOutputs) -> str:
-    share = located(outputs.recorder)
-    first = in_first_map(outputs.recorder, outputs.pipeline.tracker.parts)
-    return str(share) + (f", {first} in the first map" if first < share.frames else "")
+def _metres(value: float | None) -> str:
+    if value is None:
+        return "unknown"
+    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
 
 
 def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]:
@@ -742,60 +725,6 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     return tuple(lines)
 
 
-def _metres(value: float | None) -> str:
-    if value is None:
-        return "unknown"
-    return f"{100.0 * value:.2f} cm" if value < 1.0 else f"{value:.3f} m"
-
-
-def _degrees(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.3f} deg"
-
-
-def _counts(counts: object) -> str:
-    if not isinstance(counts, dict):
-        return "unknown"
-    return ", ".join(f"{name} {count}" for name, count in counts.items())
-
-
-def _spread(spread: object) -> str:
-    if not isinstance(spread, dict):
-        return "none"
-    return f"{spread['median']:.0f} ({spread['p05']:.0f})"
-
-
-def _milliseconds(times: object) -> str:
-    known = isinstance(times, dict) and times["median"] is not None
-    return f"{times['median']:.1f} ms" if known and isinstance(times, dict) else "unknown"
-
-
-def _end(outputs: RunOutputs, metrics: EstimatorMetrics) -> str:
-    if metrics.end_error_m is None or len(outputs.recorder) < 2:
-        return "unknown"
-    return f"{_metres(metrics.end_error_m)}, {_degrees(metrics.end_error_deg)}"
-
-
-def _start(outputs: RunOutputs, metrics: EstimatorMetrics) -> str:
-    end = metrics.more.get("end_against_start")
-    if not isinstance(end, dict) or len(outputs.recorder) < 2:
-        return "unknown"
-    # Adding zero turns -0.00 into 0.00.
-    x, y, z = (f"{round(end[name], 2) + 0.0:.2f}" for name in ("x_cm", "y_cm", "z_cm"))
-    yaw, pitch, roll = (
-        f"{round(end[name], 2) + 0.0:.2f}" for name in ("yaw_deg", "pitch_deg", "roll_deg")
-    )
-    return f"{x}, {y}, {z} cm\nyaw {yaw}, pitch {pitch}, roll {roll} deg"
-
-
-def _nees(metrics: EstimatorMetrics) -> str:
-    found = metrics.more.get("nees_pose")
-    if not isinstance(found, dict):
-        return "unknown"
-    band = f"{found['lower']:.2f}-{found['upper']:.2f}"
-    return f"{found['per_dof']:.1f}: {found['verdict']} (band {band})"
-
-
-FOLDER = "pictures"
 SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
 """Frames shown, as parts of the run: those of the paper's Figure 4."""
 
@@ -811,7 +740,7 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
         return
     from fgslam.report.pictures import draw_disparities, draw_features, draw_flow
 
-    folder = make_subfolder(outputs.folder, FOLDER)
+    folder = make_subfolder(outputs.folder, PICTURES)
     images = report.found.frame.images
     title = _title(outputs, f"frame {report.increment.index}")
     if report.found.features:
@@ -880,26 +809,8 @@ def draw_run(run: Path, figures: RunFigures) -> list[Path]:
     from fgslam.report import figures as drawn  # Plotly and Matplotlib take a second
     from fgslam.report.pictures import draw_figure, draw_views
 
-    folder = make_subfolder(run, FOLDER)
-    results = _results(figures)
-    kind = "valid landmarks" if figures.valid.any() else "landmarks"
-    what = figures.title(f"{len(results.estimators[0].landmarks):,} {kind}")
-    above = drawn.drive_from_above(results, drawn.ON_PAPER)
-    draw_figure(folder / "map_from_above.png", above, what, {drawn.LANDMARK_ELLIPSES})
-    views = drawn.map_to_turn(results, drawn.ON_PAPER)
-    draw_views(folder / "map_views.png", views, what)
-    # The first frame has no landmarks to match.
-    counts = (figures.frames, figures.matched, figures.inliers, figures.landmarks)
-    matches = drawn.matches_over_time(*(values[1:] for values in counts))
-    draw_figure(folder / "matches.png", matches, figures.title("landmark matches"))
-    if results.truth is not None:
-        title = figures.title("position error, first pose aligned")
-        draw_figure(folder / "position_error.png", drawn.error_by_axis(results), title)
-    return sorted(folder.glob("*.png"))
-
-
-def _results(figures: RunFigures) -> ReportData:
-    """Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short."""
+    folder = make_subfolder(run, PICTURES)
+    # Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short.
     estimate, valid = figures.estimate, figures.valid
     if valid.any():
         estimate = replace(estimate, landmarks=estimate.landmarks.select(valid))
@@ -907,9 +818,22 @@ def _results(figures: RunFigures) -> ReportData:
     if len(figures.predicted):
         report = replace(report, predicted=figures.predicted)
     truth = truth_in_their_world((report,), figures.truth)
-    return ReportData(
+    results = ReportData(
         title=figures.name, subtitle="", estimators=(report,), truth=truth, up=figures.up
     )
+    kind = "valid landmarks" if valid.any() else "landmarks"
+    what = figures.title(f"{len(report.landmarks):,} {kind}")
+    above = drawn.drive_from_above(results, drawn.ON_PAPER)
+    draw_figure(folder / "map_from_above.png", above, what, {drawn.LANDMARK_ELLIPSES})
+    draw_views(folder / "map_views.png", drawn.map_to_turn(results, drawn.ON_PAPER), what)
+    # The first frame has no landmarks to match.
+    counts = (figures.frames, figures.matched, figures.inliers, figures.landmarks)
+    matches = drawn.matches_over_time(*(values[1:] for values in counts))
+    draw_figure(folder / "matches.png", matches, figures.title("landmark matches"))
+    if truth is not None:
+        title = figures.title("position error, first pose aligned")
+        draw_figure(folder / "position_error.png", drawn.error_by_axis(results), title)
+    return sorted(folder.glob("*.png"))
 
 
 def _title(outputs: RunOutputs, what: str) -> str:
