@@ -1,7 +1,7 @@
 """One table of metrics: what metrics.json knows of an estimator, and where it is shown.
 
-A new metric is a row of ``_METRICS``; its name in a line of ``_SHOWN`` puts it into a table of the
-console or of the page. comparison.csv, trials.csv and sweeps have all that have a name.
+A metric is a row of ``_METRICS``: its name in comparison.csv, trials.csv and sweeps, its place in
+metrics.json, and the column of the console's and the page's tables that it stands in.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def write_frames(path: Path, replay: Replay) -> None:
     """Write frames.csv: time stamp, then a column for each name of :class:`ReplayRow`."""
     lines = [",".join(("timestamp", *ReplayRow._fields))]
     for stamp, row in zip(replay.online.timestamps, replay.rows, strict=True):
-        cells = [_cell(value) for value in row]
+        cells = (f"{cell:.6g}" if isinstance(cell, float) else str(cell) for cell in row)
         lines.append(",".join((f"{stamp:.9f}", *cells)))
     write_text(path, "\n".join(lines) + "\n")
 
@@ -131,105 +131,125 @@ def _counts(parts: list[IntArray], ids: IntArray) -> IntArray:
     return out
 
 
-def _cell(value: str | float) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
 UNKNOWN = "-"
 _REMARKS_SHOWN = 3
 
 
 class Metric(NamedTuple):
-    """A metric: its name, dotted path in metrics.json, format, why it may be absent, meaning."""
+    """A metric.
+
+    Attributes:
+        name: of its column in files; those of ``RESULT`` and ``TIME`` stand in comparison.csv.
+        path: dotted, in metrics.json.
+        group: ``RESULT``, ``TIME`` or ``FURTHER``.
+        column: table and heading that it is shown under, alone or after others; | ends a line.
+        text: its format there.
+        absent: key of the reason why it may be absent.
+        meaning: of the column.
+    """
 
     name: str
     path: str
+    group: str
+    column: str = ""
     text: str = ""
     absent: str = ""
     meaning: str = ""
 
 
-# Name, path, format, why it may be absent; below it, what it means where a page shows it.
-_METRICS = """
-kind                     kind
-odometry                 odometry
-frames                   frames
-predicted_frames         predicted_frames
-alignment                alignment
-matched_poses            matched_poses
-ate_final_m              ate_rmse_m                        cm       truth
-    absolute trajectory error of the final path: rms distance from the truth after SE3 alignment
-ate_online_m             online.ate_rmse_m                 cm       truth
-    the same of the path made of each pose as first estimated, at its own time
-ate_max_final_m          ate_max_m
-rpe_final_m              rpe_trans_m                       cm       truth
-    relative pose error from frame to frame, translation
-rpe_final_deg            rpe_rot_deg                       .3f      truth
-    relative pose error from frame to frame, rotation
-rpe_online_m             online.rpe_trans_m                cm       truth
-rpe_online_deg           online.rpe_rot_deg                .3f      truth
-end_error_final_m        end_error_m                       cm       truth
-    distance of the last pose from the true one, the first pose aligned
-end_error_final_deg      end_error_deg                     .3f      truth
-end_error_online_m       online.end_error_m
-end_error_online_deg     online.end_error_deg
-drift_percent            drift_percent                     .2f      truth
-    end error over the length of the true path
-path_length_m            path_length_m
-landmarks                landmarks                         ,.0f     frame
-    number of landmarks in the final map
-landmarks_with_truth     landmarks_with_truth
-landmark_rmse_m          landmark_rmse_m                   cm       landmarks
-    root mean square distance of the landmarks from their true positions
-landmark_median_m        landmark_median_m                 cm       landmarks
-landmark_truth_sigma_m   landmark_truth_sigma_m
-nees_pose_final_per_dof  nees_pose_per_dof                 ratio    truth
-    normalised error squared of the poses per degree of freedom: 1 is right, more overconfident
-nees_pose_band_lower     nees_pose.lower
-nees_pose_band_upper     nees_pose.upper
-nees_pose_final_verdict  nees_pose.verdict                 text     truth
-    whether the pose NEES lies in its 95 % chi-square band; one run counts as one sample
-nees_pose_online_per_dof online.nees_pose_per_dof          ratio    truth
-    NEES of each pose as first estimated, by its covariance of that time
-nees_pose_online_verdict online.nees_pose.verdict          text     truth
-coverage_final           coverage.all                      .0%      truth
-    pose errors within two sigma
-coverage_online          online.coverage.all               .0%      truth
-nees_landmark_per_dof    nees_landmark_per_dof             ratio    landmarks
-    normalised error squared of the landmarks per degree of freedom
-nees_landmark_verdict    nees_landmark.verdict             text     landmarks
-nis_per_dof              nis_per_dof                       ratio    innovation
-    normalised innovation squared of the measurements per degree of freedom
-last_pose_sigma_m        last_pose_sigma.position_m        cm       covariance
-    standard deviation of the last pose's position, as claimed
-last_pose_sigma_deg      last_pose_sigma.rotation_deg      .3f      covariance
-failure                  failure
-"""
-_TIMES = """
-update_median_ms         update_ms.median                  .2f      frame
-    time for a frame, median over the run
-update_p95_ms            update_ms.p95                     .2f      frame
-    time for a frame that 95 % stay below
-update_max_ms            update_ms.max                     .1f      frame
-    longest time for a frame
-solve_median_ms          solve_ms.median                   ratio    live
-final_estimate_ms        final_ms                          s        final
-update_growth_ratio      update_growth.ratio               ratio    few
-    median time of the last fifth of the frames over that of the second fifth: 1 is flat
-update_slope_ms_per_1000_frames update_growth.slope_ms_per_1000 +.2f few
-peak_memory_mib          peak_memory_mb                    ,.0f     system
-    largest resident memory of the process
-memory_before_mib        memory_before_mb
-"""
-# Not in comparison.csv.
-_FURTHER = """
-noise_factor             noise_factor                      .2f      weighed
-trials_ate_final         intervals.ate_rmse_m              cm3      truth
-trials_ate_online        intervals_online.ate_rmse_m       cm3      truth
-trials_landmark_median   intervals.landmark_median_m       cm2      landmarks
-trials_nees_pose         nees_pose                         pooled   truth
-trials_nees_landmark     nees_landmark                     pooled   landmarks
-"""
+RESULT, TIME, FURTHER = "result", "time", "further"
+_METRICS = tuple(Metric(*row) for row in (
+    ("kind", "kind", RESULT),
+    ("odometry", "odometry", RESULT),
+    ("frames", "frames", RESULT),
+    ("predicted_frames", "predicted_frames", RESULT),
+    ("alignment", "alignment", RESULT),
+    ("matched_poses", "matched_poses", RESULT),
+    ("ate_final_m", "ate_rmse_m", RESULT, "accuracy: ATE|final cm", "cm", "truth", "absolute "
+     "trajectory error of the final path: rms distance from the truth after SE3 alignment"),
+    ("ate_online_m", "online.ate_rmse_m", RESULT, "accuracy: ATE|online cm", "cm", "truth",
+     "the same of the path made of each pose as first estimated, at its own time"),
+    ("ate_max_final_m", "ate_max_m", RESULT),
+    ("rpe_final_m", "rpe_trans_m", RESULT, "accuracy: RPE final|cm deg", "cm", "truth",
+     "relative pose error from frame to frame, translation and rotation"),
+    ("rpe_final_deg", "rpe_rot_deg", RESULT, "accuracy: RPE final|cm deg", ".3f", "truth"),
+    ("rpe_online_m", "online.rpe_trans_m", RESULT, "accuracy: RPE online|cm deg", "cm", "truth",
+     "the same of each pose as first estimated"),
+    ("rpe_online_deg", "online.rpe_rot_deg", RESULT, "accuracy: RPE online|cm deg", ".3f", "truth"),
+    ("end_error_final_m", "end_error_m", RESULT, "accuracy: end error|cm deg", "cm", "truth",
+     "distance of the last pose from the true one, the first pose aligned"),
+    ("end_error_final_deg", "end_error_deg", RESULT, "accuracy: end error|cm deg", ".3f", "truth"),
+    ("end_error_online_m", "online.end_error_m", RESULT),
+    ("end_error_online_deg", "online.end_error_deg", RESULT),
+    ("drift_percent", "drift_percent", RESULT),
+    ("path_length_m", "path_length_m", RESULT),
+    ("landmarks", "landmarks", RESULT, "cost: map|landmarks", ",.0f", "frame",
+     "number of landmarks in the final map"),
+    ("landmarks_with_truth", "landmarks_with_truth", RESULT),
+    ("landmark_rmse_m", "landmark_rmse_m", RESULT, "accuracy: landmarks cm|rms median", "cm",
+     "landmarks", "distance of the landmarks from their true positions"),
+    ("landmark_median_m", "landmark_median_m", RESULT, "accuracy: landmarks cm|rms median", "cm",
+     "landmarks"),
+    ("landmark_truth_sigma_m", "landmark_truth_sigma_m", RESULT),
+    ("nees_pose_final_per_dof", "nees_pose_per_dof", RESULT, "consistency: NEES pose|final",
+     "ratio", "truth", "normalised error squared of the poses per degree of freedom: 1 is right, "
+     "more overconfident; and whether it lies in its 95 % chi-square band, one run as one sample"),
+    ("nees_pose_band_lower", "nees_pose.lower", RESULT),
+    ("nees_pose_band_upper", "nees_pose.upper", RESULT),
+    ("nees_pose_final_verdict", "nees_pose.verdict", RESULT, "consistency: NEES pose|final",
+     "text", "truth"),
+    ("nees_pose_online_per_dof", "online.nees_pose_per_dof", RESULT,
+     "consistency: NEES pose|online", "ratio", "truth",
+     "NEES of each pose as first estimated, by its covariance of that time"),
+    ("nees_pose_online_verdict", "online.nees_pose.verdict", RESULT,
+     "consistency: NEES pose|online", "text", "truth"),
+    ("coverage_final", "coverage.all", RESULT, "consistency: in 2 sigma|final", ".0%", "truth",
+     "pose errors within two sigma"),
+    ("coverage_online", "online.coverage.all", RESULT, "consistency: in 2 sigma|online", ".0%",
+     "truth", "the same of each pose as first estimated"),
+    ("nees_landmark_per_dof", "nees_landmark_per_dof", RESULT, "consistency: NEES|landmarks",
+     "ratio", "landmarks", "normalised error squared of the landmarks per degree of freedom"),
+    ("nees_landmark_verdict", "nees_landmark.verdict", RESULT, "consistency: NEES|landmarks",
+     "text", "landmarks"),
+    ("noise_factor", "noise_factor", FURTHER, "consistency: noise|factor", ".2f", "weighed",
+     "what the stated standard deviations of the measurements were multiplied by"),
+    ("nis_per_dof", "nis_per_dof", RESULT, "consistency: NIS", "ratio", "innovation",
+     "normalised innovation squared of the measurements per degree of freedom"),
+    ("last_pose_sigma_m", "last_pose_sigma.position_m", RESULT,
+     "consistency: sigma of last|pose cm deg", "cm", "covariance",
+     "standard deviation of the last pose, as claimed"),
+    ("last_pose_sigma_deg", "last_pose_sigma.rotation_deg", RESULT,
+     "consistency: sigma of last|pose cm deg", ".3f", "covariance"),
+    ("failure", "failure", RESULT),
+    ("update_median_ms", "update_ms.median", TIME, "cost: update ms|median p95 max", ".2f", "frame",
+     "time for a frame: median over the run, what 95 % stay below, and the longest"),
+    ("update_p95_ms", "update_ms.p95", TIME, "cost: update ms|median p95 max", ".2f", "frame"),
+    ("update_max_ms", "update_ms.max", TIME, "cost: update ms|median p95 max", ".1f", "frame"),
+    ("solve_median_ms", "solve_ms.median", TIME, "cost: pose solve|median ms", "ratio", "live",
+     "time to find a frame's pose"),
+    ("final_estimate_ms", "final_ms", TIME, "cost: final|estimate s", "s", "final",
+     "time for the whole path and map at the end"),
+    ("update_growth_ratio", "update_growth.ratio", TIME, "cost: growth|1 is flat", "ratio", "few",
+     "median time of the last fifth of the frames over that of the second fifth"),
+    ("update_slope_ms_per_1000_frames", "update_growth.slope_ms_per_1000", TIME,
+     "cost: slope ms /|1000 frames", "+.2f", "few", "by how much the time for a frame grows"),
+    ("peak_memory_mib", "peak_memory_mb", TIME, "cost: memory|MiB", ",.0f", "system",
+     "largest resident memory of the process"),
+    ("memory_before_mib", "memory_before_mb", TIME),
+    ("trials_ate_final", "intervals.ate_rmse_m", FURTHER, "trials: ATE final cm", "cm3", "truth"),
+    ("trials_ate_online", "intervals_online.ate_rmse_m", FURTHER, "trials: ATE online cm", "cm3",
+     "truth"),
+    ("trials_landmark_median", "intervals.landmark_median_m", FURTHER,
+     "trials: landmarks median cm", "cm2", "landmarks"),
+    ("trials_nees_pose", "nees_pose", FURTHER, "trials: NEES pose", "pooled", "truth"),
+    ("trials_nees_landmark", "nees_landmark", FURTHER, "trials: NEES landmarks", "pooled",
+     "landmarks"),
+))  # fmt: skip
+RESULT_COLUMNS = tuple((m.name, m.path) for m in _METRICS if m.group == RESULT)
+"""What the same measurements give to the byte: column, and where its value is in the metrics."""
+TIME_COLUMNS = tuple((m.name, m.path) for m in _METRICS if m.group == TIME)
+"""What differs from one execution to the next."""
+_TABLES = ("accuracy", "consistency", "cost")
 _ABSENT = {
     "truth": "no ground truth, or fewer than three poses matched",
     "landmarks": "true landmark positions are not known, or none of them is in the map",
@@ -242,93 +262,13 @@ _ABSENT = {
     "final": "not timed apart in a live run",
     "system": "this system does not tell",
 }
-# Headings (| ends a line) with the metrics of their cells; ! marks columns that stay where no
-# estimator fills them.
-_SHOWN = {
-    "accuracy": """
-        ATE|final cm            : ate_final_m
-        ATE|online cm           : ate_online_m
-        RPE final|cm deg        : rpe_final_m rpe_final_deg
-        RPE online|cm deg       : rpe_online_m rpe_online_deg
-        end error|cm deg        : end_error_final_m end_error_final_deg
-        landmarks cm|rms median : landmark_rmse_m landmark_median_m""",
-    "consistency": """
-        NEES pose|final           : nees_pose_final_per_dof nees_pose_final_verdict
-        NEES pose|online          : nees_pose_online_per_dof nees_pose_online_verdict
-        in 2 sigma|final          : coverage_final
-        in 2 sigma|online         : coverage_online
-        NEES|landmarks            : nees_landmark_per_dof nees_landmark_verdict
-        noise|factor              : noise_factor
-        NIS                       : nis_per_dof
-        sigma of last|pose cm deg : last_pose_sigma_m last_pose_sigma_deg""",
-    "cost": """
-        update ms|median p95 max : update_median_ms update_p95_ms update_max_ms
-        growth|1 is flat         : update_growth_ratio
-        slope ms /|1000 frames   : update_slope_ms_per_1000_frames
-        pose solve|median ms     : solve_median_ms
-        final|estimate s         : final_estimate_ms
-        memory|MiB               : peak_memory_mib
-        map|landmarks            : landmarks""",
-    "trials": """
-        ATE final cm        : trials_ate_final
-        ATE online cm       : trials_ate_online
-        landmarks median cm : trials_landmark_median
-        NEES pose           : trials_nees_pose
-        NEES landmarks      : trials_nees_landmark""",
-    "Accuracy": """
-        ATE (cm)!           : ate_final_m
-        ATE online (cm)     : ate_online_m
-        RPE (cm)!           : rpe_final_m
-        RPE (deg)!          : rpe_final_deg
-        end error (cm)!     : end_error_final_m
-        drift (%)!          : drift_percent
-        landmark error (cm) : landmark_rmse_m""",
-    "Consistency": """
-        NEES pose!      : nees_pose_final_per_dof
-        verdict!        : nees_pose_final_verdict
-        in 2 sigma      : coverage_final
-        NEES online     : nees_pose_online_per_dof
-        NEES landmarks! : nees_landmark_per_dof
-        NIS             : nis_per_dof
-        last sigma (cm) : last_pose_sigma_m""",
-    "Time and memory": """
-        landmarks!    : landmarks
-        median (ms)!  : update_median_ms
-        p95 (ms)!     : update_p95_ms
-        worst (ms)!   : update_max_ms
-        growth        : update_growth_ratio
-        memory (MiB)! : peak_memory_mib""",
-}
-_CONSOLE, _PAGE = (
-    ("accuracy", "consistency", "cost"),
-    ("Accuracy", "Consistency", "Time and memory"),
-)
-
-
-def _parsed(table: str) -> list[Metric]:
-    out: list[Metric] = []
-    for line in table.strip().splitlines():
-        if line.startswith(" "):
-            out[-1] = out[-1]._replace(meaning=line.strip())
-        else:
-            out.append(Metric(*line.split()))
-    return out
-
-
-_RESULTS = _parsed(_METRICS)
-_ALL = {metric.name: metric for table in (_METRICS, _TIMES, _FURTHER) for metric in _parsed(table)}
-RESULT_COLUMNS = tuple((metric.name, metric.path) for metric in _RESULTS)
-"""What the same measurements give to the byte: column, and where its value is in the metrics."""
-TIME_COLUMNS = tuple((metric.name, metric.path) for metric in _parsed(_TIMES))
-"""What differs from one execution to the next."""
 
 
 class _Column(NamedTuple):
-    """A column of a table that is shown: heading, what stands in it, whether it always stands."""
+    """A column of a table that is shown: heading, and what stands in it."""
 
     heading: str
     metrics: tuple[Metric, ...]
-    always: bool
 
     def cell(self, values: Mapping[str, Any]) -> str:
         """The numbers of one estimator, or that they are not known."""
@@ -347,14 +287,13 @@ class _Column(NamedTuple):
 
 
 def _columns(table: str) -> list[_Column]:
-    rows = [line.partition(":") for line in _SHOWN[table].strip().splitlines()]
+    shown = [metric for metric in _METRICS if metric.column.startswith(f"{table}: ")]
     return [
         _Column(
-            heading.strip().rstrip("!").replace("|", "\n"),
-            tuple(_ALL[name] for name in names.split()),
-            heading.strip().endswith("!"),
+            column.removeprefix(f"{table}: ").replace("|", "\n"),
+            tuple(metric for metric in shown if metric.column == column),
         )
-        for heading, _, names in rows
+        for column in dict.fromkeys(metric.column for metric in shown)
     ]
 
 
@@ -405,28 +344,25 @@ def comparison_tables(name: str, frames: int, values: Mapping[str, Any]) -> tupl
         f"{name}: time and memory, {frames} frames",
     )
     known = marked(values)
-    tables = [_table(h, h, key, known) for h, key in zip(headings, _CONSOLE, strict=True)]
+    tables = (_table(h, key, known) for h, key in zip(headings, _TABLES, strict=True))
     return tuple(table for table in tables if table.columns)
 
 
 def trials_table(heading: str, values: Mapping[str, Any]) -> TextTable:
     """Means over trials with their intervals, by estimator."""
-    return _table(heading, heading, "trials", marked(values))
+    return _table(heading, "trials", marked(values))
 
 
 def page_tables(values: Mapping[str, Any]) -> tuple[TextTable, ...]:
-    """The tables of the page, of metrics by marked title; values that are not known read `-`.
-
-    Three, for one of all columns is wider than a window.
-    """
-    return tuple(_table(key.partition(" ")[0].lower(), key, key, values) for key in _PAGE)
+    """The tables of the page, of metrics by marked title; values that are not known read `-`."""
+    return tuple(_table(key.capitalize(), key, values) for key in _TABLES)
 
 
-def _table(key: str, heading: str, shown: str, values: Mapping[str, Any]) -> TextTable:
-    kept = [one for one in _columns(shown) if one.always or not one.is_empty(values)]
+def _table(heading: str, table: str, values: Mapping[str, Any]) -> TextTable:
+    kept = [one for one in _columns(table) if not one.is_empty(values)]
     rows = tuple((title, tuple(one.cell(m) for one in kept)) for title, m in values.items())
     columns = tuple(Column(one.heading, one.metrics[0].meaning) for one in kept)
-    return TextTable(key, heading, "estimator", columns, rows)
+    return TextTable(table, heading, "estimator", columns, rows)
 
 
 def ate_table(runs: Sequence[tuple[str, Mapping[str, Any]]]) -> TextTable:
@@ -510,7 +446,7 @@ def _reasons(values: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Why values are missing, each reason once with the headings that it empties or leaves out."""
     found: dict[tuple[str, str], list[str]] = {}
     done = [m for m in values.values() if not value_at(m, "failure")]
-    for column in (one for key in _CONSOLE for one in _columns(key)):
+    for column in (one for key in _TABLES for one in _columns(key)):
         if any(column.cell(m) == UNKNOWN for m in done):
             label = "left out" if column.is_empty(values) else UNKNOWN
             headings = found.setdefault((label, _ABSENT[column.metrics[0].absent]), [])
