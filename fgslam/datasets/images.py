@@ -137,14 +137,6 @@ _JPEG_TAIL = 64  # some writers pad a JPEG after its end marker
 # The largest cameras have that many; SIFT would need 30 GB for one such image.
 _MOST_PIXELS = 100_000_000
 
-_WEB_PAGE = "is a web page, as a download that failed leaves it; download it again"
-_NO_IMAGES = {
-    b"version https://git-lfs": "is a pointer of Git LFS; get the image itself: git lfs pull",
-    b"<!doctype html": _WEB_PAGE,
-    b"<html": _WEB_PAGE,
-}
-"""Beginnings of files that stand in the place of an image, in small letters."""
-
 
 def _fault_of_bytes(data: bytes) -> str | None:
     if not data:
@@ -153,8 +145,9 @@ def _fault_of_bytes(data: bytes) -> str | None:
         return _png_fault(data)
     if data.startswith(_JPEG_START):
         return None if _JPEG_END in data[-_JPEG_TAIL:] else "is truncated (no end marker)"
-    start = data[:64].lstrip().lower()
-    return next((fault for begin, fault in _NO_IMAGES.items() if start.startswith(begin)), None)
+    if data.startswith(b"version https://git-lfs"):
+        return "is a pointer of Git LFS; get the image itself: git lfs pull"
+    return None
 
 
 def _png_fault(data: bytes) -> str | None:

@@ -114,8 +114,6 @@ def _fitting_files(given: Path) -> tuple[str, ...]:
     fitting = tuple(kind for kind, layout in LAYOUTS.items() if _all_end(files, layout))
     if fitting:
         return fitting
-    if remedy := _REMEDIES.get(files[0].suffix.lower()):
-        raise DatasetError(f"{given} is not read: {remedy}")
     known = [f"{kind.name}: {', '.join(kind.endings)}" for kind in LAYOUTS.values() if kind.endings]
     raise DatasetError(
         f"{given} is neither a folder nor an experiment's .yaml nor a file of a known kind "
@@ -127,24 +125,6 @@ def _all_end(files: list[Path], layout: Layout) -> bool:
     if layout.last and len(files) < 2:
         return False
     return all(file.is_file() and file.suffix.lower() in layout.endings for file in files)
-
-
-_REMEDIES = {
-    **dict.fromkeys(
-        (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar", ".bz2", ".xz"),
-        "unpack it, and give the folder",
-    ),
-    **dict.fromkeys(
-        (".svo", ".svo2"),
-        "only the maker's program can; export it as a film of both views side by side (ZED's SVO "
-        "export), with the calibration SN*.conf by --camera",
-    ),
-    **dict.fromkeys(
-        (".oni", ".klg", ".sens", ".h5", ".hdf5"),
-        "export its images to folders, as rgb/ and depth/, or left/ and right/",
-    ),
-}
-"""What to do with files of recordings that others' programs alone can read."""
 
 
 def _unknown(folder: Path) -> str:
@@ -168,9 +148,6 @@ def _unknown(folder: Path) -> str:
             "files (of a mirror or panoramas: fgslam teach; where each shows both views side by "
             "side, cut them into left/ and right/, or make a film of them, which is read as it is)"
         )
-    for path in shown_in(folder):
-        if path.is_file() and (remedy := _REMEDIES.get(path.suffix.lower())):
-            return f"{folder} has none of the known layouts, and {path.name} is not read: {remedy}"
     missing = "; ".join(_with_lacking(folder, layout) for layout in LAYOUTS.values())
     return f"{folder} has none of the known layouts: {missing}; docs/datasets/ describes each"
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -42,9 +42,6 @@ from fgslam.datasets.settings import (
     SyntheticOdometrySettings,
 )
 from fgslam.datasets.times import Table, read_table
-
-if TYPE_CHECKING:
-    from fgslam.worlds.simulated_measurements import SimulatedMeasurements
 
 LOG_FILE, GROUND_TRUTH_FILE = "measurements.npz", "ground_truth.tum"
 _STAMP_STEP_S = 1e-9  # of a trajectory's file
@@ -193,13 +190,6 @@ FRAME_PERIOD_S = 0.1  # of KITTI; the files lack times
 _NOT_RIGID = 1e-3  # the files give six digits
 
 
-@dataclass(frozen=True, slots=True)
-class _Files:
-    tracks: Path
-    calibration: Path
-    poses: Path
-
-
 def open_stereo_tracks(
     settings: StereoTracksSettings, odometry: OdometrySettings
 ) -> MeasurementRecording:
@@ -209,51 +199,43 @@ def open_stereo_tracks(
         DatasetError: it is missing, or malformed.
         CalibrationError: its calibration is.
     """
-    files = _find(settings.file)
-    tracks = read_table(files.tracks, _COLUMNS)
+    path = Path(settings.file)
+    if settings.file in _INSIDE:
+        found = find_spec("gtsam")
+        if found is None or found.origin is None:
+            raise DatasetError(
+                "gtsam is not installed, and the stereo tracks lie inside it; install it or give "
+                "dataset.file a path"
+            )
+        path = Path(found.origin).parent / "Data" / f"{_PREFIX}{_INSIDE[settings.file]}.txt"
+    if not path.is_file():
+        raise DatasetError(
+            f"{path}: no such file; dataset.file is {', '.join(_INSIDE)} or the path of a file "
+            f"{_PREFIX}*.txt"
+        )
+    suffix = path.stem.removeprefix(_PREFIX)
+    calibration = path.with_name(f"VO_calibration{suffix}.txt")
+    if not calibration.exists():
+        calibration = path.with_name("VO_calibration.txt")  # of the `_large` one
+    poses = path.with_name(f"VO_camera_poses{suffix}.txt")
+    tracks = read_table(path, _COLUMNS)
     rows, notes = _usable(tracks)
     numbers = np.unique(tracks.values[rows, 0]).astype(np.int64)
-    numbers = numbers[select_frames(len(numbers), settings, str(files.tracks))]
-    rig = _read_rig(files.calibration, tracks.values[rows])
-    truth = _read_poses(files.poses, rig, numbers)
+    numbers = numbers[select_frames(len(numbers), settings, str(path))]
+    rig = _read_rig(calibration, tracks.values[rows])
+    truth = _read_poses(poses, rig, numbers)
     if truth is not None:
         notes += ("the reference poses are estimates from the same images, not measured truth",)
     increments = make_increments(_frames(tracks.values[rows], numbers, settings))
-    listed = [path for path in (files.tracks, files.calibration, files.poses) if path.exists()]
+    listed = [file for file in (path, calibration, poses) if file.exists()]
     return MeasurementRecording(
-        name=f"stereo tracks {files.tracks.stem.removeprefix(_PREFIX).removeprefix('_')}",
+        name=f"stereo tracks {suffix.removeprefix('_')}",
         identity=files_identity(listed, asdict(settings) | {"frame_period_s": FRAME_PERIOD_S}),
         log=make_log(rig, increments, odometry),
         ground_truth=truth,
         landmark_truth=None,
         notes=notes,
     )
-
-
-def _find(file: str) -> _Files:
-    inside = file in _INSIDE
-    tracks = _inside_gtsam() / f"{_PREFIX}{_INSIDE[file]}.txt" if inside else Path(file)
-    if not tracks.is_file():
-        raise DatasetError(
-            f"{tracks}: no such file; dataset.file is {', '.join(_INSIDE)} or the path of a file "
-            f"{_PREFIX}*.txt"
-        )
-    suffix = tracks.stem.removeprefix(_PREFIX)
-    calibration = tracks.with_name(f"VO_calibration{suffix}.txt")
-    if not calibration.exists():
-        calibration = tracks.with_name("VO_calibration.txt")  # of the `_large` one
-    return _Files(tracks, calibration, tracks.with_name(f"VO_camera_poses{suffix}.txt"))
-
-
-def _inside_gtsam() -> Path:
-    """The wheel's folder of example data, found without loading the library."""
-    found = find_spec("gtsam")
-    if found is None or found.origin is None:
-        raise DatasetError(
-            "gtsam is not installed, and the stereo tracks lie inside it; install it or give "
-            "dataset.file a path"
-        )
-    return Path(found.origin).parent / "Data"
 
 
 def _usable(tracks: Table) -> tuple[IntArray, tuple[str, ...]]:
@@ -364,29 +346,22 @@ def open_simulated_measurements(
     from fgslam.worlds.simulated_measurements import simulate_measurements
 
     simulated = simulate_measurements(settings, seed)
-    path = settings.drive.path.replace("_", " ")
+    notes = ["the measurements are simulated"]
+    if settings.detection.noise_scale != 1.0:
+        notes.append(f"noise drawn at {settings.detection.noise_scale:g} times what is stated")
+    if settings.outlier_fraction:
+        notes.append(f"{simulated.wrong_matches} matched observations are wrong")
+    if (fault := settings.odometry_fault) is not None:
+        notes.append(f"odometry off by a factor of {fault.scale:g} for {fault.frames} frames")
+    if settings.blackout is not None:
+        notes.append(f"cameras blocked for {settings.blackout.frames} frames")
     return MeasurementRecording(
-        name=f"simulated measurements, {path}",
+        name=f"simulated measurements, {settings.drive.path.replace('_', ' ')}",
         identity=content_hash(
             {"settings": asdict(settings), "seed": seed, "simulation": SIMULATION_VERSION}
         ),
         log=make_log(simulated.rig, list(simulated.increments), odometry),
         ground_truth=simulated.truth,
         landmark_truth=LandmarkTruth(simulated.landmark_ids, simulated.landmark_positions),
-        notes=tuple(_simulation_notes(settings, simulated)),
+        notes=tuple(notes),
     )
-
-
-def _simulation_notes(
-    settings: SimulatedMeasurementsSettings, simulated: SimulatedMeasurements
-) -> Iterator[str]:
-    yield "the measurements are simulated"
-    if settings.detection.noise_scale != 1.0:
-        yield f"noise drawn at {settings.detection.noise_scale:g} times what is stated"
-    if settings.outlier_fraction:
-        yield f"{simulated.wrong_matches} matched observations are wrong"
-    if settings.odometry_fault is not None:
-        fault = settings.odometry_fault
-        yield f"odometry off by a factor of {fault.scale:g} for {fault.frames} frames"
-    if settings.blackout is not None:
-        yield f"cameras blocked for {settings.blackout.frames} frames"

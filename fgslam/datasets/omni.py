@@ -8,8 +8,8 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -17,10 +17,17 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
-from fgslam.cameras.omni import OmniCamera
+from fgslam.cameras.omni import (
+    Equirectangular,
+    LensCamera,
+    OCamCamera,
+    OmniCamera,
+    RadialCamera,
+)
 from fgslam.cameras.omni_files import make_camera
+from fgslam.cameras.rings import MirrorCircle, find_mirror_circle
 from fgslam.core.arrays import FloatArray, Image, IntArray
-from fgslam.core.errors import DatasetError, FrameError
+from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import read_text, shown_in
 from fgslam.core.geometry import wrap
 from fgslam.datasets.images import read_colour_image, require_folder
@@ -123,7 +130,7 @@ def open_omni_path(settings: OmniPathSettings) -> OmniRecording:
         camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), root),
         ids=ids_of([path.stem for path in paths]),
         names=tuple(path.name for path in paths),
-        timestamps=times_of(paths, root),
+        timestamps=_times(paths, root),
         load_image=lambda i: read_colour_image(paths[i]),
     )
     return recording.select(chosen)
@@ -190,17 +197,12 @@ def ids_of(names: Sequence[str]) -> IntArray:
     """(n,) last number in each name where all have one and all differ; else 0 to n - 1."""
     numbers = [re.findall(r"\d+", name) for name in names]
     last = [int(n[-1]) if n and len(n[-1]) < 18 else -1 for n in numbers]
-    if -1 in last or max(Counter(last).values()) > 1:
-        return np.arange(len(names), dtype=np.int64)
-    return np.array(last, dtype=np.int64)
+    known = -1 not in last and len(set(last)) == len(last)
+    return np.array(last if known else range(len(names)), np.int64)
 
 
-def times_of(images: Sequence[Path], folder: Path) -> FloatArray:
-    """Time stamps (n,) of a folder's images, by a list in the folder or their names; NaN without.
-
-    Raises:
-        DatasetError: the list is malformed, or lacks an image.
-    """
+def _times(images: Sequence[Path], folder: Path) -> FloatArray:
+    """Stamps (n,) of a folder's images, by a list in it or their names; NaN without."""
     written = written_stamps(images, [folder])
     return np.full(len(images), np.nan) if written is None else written[0]
 
@@ -269,7 +271,7 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
         camera=make_camera(settings.camera, reduced, root),
         ids=ids_of([path.stem for path in paths]),
         names=tuple(path.name for path in paths),
-        timestamps=times_of(paths, root),
+        timestamps=_times(paths, root),
         load_image=load,
     )
     if places:
@@ -289,41 +291,37 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
 
 def _read_places(path: Path) -> list[_Place]:
     reader = csv.DictReader(read_text(path).splitlines(), strict=True)
+    places: list[_Place] = []
+    seen: dict[int | str, int] = {}
     try:
-        absent = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
-        if absent:
+        if absent := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
             raise DatasetError(
                 f"{path}, line 1: no column {', '.join(absent)}; the header must name "
                 f"{', '.join(_COLUMNS)}"
             )
-        places = [_place(f"{path}, line {reader.line_num}", reader.line_num, row) for row in reader]
+        for row in reader:
+            line, where = reader.line_num, f"{path}, line {reader.line_num}"
+            words = {name: (row.get(name) or "").strip() for name in (*_COLUMNS, "room")}
+            if empty := next((name for name in _COLUMNS if not words[name]), None):
+                raise DatasetError(f"{where}: {empty} is empty; complete the row")
+            x, y, heading = (finite_number(words[name], f"{where}: {name}") for name in _NUMBERS)
+            if not words["id"].isdecimal():
+                raise DatasetError(f"{where}: id is {words['id']!r}, not a whole number from 0")
+            angle = float(wrap(np.array(math.radians(heading))))
+            number, file = int(words["id"]), words["file"]
+            places.append(_Place(line, number, file, (x, y, angle), words["room"]))
+            for key, what in ((number, "id"), (file, "file")):
+                if seen.setdefault(key, line) != line:
+                    raise DatasetError(
+                        f"{where}: {what} {key} is in line {seen[key]} already; remove one of the "
+                        "rows"
+                    )
     except csv.Error as cause:
-        raise DatasetError(
-            f"{path}, line {reader.reader.line_num}: {cause}; correct the line"
-        ) from cause
+        where = f"{path}, line {reader.reader.line_num}"
+        raise DatasetError(f"{where}: {cause}; correct the line") from cause
     if not places:
         raise DatasetError(f"{path} lists no panorama; add rows, or remove the file")
-    seen: dict[int | str, int] = {}
-    for place in places:
-        for key, what in ((place.id, "id"), (place.file, "file")):
-            if key in seen:
-                raise DatasetError(
-                    f"{path}, line {place.line}: {what} {key} is in line {seen[key]} already; "
-                    "remove one of the rows"
-                )
-            seen[key] = place.line
     return places
-
-
-def _place(where: str, line: int, row: dict[str, str | None]) -> _Place:
-    words = {name: (row.get(name) or "").strip() for name in (*_COLUMNS, "room")}
-    if empty := next((name for name in _COLUMNS if not words[name]), None):
-        raise DatasetError(f"{where}: {empty} is empty; complete the row")
-    x, y, heading = (finite_number(words[name], f"{where}: {name}") for name in _NUMBERS)
-    if not words["id"].isdecimal():
-        raise DatasetError(f"{where}: id is {words['id']!r}, not a whole number from 0")
-    angle = float(wrap(np.array(math.radians(heading))))
-    return _Place(line, int(words["id"]), words["file"], (x, y, angle), words["room"])
 
 
 def _listed_picture(root: Path, place: _Place) -> Path:
@@ -382,3 +380,133 @@ def _averaging(before: int, after: int, periodic: bool) -> sparse.csr_array:
     new = np.repeat(np.arange(after), old.shape[1])
     entries = (weights.ravel().astype(np.float32), (new, old.ravel()))
     return sparse.csr_array(entries, shape=(after, before))
+
+
+# --------------------------------------------------------------------------------------------
+# Whether the pictures can be of the camera that is stated for them
+
+
+_CHECKED = 3  # the rim may be as dark as its holder in one of them
+_CLEARLY_OFF = 0.025
+"""Of the radius: a calibrated mirror was seen off by 0.015, its rim and its axis not being one
+(docs/datasets/omnidirectional.md); this is an error of 1.4 degrees at the rim, more within."""
+_LEAST_OFF_PX = 3.0
+_UNEVEN = 1.25  # columns over rows a degree, or the reverse, that no one means
+_BLACK = 16.0  # mean of red, green and blue; a film's black is up to that
+_DARK_SIDES = 0.01  # of the width: so many black columns are no dark corner
+_STEEP = 0.01  # of the steps between columns are larger than any around a real panorama's end
+
+
+def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ...]:
+    """What the pictures show of the stated mirror or panoramas, and what a file does not state.
+
+    The latter, and a mirror that is where it should be, only of a camera that is stated here, not
+    of one that a route brings along.
+    """
+    camera = recording.camera
+    if isinstance(camera, Equirectangular):
+        return (*_panorama_notes(camera), *_side_notes(recording))
+    if isinstance(camera, LensCamera):
+        middle, other = ("up", "down") if camera.up else ("down", "up")
+        turn = "clockwise" if camera.clockwise else "counter-clockwise"
+        assumed = (
+            f"the picture's middle is taken to look {middle}, bearings to grow {turn} in it; "
+            f"dataset.camera.middle={other} and dataset.camera.clockwise say otherwise",
+        )
+        hole, rim = camera.ring
+        # A mirror reflects its camera in the middle; a lens has no rim that must be in the picture.
+        mirror = _mirror_notes(recording, camera.centre, rim, stated) if hole > 0.0 else ()
+        return (*(assumed if stated else ()), *mirror)
+    if isinstance(camera, RadialCamera):
+        assumed = (
+            "the picture's middle is taken to look down, as of a mirror above the camera; of a "
+            "fisheye that points up dataset.camera.kind=lens and dataset.camera.middle=up say so",
+        )
+        mirror = _mirror_notes(recording, camera.frame.centre, camera.outer_radius, stated)
+        return (*(assumed if stated and isinstance(camera, OCamCamera) else ()), *mirror)
+    return ()
+
+
+def _panorama_notes(camera: Equirectangular) -> tuple[str, ...]:
+    """A note where columns and rows are not equally fine: a cropped panorama, or none at all."""
+    view = np.rad2deg(camera.top_elevation - camera.bottom_elevation)
+    across, down = (camera.width - 1) / 360.0, (camera.height - 1) / view
+    if max(across, down) <= _UNEVEN * min(across, down):
+        return ()
+    return (
+        f"pictures of {camera.width}x{camera.height} pixels over 360 x {view:g} degrees have "
+        f"{across:.1f} columns but {down:.1f} rows a degree: are they whole panoramas? Else give "
+        "dataset.camera.top_elevation_deg and bottom_elevation_deg",
+    )
+
+
+def _side_notes(recording: OmniRecording) -> tuple[str, ...]:
+    """A note where the pictures do not go on from their last column to the first one.
+
+    In whole panoramas these are neighbours; here the step between them is larger than nearly all
+    others, or what is next to the picture proper is black.
+    """
+    ends = []
+    for grey in (image.mean(axis=2) for image in _first_pictures(recording)):
+        lit = np.flatnonzero(grey.max(axis=0) > _BLACK)
+        steps = np.abs(np.diff(grey)).mean(axis=0)
+        # By how many grey levels the step around exceeds nearly all steps between two columns.
+        around = float(np.abs(grey[:, -1] - grey[:, 0]).mean())
+        unusual = around - float(np.quantile(steps, 1.0 - _STEEP))
+        black = grey.shape[1] - int(lit[-1] - lit[0] + 1) if len(lit) else 0
+        ends.append((black, unusual if len(lit) else 0.0))
+    if not ends:
+        return ()
+    black, step = np.median(ends, axis=0)
+    if black > _DARK_SIDES * recording.camera.width:
+        what = f"{black:.0f} columns of the pictures are black at the sides"
+    elif step > 0.0:
+        what = "the right and left ends of the pictures do not meet"
+    else:
+        return ()
+    return (
+        f"{recording.name}: {what}: they are no panoramas of all 360 degrees from end to end, so "
+        "directions are wrong; cut off what is next to them, or give the camera that took them",
+    )
+
+
+def _first_pictures(recording: OmniRecording) -> Iterator[Image]:
+    """As many as a check needs, without damaged ones."""
+    for k in range(min(_CHECKED, len(recording))):
+        with suppress(FrameError):
+            yield recording.image(k)
+
+
+def _mirror_notes(
+    recording: OmniRecording, centre: tuple[float, float], radius: float, always: bool
+) -> tuple[str, ...]:
+    """A note on where the rim is in the first pictures; of one in its place only where asked."""
+
+    def circle(image: Image, near: tuple[tuple[float, float], float] | None) -> MirrorCircle | None:
+        with suppress(CalibrationError):
+            return find_mirror_circle(image, np.random.default_rng(0), near)
+        return None
+
+    circles = []
+    for image in _first_pictures(recording):
+        # The rim near where it should be, else around any circle: its holder's, say, is concentric.
+        found = circle(image, (centre, radius))
+        if found is None and (around := circle(image, None)) is not None:
+            found = circle(image, (around.centre, radius))
+        if found is not None:
+            circles.append(found)
+    if not circles:
+        return (
+            f"the mirror's rim is not found in {recording.names[0]}, so its centre is unchecked",
+        )
+    column, row = np.median([c.centre for c in circles], axis=0)
+    away = float(np.hypot(column - centre[0], row - centre[1]))
+    if away <= max(_CLEARLY_OFF * radius, _LEAST_OFF_PX):
+        in_place = f"the mirror's rim is found, {away:.1f} px from where it is stated"
+        return (in_place,) if always else ()
+    return (
+        f"the mirror lies {away:.1f} px off its stated centre ({centre[0]:.1f}, {centre[1]:.1f}): "
+        f"its rim's is ({column:.1f}, {row:.1f}); bearings are wrong by up to "
+        f"{np.degrees(away / radius):.1f} degrees at the rim and more within: correct "
+        "dataset.camera or the calibration",
+    )

@@ -158,6 +158,14 @@ def open_omni(settings: OmniDatasetSettings) -> OmniRecording:
     return omni.open_omni_video(settings)
 
 
+def open_checked(settings: OmniDatasetSettings) -> OmniRecording:
+    """The same, with a note where its pictures cannot be of the stated camera."""
+    from fgslam.datasets.omni import camera_notes
+
+    recording = open_omni(settings)
+    return replace(recording, notes=recording.notes + camera_notes(recording))
+
+
 def open_simulated_homing(
     settings: SimulatedBearingsSettings, outliers: float, rng: np.random.Generator
 ) -> SimulatedHoming:

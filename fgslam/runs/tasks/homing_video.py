@@ -16,7 +16,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray, StateArrays
 from fgslam.core.store import restore, state_of
 from fgslam.datasets.omni import OmniRecording
-from fgslam.datasets.omni_checks import open_checked
+from fgslam.datasets.opening import open_checked
 from fgslam.evaluation.statistics import JsonValue, UpdateTime
 from fgslam.frontend.homing.tracking import ReplenishedTracker
 from fgslam.report.content import Picture, write_csv

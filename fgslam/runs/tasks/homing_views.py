@@ -31,8 +31,7 @@ from fgslam.core.bearings import (
 from fgslam.core.errors import ConfigError, OutputError, StoredMapError
 from fgslam.core.geometry import wrap
 from fgslam.datasets.omni import OmniRecording
-from fgslam.datasets.omni_checks import open_checked
-from fgslam.datasets.opening import open_omni
+from fgslam.datasets.opening import open_checked, open_omni
 from fgslam.datasets.settings import OmniDatasetSettings
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.frontend.features.omni import OmniFeatureExtractor, empty_segments

@@ -23,9 +23,8 @@ from fgslam.core.bearings import OmniFeatures
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError, FrameError
 from fgslam.core.geometry import wrap
 from fgslam.core.types import Trajectory, read_covariances
-from fgslam.datasets.omni import OmniRecording
-from fgslam.datasets.omni_checks import camera_notes, open_checked
-from fgslam.datasets.opening import open_omni
+from fgslam.datasets.omni import OmniRecording, camera_notes
+from fgslam.datasets.opening import open_checked, open_omni
 from fgslam.datasets.times import covered, interpolate_poses, nearest_rows
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.homing.api import PathFollower

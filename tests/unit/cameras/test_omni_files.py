@@ -13,7 +13,7 @@ from PIL import Image as PictureFile
 from fgslam.cameras.omni import HyperbolicMirror, LensCamera, MirrorFrame, OmniCamera, angles_of
 from fgslam.cameras.omni_files import camera_of, camera_values, load_camera
 from fgslam.core.errors import CalibrationError
-from fgslam.datasets.omni_checks import open_checked
+from fgslam.datasets.opening import open_checked
 from fgslam.datasets.settings import OmniPathSettings
 
 MEI = """%YAML:1.0

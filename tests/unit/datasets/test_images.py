@@ -109,8 +109,6 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12
     ("data", "words"),
     [
         (LFS, "is a pointer of Git LFS; get the image itself: git lfs pull"),
-        (b"\n<!DOCTYPE html>\n<html>404", "is a web page, as a download that failed leaves it"),
-        (b"<HTML><body>gone", "is a web page, as a download that failed leaves it"),
         (b"", "is empty; copy the file again from its source"),
     ],
 )

@@ -156,17 +156,6 @@ def test_colour_and_depth_in_one_folder(tmp_path: Path, names: tuple[str, str]) 
         recognise_layout(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [("walk.zip", "unpack it"), ("walk.svo2", "as a film of both views"), ("a.klg", "to folders")],
-)
-def test_files_of_others_say_what_to_do(tmp_path: Path, name: str, words: str) -> None:
-    (tmp_path / name).write_bytes(b"PK")
-    for given in (tmp_path / name, tmp_path):
-        with pytest.raises(DatasetError, match=f"{name} is not read: .*{words}"):
-            recognise_layout(given)
-
-
 def test_kitti_360(tmp_path: Path) -> None:
     drive = tmp_path / "data_2d_raw" / "2013_05_28_drive_0000_sync"
     for number, code in (("00", 60), ("01", 10)):

@@ -19,8 +19,8 @@ from fgslam.cameras.settings import (
     OCamCalibSettings,
 )
 from fgslam.core.arrays import Image
-from fgslam.datasets.omni_checks import camera_notes, open_checked
-from fgslam.datasets.opening import open_omni
+from fgslam.datasets.omni import camera_notes
+from fgslam.datasets.opening import open_checked, open_omni
 from fgslam.datasets.settings import OmniPathSettings, PanoramasSettings
 
 SIZE = (320, 240)
