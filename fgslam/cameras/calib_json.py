@@ -243,9 +243,7 @@ def correction_values(source: str, values: Mapping[str, float], rig: CameraRig) 
             f"{source}: {CORRECTIONS} has {unknown[0]!r}, which is no term; known: "
             f"{', '.join(names)}"
         )
-    later = [name for name in names if name.startswith("all.") or name.endswith("_outer")]
-    every = {**dict.fromkeys(later, 0.0), **values}  # older files have none of these
-    return np.array([number(Path(source), every, name) for name in names])
+    return np.array([number(Path(source), values, name) for name in names])
 
 
 def write_corrected(

@@ -20,7 +20,7 @@ ocam       a0 a1 a2 ...                 Scaramuzza, Martinelli and Siegwart (200
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -454,27 +454,7 @@ def checked_camera(camera: RawCamera) -> RawCamera:
     Raises:
         CalibrationError: a number is impossible, the message names it.
     """
-    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    known = camera.width == 0 or min(camera.size) > 0
-    if not known or not min(fx, fy) > 0.0:
-        raise CalibrationError(
-            f"{camera.name}: size {camera.width}x{camera.height} and focal lengths {fx:g}, {fy:g} "
-            "must be positive; correct the file"
-        )
-    if len(camera.distortion) not in camera.lens.sizes:
-        raise CalibrationError(
-            f"{camera.name}: {camera.model} takes {_either(camera.lens.sizes)} parameters, not "
-            f"{len(camera.distortion)}; correct the file"
-        )
-    if not is_rigid(camera.bTc):
-        raise CalibrationError(f"{camera.name}: its pose is not a rigid motion; correct the file")
-    if np.abs(camera.bTc[:3, 3]).max() > _FARTHEST_M:
-        raise CalibrationError(
-            f"{camera.name}: it is {np.abs(camera.bTc[:3, 3]).max():g} m from its body or the "
-            "other camera; correct the file"
-        )
-    fault = _matrix_fault(camera.matrix) or _size_fault(camera) or _view_fault(camera)
-    if fault:
+    for fault in _camera_faults(camera):
         raise CalibrationError(f"{camera.name}: {fault}; correct the file")
     return camera
 
@@ -485,74 +465,61 @@ def checked_view(view: StatedView, source: str) -> StatedView:
     Raises:
         CalibrationError: its matrix is none of a camera's, the message names ``source``.
     """
-    fault = _matrix_fault(view.matrix)
-    if fault:
+    for fault in _matrix_faults(view.matrix):
         raise CalibrationError(f"{source}: of the rectified images: {fault}; correct the file")
     return view
 
 
-def _matrix_fault(matrix: FloatArray) -> str | None:
-    """What no camera's intrinsics are, in words; None where they may be one's."""
+def _matrix_faults(matrix: FloatArray) -> Iterator[str]:
+    """What no camera's intrinsics are, in words."""
     (fx, skew, _), (other, fy, _), last = matrix
+    rows = ", ".join(" ".join(f"{value:g}" for value in row) for row in matrix)
     if not min(fx, fy) > 0.0:
-        return f"focal lengths {fx:g}, {fy:g} must be positive"
+        yield f"focal lengths {fx:g}, {fy:g} must be positive"
     if np.abs(last - (0.0, 0.0, 1.0)).max() > _ZERO:
-        return f"its matrix must be fx s cx, 0 fy cy, 0 0 1 by rows; it is {_rows(matrix)}"
+        yield f"its matrix must be fx s cx, 0 fy cy, 0 0 1 by rows; it is {rows}"
     if not max(fx / fy, fy / fx) < _MOST_OBLONG:
-        return f"focal lengths {fx:g} and {fy:g} are no camera's, pixels are nearly square"
+        yield f"focal lengths {fx:g} and {fy:g} are no camera's, pixels are nearly square"
     if not (abs(skew) < fx and abs(other) < fy):  # OCamCalib has both
-        return f"its matrix is no camera's, pixels have nearly right angles: {_rows(matrix)}"
-    return None
+        yield f"its matrix is no camera's, pixels have nearly right angles: {rows}"
 
 
-def _size_fault(camera: RawCamera) -> str | None:
+def _camera_faults(camera: RawCamera) -> Iterator[str]:
+    """What no camera is, in words; of one whose size is not known less is said."""
+    sizes, count = camera.lens.sizes, len(camera.distortion)
+    size, centre, place = np.array(camera.size), camera.matrix[:2, 2], camera.bTc[:3, 3]
+    shown = f"{camera.width}x{camera.height} pixels"
+    if camera.width and min(camera.size) <= 0:
+        yield f"size {camera.width}x{camera.height} must be positive"
+    if count not in sizes:
+        some = " or ".join(map(str, sizes)) if len(sizes) < 6 else f"{sizes[0]} to {sizes[-1]}"
+        yield f"{camera.model} takes {some} parameters, not {count}"
+    if not is_rigid(camera.bTc):
+        yield "its pose is not a rigid motion"
+    if np.abs(place).max() > _FARTHEST_M:
+        yield f"it is {np.abs(place).max():g} m from its body or the other camera"
+    yield from _matrix_faults(camera.matrix)
     if max(camera.size) > _LARGEST_SIDE:
-        return f"no image is {camera.width}x{camera.height} pixels large"
-    size, centre = np.array(camera.size), camera.matrix[:2, 2]
-    # Cropped images may have it outside, but hardly by more than their own size.
-    if camera.width and not ((centre >= -size) & (centre <= 2 * size)).all():
-        column, row = centre
-        return (
-            f"its principal point ({column:g}, {row:g}) is far from the image of "
-            f"{camera.width}x{camera.height} pixels"
-        )
-    return None
-
-
-def _view_fault(camera: RawCamera) -> str | None:
-    """What such images cannot show, in words; None where they may, or the size is not known."""
+        yield f"no image is {shown} large"
     if camera.width == 0:
-        return None
-    half = np.array(camera.size) / 2.0
+        return
+    # Cropped images may have it outside, but hardly by more than their own size.
+    if not ((centre >= -size) & (centre <= 2 * size)).all():
+        yield f"its principal point ({centre[0]:g}, {centre[1]:g}) is far from the image of {shown}"
     steps = np.linspace(-1.0, 1.0, _PLACES)
-    offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * half
-    centre = camera.matrix[:2, 2]
+    offset = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) * (size / 2.0)
     with np.errstate(all="ignore"):  # what overflows has no ray
         rays = camera.unproject(np.vstack([centre, centre + offset]))
         straight = np.hypot(*(offset / np.diag(camera.matrix)[:2]).T)
     angle = np.arctan2(np.linalg.norm(np.cross(rays[0], rays[1:]), axis=1), rays[1:] @ rays[0])
     seen = np.isfinite(angle)
     if not seen.any():
-        return f"its lens model has no ray for any of {camera.width}x{camera.height} pixels"
-    if np.median(angle[seen]) < _NARROWEST or (
+        yield f"its lens model has no ray for any of {shown}"
+    elif np.median(angle[seen]) < _NARROWEST or (
         camera.model != "ocam" and np.median((angle / np.arctan(straight))[seen]) < _LEAST_SHARE
     ):
-        shown = np.rad2deg(2.0 * angle[seen].max())
-        return (
-            f"focal lengths and lens model show {shown:.2g} degrees in {camera.width}x"
-            f"{camera.height} pixels"
-        )
-    return None
-
-
-def _rows(matrix: FloatArray) -> str:
-    return ", ".join(" ".join(f"{value:g}" for value in row) for row in matrix)
-
-
-def _either(sizes: tuple[int, ...]) -> str:
-    if len(sizes) > 5:
-        return f"{sizes[0]} to {sizes[-1]}"
-    return " or ".join(map(str, sizes))
+        degrees = np.rad2deg(2.0 * angle[seen].max())
+        yield f"focal lengths and lens model show {degrees:.2g} degrees in {shown}"
 
 
 # --------------------------------------------------------------------------------------------

@@ -35,9 +35,9 @@ from fgslam.cameras.settings import (
     OCamCalibSettings,
     RadialPolynomialSettings,
 )
-from fgslam.cameras.trees import read_tree
+from fgslam.cameras.trees import flat_numbers, read_tree
 from fgslam.core.errors import CalibrationError, shortened
-from fgslam.core.files import as_path, read_lines
+from fgslam.core.files import as_path, read_lines, read_text
 from fgslam.core.settings import make_settings
 from fgslam.core.yaml_text import read_yaml
 
@@ -132,8 +132,14 @@ def make_camera(
             return Cylinder(*size, float(tangents[0]), float(tangents[1]))
         case HyperbolicMirrorSettings():
             return _hyperbolic(settings, _stated_size("mirror", settings.size, image_size))
-        case OCamCalibSettings() | LensSettings():
-            return _calibrated(settings, _find(settings.file, folder), image_size)
+        case OCamCalibSettings():
+            ahead, ring = math.radians(settings.ahead_deg), settings.ring_px
+            found = read_ocamcalib(_find(settings.file, folder))
+            return found.camera(image_size, ring, ahead, settings.clockwise)
+        case LensSettings():
+            ahead, up = math.radians(settings.ahead_deg), settings.middle == "up"
+            raw = _only_camera(_find(settings.file, folder), image_size)
+            return LensCamera.of(raw, settings.ring_px, up, ahead, settings.clockwise)
         case RadialPolynomialSettings():
             size = _stated_size(settings.kind, settings.size, image_size)
             frame = _frame(settings, size, settings.centre)
@@ -157,7 +163,12 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
         tree = read_tree(path)
         if tree is not None and "kind" not in tree and (is_camodocal(tree) or is_camchain(tree)):
             return LensSettings(file=path.name), path.parent
-        _refuse_opencv(path)
+        if read_text(path, CalibrationError).startswith("%YAML:"):
+            raise CalibrationError(
+                f"{path} is written by OpenCV, of no omnidirectional camera that is read; give "
+                "OCamCalib's result, camodocal's of one camera (MEI), or a YAML file of keys with "
+                f"a kind, one of {', '.join(_KINDS)}"
+            )
         return _settings_of(read_yaml(path, CalibrationError), str(path)), path.parent
     if path.suffix.lower() == ".json":
         raise CalibrationError(
@@ -168,16 +179,6 @@ def _read(source: str | Path) -> tuple[OmniCameraKind, Path | None]:
     if any(line.startswith("INPUT_WIDTH") for _, line in read_lines(path, CalibrationError)):
         return BloggieSettings(file=path.name), path.parent
     return OCamCalibSettings(file=path.name), path.parent
-
-
-def _refuse_opencv(path: Path) -> None:
-    lines = read_lines(path, CalibrationError)
-    if lines and lines[0][1].startswith("%YAML:"):
-        raise CalibrationError(
-            f"{path} is written by OpenCV, of no omnidirectional camera that is read; give "
-            "OCamCalib's result, camodocal's of one camera (MEI), or a YAML file of keys with a "
-            f"kind, one of {', '.join(_KINDS)}"
-        )
 
 
 def _settings_of(source: object, where: str = "camera") -> OmniCameraKind:
@@ -230,16 +231,6 @@ def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMir
     inner = settings.inner_radius_px
     inner = focal * scales[lowest] if inner is None else inner
     return HyperbolicMirror(frame, inner, outer, xi=settings.xi, focal_px=focal)
-
-
-def _calibrated(
-    settings: OCamCalibSettings | LensSettings, path: Path, size: Size | None
-) -> OmniCamera:
-    ahead, clockwise = math.radians(settings.ahead_deg), settings.clockwise
-    if isinstance(settings, OCamCalibSettings):
-        return read_ocamcalib(path).camera(size, settings.ring_px, ahead, clockwise)
-    raw = _only_camera(path, size)
-    return LensCamera.of(raw, settings.ring_px, settings.middle == "up", ahead, clockwise)
 
 
 def _only_camera(path: Path, size: Size | None) -> RawCamera:
@@ -334,14 +325,11 @@ def _bloggie_values(path: Path) -> dict[str, float]:
         key, _, word = (part.strip() for part in text.partition(","))
         if key not in _BLOGGIE_KEYS:
             continue
-        try:
-            values[key] = float(word)
-        except ValueError:
-            values[key] = math.nan
-        if not math.isfinite(values[key]):
+        if (found := flat_numbers(word)) is None:
             raise CalibrationError(
                 f"{path}, line {line}: {key} is {word!r}, not a finite number; correct it"
             )
+        values[key] = float(found[0])
     absent = [key for key in _BLOGGIE_KEYS if key not in values]
     if absent:
         raise CalibrationError(f"{path} lacks {', '.join(absent)}; add `{absent[0]}, value`")
@@ -354,15 +342,8 @@ def _bloggie_values(path: Path) -> dict[str, float]:
 
 _MODELS: dict[str, Any] = {
     model.__name__: model
-    for model in (
-        Equirectangular,
-        Cylinder,
-        HyperbolicMirror,
-        RadialPolynomial,
-        OCamCamera,
-        LensCamera,
-    )
-}
+    for model in (Equirectangular, Cylinder, HyperbolicMirror, RadialPolynomial, OCamCamera)
+} | {"LensCamera": LensCamera}
 
 
 def camera_values(camera: OmniCamera) -> dict[str, Any]:

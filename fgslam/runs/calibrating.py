@@ -32,7 +32,8 @@ from fgslam.cameras.calibrate import (
     held_out,
     held_out_alone,
 )
-from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
+from fgslam.cameras.formats import pose_difference
+from fgslam.cameras.lenses import Calibration, StatedView
 from fgslam.cameras.omni import MirrorFrame
 from fgslam.cameras.rig import (
     StereoRig,
@@ -44,6 +45,7 @@ from fgslam.cameras.rig import (
     rig_of,
 )
 from fgslam.cameras.rings import calibrate_from_rings, find_mirror_circle
+from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
@@ -111,15 +113,12 @@ def calibrate_cameras(
         raise ConfigError(f"{out}: a calibration is written as .json; give such a name")
     _require_model(model, RIG_MODELS)
     files, notes = _files(folders)
-    bits, held = bits_of([moment[0] for moment in files])
-    views, size = _views(files, bits, partial(find_corners, board), progress)
-    _require_found(views, files, bits, board)
+    views, size, held = _views(files, board, partial(find_corners, board), progress)
     found = calibrate(board, views, size, model)
     checked = [held_out(board, views, size, model, k) for k in range(1, len(found.cameras))]
     calibration = Calibration(str(out), "fgslam calibrate", found.cameras, sided=True)
     remarks = rig_of(calibration).remarks
-    write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
-    others = _write_beside(out, files, views, found)
+    others = _write(calibration, out, files, views, found)
     fit = _fit_lines(files, views, found)
     lines = [*notes, *held, *fit, *_rig_verdict(board, found, checked), *remarks]
     return [*lines, f"calibration {out}, with {', '.join(map(str, others))}"]
@@ -148,21 +147,26 @@ def calibrate_wide_camera(
         raise ConfigError(f"mount {mount!r} is not known; use {', '.join(MOUNTS)}")
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{out}: a camera file is written as .yaml; give such a name")
-    files = _files_of_one(folder)
-    bits, held = bits_of([moment[0] for moment in files])
+    if not folder.is_dir():
+        what = "is a file" if folder.is_file() else "no such folder"
+        raise DatasetError(
+            f"{folder}: {what}; give the folder of the board's images (a mirror is calibrated from "
+            "one image of rings by fgslam calibrate rings)"
+        )
+    files = [(path,) for path in images_in(folder)]
+    if not files:
+        raise DatasetError(f"{folder}: holds no images; give the folder of the board's images")
     finder = partial(find_corners_of_wide, board, mirrored=mount == "mirror")
-    views, size = _views(files, bits, finder, progress)
-    _require_found(views, files, bits, board)
+    views, size, held = _views(files, board, finder, progress)
     found = calibrate(board, views, size, model)
     checked = held_out_alone(board, views, size, model)
     # Not rig.json of rig.yaml, which may be the calibration of a rig, with a picture and tables.
     numbers = numbers_beside(out)
     calibration = Calibration(str(numbers), "fgslam calibrate", found.cameras)
-    write_text(numbers, json.dumps(raw_values(calibration), indent=2) + "\n")
+    others = numbers, *_write(calibration, numbers, files, views, found)
     middle, clockwise, words = MOUNTS[mount]
     keys = {"kind": "lens", "file": numbers.name, "middle": middle, "clockwise": clockwise}
     write_text(out, yaml.safe_dump(keys, sort_keys=False))
-    others = (numbers, *_write_beside(numbers, files, views, found))
     return [
         *held,
         *_fit_lines(files, views, found),
@@ -170,21 +174,6 @@ def calibrate_wide_camera(
         f"mount       {mount}: {words}; if not, give --mount",
         f"calibration {out}, with {', '.join(map(str, others))}",
     ]
-
-
-def _files_of_one(folder: Path) -> list[tuple[Path, ...]]:
-    """The images of one camera, each a moment of its own."""
-    if folder.is_file():
-        raise DatasetError(
-            f"{folder}: is a file; give the folder of the board's images (a mirror is calibrated "
-            "from one image of rings by fgslam calibrate rings)"
-        )
-    if not folder.is_dir():
-        raise DatasetError(f"{folder}: no such folder; give the folder of the board's images")
-    found = images_in(folder)
-    if not found:
-        raise DatasetError(f"{folder}: holds no images; give the folder of the board's images")
-    return [(path,) for path in found]
 
 
 def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, ...]]:
@@ -214,10 +203,17 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
 
 
 def _views(
-    files: Files, bits: int, finder: Finder, progress: Progress
-) -> tuple[list[View], tuple[int, int]]:
-    """What the cameras see of the board at each moment, and the size of all images."""
-    views, sizes = [], set()
+    files: Files, board: Board, finder: Finder, progress: Progress
+) -> tuple[list[View], tuple[int, int], tuple[str, ...]]:
+    """What the cameras see of the board at each moment, the size of all images, and remarks.
+
+    Raises:
+        CalibrationError: no image shows the board.
+        DatasetError: the images differ in size.
+    """
+    bits, held = bits_of([moment[0] for moment in files])
+    views: list[View] = []
+    sizes = set()
     for done, moment in enumerate(files):
         progress("board", done, len(files))
         images = [read_grey_image(path, bits) for path in moment]
@@ -229,14 +225,8 @@ def _views(
             )
         views.append(tuple(finder(image) for image in images))
     progress("board", len(files), len(files))
-    return views, sizes.pop()
-
-
-def _require_found(views: Sequence[View], files: Files, bits: int, board: Board) -> None:
-    """Raises CalibrationError where no image shows the board."""
     if any(corners for view in views for corners in view):
-        return
-    size = f"{board.columns}x{board.rows}"
+        return views, sizes.pop(), held
     others = sizes_that_fit(board, read_grey_image(files[0][0], bits))
     meant = f"; {files[0][0].name} shows {', '.join(others)}" if others else ""
     counted = {
@@ -245,8 +235,8 @@ def _require_found(views: Sequence[View], files: Files, bits: int, board: Board)
         "aprilgrid": "tags are counted, of the family 36h11",
     }
     raise CalibrationError(
-        f"no image of {len(files)} moments shows a {board.kind} of {size}{meant}; correct --board "
-        f"({counted[board.kind]})"
+        f"no image of {len(files)} moments shows a {board.kind} of {board.columns}x{board.rows}"
+        f"{meant}; correct --board ({counted[board.kind]})"
     )
 
 
@@ -357,20 +347,28 @@ def _verdict(faults: Sequence[str], checked: bool) -> str:
     return "verdict     good for mapping"
 
 
-def _write_beside(
-    out: Path, files: Files, views: Sequence[View], found: BoardCalibration
+def _write(
+    calibration: Calibration,
+    out: Path,
+    files: Files,
+    views: Sequence[View],
+    found: BoardCalibration,
 ) -> tuple[Path, Path, Path]:
-    """Writes a picture of where corners were used, a table of images, one of parameters; paths.
+    """Writes a calibration, a picture of where corners were used, tables of images and parameters.
 
     Of each image: its camera, the corners found, those left out, and the residual of the others.
     Of each parameter: its value and standard deviation. Turns and shifts take coordinates of the
     first camera to a camera's own, radians and metres.
+
+    Returns:
+        Picture and tables.
 
     Raises:
         OutputError: a file cannot be written.
     """
     from fgslam.report.pictures import draw_corners
 
+    write_text(out, json.dumps(raw_values(calibration), indent=2) + "\n")
     picture = out.with_suffix(".png")
     images = out.with_name(f"{out.stem}_images.csv")
     parameters = out.with_name(f"{out.stem}_parameters.csv")
@@ -382,9 +380,8 @@ def _write_beside(
     draw_corners(picture, found.cameras[0].size, corners, names)
     of_images = []
     for v, view in enumerate(views):
-        for c, seen in enumerate(view):
-            count, kept = 0 if seen is None else len(seen), found.kept[v][c]
-            used = 0 if kept is None else len(kept)
+        for c, (seen, kept) in enumerate(zip(view, found.kept[v], strict=True)):
+            count, used = (0 if one is None else len(one) for one in (seen, kept))
             rms = float(found.errors[v, c])
             of_images.append((files[v][c].name, names[c], count, count - used, rms))
     write_csv(images, ("image", "camera", "corners", "left_out", "rms_px"), of_images)
@@ -515,17 +512,15 @@ def _view(found: Calibration, fov_deg: float | None) -> StatedView:
     """The rectification of a pair, left camera first."""
     if found.view is not None and fov_deg is None:
         return found.view
-    made = rig_of(found, fov_deg)
-    if made.sources != (1, 0):
+    rig = rig_of(found, fov_deg)
+    if rig.sources != (1, 0):
         raise CalibrationError(
             f"{found.source}: its first camera is the right one, and ROS wants the left one first; "
             "choose them in that order: --cameras 1,0"
         )
-    rig = made
-    axes = rig.bTc[:3, :3].T
-    rotations = tuple(axes @ camera.bTc[:3, :3] for camera in found.cameras)
-    matrix = np.array([[rig.fx, 0.0, rig.cx], [0.0, rig.fy, rig.cy], [0.0, 0.0, 1.0]])
-    return StatedView((rotations[0], rotations[1]), matrix, (rig.width, rig.height))
+    first, second = (rig.bTc[:3, :3].T @ camera.bTc[:3, :3] for camera in found.cameras)
+    matrix = intrinsic_matrix(rig.fx, rig.fy, rig.cx, rig.cy)
+    return StatedView((first, second), matrix, (rig.width, rig.height))
 
 
 # --------------------------------------------------------------------------------------------
@@ -552,28 +547,26 @@ def show_calibration(asked: Asked, picture: Path | None) -> list[str]:
     return lines
 
 
-_HEAD = ("camera", "image", "model", "focal px", "view deg (h x v x d)", "place mm", "turned deg")
-
-
 def _table(found: Calibration) -> list[str]:
-    rows = [_HEAD, *(_row(found, k) for k in range(len(found.cameras)))]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(_HEAD))]
+    rows = [
+        ("camera", "image", "model", "focal px", "view deg (h x v x d)", "place mm", "turned deg")
+    ]
+    for k, camera in enumerate(found.cameras):
+        place = found.offset(k, 0)
+        angles = np.degrees(camera.field_of_view()) if camera.width else np.full(3, np.nan)
+        rows.append(
+            (
+                f"{k}: {camera.name}",
+                f"{camera.width}x{camera.height}" if camera.width else "unknown",
+                camera.model,
+                f"{camera.focal_px:.1f}",
+                " x ".join(f"{angle:.0f}" for angle in angles),
+                " ".join(f"{1e3 * v:+.1f}" for v in place[:3, 3]),
+                f"{pose_difference(np.eye(4), place)[1]:.2f}",
+            )
+        )
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
-
-
-def _row(found: Calibration, k: int) -> tuple[str, ...]:
-    camera, place = found.cameras[k], found.offset(k, 0)
-    angles = np.degrees(camera.field_of_view()) if camera.width else np.full(3, np.nan)
-    cosine = 0.5 * (float(np.trace(place[:3, :3])) - 1.0)
-    return (
-        f"{k}: {camera.name}",
-        f"{camera.width}x{camera.height}" if camera.width else "unknown",
-        camera.model,
-        f"{camera.focal_px:.1f}",
-        " x ".join(f"{angle:.0f}" for angle in angles),
-        " ".join(f"{1e3 * v:+.1f}" for v in place[:3, 3]),
-        f"{np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.2f}",
-    )
 
 
 def _about(rig: StereoRig, found: Calibration) -> list[str]:
@@ -582,51 +575,37 @@ def _about(rig: StereoRig, found: Calibration) -> list[str]:
     lines = [f"rig: {', '.join(parts)}; baseline {1e3 * rig.baseline:.2f} mm"]
     if rig.vertical_baseline is not None:
         lines[0] += f", vertical baseline {1e3 * rig.vertical_baseline:.2f} mm"
-    view = rig.angles_deg
-    what = "rectified already" if rig.rectifier is None else "rectified view"
+    view, what, overlap = rig.angles_deg, "rectified already", 1.0
+    if rig.rectifier is not None:
+        what, overlap = "rectified view", np.logical_and.reduce(rig.rectifier.masks).mean()
     lines.append(
         f"{what}: {rig.width}x{rig.height}, focal length {rig.fx:.1f} px, {view[0]:.0f} x "
-        f"{view[1]:.0f} degrees, {100.0 * _overlap(rig):.1f} % of it seen by all cameras; 1 px of "
+        f"{view[1]:.0f} degrees, {100.0 * overlap:.1f} % of it seen by all cameras; 1 px of "
         f"disparity at {rig.fx * rig.baseline:.1f} m"
     )
     return [*lines, *rig.remarks]
 
 
-def _overlap(rig: StereoRig) -> float:
-    """Share of the rectified pixels that every camera sees."""
-    if rig.rectifier is None:
-        return 1.0
-    return float(np.logical_and.reduce(rig.rectifier.masks).mean())
-
-
 def _draw(found: Calibration, rig: StereoRig | None, path: Path) -> None:
     from fgslam.report.pictures import CameraDrawing, draw_cameras
 
-    reference = found.cameras[0]
     drawings = []
     for k, camera in enumerate(found.cameras):
-        place = found.offset(k, 0)
-        size = camera.size if camera.width else _guessed_size(camera)
-        outline = np.empty((0, 2))
+        size, half, outline = camera.size, 0.5, np.empty((0, 2))
+        if camera.width:
+            half = 0.5 * float(camera.field_of_view()[0])
+        else:  # as large as the principal point says
+            width, height = np.round(2.0 * camera.matrix[:2, 2]).astype(int).tolist()
+            size = max(width, 1), max(height, 1)
         if rig is not None and k in rig.sources and rig.rectifier is not None:
-            outline = _outline(rig.rectifier.maps[rig.sources.index(k)])
-        half = 0.5 * float(camera.field_of_view()[0]) if camera.width else 0.5
+            # Where the border of the rectified view lies in the raw image.
+            both = np.stack(rig.rectifier.maps[rig.sources.index(k)], axis=2).astype(np.float64)
+            across = np.linspace(0, both.shape[1] - 1, _EDGE_STEPS).astype(int)
+            down = np.linspace(0, both.shape[0] - 1, _EDGE_STEPS).astype(int)
+            sides = both[0, across], both[down, -1], both[-1, across[::-1]], both[down[::-1], 0]
+            outline = np.concatenate(sides)
+        place = found.offset(k, 0)
         drawings.append(
             CameraDrawing(camera.name, size, camera.matrix[:2, 2], outline, place, half)
         )
-    draw_cameras(path, f"{found.format}, {reference.model}", drawings)
-
-
-def _guessed_size(camera: RawCamera) -> tuple[int, int]:
-    width, height = np.round(2.0 * camera.matrix[:2, 2]).astype(int).tolist()
-    return max(width, 1), max(height, 1)
-
-
-def _outline(maps: Sequence[FloatArray] | tuple[object, ...]) -> FloatArray:
-    """Where the border of the rectified view lies in the raw image, (n, 2) pixels."""
-    both = np.stack([np.asarray(one, np.float64) for one in maps], axis=2)
-    height, width = both.shape[:2]
-    across = np.linspace(0, width - 1, _EDGE_STEPS).astype(int)
-    down = np.linspace(0, height - 1, _EDGE_STEPS).astype(int)
-    border = [both[0, across], both[down, -1], both[-1, across[::-1]], both[down[::-1], 0]]
-    return np.concatenate(border)
+    draw_cameras(path, f"{found.format}, {found.cameras[0].model}", drawings)

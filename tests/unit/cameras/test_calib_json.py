@@ -101,18 +101,6 @@ def test_a_rig_without_correction_needs_no_rectifier(tmp_path: Path) -> None:
     assert StereoRig.load(tmp_path / "camera.json").rectifier is None
 
 
-def test_a_correction_of_older_files_has_none_of_the_later_terms(tmp_path: Path) -> None:
-    path = tmp_path / "camera.json"
-    write_corrected(path, knocked(PAIR))
-    content = json.loads(path.read_text())
-    for name in ("left.decentring_x_outer", "left.decentring_y_outer", "all.radial"):
-        del content["corrections"][name]
-    path.write_text(json.dumps(content))
-    back, expected = StereoRig.load(path).rectifier, rectifier_of(PAIR, knocked(PAIR).values)
-    assert back is not None
-    np.testing.assert_array_equal(back.maps[1], expected.maps[1])
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
