@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -49,10 +49,6 @@ from fgslam.slam.motion import MotionModel
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session, checked_images
 from fgslam.slam.settings import MapSettings
-
-if TYPE_CHECKING:
-    from fgslam.frontend.places.merging import Alignment
-
 
 # ------------------------------------------------------------------------------------------
 # Maps for other tools and later days: point clouds, map files, and finding oneself in one
@@ -183,16 +179,10 @@ class Map:
 def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:
     """The estimator's geometry joined with the front-end's bookkeeping."""
     rows = database.rows(landmarks.ids)
-    return MapPoints(
-        ids=landmarks.ids,
-        positions=landmarks.positions,
-        covariances=landmarks.covariances,
-        colours=np.repeat(database.colour[rows, None], 3, axis=1),
-        hits=database.hits[rows],
-        misses=database.misses[rows],
-        valid=database.valid[rows],
-        permanent=database.permanent[rows],
-    )
+    colours = np.repeat(database.colour[rows, None], 3, axis=1)
+    counted: tuple[Any, ...] = (database.hits, database.misses, database.valid, database.permanent)
+    geometry = (landmarks.ids, landmarks.positions, landmarks.covariances)
+    return MapPoints(*geometry, colours, *(column[rows] for column in counted))
 
 
 def drives_of(saved: SavedMap) -> list[dict[str, Any]]:
@@ -216,16 +206,9 @@ def valid_of(saved: SavedMap) -> BoolArray:
 
 def points_of(saved: SavedMap) -> MapPoints:
     """The landmarks of a map file as a point cloud."""
-    return MapPoints(
-        ids=saved.landmarks.ids,
-        positions=saved.landmarks.positions,
-        covariances=saved.landmarks.covariances,
-        colours=np.repeat(saved.colour[:, None], 3, axis=1),
-        hits=saved.hits,
-        misses=saved.misses,
-        valid=valid_of(saved),
-        permanent=saved.permanent,
-    )
+    landmarks, colours = saved.landmarks, np.repeat(saved.colour[:, None], 3, axis=1)
+    geometry = (landmarks.ids, landmarks.positions, landmarks.covariances)
+    return MapPoints(*geometry, colours, saved.hits, saved.misses, valid_of(saved), saved.permanent)
 
 
 # --------------------------------------------------------------------------------------------
@@ -244,7 +227,13 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
         OutputError: ``out`` is there already, is one of the two, or cannot be written.
     """
     # Not before: no run merges maps, and these load much of SciPy.
-    from fgslam.frontend.places.merging import adds_nothing, align_maps, merge_maps
+    from fgslam.frontend.places.merging import (
+        adds_nothing,
+        align_maps,
+        merge_maps,
+        shared_frames,
+        shared_moments,
+    )
 
     require_output(out, overwrite, (first, second))
     a, b = load_map(first), load_map(second)
@@ -259,17 +248,9 @@ def merge_files(first: Path, second: Path, out: Path, overwrite: bool = False) -
     found = align_maps(a, b, np.random.default_rng(_SEED), f"{first} and {second}")
     merged = merge_maps(a, b, found)
     size = save_map(merged, out)
-    return [
-        *_about_alignment(found, str(first), str(second)),
-        *_in_common(a, b, str(first), str(second)),
-        f"{out}: {len(merged)} landmarks of {len(a)} and {len(b)}, {size / 1e6:.2f} MB",
-    ]
-
-
-def _about_alignment(found: Alignment, first: str, second: str) -> list[str]:
     x, y, z = found.aTb[:3, 3]
     turn = np.degrees(np.linalg.norm(so3_log(found.aTb[:3, :3])))
-    return [
+    lines = [
         f"{second} lies at ({x:.3f}, {y:.3f}, {z:.3f}) m, turned by {turn:.2f} deg, in {first}",
         f"{found.agreeing} of {found.candidates} landmarks that look alike agree, {found.second} "
         "with the second-best alignment elsewhere",
@@ -277,21 +258,19 @@ def _about_alignment(found: Alignment, first: str, second: str) -> list[str]:
         f"({found.residual_sigmas:.2f} sigma); {found.found} of the {found.among} that lie among "
         "the first map's were found there",
     ]
-
-
-def _in_common(a: SavedMap, b: SavedMap, first: str, second: str) -> list[str]:
-    """A line about the evidence that both maps hold; none where there is none."""
-    from fgslam.frontend.places.merging import shared_frames, shared_moments
-
+    # Evidence that both maps hold.
     once = "they count once (covariance intersection)"
     if common := shared_frames(a, b):
-        return [f"{common} of the {len(b.evidence)} frames of {second} are in {first}, too: {once}"]
-    if moments := shared_moments(a, b):
-        return [
+        lines.append(
+            f"{common} of the {len(b.evidence)} frames of {second} are in {first}, too: {once}"
+        )
+    elif moments := shared_moments(a, b):
+        lines.append(
             f"{moments} poses of {second} have times of poses of {first}, though no image is the "
             f"same: one recording read in two ways, by all appearances; {once}"
-        ]
-    return []
+        )
+    size_text = f"{len(merged)} landmarks of {len(a)} and {len(b)}, {size / 1e6:.2f} MB"
+    return [*lines, f"{out}: {size_text}"]
 
 
 Overrides = Mapping[str, Any] | Iterable[str]
@@ -503,11 +482,9 @@ def override_texts(overrides: Overrides) -> list[str]:
     Raises:
         ConfigError: a value is not plain (number, text, list, mapping).
     """
-    if isinstance(overrides, str):
-        raise ConfigError(f"overrides: {overrides!r} is one text; give a list of texts or a dict")
-    if not isinstance(overrides, Iterable):
+    if isinstance(overrides, str) or not isinstance(overrides, Iterable):
         raise ConfigError(
-            f"overrides: {overrides!r} is no settings; give a dict or a list of texts"
+            f"overrides: {overrides!r} is one value; give a dict or a list of texts a.b=value"
         )
     if not isinstance(overrides, Mapping):
         texts = list(overrides)

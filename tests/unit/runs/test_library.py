@@ -252,7 +252,7 @@ def wrong_uses() -> dict[str, tuple[type[FgslamError], str, Any]]:
         "experiment": (ConfigError, "comes with fgslam", lambda _: fg.run("lab_lop")),
         "file": (ConfigError, "no such file", lambda _: fg.run("nowhere/x.yaml")),
         "key": (ConfigError, "unknown key sed", lambda p: fg.run("lab_loop", p, {"sed": 1})),
-        "one text": (ConfigError, "is one text", lambda p: fg.run("lab_loop", p, "seed=1")),
+        "one text": (ConfigError, "is one value", lambda p: fg.run("lab_loop", p, "seed=1")),
         "array": (ConfigError, "seed is a ndarray", lambda p: fg.run("x", p, {"seed": np.ones(2)})),
         "folder": (DatasetError, "is empty; give the folder", lambda p: fg.open_recording(p)),
         "no folder": (DatasetError, "no such folder", lambda p: fg.open_recording(p / "x")),
