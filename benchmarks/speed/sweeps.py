@@ -23,7 +23,8 @@ import numpy as np
 
 from benchmarks.speed.blocks import resident_mb
 from fgslam.core.errors import ConfigError
-from fgslam.runs.sweep import JOURNAL_FILE, make_plan, run_sweep, workers_of
+from fgslam.runs.sweep import JOURNAL_FILE, make_plan, run_sweep
+from fgslam.runs.workers import Pool
 
 CASES = 2_000
 _LEAST = 20
@@ -83,7 +84,7 @@ def _sweep(workers: int, cases: int) -> dict[str, float]:
         begun, cpu = time.monotonic(), time.process_time()
         plan = make_plan([_EXPERIMENT], axes, _ESTIMATORS)
         watch = (clock.tell, lambda: False, lambda table: None)
-        result = run_sweep(plan, folder, workers_of(workers, None), watch=watch)
+        result = run_sweep(plan, folder, Pool(workers), watch=watch)
         wall, driver = time.monotonic() - begun, time.process_time() - cpu
         if result.done != cases:
             raise RuntimeError(f"{cases - result.done} cases failed: {result.failures}")

@@ -319,14 +319,15 @@ def sweep(  # noqa: PLR0913 - each option is a parameter
         resume: do what has no result yet; axes may have become longer
     """
     from fgslam.cli.console import display
-    from fgslam.runs.sweep import make_plan, run_sweep, workers_of
+    from fgslam.runs.sweep import make_plan, run_sweep
+    from fgslam.runs.workers import Pool
 
     existing = existing_folder(overwrite, resume)
     plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
     folder = out or plan.default_folder
     with stop_flag() as stopped, display() as shown:
         watch = (stoppable(shown.tell, stopped), stopped, shown.show_table)
-        result = run_sweep(plan, folder, workers_of(jobs, scheduler), existing, metric, watch)
+        result = run_sweep(plan, folder, Pool(jobs, scheduler), existing, metric, watch)
     show_all([result], same_with_resume())
     exit_as([result])
 

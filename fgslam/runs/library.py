@@ -25,7 +25,8 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.session import Overrides, override_texts, slam_config
-from fgslam.runs.sweep import UNWATCHED, SweepResult, make_plan, run_sweep, workers_of
+from fgslam.runs.sweep import UNWATCHED, SweepResult, make_plan, run_sweep
+from fgslam.runs.workers import Pool
 from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
 from fgslam.slam.replay import replay as replay_log
@@ -246,7 +247,7 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
     folder = plan.default_folder if out is None else Path(out)
     watch = (progress, *UNWATCHED[1:])
     existing = _checked_existing(existing)
-    return run_sweep(plan, folder, workers_of(jobs, scheduler), existing, metric, watch)
+    return run_sweep(plan, folder, Pool(jobs, scheduler), existing, metric, watch)
 
 
 def replay(

@@ -63,7 +63,7 @@ from fgslam.runs.slam_comparison import judged_apart
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, measured_marks, with_marks
 from fgslam.runs.trials import TrialTask, perform_trial
 from fgslam.runs.units import Progress, Stopped
-from fgslam.runs.workers import NOT_BEGUN, Executor, Failed, InProcess, Pool
+from fgslam.runs.workers import NOT_BEGUN, Executor, Failed
 
 if TYPE_CHECKING:
     import pandas
@@ -405,7 +405,7 @@ def _rows_of_case(config: Experiment, estimators: tuple[Any, ...]) -> Iterator[R
     config = with_estimators(config, estimators) if estimators else config
     with tempfile.TemporaryDirectory(prefix="fgslam-case-") as scratch:
         run = Path(scratch) / "run"
-        run_task(opener_of(config), config, run, jobs=1, executor=InProcess())
+        run_task(opener_of(config), config, run, jobs=1, executor=Executor())
         document = read_metrics(run / METRICS_FILE)
     alone = {name: value for name, value in document.items() if name not in _ABOUT}
     for title, values in (document.get("estimators") or {"": alone}).items():
@@ -824,19 +824,6 @@ class SweepResult(RunResult):
         return pandas.read_parquet(self.folder / TABLE_FILE)
 
 
-def workers_of(jobs: int | None, scheduler: str | None) -> Pool:
-    """Workers of a scheduler, or so many of this machine; None: one a core.
-
-    Raises:
-        ConfigError: both are given, or there would be no worker.
-    """
-    if jobs is not None and jobs < 1:
-        raise ConfigError(f"jobs is {jobs}; give at least 1, or none for one a core")
-    if jobs is not None and scheduler is not None:
-        raise ConfigError("--jobs is for workers of this machine; leave it out with --scheduler")
-    return Pool(jobs, scheduler)
-
-
 def run_sweep(
     plan: Plan,
     folder: Path,
@@ -850,7 +837,7 @@ def run_sweep(
     Args:
         plan: what is swept.
         folder: of the results.
-        pool: does the cases, as :func:`workers_of` makes it.
+        pool: does the cases.
         existing: what to do where it holds a sweep: `resume` does what is missing, also of axes
             that have become longer.
         metric: column of the table that curves and tests are of; None: the first that is known.

@@ -18,12 +18,12 @@ import time
 import types
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fgslam.core.errors import ConfigError, FgslamError, OutputError
 from fgslam.core.memory import ShortageTold
@@ -59,13 +59,14 @@ class Failed:
     why: str
 
 
-class Executor(Protocol):
-    """Calls a function on arguments."""
+class Executor:
+    """Calls a function on arguments, here in this process; one that has begun is done.
 
-    @property
-    def lost(self) -> bool:
-        """Whether all workers have gone for good, and with them what was pending."""
-        ...
+    Attributes:
+        lost: whether all workers have gone for good, and with them what was pending.
+    """
+
+    lost = False
 
     def run(
         self,
@@ -80,40 +81,22 @@ class Executor(Protocol):
             function: of a module's top level.
             arguments: read one at a time, some ahead of the results.
             stopped: asked every moment; True ends what is pending and begins no more.
-            fresh: each in a process that has done nothing before, of which memory is measured.
+            fresh: each in a process that has done nothing before, of which memory is measured;
+                means nothing where there are no workers.
 
         Raises:
             FgslamError: what the function raised.
         """
-        ...
-
-
-class InProcess:
-    """The executor of this process: one argument after the other; one that has begun is done."""
-
-    lost = False
-
-    def run(
-        self,
-        function: Callable[[Argument], Result],
-        arguments: Sequence[Argument],
-        stopped: Callable[[], bool],
-        fresh: bool = False,
-    ) -> Iterator[tuple[int, Result | Failed]]:
-        """As :meth:`Executor.run`, but never fresh."""
         del fresh
-        for index in range(len(arguments)):
-            yield index, Failed(NOT_BEGUN) if stopped() else function(arguments[index])
+        for index, argument in enumerate(arguments):
+            yield index, Failed(NOT_BEGUN) if stopped() else function(argument)
 
 
-class Pool:
+class Pool(Executor):
     """Workers of Dask, while its context lasts.
 
     Those of this machine are processes of one thread each, which begin with the first work and end
     with this process; one that crashes is replaced, and no Ctrl-C reaches them.
-
-    Attributes:
-        lost: the scheduler has gone, and with it what was pending.
     """
 
     def __init__(self, jobs: int | None = None, scheduler: str | None = None) -> None:
@@ -124,8 +107,16 @@ class Pool:
                 or than four a core: those would cost memory alone.
             scheduler: its address, `tcp://host:8786` or `tls://...`; or the file that
                 `dask scheduler --scheduler-file` wrote.
+
+        Raises:
+            ConfigError: both are given, or there would be no worker.
         """
-        self.lost = False
+        if jobs is not None and jobs < 1:
+            raise ConfigError(f"jobs is {jobs}; give at least 1, or none for one a core")
+        if jobs is not None and scheduler is not None:
+            raise ConfigError(
+                "--jobs is for workers of this machine; leave it out with --scheduler"
+            )
         self._jobs, self._scheduler = jobs, scheduler
         self._stack = ExitStack()
         self._client: Client | None = None
@@ -337,7 +328,8 @@ def _local_cluster() -> Iterator[LocalCluster]:
         )
         threads = ("OMP", "OPENBLAS", "MKL", "NUMEXPR")
         environment = {"TMPDIR": folder} | {f"{library}_NUM_THREADS": 1 for library in threads}
-        stack.enter_context(_environment_restored(environment))
+        for name in environment:  # Dask sets them in this process, and leaves them there
+            stack.callback(_set_variable, name, os.environ.get(name))
         rules = {
             "distributed.nanny.pre-spawn-environ": environment,
             # A unit waits at the scheduler, not behind one that may end the worker.
@@ -375,17 +367,10 @@ def _local_cluster() -> Iterator[LocalCluster]:
         yield cluster
 
 
-@contextmanager
-def _environment_restored(names: Iterable[str]) -> Iterator[None]:
-    """Dask sets its workers' variables in this process, and leaves them there."""
-    before = {name: os.environ.get(name) for name in names}
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+def _set_variable(name: str, value: str | None) -> None:
+    os.environ.pop(name, None)
+    if value is not None:
+        os.environ[name] = value
 
 
 def _kill_workers(cluster: LocalCluster) -> None:

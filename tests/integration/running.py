@@ -25,7 +25,7 @@ from fgslam.runs.config import make_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.tasks.slam import SlamResult, open_slam
-from fgslam.runs.workers import InProcess
+from fgslam.runs.workers import Executor
 from fgslam.slam.results import STAGES
 
 Capture = pytest.CaptureFixture[str]
@@ -93,8 +93,9 @@ def units_in_this_process() -> Iterator[None]:
     """The units of a run are done in this process, one after the other."""
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fgslam.runs.engine.Pool", lambda jobs: nullcontext(InProcess()))
-        patch.setattr("fgslam.runs.sweep.Pool", lambda *_: nullcontext(InProcess()))
+        patch.setattr("fgslam.runs.engine.Pool", lambda jobs: nullcontext(Executor()))
+        for module in ("library", "workers"):
+            patch.setattr(f"fgslam.runs.{module}.Pool", lambda *_: nullcontext(Executor()))
         yield
 
 

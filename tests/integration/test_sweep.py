@@ -21,7 +21,7 @@ from running import HANGS_AFTER_S, main
 import fgslam
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.runs.sweep import UNWATCHED, SweepResult, make_plan, run_sweep
-from fgslam.runs.workers import InProcess
+from fgslam.runs.workers import Executor
 
 DRIVE: dict[str, Any] = {
     "name": "short_drive",
@@ -51,21 +51,15 @@ def drive(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Cases are done in this process."""
-    monkeypatch.setattr("fgslam.runs.sweep.Pool", lambda *_: nullcontext(InProcess()))
-
-
 def do(
     source: Path, sets: list[str], out: Path, existing: Any = "refuse", stopped: Any = None
 ) -> SweepResult:
     watch = UNWATCHED if stopped is None else (UNWATCHED[0], stopped, UNWATCHED[2])
     plan = make_plan([source], sets)
-    return run_sweep(plan, out, nullcontext(InProcess()), existing, watch=watch)
+    return run_sweep(plan, out, nullcontext(Executor()), existing, watch=watch)
 
 
-@pytest.mark.usefixtures("here")
+@pytest.mark.usefixtures("in_this_process")
 def test_a_sweep_from_the_command_line_and_from_python_gives_the_same_bytes(
     drive: Path,
     tmp_path: Path,
@@ -306,7 +300,7 @@ def test_a_sweep_that_is_ended_leaves_no_worker_and_goes_on(
         assert len(pandas.read_parquet(out / "results.parquet")) == done(out)
     when(lambda: not any(Path("/proc", pid).exists() for pid in workers))
     plan = make_plan([drive], ["seed=0:40"])
-    assert run_sweep(plan, out, nullcontext(InProcess()), "resume").done == 40
+    assert run_sweep(plan, out, nullcontext(Executor()), "resume").done == 40
 
 
 def children(parent: int) -> list[str]:

@@ -73,7 +73,7 @@ from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.tasks.slam_results import Sighted, TrueSights, truth_in_map
 from fgslam.runs.units import Progress, UnitStore
-from fgslam.runs.workers import InProcess
+from fgslam.runs.workers import Executor
 from fgslam.slam.build import make_pipeline, make_relocaliser, make_stereo, make_stream, trusted
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import body_motion
@@ -735,7 +735,7 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
         if out is not None:
             begin_folder(out, wanted.existing, stack.enter_context(Owner(out)))
             write_config(out, config, _provenance(given, sequence))
-        loop = (1, progress, stopped, InProcess())
+        loop = (1, progress, stopped, Executor())
         context = Context(out or Path(), False, UnitStore(None), *loop)
         asked = ask_all(config, given, sequence, context)
         result = result_of(config, out, asked, notes)

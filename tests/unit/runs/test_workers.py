@@ -20,7 +20,7 @@ import cv2
 import pytest
 
 from fgslam.core.errors import ConfigError, MemoryShortageError
-from fgslam.runs.workers import Failed, InProcess, Pool
+from fgslam.runs.workers import Executor, Failed, Pool
 
 
 def never() -> bool:
@@ -56,7 +56,7 @@ def doubled(value: int) -> int:
 def test_every_argument_has_one_result_whoever_does_it(pool: Pool) -> None:
     found = list(pool.run(doubled, range(200), never))
     assert sorted(found) == [(k, 2 * k) for k in range(200)]
-    assert list(InProcess().run(doubled, range(3), never)) == [(0, 0), (1, 2), (2, 4)]
+    assert list(Executor().run(doubled, range(3), never)) == [(0, 0), (1, 2), (2, 4)]
 
 
 def nothing(value: int) -> None:
@@ -128,7 +128,7 @@ def test_what_had_not_come_in_when_it_was_stopped_is_named(which: str, pool: Poo
         asked.append(time.monotonic())
         return len(asked) > (0 if which == "here" else 3)
 
-    executor = InProcess() if which == "here" else pool
+    executor = Executor() if which == "here" else pool
     begun = time.monotonic()
     found = list(executor.run(waits, [1, 2, 3], stopped))
     GO.set()
