@@ -102,8 +102,6 @@ def _worst(rows: list[tuple[Cell, ...]]) -> tuple[Cell, ...]:
     return tuple(out)
 
 
-# Frames that Figure 4 of the paper shows, and the last one.
-_SHOWN = (1, 60, 120, 180, 249)
 _VARIANTS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("3 degrees of freedom (default)", ()),
     ("5 (the paper's)", ("frontend.ego_motion.dof=5",)),
@@ -116,7 +114,7 @@ _VARIANTS: tuple[tuple[str, tuple[str, ...]], ...] = (
 def paper_tables() -> list[Table]:
     """End pose and accuracy; landmarks and matches. One row a variant, the paper's first."""
     runs = [(name, run_whole(experiment("lab_loop", options))) for name, options in _VARIANTS]
-    return [_end_poses(runs), _maps(runs), _growth(runs)]
+    return [_end_poses(runs), _maps(runs)]
 
 
 def _end_poses(runs: list[tuple[str, Run]]) -> Table:
@@ -166,12 +164,3 @@ def _map_row(name: str, run: Run) -> tuple[Cell, ...]:
         run.metrics["mean_residual_px"],
         run.metrics["stereo_precision"],
     )
-
-
-def _growth(runs: list[tuple[str, Run]]) -> Table:
-    columns = ("degrees of freedom", *(f"frame {frame}" for frame in _SHOWN))
-    rows: list[tuple[Cell, ...]] = []
-    for name, run in runs:
-        counts = run.result.outputs.recorder.column("landmarks")
-        rows.append((name, *(int(counts[frame - 1]) for frame in _SHOWN)))
-    return Table("Landmarks in the map over the drive", columns, rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,8 +12,6 @@ from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.types import EgoMotion, Trajectory
 from fgslam.evaluation.statistics import end_pose
-from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.settings import StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.build import make_pipeline
@@ -49,14 +47,13 @@ _PAPER_STEREO: dict[str, Cell] = {
     "right-left / fewest features": 106 / 166,
     "three images / right-left": 59 / 106,
 }
-_WIDTHS = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 _COMPONENTS = ("X cm", "Y cm", "Z cm", "yaw deg", "pitch deg", "roll deg")
 
 Triple = tuple[View, View, View]
 
 
 def tables() -> list[Table]:
-    """All five, from the same rendered views."""
+    """All of them, from the same rendered views."""
     say(f"rendering {3 * len(STARTS)} views")
     lab = LabViews(experiment("lab_loop", EVERY_FRAME))
     triples = [lab.triple(i) for i in STARTS if i < len(lab.sequence)]
@@ -64,7 +61,6 @@ def tables() -> list[Table]:
     return [
         features_table([triple[0] for triple in triples]),
         matches_table(lab, triples),
-        sweep_table(lab, [view for triple in triples for view in triple]),
         frames_table(moves),
         *(estimates_table(name, both) for name, both in moves.items()),
     ]
@@ -99,8 +95,13 @@ def features_table(views: list[View]) -> Table:
 
 def matches_table(lab: LabViews, triples: list[Triple]) -> Table:
     """Matches right-left, then confirmed by the top image, in three neighbouring views."""
-    columns = ("", "paper", *_modes_twice())
-    found = [_quantities(_stereo_counts(lab, triples, mode)) for mode in ("descriptor", "paper")]
+    modes = ("descriptor", "paper")
+    columns = (
+        "",
+        "paper",
+        *(f"`{mode}`: {what}" for mode in modes for what in ("start", "median")),
+    )
+    found = [_quantities(_stereo_counts(lab, triples, mode)) for mode in modes]
     rows: list[tuple[Cell, ...]] = []
     for name, paper in _PAPER_STEREO.items():
         cells: list[Cell] = [name, paper]
@@ -128,12 +129,6 @@ def _number(value: float) -> Cell:
     return int(value) if float(value).is_integer() else float(value)
 
 
-def _modes_twice() -> tuple[str, ...]:
-    return tuple(
-        f"`{mode}`: {what}" for mode in ("descriptor", "paper") for what in ("start", "median")
-    )
-
-
 def _stereo_counts(lab: LabViews, triples: list[Triple], mode: str) -> FloatArray:
     """(n, 3, 3) per triple and view: right-left matches, final ones, fewest features."""
     settings = experiment("lab_loop", [*EVERY_FRAME, f"frontend.appearance.mode={mode}"]).frontend
@@ -145,48 +140,6 @@ def _stereo_counts(lab: LabViews, triples: list[Triple], mode: str) -> FloatArra
 def _counts(matcher: StereoMatcher, view: View) -> tuple[int, int, int]:
     pairs, _ = matcher.match_left(view.features[0], view.features[1])
     return len(pairs), len(matcher.match(view.features)), min(len(f) for f in view.features)
-
-
-def sweep_table(lab: LabViews, views: list[View]) -> Table:
-    """Wider gates need not give more matches where ambiguity discards."""
-    stereo = experiment("lab_loop", EVERY_FRAME).frontend.stereo
-    columns = (
-        "all gates, times", "right-left", "right-left, start", "three images",
-        "three images, start", "`descriptor`, three images",
-    )  # fmt: skip
-    rows: list[tuple[Cell, ...]] = []
-    for width in _WIDTHS:
-        counts = {
-            mode: np.array([_counts(_widened(lab, stereo, mode, width), view) for view in views])
-            for mode in ("paper", "descriptor")
-        }
-        paper, other = counts["paper"], counts["descriptor"]
-        mean = paper.mean(axis=0)
-        start = (int(paper[0, 0]), int(paper[0, 1]))
-        rows.append(
-            (width, float(mean[0]), start[0], float(mean[1]), start[1], float(other[:, 1].mean()))
-        )
-    note = (
-        f"`appearance: paper`, means of {len(views)} views; epipolar, disparity agreement, scale "
-    )
-    return Table(
-        "Width of the gates against the number of matches",
-        columns,
-        rows,
-        (note + "and orientation gates scaled together",),
-    )
-
-
-def _widened(lab: LabViews, stereo: StereoSettings, mode: str, width: float) -> StereoMatcher:
-    wider = replace(
-        stereo,
-        epipolar_px=stereo.epipolar_px * width,
-        disparity_agreement_px=stereo.disparity_agreement_px * width,
-        scale_ratio=stereo.scale_ratio**width,
-        orientation_deg=min(180.0, stereo.orientation_deg * width),
-    )
-    appearance = AppearanceSettings(mode="paper" if mode == "paper" else "descriptor")
-    return StereoMatcher(lab.rig, wider, appearance)
 
 
 # ----------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ are those of a homing in the rendered house: the paper's camera, 320x240 pixels.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -236,10 +235,3 @@ def medians_of(legs: list[Leg]) -> dict[str, float]:
     found["homing_track_over_raw_klt"] = statistics.median(tracked)
     each = [front_end_ratios(leg) for leg in legs]
     return found | {name: statistics.median(e[name] for e in each) for name in each[0]}
-
-
-if __name__ == "__main__":
-    start = time.perf_counter()
-    for name, value in ratios_of_homing().items():
-        print(f"{name:40s} {value:.3f}")
-    print(f"{time.perf_counter() - start:.0f} s")

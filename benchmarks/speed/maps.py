@@ -184,8 +184,3 @@ def ratios_of_maps() -> dict[str, float]:
     found = {f"map_frame_{size // 1000}k_ms": frame[size] for size in SIZES}
     found |= {f"map_expected_{size // 1000}k_ms": expected[size] for size in SIZES}
     return found | {"map_frame_100k_over_1k": frame[SIZES[-1]] / frame[SIZES[0]]}
-
-
-if __name__ == "__main__":
-    for name, value in ratios_of_maps().items():
-        print(f"{name:40s} {value:.3f}")

@@ -8,9 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.speed import (
-    comparing,
     estimators,
-    growth,
     homing,
     images,
     long_drive,
@@ -26,9 +24,7 @@ from fgslam.core.threads import one_blas_thread
 
 LIMITS: dict[str, float] = (
     images.LIMITS
-    | comparing.LIMITS
     | estimators.LIMITS
-    | growth.LIMITS
     | long_drive.LIMITS
     | homing.LIMITS
     | maps.LIMITS
@@ -60,8 +56,6 @@ PARTS: dict[str, Callable[[int], dict[str, float]]] = {
     "homing": lambda frames: homing.ratios_of_homing(),
     "smoothers": lambda frames: smoothers.ratios_of_smoothers(),
     "fixed_lag": lambda frames: smoothers.ratios_of_fixed_lag(),
-    "comparing": lambda frames: comparing.seconds_of_comparing(),
-    "growth": lambda frames: growth.exponents(),
     "starting": lambda frames: starting.ratios_of_starting(),
 }
 """Each part, called with the number of frames of the drive over images."""

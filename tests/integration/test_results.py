@@ -266,9 +266,8 @@ def test_smoothers_are_as_uncertain_as_they_err(kind: str) -> None:
 @pytest.mark.slow
 def test_tables_of_the_paper_s_views_hold_every_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(paper_views, "STARTS", range(0, 20, 10))
-    features, matches, gates, frames, *estimates = paper_views.tables()
+    features, matches, frames, *estimates = paper_views.tables()
     assert features.column("image") == ["top", "left", "right"]
     assert len(matches.rows) == 6
-    assert len(gates.rows) == 10
     assert len(frames.rows) == 6
     assert [len(table.rows) for table in estimates] == [16, 16]

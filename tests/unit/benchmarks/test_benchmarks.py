@@ -21,7 +21,7 @@ from benchmarks.rows import (
     shown_bound,
     shown_number,
 )
-from benchmarks.speed import growth, images, parts, ring, soak, sweeps
+from benchmarks.speed import images, parts, ring, soak, sweeps
 from benchmarks.tables import Table
 
 
@@ -253,9 +253,3 @@ def test_overhead_of_a_sweep_is_what_the_workers_had_less_what_the_cases_took() 
     assert found["two_cases_a_second"] == pytest.approx(20.0, rel=0, abs=1e-9)
     assert found["two_overhead_ms"] == pytest.approx(2 * 50.0 - 80.0, rel=0, abs=1e-9)
     assert found["two_overhead_ms_in_all"] == pytest.approx(2 * 250.0 - 80.0, rel=0, abs=1e-9)
-
-
-def test_growth_of_memory_is_the_exponent_of_the_factors() -> None:
-    factors = np.array([1e3, 3e3, 8e3, 2e4])
-    for expected in (0.0, 1.0, 1.37):
-        assert growth.exponent(factors, 0.02 * factors**expected) == pytest.approx(expected)
