@@ -67,12 +67,10 @@ def apart(a: Calibration, b: Calibration, widest_deg: float, camera: int = 0) ->
 EUROC = 0.11008
 BASELINES = {
     "kalibr/msckf_vio/camchain-imucam-euroc.yaml": EUROC,
-    "kalibr/msckf_vio/camchain-imucam-fla.yaml": 0.20006,
     "kalibr/kimera_vio_ros/euroc_camchain.yaml": 0.11007,
     "kalibr/whyscience_t265_omni": 0.06380,
     "calibrations/openvins/euroc_mav/kalibr_imucam_chain.yaml": EUROC,
     "calibrations/openvins/tum_vi/kalibr_imucam_chain.yaml": 0.10109,
-    "calibrations/openvins/kaist/kalibr_imucam_chain.yaml": 0.47515,
     "calibrations/basalt/euroc_ds_calib.json": 0.11023,
     "calibrations/vins_fusion/euroc/euroc_stereo_imu_config.yaml": EUROC,
     "calibrations/kimera_vio/Euroc": EUROC,
@@ -80,9 +78,6 @@ BASELINES = {
     "camera_info/side_x_side_stereo/2022-12-15-16-50-41-camchain.yaml": 0.0591,
     "camera_info/side_x_side_stereo/left.yaml": 0.05489,
     "camera_info/tp_vision": 0.11184,
-    "camera_info/i3dr": 0.08833,
-    "camera_info/ps4eye": 0.07857,
-    "camera_info/trebladev": 0.06337,
     "camera_info/emmanuelmess": 0.05966,
     "camera_info/uby56_imx219_stereo": 0.0631,
     "camera_info/zed/zed-cam-sn-1010.conf": 0.120,
