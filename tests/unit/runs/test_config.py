@@ -11,21 +11,23 @@ import yaml
 from fgslam.core.errors import ConfigError
 from fgslam.datasets.settings import ConstantVelocitySettings, ImageFolderSettings
 from fgslam.runs.config import (
+    TASKS,
+    Experiment,
     ExperimentConfig,
+    HomingTrialsConfig,
+    is_homing,
     load_config,
+    load_experiment,
+    load_homing,
     make_config,
     make_experiment,
-    read_mapping,
 )
 from fgslam.worlds.settings import RenderedLabSettings
 
-EXPERIMENTS = [
-    path
-    for path in sorted((Path(__file__).parents[3] / "experiments").glob("*.yaml"))
-    if "task" not in read_mapping(path)
-]
+EXPERIMENTS = sorted((Path(__file__).parents[3] / "experiments").glob("*.yaml"))
 MINIMAL: dict[str, Any] = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
 LAB: dict[str, Any] = {"name": "x", "dataset": {"kind": "rendered_lab"}}
+TRIALS: dict[str, Any] = {"task": "homing_trials", "name": "x"}
 
 
 def nested(base: dict[str, Any], dotted: str, value: object) -> dict[str, Any]:
@@ -35,11 +37,16 @@ def nested(base: dict[str, Any], dotted: str, value: object) -> dict[str, Any]:
     return base | {first: nested(inner, rest, value) if rest else value}
 
 
-def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
+def written(tmp_path: Path, values: object) -> Path:
     path = tmp_path / "c.yaml"
     path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    return path
+
+
+def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
+    path = written(tmp_path, values)
     with pytest.raises(ConfigError) as caught:
-        load_config(path, overrides)
+        load_experiment(path, overrides)
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith((str(path), "--set"))
@@ -208,9 +215,7 @@ def test_a_key_given_twice_is_refused(tmp_path: Path) -> None:
 
 
 def load(tmp_path: Path, *overrides: str, base: dict[str, Any] = MINIMAL) -> ExperimentConfig:
-    path = tmp_path / "c.yaml"
-    path.write_text(yaml.safe_dump(base), encoding="utf-8")
-    return load_config(path, overrides)
+    return load_config(written(tmp_path, base), overrides)
 
 
 def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
@@ -329,17 +334,15 @@ def test_another_kind_drops_the_keys_of_the_old_one_but_no_misspelling(tmp_path:
 
 
 def test_there_are_experiments() -> None:
-    assert {"lab_loop.yaml", "kitti06.yaml"} <= {path.name for path in EXPERIMENTS}
+    assert {"lab_loop.yaml", "kitti06.yaml", "homing_lab.yaml"} <= {p.name for p in EXPERIMENTS}
 
 
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 def test_every_experiment_is_valid_and_survives_a_round_trip(path: Path, tmp_path: Path) -> None:
-    config = load_config(path)
+    config = load_experiment(path)
     assert config.name == path.stem
-    resolved = tmp_path / "config.yaml"
-    values = config.as_values() | {"provenance": {"fgslam": "0", "dataset": {"identity": "ab"}}}
-    resolved.write_text(yaml.safe_dump(values), encoding="utf-8")
-    again = load_config(resolved)
+    provenance = {"fgslam": "0", "dataset": {"identity": "ab"}}
+    again = load_experiment(written(tmp_path, config.as_values() | {"provenance": provenance}))
     assert again.as_values() == config.as_values()
     assert again.model_copy(update={"provenance": None}) == config
 
@@ -358,24 +361,22 @@ def test_a_configuration_cannot_be_changed() -> None:
         config.seed = 3  # type: ignore[misc]
 
 
-def descriptions(node: dict[str, Any], schema: dict[str, Any], at: str) -> list[str]:
-    """Dotted names of all fields below a schema node that say nothing about themselves."""
-    if "$ref" in node:
-        node = schema["$defs"][node["$ref"].rsplit("/", 1)[-1]]
-    silent = []
-    for name, inner in node.get("properties", {}).items():
-        kinds = [inner, *inner.get("oneOf", []), *inner.get("anyOf", []), *inner.get("allOf", [])]
-        groups = [kind for kind in kinds if "$ref" in kind]
-        if not groups and name != "kind" and "description" not in inner:
-            silent.append(f"{at}{name}")
-        for kind in groups:
-            silent += descriptions(kind, schema, f"{at}{name}.")
-    return silent
+def silent(schema: dict[str, Any]) -> list[str]:
+    """Keys of any group that say nothing about themselves."""
+    groups = {"": schema, **schema["$defs"]}
+    return [
+        f"{title}.{name}"
+        for title, group in groups.items()
+        for name, node in group.get("properties", {}).items()
+        if name != "kind"
+        and "description" not in node
+        and not {"$ref", "oneOf", "anyOf", "allOf"} & node.keys()
+    ]
 
 
-def test_every_key_says_what_it_means() -> None:
-    schema = ExperimentConfig.model_json_schema()
-    assert descriptions(schema, schema, "") == []
+@pytest.mark.parametrize("model", TASKS.values(), ids=map(str, TASKS))
+def test_every_key_says_what_it_means(model: type[Experiment]) -> None:
+    assert silent(model.model_json_schema()) == []
 
 
 # --------------------------------------------------------------------------------------------
@@ -461,3 +462,64 @@ def test_a_map_that_is_not_extended_allows_loops() -> None:
     config = make_config(values, "test")
     assert not config.map.extend
     assert config.frontend.loops
+
+
+# --------------------------------------------------------------------------------------------
+# Tasks: each has a model of its own, as strict as that of SLAM
+
+
+def test_configuration_class_follows_from_the_task(tmp_path: Path) -> None:
+    assert isinstance(load_experiment(written(tmp_path, TRIALS)), HomingTrialsConfig)
+    assert isinstance(load_experiment(written(tmp_path, LAB)), ExperimentConfig)
+    assert is_homing(written(tmp_path, TRIALS))
+    assert not is_homing(written(tmp_path, LAB))
+
+
+@pytest.mark.parametrize(
+    ("values", "overrides", "words"),
+    [
+        (TRIALS | {"task": "homing_trial"}, (), "is 'homing_trial'; did you mean homing_trials?"),
+        (TRIALS | {"task": "slam"}, (), "use one of localisation, homing_"),
+        (TRIALS | {"task": None}, (), "task is None"),
+        (TRIALS | {"task": ["a"]}, (), "task is ['a']"),
+        (LAB, ("task=homing_trals",), "did you mean homing_trials?"),
+        (TRIALS, ("trial=3",), "unknown key trial; did you mean trials?"),
+        (TRIALS, ("dataset.feature=3",), "unknown key dataset.feature; did you mean features?"),
+        (TRIALS, ("homing_vector.sample=3",), "unknown key homing_vector.sample; did you"),
+        (TRIALS, ("estimator.kind=homing_graf",), "use one of homing_ekf, paper_ekf, homing_graph"),
+        (TRIALS, ("estimator.solvr=batch",), "unknown key estimator.solvr; did you mean solver?"),
+        (TRIALS, ("compare=[homing_ekf, isam2]",), "compare[1].kind is 'isam2'; use one of"),
+        (TRIALS, ("outliers=[0.1, 1.0]",), "outliers[1] = 1.0 is not usable"),
+        (TRIALS, ("trials=0",), "trials = 0 is not usable"),
+        (TRIALS, ("estimator.label=logs",), "cannot be called logs, a folder of the run"),
+        (TRIALS, ("estimator.label=units",), "cannot be called units, a folder of the run"),
+        (
+            TRIALS,
+            ("compare=[{kind: homing_graph, solver: batch}]",),
+            "two different estimators are called homing_graph",
+        ),
+        ({"task": "homing_trials"}, (), "key name is missing"),
+    ],
+)
+def test_mistakes_are_reported(
+    values: dict[str, Any], overrides: tuple[str, ...], words: str, tmp_path: Path
+) -> None:
+    assert words in message_of(values, tmp_path, *overrides)
+
+
+def test_slam_s_own_commands_refuse_homing_and_the_other_way_round(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="task homing_trials is a homing experiment"):
+        load_config(written(tmp_path, TRIALS))
+    with pytest.raises(ConfigError, match="has no task"):
+        load_homing(written(tmp_path, LAB))
+
+
+def test_the_same_estimator_twice_counts_once() -> None:
+    config = make_experiment(TRIALS | {"compare": ["homing_graph", "alv"]}, "x")
+    assert [settings.title for settings in config.estimators] == ["homing_graph", "alv"]
+
+
+def test_every_task_is_its_model_s_own() -> None:
+    for task, model in TASKS.items():
+        found = model.model_json_schema()["properties"].get("task", {"const": None})
+        assert found["const"] == task
