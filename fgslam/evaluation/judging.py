@@ -244,7 +244,7 @@ def judge_replay(replay: Replayed, truth: Truth) -> Judgement:
 
 
 def predicted_poses(statuses: Iterable[str], kind: str = "") -> BoolArray:
-    """(n,) whether a status says that no landmark measured the pose; the first frame is given.
+    """(n,) where by its status no landmark measured the pose; the first frame is given.
 
     Of dead reckoning, an estimator's ``kind``, no pose is marked, since none is measured.
     """
@@ -631,7 +631,7 @@ FALSE_DEG = 10.0
 
 @dataclass(frozen=True, slots=True)
 class JudgedClosure:
-    """One closure beside the truth; NaN and None where nothing is known.
+    """One closure against the truth; NaN and None where nothing is known.
 
     Attributes:
         at, to: positions in the log of the frame that closed it and the one it returned to.

@@ -35,7 +35,7 @@ class Answers(Rows):
     """What was asked and answered, row by row.
 
     Attributes:
-        accepted: (n,) whether the pose is to be believed.
+        accepted: (n,) whether the pose was accepted.
         poses: (n, 4, 4) ``wTc`` found; anything where it is not accepted.
         covariances: (n, 6, 6) in the tangent space at them.
         truth: (n, 4, 4) true poses in the map's world; NaN where unknown.
@@ -155,5 +155,5 @@ def score(answers: Answers, bounds: Bounds) -> LocalisationScore:
 
 
 def enough(in_view: IntArray, bounds: Bounds) -> BoolArray:
-    """(n,) where enough landmarks are in view (n,), or nobody knows how many."""
+    """(n,) where enough landmarks are in view (n,), or their number is unknown."""
     return np.asarray((in_view < 0) | (in_view >= bounds.least_visible))

@@ -317,7 +317,7 @@ class Nees:
 
 @dataclass(frozen=True, slots=True)
 class Consistency:
-    """NEES per degree of freedom beside the band in which a consistent one would lie.
+    """NEES per degree of freedom and the band in which a consistent one would lie.
 
     Attributes:
         per_dof: mean NEES per degree of freedom.
@@ -420,12 +420,12 @@ def chi_square_band(dof: float, probability: float = 0.95) -> tuple[float, float
 def judge(
     runs: Sequence[Nees], probability: float = 0.95, *, items_independent: bool = False
 ) -> Consistency | None:
-    """NEES of one or more runs beside its chi-square band, and whether it lies inside.
+    """NEES of one or more runs and its chi-square band, and whether it lies inside.
 
     The errors within one run are correlated (each pose starts from the one before, all landmarks
     are seen from the same poses), so their mean scatters far more than that many independent
     ones would. By default each *run* counts as a single independent item of average dimension,
-    which calls no consistent estimator inconsistent more often than the band says; many runs make
+    which calls no consistent estimator inconsistent more often than the band states; many runs make
     the band narrow.
 
     Args:
@@ -480,7 +480,7 @@ class EstimatorMetrics:
     """What is known about one estimator's result; None where it cannot be known.
 
     Attributes:
-        ate_rmse_m: absolute trajectory error (`alignment` in ``more`` says how it was aligned).
+        ate_rmse_m: absolute trajectory error (by `alignment` in ``more``).
         rpe_trans_m, rpe_rot_deg: relative pose error a frame.
         drift_percent: error at the end over the length of the path, first pose aligned.
         end_error_m, end_error_deg: error of the last pose against truth, first pose aligned.

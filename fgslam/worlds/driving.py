@@ -161,7 +161,7 @@ def through_waypoints(points: FloatArray, closed: bool) -> PlanarPath:
 
 
 def round_corners(corners: FloatArray, bend_m: float) -> PlanarPath:
-    """Straight from corner to corner (n, 2), each but the ends rounded by a smooth bend.
+    """Straight from corner to corner (n, 2), each but the ends rounded by a smooth turn.
 
     Closed where the last corner is the first and the drive arrives there in its first heading.
 
@@ -170,7 +170,7 @@ def round_corners(corners: FloatArray, bend_m: float) -> PlanarPath:
         bend_m: way over which a quarter turn is driven; other turns in proportion.
 
     Raises:
-        ValueError: two corners are too near to each other for their bends.
+        ValueError: two corners are too near to each other for their turns.
     """
     edges = np.diff(corners, axis=0)
     heading = np.arctan2(edges[:, 1], edges[:, 0])
@@ -184,8 +184,7 @@ def round_corners(corners: FloatArray, bend_m: float) -> PlanarPath:
         raise ValueError(f"corners {int(np.argmin(straight))} and the next are too near")
     segments = [(float(straight[0]), 0.0)]
     for k in range(len(turns)):
-        bend = [(float(way[k]), float(turns[k]))] if way[k] > 0.0 else []
-        segments += [*bend, (float(straight[k + 1]), 0.0)]
+        segments += [(float(way[k]), float(turns[k])), (float(straight[k + 1]), 0.0)]
     back = np.exp(1j * heading[-1]), np.exp(1j * heading[0])
     closed = bool(np.allclose(corners[0], corners[-1]) and np.isclose(*back))
     start = (float(corners[0, 0]), float(corners[0, 1]), float(heading[0]))
@@ -193,11 +192,11 @@ def round_corners(corners: FloatArray, bend_m: float) -> PlanarPath:
 
 
 def _bend_cut(way: float, turn: float) -> float:
-    """How far before and after its corner a bend begins and ends, metres."""
+    """How far before and after its corner a rounded turn begins and ends, metres."""
     if way == 0.0:
         return 0.0
-    bend = straights_and_turns((0.0, 0.0, 0.0), [(way, turn)], closed=False)
-    return float(np.linalg.norm(bend.xy[-1]) / (2.0 * np.cos(0.5 * turn)))
+    curve = straights_and_turns((0.0, 0.0, 0.0), [(way, turn)], closed=False)
+    return float(np.linalg.norm(curve.xy[-1]) / (2.0 * np.cos(0.5 * turn)))
 
 
 def paper_loop() -> PlanarPath:
@@ -362,7 +361,7 @@ CHAIR_ACCELERATION_M_S2 = 0.5
 CHAIR_TURN_ACCELERATION_DEG_S2 = 120.0
 MAX_SPEED_M_S, MAX_TURN_DEG_S = 0.5, 45.0  # one that is driven slowly
 # Deviations of what is drawn once a drive: relative errors of speed and of turns, and the turn a
-# metre that nobody asked for.
+# metre that was not commanded.
 SPEED_SCALE, TURN_SCALE, PULL_DEG_M = 0.03, 0.03, 1.0
 SLIP_M_SQRT_M, SLIP_DEG_SQRT_M = 0.02, 1.0
 """Noise along the way, metres, and of the heading, degrees, per root metre."""

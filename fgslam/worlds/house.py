@@ -167,7 +167,7 @@ class OmniWorld:
     # ---------------------------------------------------------------------------- acting
 
     def put(self, pose: FloatArray) -> None:
-        """Puts the wheelchair elsewhere (3,), standing still: all begins anew at time 0."""
+        """Puts the wheelchair elsewhere (3,), standing still, and time begins again at 0."""
         self.wheelchair = Wheelchair(pose, self._rng(3), self._touches)
         self._scan_rng = self._rng(4)
         self._people.restart()
@@ -223,7 +223,7 @@ class OmniWorld:
 
     @cached_property
     def targets(self) -> tuple[Image, ...]:
-        """The target images, taken at another time: other light and noise, nobody about."""
+        """The target images, taken at another time: other light and noise, no people."""
         tilt = camera_tilt(self.settings.tilt_deg, self._rng(5))
         return tuple(self.picture(pose, k, tilt) for k, pose in enumerate(self.target_poses))
 

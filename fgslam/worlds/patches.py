@@ -23,7 +23,7 @@ class Surface:
 
     Attributes:
         texture: name in the texture library.
-        tile_m: size in metres that one copy of the texture covers; None stretches it once.
+        tile_m: size in metres that one copy of the texture covers; None: the patch holds one.
         glow: fraction of the light that the surface emits by itself (lamps, screens).
     """
 

@@ -377,7 +377,7 @@ def _rug(width: float, depth: float, texture: str) -> list[Patch]:
 
 # Turned by this much (degrees), a piece whose front is -y faces the room from that wall.
 _WALLS = {"north": 0.0, "east": -90.0, "south": 180.0, "west": 90.0}
-# Kept free of furniture beside an opening and in corners, metres.
+# Kept free of furniture next to an opening and in corners, metres.
 _DOOR_MARGIN, _CORNER_MARGIN = 0.55, 0.25
 _WIDTHS = {
     "shelf": (0.9, 1.5),

@@ -7,7 +7,7 @@ ratio along ``d_c`` and ``d_r`` are the pixel's footprint on the texture, which 
 filter over. Pixels at the border of two surfaces are replaced by the mean of four points in them.
 
 Light is baked into the scene: lamps with soft shadows, and sky light dimmed in corners. Diffuse
-light does not depend on where the camera is, so a surface looks the same from everywhere, as
+light does not depend on where the camera is, so a surface appears the same from everywhere, as
 landmarks must.
 """
 
@@ -44,7 +44,7 @@ _CORNER_REACH_M = 0.7
 _CORNER_RAYS = 24
 _LAMP_SAMPLES = 3
 _LAMP_POWER = 3.6
-# Light is measured this far before a surface: a poster must not darken the wall it hangs on.
+# Light is measured this far before a surface: a poster must not darken the wall behind it.
 _LIFT_M = 0.015
 
 
@@ -528,7 +528,7 @@ class Renderer:
         return levels
 
     def _borders(self, hits: _Hits, levels: Float32) -> IntArray:
-        """Pixels beside one that shows another surface, as indices into the valid ones."""
+        """Pixels next to one that shows another surface, as indices into the valid ones."""
         first, second = self._pairs
         label = hits.patch * _MOST_LAYERS + hits.layer
         change = np.flatnonzero(label[first] != label[second])
@@ -590,7 +590,7 @@ def _seen(scene: Layer, pose: FloatArray, bodies: Sequence[Body]) -> list[tuple[
 
 
 def _neighbours(valid: IntArray, shape: tuple[int, int]) -> tuple[IntArray, IntArray]:
-    """Pairs of valid pixels beside and below each other, as indices into the valid ones."""
+    """Pairs of valid pixels, right and below neighbours, as indices into the valid ones."""
     place = np.full(shape, -1, dtype=np.int64)
     place.ravel()[valid] = np.arange(len(valid))
     first = np.concatenate([place[:, :-1].ravel(), place[:-1].ravel()])

@@ -36,7 +36,7 @@ PathName: TypeAlias = Literal["paper_loop", "laps", "waypoints", "tour", "one_wa
 
 @dataclass(frozen=True, config=STRICT)
 class LabRigSettings:
-    """The cameras: the right one is the reference, left beside it, top above it."""
+    """The cameras: the right one is the reference, left next to it, top above it."""
 
     width: ImageSide = Field(default=320, description="image width, pixels")
     height: ImageSide = Field(default=240, description="image height, pixels")

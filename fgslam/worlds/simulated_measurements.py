@@ -326,8 +326,8 @@ def plan_measured_drive(
     else:  # from the middle of a rectangle's first side
         a, b = _ROUND_M
         turn = (_BEND_M, np.pi / 2)
-        bend = straights_and_turns((0.0, 0.0, 0.0), [turn], closed=False)
-        cut = float(bend.xy[-1, 0])  # before and after a corner the bend begins and ends
+        corner = straights_and_turns((0.0, 0.0, 0.0), [turn], closed=False)
+        cut = float(corner.xy[-1, 0])  # before and after a corner the turn begins and ends
         half, long, short = a / 2 - cut, a - 2 * cut, b - 2 * cut
         lap = [(half, 0.0), turn, (short, 0.0), turn, (long, 0.0), turn, (short, 0.0), turn]
         laps = [*lap, (half, 0.0)] * settings.laps
@@ -338,7 +338,7 @@ def plan_measured_drive(
 
 
 def _sharp_turns(settings: MeasurementDriveSettings) -> FloatArray:
-    """(n, 3) x, y, heading: spins on the spot and tight bends, round after round."""
+    """(n, 3) x, y, heading: spins on the spot and tight curves, round after round."""
     step = _CRUISE * settings.max_speed_m_s / settings.frame_rate_hz
     turn = np.deg2rad(settings.turn_deg_per_frame)
     segments = []
@@ -361,7 +361,7 @@ def _sharp_turns(settings: MeasurementDriveSettings) -> FloatArray:
 # --------------------------------------------------------------------------------------------
 # Landmarks on the surfaces of a room or of corridors, with the side they are seen from
 #
-# Identities are as the landmark database makes them: given in the order of first sight, kept
+# Identities are as the landmark database makes them: given in the order of first observation, kept
 # through misses, dropped after too many in a row, and new when the point is seen again (Se et al.
 # 4.3).
 
@@ -433,7 +433,7 @@ def _inside(points: FloatArray, boxes: FloatArray) -> BoolArray:
 
 
 def _lab_points(count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Spread over walls, furniture and what hangs on the walls, by area."""
+    """Spread over walls, furniture and pictures, by area."""
     things = build_lab(np.random.default_rng([0, 2])).things
     patches = stack(things)
     area = np.linalg.norm(np.cross(patches.edge_u, patches.edge_v), axis=1)
