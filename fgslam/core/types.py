@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from pathlib import Path
@@ -483,6 +484,7 @@ __all__ = [
     "Prediction",
     "Relocalisation",
     "RelocalisationStatus",
+    "Remark",
     "Trajectory",
     "UpdateStats",
     "correlation",
@@ -521,6 +523,21 @@ class Prediction(Brief):
 
     wTc: FloatArray
     covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """What was found on a drive, as data; ``report.content`` makes its sentence.
+
+    Attributes:
+        code: key of the sentence.
+        frames: numbers of the frames that it is about, ascending.
+        values: numbers and names in the sentence.
+    """
+
+    code: str
+    frames: tuple[int, ...] = ()
+    values: Mapping[str, float | str] = field(default_factory=dict)
 
 
 class EgoMotionStatus(str, Enum):

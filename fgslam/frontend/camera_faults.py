@@ -20,6 +20,7 @@ from fgslam.core.correction import IMPLAUSIBLE_PX, TERMS, camera_displacements, 
 from fgslam.core.least_squares import KERNEL, cauchy_fit
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import Kept
+from fgslam.core.types import Remark
 
 # ------------------------------------------------------------------------------------------
 # By how many frames one camera's image is older than another's, from the two images alone
@@ -356,18 +357,32 @@ class TurnWatch:
         """Of the noise of windows, over that of their points."""
         return max(float(self._noise[0] / self._noise[1]), 1.0)
 
-    def remarks(self) -> tuple[str, ...]:
-        """A line for each knock: which camera, by how much about which axis, since when.
+    def remarks(self) -> tuple[Remark, ...]:
+        """One for each knock: which camera, by how much about which axis, since when.
 
-        Of more than two, a line for each camera. Knocks without a sure axis are left out.
+        Of more than two, one for each camera. Knocks without a sure axis are left out.
         """
         changes = self._changes()
+        grouped = [[x for x in changes if x.camera == k] for k in range(self._rig.cameras)]
         if len(changes) <= _FEW:
-            return tuple(map(self._of_one, changes))
-        of_camera = [[x for x in changes if x.camera == k] for k in range(self._rig.cameras)]
-        return tuple(
-            self._of_many(own) if len(own) > 1 else self._of_one(own[0]) for own in of_camera if own
-        )
+            grouped = [[x] for x in changes]
+        against = " against the right one (or that one by the opposite)"
+        out = []
+        for own in filter(None, grouped):
+            frames = tuple(change.frame for change in own)
+            values: dict[str, float | str] = {
+                "camera": CAMERA_NAMES[own[0].camera],
+                "against": against if self._rig.cameras == 2 else "",
+                "degrees": max(change.degrees for change in own),
+                "turns": ", ".join(
+                    f"{np.rad2deg(own[0].turn[k]):.2f} degrees in {_AXES[k]} "
+                    f"({abs(own[0].turn[k]) / own[0].sigma[k]:.0f} sigma)"
+                    for k in own[0].axes
+                ),
+            }
+            code = "camera_turned" if len(own) == 1 else "camera_loose"
+            out.append(Remark(code, frames, values))
+        return tuple(out)
 
     def _changes(self) -> list[_Change]:
         """The knocks that have a sure axis."""
@@ -382,33 +397,6 @@ class TurnWatch:
             if axes:
                 out.append(_Change(knock.frame, camera, turn, sigma, axes))
         return out
-
-    def _of_one(self, change: _Change) -> str:
-        parts = ", ".join(
-            f"{np.rad2deg(change.turn[k]):.2f} degrees in {_AXES[k]} "
-            f"({abs(change.turn[k]) / change.sigma[k]:.0f} sigma)"
-            for k in change.axes
-        )
-        return (
-            f"the {CAMERA_NAMES[change.camera]} camera was turned by {parts}{self._against} at "
-            f"about frame {change.frame} of the run, as points off their lines show: fasten it and "
-            "calibrate the rig again; what is measured from there on may be wrong"
-        )
-
-    def _of_many(self, changes: list[_Change]) -> str:
-        largest = max(change.degrees for change in changes)
-        return (
-            f"the {CAMERA_NAMES[changes[0].camera]} camera is loose: it turned {len(changes)} "
-            f"times, by up to {largest:.2f} degrees{self._against}, from about frame "
-            f"{changes[0].frame} to {changes[-1].frame} of the run, as points off their lines "
-            "show: fasten it and calibrate the rig again; what is measured from there on may be "
-            "wrong"
-        )
-
-    @property
-    def _against(self) -> str:
-        pair = self._rig.cameras == 2
-        return " against the right one (or that one by the opposite)" * pair
 
     # ----------------------------------------------------------------------------------------
 
@@ -531,17 +519,17 @@ class CameraWatch:
         """Whether remarks report that a camera was turned during the drive."""
         return bool(self._turns.remarks())
 
-    def remarks(self) -> tuple[str, ...]:
-        """What is to be said of images that are used all the same."""
-        out = list(self._turns.remarks())
-        for camera, pair in enumerate(self._pairs, 1):
-            if pair.unequal:
-                out.append(
-                    f"the {CAMERA_NAMES[camera]} images were darker or brighter than the right "
-                    f"ones by more than a third of a stop in {pair.unequal} of {self._frames} "
-                    "frames; give all cameras one exposure time and gain"
-                )
-        return tuple(out)
+    def remarks(self) -> tuple[Remark, ...]:
+        """On images that are used all the same."""
+        unequal = [
+            Remark(
+                "unequal_exposure",
+                values={"camera": CAMERA_NAMES[k], "count": pair.unequal, "all": self._frames},
+            )
+            for k, pair in enumerate(self._pairs, 1)
+            if pair.unequal
+        ]
+        return (*self._turns.remarks(), *unequal)
 
     # ----------------------------------------------------------------------------------------
 

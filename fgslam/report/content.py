@@ -20,6 +20,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import replacing, write_text
 from fgslam.core.geometry import congruence
+from fgslam.core.types import Remark
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
 
 if TYPE_CHECKING:
@@ -445,3 +446,71 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+# --------------------------------------------------------------------------------------------
+# Sentences of remarks: all of their words stand here
+
+_UNSURE = (
+    "something large passes{or_odometry}. Without odometry that tells which is which the pose is "
+    "in doubt where that fills more of the view than the scene, for it may follow what passes "
+    "(leave these frames out: --start, --stop)"
+)
+_MOTION = (
+    "in {count} frames, {span}, something else moves rigidly, with up to {percent:.0f} % as many "
+    "matches as the pose follows: "
+)
+_PREDICTED = "{fault}: {count} of {all} frames, {span}, are not used; their poses are predicted "
+_WATCH = "frontend.watch_cameras: false uses them all"
+_FASTEN = (
+    "as points off their lines show: fasten it and calibrate the rig again; what is measured from "
+    "there on may be wrong"
+)
+_NO_MATCHES = (
+    "no stereo matches in the first {count} frames: {features:.0f} features in the right image, "
+    "{matched:.0f} of them matched"
+)
+SENTENCES = {
+    "bridged": "{named}: not located in the first map; in the final trajectory interpolated "
+    "between the located frames around, where that is more certain than what the estimator knows",
+    "camera_fault": _PREDICTED + "(mend the camera; " + _WATCH + ")",
+    "camera_loose": "the {camera} camera is loose: it turned {count} times, by up to "
+    "{degrees:.2f} degrees{against}, from about frame {first} to {last} of the run, " + _FASTEN,
+    "camera_turned": "the {camera} camera was turned by {turns}{against} at about frame {first} "
+    "of the run, " + _FASTEN,
+    "cameras_swapped": _PREDICTED + "(swap their images; " + _WATCH + ")",
+    "left_out": "the first {count} frames could not be located: left out",
+    "lost_bits": "{fault}",
+    "no_features": _NO_MATCHES + "{left}; are the images dark, or 12-bit values in 16-bit images?",
+    "no_matches": _NO_MATCHES + "{left}; are left and right swapped, or the images not rectified?",
+    "no_matches_fault": _NO_MATCHES + "; {fault}",
+    "odometry_contradicted": "the odometry contradicts the images in {count} of {all} frames, "
+    "which are located without it: check its unit, its clock and where the camera sits on the "
+    "robot (dataset.camera_yaw_deg, dataset.lever_arm_m)",
+    "other_motion": _MOTION + _UNSURE.format(or_odometry=""),
+    "other_motion_or_odometry": _MOTION
+    + _UNSURE.format(
+        or_odometry=", or the odometry is wrong (its unit or clock, the camera's place on the "
+        "robot)"
+    ),
+    "unconnected": "{named}: located relative to each other only, not in the first map; before is "
+    "a gap that neither landmarks nor odometry bridge; {known} of {all} frames ({percent:.0f} %) "
+    "are located in the first map",
+    "unequal_exposure": "the {camera} images were darker or brighter than the right ones by more "
+    "than a third of a stop in {count} of {all} frames; give all cameras one exposure time and "
+    "gain",
+}
+"""By the code of a :class:`~fgslam.core.types.Remark`."""
+
+
+def sentence(remark: Remark | str) -> str:
+    """A remark in words; what is in words already, as it is."""
+    if isinstance(remark, str):
+        return remark
+    of_frames: dict[str, float | str] = {}
+    if frames := remark.frames:
+        n, first, last = len(frames), frames[0], frames[-1]
+        span = f"from {first} to {last}" if n > 1 else f"frame {first}"
+        of_frames = {"count": n, "first": first, "last": last, "span": span}
+        of_frames["named"] = f"{n} frames {span}" if n > 1 else span
+    return SENTENCES[remark.code].format(**of_frames, **remark.values)

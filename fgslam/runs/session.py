@@ -30,6 +30,7 @@ from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
+from fgslam.report.content import sentence
 from fgslam.report.formats import MapPoints, write_map
 from fgslam.runs.bare import bare_experiment
 from fgslam.runs.config import ExperimentConfig, load_config
@@ -291,7 +292,13 @@ class Result(SessionResult):
         map: landmarks with covariances and appearance, to save or to find oneself in.
     """
 
+    notes: tuple[str, ...]
     map: Map
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Remarks on the images, and on what the estimator left out or had to repair."""
+        return (*self.notes, *self.estimate.remarks)
 
 
 class Slam(Session):
@@ -431,6 +438,7 @@ class Slam(Session):
         evidence = evidence_of(self.pipeline, self.recorder, self._before)
         saved = saved_map(self.pipeline, self.rig, found.estimate, about, evidence)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
+        values["notes"] = tuple(map(sentence, found.notes))
         return Result(**values, map=Map(saved, points, self._remark))
 
     def _drive(self, found: SessionResult) -> dict[str, Any]:
@@ -441,7 +449,7 @@ class Slam(Session):
             "estimator": found.kind,
             "valid_hits": self.frontend.database.valid_hits,
             "remark": self._remark,
-            "remarks": list(found.remarks),
+            "remarks": list(map(sentence, found.remarks)),
         }
 
 

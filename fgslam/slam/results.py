@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -12,13 +12,19 @@ import numpy.typing as npt
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import WeighedCorrection
-from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray
+from fgslam.core.arrays import BoolArray, Brief, FloatArray
 from fgslam.core.errors import FgslamError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Observations
 from fgslam.core.store import Kept
-from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, StereoFeatures, Trajectory
-from fgslam.frontend.camera_faults import CameraWatch
+from fgslam.core.types import (
+    EgoMotionStatus,
+    Estimate,
+    LandmarkMap,
+    Remark,
+    StereoFeatures,
+    Trajectory,
+)
 from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.bridging import bridged_frames
 from fgslam.slam.feature_stream import FeatureFrame
@@ -216,7 +222,7 @@ class SessionResult(Brief):
         online_covariances: (n, 6, 6) of those.
         closed: of all loop closures offered so far, whether the estimator took them.
         frames: the record of every frame, by name of the column.
-        notes: remarks on the images, and of frames left out.
+        notes: remarks on frames, cameras and images, and on frames left out.
         rig: what the drive shows of the rig's calibration: estimated, with its covariance, and
             applied; None where the calibration is taken as it is stated.
     """
@@ -227,7 +233,7 @@ class SessionResult(Brief):
     online_covariances: FloatArray
     closed: tuple[bool, ...]
     frames: dict[str, npt.NDArray[Any]]
-    notes: tuple[str, ...]
+    notes: tuple[Remark | str, ...]
     rig: WeighedCorrection | None
 
     # What a comparison of estimators asks of a replay, and a live session does not know.
@@ -247,7 +253,7 @@ class SessionResult(Brief):
         return self.estimate.covariances
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def remarks(self) -> tuple[Remark | str, ...]:
         """Remarks on the images, and on what the estimator left out or had to repair."""
         return (*self.notes, *self.estimate.remarks)
 
@@ -261,7 +267,7 @@ class SessionResult(Brief):
 
 
 def result_of(
-    pipeline: SlamPipeline, recorder: RunRecorder, notes: tuple[str, ...], failed: bool
+    pipeline: SlamPipeline, recorder: RunRecorder, notes: tuple[Remark, ...], failed: bool
 ) -> SessionResult:
     """The result of the frames so far; nothing is changed.
 
@@ -334,32 +340,6 @@ def _columns(recorder: RunRecorder) -> dict[str, npt.NDArray[Any]]:
 
 
 # ------------------------------------------------------------------------------------------
-# Remarks of a session on its cameras: frames whose images could not be used, unequal exposure
-
-
-def camera_remarks(recorder: RunRecorder, watch: CameraWatch | None) -> tuple[str, ...]:
-    """A line for each fault with its frames; none where the cameras are sound or not watched."""
-    frames: dict[str, list[int]] = {}
-    for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
-        if row.status == EgoMotionStatus.CAMERA_FAULT.value:
-            frames.setdefault(row.problem, []).append(number)
-    lines = [
-        f"{fault}: {len(which)} of {len(recorder)} frames, {_between(which)}, are not used; their "
-        f"poses are predicted ({'swap their images' if 'swapped' in fault else 'mend the camera'}; "
-        "frontend.watch_cameras: false uses them all)"
-        for fault, which in frames.items()
-    ]
-    return (*lines, *(() if watch is None else watch.remarks()))
-
-
-def _between(frames: list[int]) -> str:
-    """First and last of some frames in words."""
-    if len(frames) == 1:
-        return f"frame {frames[0]}"
-    return f"from {frames[0]} to {frames[-1]}"
-
-
-# ------------------------------------------------------------------------------------------
 # Remarks on images that stereo matching cannot use: swapped cameras, darkness, 12-bit values
 
 _FRAMES = 10  # judged: what is wrong with cables, drivers or calibration is wrong from the start
@@ -425,25 +405,24 @@ def any_uint16(images: Sequence[npt.ArrayLike]) -> bool:
     return any(getattr(image, "dtype", None) == np.uint16 for image in images)
 
 
-def stereo_remarks(recorder: RunRecorder, seen: FirstImages | None = None) -> tuple[str, ...]:
-    """A remark where the first frames with images have next to no stereo match, or lost bits."""
+def _image_remarks(recorder: RunRecorder, seen: FirstImages) -> Iterator[Remark]:
+    """Whether the first frames with images have next to no stereo match, or lost bits."""
     rows = [row for row in recorder.rows if not row.problem][:_FRAMES]
     features, matched = sum(row.features for row in rows), sum(row.stereo for row in rows)
     if len(rows) < _FEWEST:
-        return ()
-    seen = seen or FirstImages()
+        return
     if matched > _LEAST_MATCHED * features:
-        return (seen.lost_bits(),) if seen.lost_bits() else ()
-    n = len(rows)
-    found = f"no stereo matches in the first {n} frames: {features / n:.0f} features in the right"
-    found += f" image, {matched / n:.0f} of them matched"
+        if seen.lost_bits():
+            yield Remark("lost_bits", values={"fault": seen.lost_bits()})
+        return
+    n, values = len(rows), dict[str, float | str]()
+    values |= {"count": n, "features": features / n, "matched": matched / n}
     if seen.fault():
-        return (f"{found}; {seen.fault()}",)
-    if seen.left():
-        found += f" ({seen.left()})"
-    if not features:
-        return (f"{found}; are the images dark, or 12-bit values in 16-bit images?",)
-    return (f"{found}; are left and right swapped, or the images not rectified?",)
+        yield Remark("no_matches_fault", values=values | {"fault": seen.fault()})
+        return
+    left = f" ({seen.left()})" if seen.left() else ""
+    code = "no_matches" if features else "no_features"
+    yield Remark(code, values=values | {"left": left})
 
 
 # ------------------------------------------------------------------------------------------
@@ -466,67 +445,54 @@ def in_first_map(recorder: RunRecorder, parts: MapParts) -> int:
     return int((located_frames(recorder) & connected_frames(recorder, parts)).sum())
 
 
-def left_out_note(count: int) -> str:
-    """That a drive begins after its first ``count`` frames."""
-    return f"the first {count} frames could not be located: left out"
-
-
-def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
-    """Lines on frames that nothing measured, that lie in parts of their own, or off odometry."""
+def session_remarks(
+    pipeline: SlamPipeline, recorder: RunRecorder, seen: FirstImages | None = None
+) -> tuple[Remark, ...]:
+    """On frames, cameras and images of a drive; ``seen``: its first images, where known."""
+    watch = pipeline.watch
     return (
-        *_of_bridged(recorder, parts),
-        *_of_unconnected(recorder, parts),
-        *_of_contradicted(recorder),
+        *part_remarks(recorder, pipeline.tracker.parts),
+        *camera_remarks(recorder),
+        *(() if watch is None else watch.remarks()),
+        *_image_remarks(recorder, seen or FirstImages()),
+        *pipeline.tracker.other_motion.remarks(),
     )
 
 
-def _of_bridged(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
-    """A line where final poses may be interpolated."""
-    frames = bridged_frames(parts)
-    frames = frames[frames < len(recorder)]
-    if not len(frames):
-        return ()
-    numbers = recorder.log.numbers[frames]
-    return (
-        f"{_named(numbers)}: not located in the first map; in the final trajectory interpolated "
-        "between the located frames around, where that is more certain than what the estimator "
-        "knows",
+def camera_remarks(recorder: RunRecorder) -> tuple[Remark, ...]:
+    """One for each fault of a camera, with the frames that are not used for it."""
+    frames: dict[str, list[int]] = {}
+    for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
+        if row.status == EgoMotionStatus.CAMERA_FAULT.value:
+            frames.setdefault(row.problem, []).append(number)
+    return tuple(
+        Remark(
+            "cameras_swapped" if "swapped" in fault else "camera_fault",
+            tuple(which),
+            {"fault": fault, "all": len(recorder)},
+        )
+        for fault, which in frames.items()
     )
 
 
-def _of_unconnected(recorder: RunRecorder, parts: MapParts) -> tuple[str, ...]:
-    """A line where frames are located in parts that a guess alone joins to the first."""
+def part_remarks(recorder: RunRecorder, parts: MapParts) -> tuple[Remark, ...]:
+    """On frames that nothing measured, that lie in parts of their own, or off odometry."""
+    out, numbers, n = [], recorder.log.numbers, len(recorder)
+    bridged = bridged_frames(parts)
+    bridged = bridged[bridged < n]
+    if len(bridged):  # final poses may be interpolated
+        out.append(Remark("bridged", tuple(numbers[bridged].tolist())))
     apart = located_frames(recorder) & ~connected_frames(recorder, parts)
-    if not apart.any():
-        return ()
-    numbers = recorder.log.numbers[apart]
-    known, n = in_first_map(recorder, parts), len(recorder)
-    return (
-        f"{_named(numbers)}: located relative to each other only, not in the first map; before is "
-        f"a gap that neither landmarks nor odometry bridge; {known} of {n} frames "
-        f"({100.0 * known / n:.0f} %) are located in the first map",
-    )
-
-
-def _of_contradicted(recorder: RunRecorder) -> tuple[str, ...]:
-    """A line where landmarks place most frames elsewhere than odometry does."""
+    if apart.any():
+        known = in_first_map(recorder, parts)
+        values = {"known": known, "all": n, "percent": 100.0 * known / n}
+        out.append(Remark("unconnected", tuple(numbers[apart].tolist()), values))
     again = recorder.column("status") == EgoMotionStatus.RELOCALISED.value
-    if 2 * int(again.sum()) <= len(recorder):  # the log is read only where it may be so
-        return ()
-    steps = [one.odometry for one in recorder.log]
-    moved = np.array([step is not None and step.measured for step in steps], np.bool_)
-    contradicted = int((again & moved).sum())
-    if 2 * contradicted <= int(moved.sum()):
-        return ()
-    return (
-        f"the odometry contradicts the images in {contradicted} of {int(moved.sum())} frames, "
-        "which are located without it: check its unit, its clock and where the camera sits on the "
-        "robot (dataset.camera_yaw_deg, dataset.lever_arm_m)",
-    )
-
-
-def _named(numbers: IntArray) -> str:
-    """Frames by how many they are and the first and last of them."""
-    if len(numbers) == 1:
-        return f"frame {numbers[0]}"
-    return f"{len(numbers)} frames from {numbers[0]} to {numbers[-1]}"
+    if 2 * int(again.sum()) > n:  # the log is read only where it may be so
+        steps = [one.odometry for one in recorder.log]
+        moved = np.array([step is not None and step.measured for step in steps], np.bool_)
+        contradicted, all_moved = int((again & moved).sum()), int(moved.sum())
+        if 2 * contradicted > all_moved:
+            values = {"count": contradicted, "all": all_moved}
+            out.append(Remark("odometry_contradicted", values=values))
+    return tuple(out)

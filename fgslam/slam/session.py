@@ -22,6 +22,7 @@ from fgslam.core.geometry import compose_odometry, is_rigid
 from fgslam.core.log import Frame, MeasurementLog
 from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.threads import one_blas_thread
+from fgslam.core.types import Remark
 from fgslam.datasets.odometry import pose_noise
 from fgslam.datasets.settings import OdometrySettings, RecordedOdometrySettings
 from fgslam.frontend.features.sift import grey_image
@@ -47,11 +48,8 @@ from fgslam.slam.results import (
     SessionResult,
     Step,
     any_uint16,
-    camera_remarks,
-    left_out_note,
-    part_remarks,
     result_of,
-    stereo_remarks,
+    session_remarks,
 )
 
 # ------------------------------------------------------------------------------------------
@@ -530,12 +528,9 @@ class Session:
         left_out = self._left_out
         if not len(self.recorder):
             raise SessionError(self._why_empty())
-        notes = stereo_remarks(self.recorder, self._seen)
-        notes = (*camera_remarks(self.recorder, self.pipeline.watch), *notes)
-        notes = (*part_remarks(self.recorder, self.pipeline.tracker.parts), *notes)
-        notes = (*notes, *self.pipeline.tracker.other_motion.remarks())
+        notes = session_remarks(self.pipeline, self.recorder, self._seen)
         if left_out.count:
-            notes = (*notes, left_out_note(left_out.count))
+            notes = (*notes, Remark("left_out", values={"count": left_out.count}))
         with one_blas_thread():
             return result_of(self.pipeline, self.recorder, notes, self._failed)
 

@@ -24,6 +24,7 @@ from fgslam.core.types import (
     LandmarkAppearances,
     LandmarkMap,
     Prediction,
+    Remark,
     StereoFeatures,
 )
 from fgslam.frontend.features.matching import mutual_nearest
@@ -232,24 +233,14 @@ class OtherMotion:
         if followed:
             self._before = _Unexplained.of(features.select(left), partners[left], wTc)
 
-    def remarks(self) -> tuple[str, ...]:
-        """What is to be said of the frames with two motions."""
+    def remarks(self) -> tuple[Remark, ...]:
+        """On the frames with two motions; none where there are none."""
         if not self._doubted:
             return ()
-        frames, most = sorted(self._doubted), max(self._doubted.values())
+        most = max(self._doubted.values())
         # The pose follows the fewer matches only where odometry, or the map, says so.
-        or_odometry = (
-            ", or the odometry is wrong (its unit or clock, the camera's place on the robot)"
-            if most > 1.0
-            else ""
-        )
-        return (
-            f"in {len(frames)} frames, from {frames[0]} to {frames[-1]}, something else moves "
-            f"rigidly, with up to {100.0 * most:.0f} % as many matches as the pose follows: "
-            f"something large passes{or_odometry}. Without odometry that tells which is which the "
-            "pose is in doubt where that fills more of the view than the scene, for it may follow "
-            "what passes (leave these frames out: --start, --stop)",
-        )
+        code = "other_motion" if most <= 1.0 else "other_motion_or_odometry"
+        return (Remark(code, tuple(sorted(self._doubted)), {"percent": 100.0 * most}),)
 
     def _share(
         self, features: StereoFeatures, left: IntArray, old: IntArray, tracking: EgoMotion

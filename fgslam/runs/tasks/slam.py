@@ -22,7 +22,9 @@ from fgslam.core.files import remove_file, remove_files
 from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.saved_map import save_map
 from fgslam.core.store import load_arrays, write_arrays
+from fgslam.core.types import Remark
 from fgslam.evaluation.statistics import EstimatorMetrics
+from fgslam.report.content import sentence
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of, run_task
 from fgslam.runs.folder import (
@@ -63,7 +65,7 @@ from fgslam.runs.units import Progress
 from fgslam.slam.build import evidence_of, make_estimator, make_stream, require_map_user, saved_map
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
-from fgslam.slam.results import RunRecorder, left_out_note
+from fgslam.slam.results import RunRecorder
 from fgslam.slam.session import Session
 from fgslam.slam.settings import MapSettings
 
@@ -394,7 +396,9 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         config = config.model_copy(update={"dataset": later})
         sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
     arrival = None
-    notes: tuple[str, ...] = (left_out_note(run.frames_before),) if run.frames_before else ()
+    notes: tuple[str, ...] = ()
+    if run.frames_before:
+        notes = (sentence(Remark("left_out", values={"count": run.frames_before})),)
     if entry is not None and given is not None:
         arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
     session = Session(

@@ -13,11 +13,11 @@ import numpy as np
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.log import ImageSequence
 from fgslam.core.saved_map import SavedMap, load_map
-from fgslam.core.types import Prediction, Relocalisation
+from fgslam.core.types import Prediction, Relocalisation, Remark
+from fgslam.report.content import sentence
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.folder import RUN_MARKER, is_run_folder
 from fgslam.slam.build import Arrival, MapStart, make_locator, make_stream
-from fgslam.slam.results import left_out_note
 from fgslam.slam.settings import MapSettings
 
 FIRST_FOLDER = "first"
@@ -99,7 +99,7 @@ class Entry:
         )
         if not self.frames_before:
             return (entered,)
-        return (entered, left_out_note(self.frames_before))
+        return (entered, sentence(Remark("left_out", values={"count": self.frames_before})))
 
 
 def open_map(path: Path) -> GivenMap:

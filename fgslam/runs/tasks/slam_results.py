@@ -38,6 +38,7 @@ from fgslam.report.content import (
     Column,
     StageTime,
     TextTable,
+    sentence,
     write_csv,
     write_metrics,
     write_timing,
@@ -65,10 +66,8 @@ from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import (
     STAGES,
     RunRecorder,
-    camera_remarks,
     in_first_map,
-    part_remarks,
-    stereo_remarks,
+    session_remarks,
 )
 from fgslam.slam.session import Session
 
@@ -621,16 +620,13 @@ class RunOutputs:
 
     def remarks(self) -> tuple[str, ...]:
         """Notes on the recording, its cameras and its first images."""
-        tracker, share = self.pipeline.tracker, located(self.recorder)
+        share = located(self.recorder)
         few = f"only {share} were located by landmarks; the rest of the path is predicted"
         return (
             *self.sequence.notes,
             *self.notes,
             *(() if share.enough else (few,)),
-            *part_remarks(self.recorder, tracker.parts),
-            *camera_remarks(self.recorder, self.pipeline.watch),
-            *stereo_remarks(self.recorder),
-            *tracker.other_motion.remarks(),
+            *map(sentence, session_remarks(self.pipeline, self.recorder)),
         )
 
     def _about(self, status: str) -> dict[str, JsonValue]:

@@ -31,6 +31,7 @@ from fgslam.frontend.camera_faults import (
     turns_of,
 )
 from fgslam.frontend.features.sift import contrast_share, noise_sigma
+from fgslam.report.content import sentence
 
 # ------------------------------------------------------------------------------------------
 # A camera that is late, frozen, swapped or darker is found out within frames; a sound one never
@@ -152,7 +153,7 @@ def test_a_darker_camera_is_said_and_its_frames_are_used(
     assert not any(said)
     remarks = watch.remarks()
     assert len(remarks) == (2 if camera == 0 else 1)  # a dark reference differs from both others
-    assert "more than a third of a stop" in remarks[0]
+    assert remarks[0].code == "unequal_exposure"
     assert watched(*lab, darker(camera), until=BEGINS)[1].remarks() == ()
 
 
@@ -163,7 +164,7 @@ def test_a_darker_camera_is_said_on_a_real_road(
 ) -> None:
     said, watch = watched(*road, darker(camera))
     assert not any(said)
-    assert "more than a third of a stop" in watch.remarks()[0]
+    assert watch.remarks()[0].code == "unequal_exposure"
 
 
 def test_one_repeated_image_costs_one_frame(lab: tuple[CameraRig, list[Images]]) -> None:
@@ -365,8 +366,8 @@ def test_frames_are_named_by_their_own_numbers(turned_lab: tuple[CameraRig, list
     for k, images in enumerate(frames):
         left = turned(rig, images[1], about(0)) if k >= KNOCKED_AT else images[1]
         watch.look((images[0], left, images[2]), 100 + 2 * k)
-    (line,) = watch.remarks()
-    assert f"at about frame {100 + 2 * KNOCKED_AT} of" in line
+    (remark,) = watch.remarks()
+    assert remark.frames == (100 + 2 * KNOCKED_AT,)
     assert watch.knocked
 
 
@@ -378,7 +379,7 @@ def said_of(rig: CameraRig, frames: list[Images], camera: int, turn_deg: FloatAr
         if k >= KNOCKED_AT:
             shown[camera] = turned(rig, shown[camera], turn_deg)
         assert watch.look(tuple(shown)) == ""
-    return list(watch.remarks())
+    return list(map(sentence, watch.remarks()))
 
 
 def about(axis: int) -> FloatArray:
@@ -494,8 +495,9 @@ def test_knock_is_found_wherever_it_lies_in_a_window(
     for frame in range(12 * WINDOW):
         turn = np.array([0.3, 0.0, 0.0]) * (frame >= at)
         watch.take(frame, [seen(rng, turn, 2.0 * np.sin(frame), lag)])
-    (line,) = watch.remarks()
-    size, words = line.removeprefix("the left camera was turned by ").split(" degrees in ", 1)
+    (remark,) = watch.remarks()
+    assert remark.values["camera"] == "left"
+    size, words = str(remark.values["turns"]).split(" degrees in ", 1)
     assert words.startswith("pitch")
     assert float(size) == pytest.approx(0.3, abs=0.05)
     assert abs(watch.knocks[0].frame - at) <= WINDOW
@@ -524,9 +526,10 @@ def test_camera_that_turns_again_and_again_is_loose(rng: np.random.Generator) ->
     watch = TurnWatch(PAIR, 0.1)
     for frame in range(20 * WINDOW):
         show(watch, frame, rng, (0.0, 0.4, -0.2, 0.2)[frame // (5 * WINDOW)])
-    (line,) = watch.remarks()
-    assert line.startswith("the left camera is loose: it turned 3 times, by up to 0.60 degrees")
-    assert f"from about frame {5 * WINDOW} to {15 * WINDOW} of the run" in line
+    (remark,) = watch.remarks()
+    assert (remark.code, remark.values["camera"]) == ("camera_loose", "left")
+    assert remark.values["degrees"] == pytest.approx(0.6, abs=0.005)
+    assert remark.frames == (5 * WINDOW, 10 * WINDOW, 15 * WINDOW)
 
 
 def test_what_passes_within_a_window_is_no_knock(rng: np.random.Generator) -> None:
@@ -548,8 +551,8 @@ def test_two_knocks_are_told_apart(rng: np.random.Generator) -> None:
     for frame in range(15 * WINDOW):
         show(watch, frame, rng, (0.0, 0.4, -0.2)[frame // (5 * WINDOW)])
     first, second = watch.remarks()
-    for line, expected in ((first, 0.4), (second, -0.6)):
-        size, words = line.removeprefix("the left camera was turned by ").split(" degrees in ", 1)
+    for remark, expected in ((first, 0.4), (second, -0.6)):
+        size, words = str(remark.values["turns"]).split(" degrees in ", 1)
         assert words.startswith("roll")
         assert float(size) == pytest.approx(expected, abs=0.02)
     assert [knock.frame for knock in watch.knocks] == [5 * WINDOW, 10 * WINDOW]

@@ -7,7 +7,7 @@ from simulated import RIG
 
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, Odometry
-from fgslam.core.types import StereoFeatures
+from fgslam.core.types import Remark, StereoFeatures
 from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.results import FrameRow, RunRecorder, in_first_map, part_remarks
 
@@ -44,15 +44,15 @@ def test_nothing_is_said_of_one_map() -> None:
 def test_frames_that_are_interpolated_are_told() -> None:
     parts = Apart([True, True, False, True, True])
     (remark,) = part_remarks(recorded(STATUSES), parts)
-    assert remark.startswith("frame 20: not located in the first map")
+    assert (remark.code, remark.frames) == ("bridged", (20,))
     assert in_first_map(recorded(STATUSES), parts) == 4
 
 
 def test_frames_beyond_a_gap_are_told() -> None:
     parts = Apart([True, True, False, False, False])
     (remark,) = part_remarks(recorded(STATUSES), parts)
-    assert remark.startswith("2 frames from 30 to 40: located relative to each other only")
-    assert remark.endswith("2 of 5 frames (40 %) are located in the first map")
+    assert (remark.code, remark.frames) == ("unconnected", (30, 40))
+    assert remark.values == {"known": 2, "all": 5, "percent": 40.0}
 
 
 def test_a_frame_that_failed_is_not_counted() -> None:
@@ -65,7 +65,6 @@ def test_odometry_against_which_most_frames_are_located_is_told() -> None:
     connected = Apart([True] * 5)
     step = Odometry(np.eye(4), np.eye(6))
     (remark,) = part_remarks(recorded(statuses, step), connected)
-    assert remark.startswith("the odometry contradicts the images in 3 of 5 frames")
-    assert "dataset.camera_yaw_deg" in remark
+    assert remark == Remark("odometry_contradicted", values={"count": 3, "all": 5})
     assert part_remarks(recorded(statuses), connected) == ()  # a guess alone was contradicted
     assert part_remarks(recorded(STATUSES, step), connected) == ()

@@ -29,7 +29,7 @@ from fgslam.core.errors import (
 )
 from fgslam.core.log import Frame
 from fgslam.core.sensors import Odometry
-from fgslam.core.types import EgoMotionStatus, Features, Prediction
+from fgslam.core.types import EgoMotionStatus, Features, Prediction, Remark
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.tracker import Tracked
@@ -116,7 +116,7 @@ def test_the_world_begins_with_the_first_frame_that_shows_enough(
         assert (step.index, step.status) == (k, expected.status)
     assert_same_result(late, straight)
     assert [increment.index for increment in late.log] == [2, 3, 4]
-    assert "the first 2 frames could not be located: left out" in late.result().remarks
+    assert Remark("left_out", values={"count": 2}) in late.result().remarks
     replayed = replay(late.log, estimator, EgoMotionSettings())
     assert_same_bits(replayed.estimate.trajectory, late.result().trajectory)
 
