@@ -26,7 +26,13 @@ from fgslam.core.checks import is_finite_number
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import read_lines, shown_in
 from fgslam.core.sensors import CameraRig
-from fgslam.datasets.images import first_size, read_colour_image, read_depth_image, require_size
+from fgslam.datasets.images import (
+    ImageLoader,
+    first_size,
+    read_colour_image,
+    read_depth_image,
+    require_size,
+)
 from fgslam.datasets.layouts import (
     CameraFiles,
     colour_and_depth,
@@ -35,7 +41,6 @@ from fgslam.datasets.layouts import (
 )
 from fgslam.datasets.odometry import file_odometry, find_odometry
 from fgslam.datasets.recording import (
-    ImageLoader,
     Recording,
     image_recording,
     mounted,

@@ -80,7 +80,7 @@ def open_loose_images(
     identity = recording_identity(defining, (path for pair in pairs for path in pair))
     notes = (*mounting, *noticed, *others, *unpaired, *assumed)
     name = root.resolve().name
-    recording = image_recording(settings, name, rig, stamps, images.load, identity, notes)
+    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
     return replace(recording, odometry_source=file_odometry(odometry_file, odometry))
 
 
@@ -137,7 +137,7 @@ def open_image_folder(
         root.resolve().name,
         rig,
         stamps,
-        images.load,
+        images,
         identity,
         (*mounting, *noticed, *notes),
     )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -18,6 +17,10 @@ from fgslam.core.errors import CalibrationError, DatasetError, FrameError
 from fgslam.core.files import require_file
 from fgslam.core.sensors import CAMERA_NAMES
 from fgslam.datasets.layouts import IMAGE_SUFFIXES
+
+ImageLoader: TypeAlias = Callable[[int, bool], tuple[Image, ...]]
+"""Images (right, left[, top]) of one of the recording's own frames, grey or, where the flag is set,
+in red, green, blue if it has colour; raises FrameError."""
 
 # --------------------------------------------------------------------------------------------
 # One image
@@ -315,48 +318,50 @@ def require_folder(path: Path, what: str) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class FrameFiles:
-    """Images of every frame in files, rectified when read.
-
-    Attributes:
-        paths: per frame the files of right, left[, top] camera; they need not exist.
-        rig: of the cameras.
-        bits: that pixels of 16 bits hold.
-    """
-
-    paths: tuple[tuple[Path, ...], ...]
-    rig: StereoRig
-    bits: int = 16
-
-    def load(self, index: int, colour: bool = False) -> tuple[Image, ...]:
-        """Rectified images. Raises FrameError: one is missing, damaged or of another size."""
-        read = read_colour_image if colour else read_grey_image
-        size = self.rig.image_size
-        return self.rig.rectified(
-            tuple(
-                require_size(read(path, self.bits), f"image {path}", *size)
-                for path in self.paths[index]
-            )
-        )
-
-
 def open_frames(
     paths: Sequence[tuple[Path, ...]], rig: StereoRig, where: Path
-) -> tuple[FrameFiles, tuple[str, ...]]:
-    """Files of frames, of which the first readable one is checked, and what was noticed.
+) -> tuple[ImageLoader, tuple[str, ...]]:
+    """What reads and rectifies the images of a frame, and what was noticed.
+
+    The first readable frame is checked.
+
+    Args:
+        paths: per frame the files of right, left[, top] camera; they need not exist.
+        rig: of the cameras.
+        where: the recording, in messages.
 
     Raises:
         DatasetError: no frame can be read, or the cameras' images differ in size.
         CalibrationError: their size is not the calibrated one.
     """
-    if not paths:  # refused where frames are selected
-        return FrameFiles((), rig), ()
-    _check_sizes(paths, rig.image_size, where)
-    right = [frame[0] for frame in paths]
-    bits, held = bits_of(right)
-    mosaic = mosaic_note(len(right), lambda k: read_grey_image(right[k], bits))
-    return FrameFiles(tuple(paths), rig, bits), (*held, *mosaic, *_missing_note(paths))
+    bits, size, notes = 16, rig.image_size, []
+    if paths:  # else it is refused where frames are selected
+        _check_sizes(paths, size, where)
+        right = [frame[0] for frame in paths]
+        bits, held = bits_of(right)
+        notes += [*held, *mosaic_note(len(right), lambda k: read_grey_image(right[k], bits))]
+    # Existence only: damage shows when reading.
+    missing = [
+        (k, name)
+        for k, frame in enumerate(paths)
+        for name, path in zip(CAMERA_NAMES, frame, strict=False)
+        if not path.is_file()
+    ]
+    if missing:
+        first = ", ".join(f"{k} ({camera})" for k, camera in missing[:_NAMED_IN_NOTES])
+        more = ", ..." if len(missing) > _NAMED_IN_NOTES else ""
+        count = len({k for k, _ in missing})
+        notes.append(f"{count} of {len(paths)} frames lack an image: {first}{more}")
+
+    def load(index: int, colour: bool) -> tuple[Image, ...]:
+        read = read_colour_image if colour else read_grey_image
+        images = (require_size(read(p, bits), f"image {p}", *size) for p in paths[index])
+        return rig.rectified(tuple(images))
+
+    return load, tuple(notes)
+
+
+_NAMED_IN_NOTES = 5
 
 
 def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where: Path) -> None:
@@ -389,22 +394,3 @@ def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where
             f"{where}: images are {sizes[0]} but the calibration states {size[0]}x{size[1]}"
             "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
         )
-
-
-_NAMED_IN_NOTES = 5
-
-
-def _missing_note(paths: Sequence[tuple[Path, ...]]) -> tuple[str, ...]:
-    """Which frames lack an image (existence only: damage shows when reading)."""
-    missing = [
-        (k, CAMERA_NAMES[c])
-        for k, frame in enumerate(paths)
-        for c, path in enumerate(frame)
-        if not path.is_file()
-    ]
-    if not missing:
-        return ()
-    first = ", ".join(f"{k} ({camera})" for k, camera in missing[:_NAMED_IN_NOTES])
-    more = ", ..." if len(missing) > _NAMED_IN_NOTES else ""
-    count = len({k for k, _ in missing})
-    return (f"{count} of {len(paths)} frames lack an image: {first}{more}",)

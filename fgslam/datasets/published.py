@@ -101,7 +101,7 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig,
         right.stamps[rows[:, 0]].astype(np.float64) * NANOSECONDS,
-        images.load,
+        images,
         identity,
         (*noticed, *paired),
     )
@@ -257,7 +257,7 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
     listed = [path for found in cameras.values() for path in found.values()]
     identity = recording_identity([calibration, times], listed)
     name = f"KITTI {settings.sequence}"
-    recording = image_recording(settings, name, rig, stamps, images.load, identity, noticed)
+    recording = image_recording(settings, name, rig, stamps, images, identity, noticed)
     poses = _kitti_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
     if poses is None:
         return recording
@@ -328,7 +328,7 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     notes = (*noticed, *unpaired, *assumed, *([untrue] if oxts and iTc is None else []))
     identity = recording_identity(lists, (path for pair in pairs for path in pair))
     name = drive.resolve().name
-    recording = image_recording(settings, name, rig, stamps, images.load, identity, notes)
+    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
     if oxts is None:
         return recording
     source = recorded_motions(str(oxts.speeds.path), lambda: motions_of(oxts.speeds, odometry))

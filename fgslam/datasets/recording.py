@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
+from fgslam.datasets.images import ImageLoader
 from fgslam.datasets.odometry import (
     STAMP_TOLERANCE_S,
     OdometrySource,
@@ -36,10 +37,6 @@ from fgslam.datasets.settings import (
 from fgslam.datasets.times import rows_at
 
 Rig = TypeVar("Rig", bound=CameraRig)
-
-ImageLoader: TypeAlias = Callable[[int, bool], tuple[Image, ...]]
-"""Images (right, left[, top]) of one of the recording's own frames, grey or, where the flag is set,
-in red, green, blue if it has colour; raises FrameError."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

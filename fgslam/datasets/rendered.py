@@ -7,8 +7,8 @@ noise when they are read. Poses, depths and object identities are exact.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -228,28 +228,17 @@ class RenderedLabSequence:
         if not missing:
             return
         self._open_world()
-        for done, _ in enumerate(self._rendered(missing), start=1):
-            if progress is not None:
-                progress(done, len(missing))
 
-    def _rendered(self, missing: list[int]) -> Iterator[int]:
-        """Renders and stores frames on two threads, a few at a time so that Ctrl-C is prompt."""
+        def store(index: int) -> None:
+            self._cache.write(index, self._render(index))
+
         pool = ThreadPoolExecutor(_THREADS)
-        running: set[Future[int]] = set()
         try:
-            for index in missing:
-                running.add(pool.submit(self._render_and_store, index))
-                if len(running) >= 2 * _THREADS:
-                    finished, running = wait(running, return_when=FIRST_COMPLETED)
-                    yield from (future.result() for future in finished)
-            for future in running:
-                yield future.result()
+            for done, _ in enumerate(pool.map(store, missing), start=1):
+                if progress is not None:
+                    progress(done, len(missing))
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)
-
-    def _render_and_store(self, index: int) -> int:
-        self._cache.write(index, self._render(index))
-        return index
+            pool.shutdown(wait=True, cancel_futures=True)  # Ctrl-C waits for two frames alone
 
     def _render(self, index: int) -> Image:
         """Clean images (cameras, height, width) of one of the drive's frames."""
