@@ -211,7 +211,8 @@ def _map_of(pipeline: SlamPipeline, sequence: ImageSequence) -> SavedMap:
     database, estimate = pipeline.tracker.database, pipeline.estimator.estimate()
     return SavedMap(
         sequence.rig, estimate.landmarks, database.appearances(), database.hits.copy(),
-        database.misses.copy(), database.permanent.copy(), database.colour.copy(),
+        database.misses.copy(), database.farthest.copy(), database.permanent.copy(),
+        database.colour.copy(),
         estimate.trajectory, {}, np.empty(0, np.int64),
     )  # fmt: skip
 

@@ -88,6 +88,7 @@ def saved_map(landmarks: int) -> SavedMap:
         ),
         hits=np.full(landmarks, 8),
         misses=np.full(landmarks, 4),
+        farthest=np.full(landmarks, np.inf),
         permanent=np.arange(landmarks) % 2 == 0,
         colour=np.zeros(landmarks, np.uint8),
         trajectory=Trajectory(np.zeros(1), np.eye(4)[None]),

@@ -186,6 +186,7 @@ def saved(known: tuple[LandmarkMap, LandmarkAppearances], rig: CameraRig) -> Sav
         appearances=looks,
         hits=np.full(n, 8),
         misses=np.zeros(n, np.int64),
+        farthest=np.full(n, np.inf),
         permanent=np.zeros(n, np.bool_),
         colour=np.zeros(n, np.uint8),
         trajectory=Trajectory(np.zeros(1), np.eye(4)[None]),

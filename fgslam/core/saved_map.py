@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from fgslam.core.arrays import BoolArray, ByteArray, IntArray
+from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.errors import MapError
 from fgslam.core.log import rig_fault
 from fgslam.core.sensors import CameraRig
@@ -39,6 +39,7 @@ class SavedMap:
         appearances: their stored views.
         hits: (n,) frames in which each was seen (Se et al. 6.1).
         misses: (n,) frames in which it was expected and not seen.
+        farthest: (n,) metres, from how far it was ever seen: from farther it is not missed.
         permanent: (n,) never to be pruned for being missed (6.2).
         colour: (n,) grey value.
         trajectory: the drive that made the map.
@@ -52,6 +53,7 @@ class SavedMap:
     appearances: LandmarkAppearances
     hits: IntArray
     misses: IntArray
+    farthest: FloatArray
     permanent: BoolArray
     colour: ByteArray
     trajectory: Trajectory
@@ -75,6 +77,7 @@ def _require_map(saved: SavedMap) -> None:
         ("landmark covariances", landmarks.covariances, (n, 3, 3)),
         ("hits", saved.hits, (n,)),
         ("misses", saved.misses, (n,)),
+        ("farthest", saved.farthest, (n,)),
         ("permanent", saved.permanent, (n,)),
         ("colour", saved.colour, (n,)),
         ("descriptors", views.descriptors, (v, 128)),
@@ -90,6 +93,8 @@ def _require_map(saved: SavedMap) -> None:
     for name, values in (("landmark ids", landmarks.ids), ("times of poses", drive.timestamps)):
         require_ascending(name, values)
     require_ascending("evidence", saved.evidence)
+    if not (saved.farthest >= 0.0).all():
+        raise ValueError("a distance from which a landmark was seen is negative or not a number")
     if not ((np.diff(views.ids) >= 0).all() and np.isin(views.ids, landmarks.ids).all()):
         raise ValueError("landmarks of views are out of order")
     for name, values in (("positions", landmarks.positions), ("poses", drive.poses)):
@@ -106,7 +111,7 @@ def _require_map(saved: SavedMap) -> None:
 _FILE = FileKind(
     SavedMap,
     "fgslam map",
-    version=5,
+    version=6,
     error=MapError,
     give="give a file that fgslam run --map-out wrote",
     again="make the map again",

@@ -197,6 +197,7 @@ def saved_map(
         appearances=database.appearances(landmarks.ids),
         hits=database.hits[rows],
         misses=database.misses[rows],
+        farthest=database.farthest[rows],
         permanent=database.lasting[rows],
         colour=database.colour[rows],
         patches=patches if patches.kept else None,

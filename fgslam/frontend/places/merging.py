@@ -356,7 +356,7 @@ _MEDIAN_OF_CHI_SQUARE_3 = 2.366
 _SINCE_A_START_S = 1e8  # three years: below, a time stamp may count from any recording's start
 _SHARES = 21  # weightings tried by covariance intersection: from all of a to all of b
 
-Counts = TypeVar("Counts", IntArray, BoolArray)
+Counts = TypeVar("Counts", IntArray, FloatArray, BoolArray)
 
 
 def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
@@ -387,6 +387,7 @@ def merge_maps(a: SavedMap, b: SavedMap, alignment: Alignment) -> SavedMap:
         appearances=_appearances(a, b, alignment.aTb, names),
         hits=_counted(count, a.hits, b.hits, alignment.pairs, rest),
         misses=_counted(count, a.misses, b.misses, alignment.pairs, rest),
+        farthest=_counted(np.maximum, a.farthest, b.farthest, alignment.pairs, rest),
         permanent=_counted(np.logical_or, a.permanent, b.permanent, alignment.pairs, rest),
         colour=np.concatenate([a.colour, b.colour[rest]]),
         trajectory=_trajectory(a.trajectory, b.trajectory, alignment.aTb),

@@ -467,6 +467,11 @@ class LandmarkDatabase:
         return self._columns["missed"]
 
     @property
+    def farthest(self) -> FloatArray:
+        """(n,) metres, from how far each was ever seen."""
+        return self._columns["farthest"]
+
+    @property
     def colour(self) -> ByteArray:
         """(n,) grey values."""
         return self._columns["colour"]
@@ -552,7 +557,7 @@ class LandmarkDatabase:
             np.add.at(self._columns[name], to_rows, self._columns[name][from_rows])
         seen = self._columns["seen"]
         np.maximum.at(seen, to_rows, seen[from_rows])
-        np.maximum.at(self._columns["farthest"], to_rows, self._columns["farthest"][from_rows])
+        np.maximum.at(self.farthest, to_rows, self.farthest[from_rows])
         lacking = self._columns["patch_distance"][to_rows] == 0.0
         for name in _PATCH:
             column = self._columns[name]
@@ -603,7 +608,7 @@ class LandmarkDatabase:
                 "unlooked": zeros,
                 "seen": zeros,
                 "contradicted": zeros,
-                "farthest": np.full(len(ids), np.inf),
+                "farthest": saved.farthest,
                 **self._as_columns(saved.patches, len(ids)),
             }
         )
@@ -668,9 +673,8 @@ class LandmarkDatabase:
             directions: (k, 3) from the camera to each, unit, world; None where nobody asks.
         """
         rows = self._hit(ids)
-        farthest = self._columns["farthest"]
         distances = np.linalg.norm(features.position[which], axis=1)
-        farthest[rows] = np.maximum(farthest[rows], distances)
+        self.farthest[rows] = np.maximum(self.farthest[rows], distances)
         places = self._places[rows]
         self._pool.refresh(places, Views.of(features, which, directions, self._frame))
         self._places[rows] = places
@@ -810,7 +814,7 @@ class LandmarkDatabase:
         From farther than a valid landmark was ever seen a nearer wall hides it, or it is too small:
         as when the drive first came that way. Pruning it would leave no loop to close there.
         """
-        near = np.linalg.norm(points, axis=1) <= self._columns["farthest"][rows]
+        near = np.linalg.norm(points, axis=1) <= self.farthest[rows]
         return np.asarray(near | ~self.valid[rows])
 
     def _larger_than(self, least: float, ids: IntArray) -> Wanted:

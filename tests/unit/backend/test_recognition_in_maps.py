@@ -62,6 +62,7 @@ def half_a_ring() -> SavedMap:
         appearances=database.appearances(estimate.landmarks.ids),
         hits=database.hits[rows],
         misses=database.misses[rows],
+        farthest=database.farthest[rows],
         permanent=database.lasting[rows],
         colour=database.colour[rows],
         trajectory=estimate.trajectory,

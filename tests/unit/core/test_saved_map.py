@@ -50,6 +50,7 @@ def make_map(rng: np.random.Generator, n: int, rig: CameraRig = RIG) -> SavedMap
         misses=rng.integers(0, 90, n),
         permanent=rng.random(n) < 0.5,
         colour=rng.integers(0, 256, n).astype(np.uint8),
+        farthest=9.0 * rng.random(n),
         trajectory=Trajectory(np.arange(4.0), poses),
         about={"recording": {"name": "lab", "identity": "ab12"}, "frames": 4, "ratio": 0.1},
         evidence=np.array([-7, 3, 8]),

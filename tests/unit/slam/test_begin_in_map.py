@@ -74,6 +74,7 @@ def saved(rng: np.random.Generator) -> SavedMap:
         ),
         hits=rng.integers(3, 30, n),
         misses=np.zeros(n, np.int64),
+        farthest=np.full(n, np.inf),
         permanent=np.zeros(n, np.bool_),
         colour=np.zeros(n, np.uint8),
         trajectory=Trajectory(np.empty(0), np.empty((0, 4, 4))),

@@ -68,6 +68,7 @@ class World:
             appearances=appearances(ids, np.clip(looks, 0, 255).astype(np.uint8), size),
             hits=rng.integers(3, 40, n),
             misses=rng.integers(0, 10, n),
+            farthest=np.linspace(1.0, 2.0, n),
             permanent=rng.random(n) < 0.3,
             colour=np.full(n, 90, np.uint8),
             trajectory=Trajectory(stamp + np.arange(5.0), np.tile(np.eye(4), (5, 1, 1))),
@@ -210,6 +211,8 @@ def test_what_both_hold_is_fused_by_covariance_and_the_rest_kept(world: World) -
     assert (trace < 1.95 * SIGMA_M**2).all()
     assert merged.hits.sum() == a.hits.sum() + b.hits.sum()
     assert merged.misses.sum() == a.misses.sum() + b.misses.sum()
+    farthest = np.maximum(a.farthest[fused], b.farthest[found.pairs[:, 1]])
+    np.testing.assert_array_equal(merged.farthest[fused], farthest)
     assert merged.permanent.sum() >= max(a.permanent.sum(), b.permanent.sum())
     assert len(merged.appearances) == len(a.appearances) + len(b.appearances)
     twice = np.bincount(np.searchsorted(merged.landmarks.ids, merged.appearances.ids))
@@ -353,6 +356,7 @@ class Place:
             ),
             hits=np.array([(every == one).sum() for one in ids]),
             misses=np.zeros(n, np.int64),
+            farthest=np.full(n, 3.0),
             permanent=np.zeros(n, np.bool_),
             colour=np.zeros(n, np.uint8),
             trajectory=estimate.trajectory,

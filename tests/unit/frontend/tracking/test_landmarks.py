@@ -627,6 +627,7 @@ def saved(database: LandmarkDatabase, positions: FloatArray) -> SavedMap:
         appearances=database.appearances(),
         hits=database.hits.copy(),
         misses=database.misses.copy(),
+        farthest=database.farthest.copy(),
         permanent=database.lasting,
         colour=database.colour.copy(),
         trajectory=Trajectory(np.empty(0), np.empty((0, 4, 4))),
@@ -661,7 +662,7 @@ def test_a_saved_map_s_database() -> None:
     given = saved(first, PLACES[[0, 2, 3]])
     second = LandmarkDatabase(RIG, VIEWS, 40.0)
     second.load(given)
-    for name in ("ids", "hits", "misses", "permanent", "colour"):
+    for name in ("ids", "hits", "misses", "farthest", "permanent", "colour"):
         np.testing.assert_array_equal(getattr(second, name), getattr(first, name))
     assert_same_bits(second.appearances(), first.appearances())
     assert second.missed.tolist() == state_of(second)["columns/contradicted"].tolist() == [0, 0, 0]
