@@ -10,7 +10,7 @@ import re
 import sys
 from pathlib import Path
 
-CLEAN = ("fgslam/slam", "fgslam/datasets", "fgslam/evaluation", "README.md")
+CLEAN = ("fgslam/report", "fgslam/slam", "fgslam/datasets", "fgslam/evaluation", "README.md")
 """Files and folders that hold none; the others follow."""
 
 WORDS = {

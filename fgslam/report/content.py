@@ -64,7 +64,7 @@ class TextTable:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture beside the figures: PNG or JPEG, with a caption that says what it shows."""
+    """A picture next to the figures: PNG or JPEG, with a caption."""
 
     caption: str
     content: bytes = field(repr=False)
@@ -165,7 +165,7 @@ _BULK = (1.5, 98.5)
 def level_axes(up: FloatArray) -> FloatArray:
     """Rotation (3, 3) from the world to (right, ahead, up)."""
     vertical = up / np.linalg.norm(up)
-    # A camera that looks along the vertical about its x axis has no level x: then its z serves.
+    # A camera whose x axis is near the vertical has no level x: then its z serves.
     first = np.array([1.0, 0.0, 0.0] if abs(vertical[0]) < 0.9 else [0.0, 0.0, 1.0])
     right = first - vertical * (vertical @ first)
     right /= np.linalg.norm(right)
@@ -193,7 +193,7 @@ def thinned(count: int, limit: int) -> IntArray:
 
 
 def peaks(values: FloatArray, limit: int) -> IntArray:
-    """Rows of values (n,) so thinned that the largest of each stretch stays; NaN only if alone."""
+    """Rows of values (n,) so thinned that the largest of each part stays; NaN only if alone."""
     if len(values) <= limit:
         return np.arange(len(values))
     known = np.where(np.isnan(values), -np.inf, values)

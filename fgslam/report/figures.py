@@ -50,7 +50,7 @@ _AXIS = {
     "zerolinecolor": "#9aa2ab",
     "linecolor": "#9aa2ab",
     "automargin": True,
-    "exponentformat": "power",  # not 100µ, beside a unit of its own
+    "exponentformat": "power",  # not 100µ, next to a unit of its own
 }
 TEMPLATE = go.layout.Template(
     layout={
@@ -65,7 +65,7 @@ TEMPLATE = go.layout.Template(
         "colorway": ON_LIGHT,
     }
 )
-"""How every figure looks."""
+"""Style of every figure."""
 
 _BAND = "rgba(90, 100, 110, 0.18)"
 _SECONDS = "time since the start (s)"
@@ -102,7 +102,7 @@ def scatter(
 def line(
     name: str, points: FloatArray, colour: str, width: float = 2.0, dash: str = "solid", **more: Any
 ) -> go.Scatter | go.Scatter3d:
-    """A polyline, or several, silent at the pointer unless ``more`` says otherwise."""
+    """A polyline, or several, silent at the pointer unless ``more`` has a hover text."""
     style = {"color": colour, "width": width, "dash": dash}
     usual = {"mode": "lines", "line": style, "hoverinfo": "skip"}
     return scatter(name, points, **(usual | more))
@@ -187,7 +187,7 @@ def _scales(*, log: bool) -> dict[str, Any]:
 
 _ELLIPSES = 40
 _MARKED = 500  # predicted poses of an estimator
-_DENSE = 3_000  # dots; finer ones keep the paths in sight
+_DENSE = 3_000  # dots; finer ones do not hide the paths
 # Dead reckoning next to smoothers: enlarged as these need it, its ellipses would cover everything.
 _FLOOD = 0.25
 LANDMARK_ELLIPSES = "uncertainty of a landmark"
@@ -642,9 +642,9 @@ def noise_over_time(data: ReportData) -> Figure:
         "noise",
         "Noise estimated from the drive",
         "Standard deviations in use in each frame. Rotation, translation: the acceleration by "
-        "which the camera's velocity is expected to change, where no odometry says it. Times the "
-        "stated deviation: of a gyroscope's turns; of matches, where a frame's pose is found; in "
-        "a graph, as measurements are weighed (solid: errors that persist from frame to frame "
+        "which the camera's velocity is expected to change, where no odometry measures it. Times "
+        "the stated deviation: of a gyroscope's turns; of matches, where a frame's pose is found; "
+        "in a graph, as measurements are weighed (solid: errors that persist from frame to frame "
         "count for more) and as a single one is judged (dashed).",
         out,
         note=""

@@ -416,7 +416,7 @@ def drive_figure(
         heading,
         "The path as it was truly driven, coloured by the leg. Squares: where the target images "
         f"were taken, with a tick ahead and a circle of {PASS_RADIUS_M:g} m. The robot's arrow "
-        "points where the estimator says that the target lies. Grey: walls and furniture.",
+        "points where the estimator places the target. Grey: walls and furniture.",
         _with_moments(
             plane(traces, x="x (m)", y="y (m)"),
             moments,
@@ -515,7 +515,7 @@ def network_figure(
 def unfolded(count: int, pairs: Sequence[tuple[int, int]]) -> FloatArray:
     """(count, 2) places such that distances are as those along the links (classical scaling).
 
-    Parts of the graph without a link between them are set beside each other.
+    Parts of the graph without a link between them are placed next to each other.
     """
     weights = np.zeros((count, count))
     for a, b in pairs:

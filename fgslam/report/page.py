@@ -1,8 +1,8 @@
-"""The page of any task: one HTML file that needs nothing else, neither beside it nor the network.
+"""The page of any task: one HTML file that needs no other file and no network.
 
 A jinja2 template with automatic escaping; the page's own policy lets only the two scripts run whose
-digests it names, so that not even a mistake here would run what a configuration or a file name
-says. Plotly and the figures are compressed: the browser unpacks them.
+digests it names, so that not even a mistake here would run a script in a configuration or a
+file name. Plotly and the figures are compressed: the browser unpacks them.
 """
 
 from __future__ import annotations

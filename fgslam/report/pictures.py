@@ -285,7 +285,7 @@ def _paper_size(layout: Any, panels: int) -> tuple[float, float]:
 # Images with what was found in them
 
 _CAMERAS = ("Right", "Left", "Top")
-# The descriptor looks at a window of about twelve scales; a square of four stays readable.
+# The descriptor covers a window of about twelve scales; a square of four stays readable.
 _SQUARE_SIDE_IN_SCALES = 4.0
 # Wider images than this are stacked rather than set side by side.
 _PANORAMIC_ASPECT = 2.2

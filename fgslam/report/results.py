@@ -1,7 +1,7 @@
 """Results of the estimators of one run, as figures and the page show them: plain arrays.
 
 All poses and points of one report are in one world: that of the estimates, the reference camera's
-first frame. What cannot be known is None or NaN, never a guess; the page then says so.
+first frame. What cannot be known is None or NaN, never a guess; the page then reports it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class EstimatorReport:
         nees: (n,) normalised error squared of the final pose per degree of freedom; NaN unknown.
         nees_band: interval that holds 95 % of a consistent estimator's values, or None.
         update_ms: (n,) milliseconds a frame; NaN where not timed.
-        ate_m: absolute trajectory error of the final path, as ``ReportData.alignment`` says.
+        ate_m: absolute trajectory error of the final path, as ``ReportData.alignment`` states.
         nees_per_dof: mean NEES of the run per degree of freedom.
         verdict: `consistent`, `overconfident` or `conservative`; None where not known.
         remarks: what the estimator had to correct or leave out, in words.
@@ -117,7 +117,7 @@ class EstimatorReport:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReportData:
-    """Results of one run with what a page or a viewer says about it.
+    """Results of one run with the words of its page or viewer.
 
     Attributes:
         title, subtitle: headings.

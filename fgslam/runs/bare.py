@@ -59,7 +59,7 @@ class Bare:
 def bare_experiment(
     folder: Path, camera: Path | None = None, overrides: Iterable[str] = ()
 ) -> Bare:
-    """Opens a recording and says what it is.
+    """Opens a recording and describes it.
 
     Its odometry is used where it has some, else the motion is predicted by constant velocity.
 
@@ -139,7 +139,7 @@ def experiment_of(
 
 
 def require_no_camera(experiment: Path, camera: Path | None) -> None:
-    """Raises ConfigError where an experiment, which says its own, is given a calibration."""
+    """Raises ConfigError where an experiment, which names its own, is given a calibration."""
     if camera is not None:
         raise ConfigError(
             f"{experiment}: --camera is for a recording; in an experiment it is dataset.camera_file"

@@ -73,7 +73,7 @@ class Wanted:
 def export_run(run: Path, wanted: Wanted) -> list[str]:
     """Writes what was asked for; returns a line about each file.
 
-    Of a saved map in place of a run, it says what is in it where nothing is asked for.
+    Of a saved map in place of a run, it describes the map where nothing is asked for.
 
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
@@ -120,7 +120,7 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
 
 
 def sources_of(run: Path) -> tuple[Path, ...]:
-    """A run or a saved map, and what that was made from as far as it says so."""
+    """A run or a saved map, and the inputs that it names."""
     if not is_run_folder(run):
         return (run,)
     return (run, *load_experiment(run / RUN_MARKER).inputs)
@@ -175,7 +175,7 @@ def results_folder(run: Path, wanted: str | None) -> str:
 
 
 def _export_map(path: Path, wanted: Wanted) -> list[str]:
-    """Writes what was asked for of a saved map, or says what is in it; a line about each."""
+    """Writes what was asked for of a saved map, or describes it; a line about each."""
     saved = load_map(path)
     if wanted.map is None and wanted.trajectory is None:
         return describe_map(saved, path)
@@ -221,7 +221,7 @@ _HEADER = (
     "poses wTc of the reference camera; x right, y down, z forward; metres",
     "information: g2o's error (translation, vector part of the quaternion), metres and half angles",
     "left out: observations that the run rejected, constraints of a floor, closures of loops, "
-    "odometry to frames located anew",
+    "odometry to relocalised frames",
     "vertices: the estimator's final answer, first pose held",
 )
 
@@ -288,7 +288,7 @@ def build_graph(
     moved = [
         (rows[k - 1], rows[k], increment.odometry)
         for k, increment in enumerate(log)
-        # A frame found anew after being carried off: its odometry does not know of that.
+        # A relocalised frame was carried there: its odometry does not know of that.
         if k
         and increment.odometry is not None
         and not increment.relocalised

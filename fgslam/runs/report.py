@@ -115,7 +115,7 @@ def frame_problems(recorder: RunRecorder) -> list[str]:
     lines = []
     for number, row in zip(recorder.log.numbers.tolist(), recorder.rows, strict=True):
         status = EgoMotionStatus(row.status)
-        if status is EgoMotionStatus.CAMERA_FAULT:  # said of all of them together
+        if status is EgoMotionStatus.CAMERA_FAULT:  # reported of all of them together
             continue
         if row.problem:
             lines.append(f"frame {number}: {row.problem}")

@@ -66,7 +66,7 @@ class Map:
         saved: everything that a map file holds.
         points: the landmarks as other tools get them: positions (n, 3) metres, covariances
             (n, 3, 3), grey values, numbers of frames that saw and missed each.
-        remark: what must be said wherever the map is shown; mostly empty.
+        remark: what any display of the map must state; mostly empty.
     """
 
     saved: SavedMap
@@ -113,7 +113,7 @@ class Map:
         frontend: FrontendSettings | Mapping[str, Any] | None = None,
         seed: int = 0,
     ) -> Relocalisation:
-        """Pose of a frame in the map without a prior, or why there is none to be believed.
+        """Pose of a frame in the map without a prior, or why there is none.
 
         The same images, map and seed give the same answer. Of the landmarks those count that are
         permanent or were seen often enough (Se et al. 6.1).
@@ -126,7 +126,7 @@ class Map:
             seed: of RANSAC's samples.
 
         Returns:
-            ``found`` says whether to believe ``wTc`` (4, 4) with ``covariance`` (6, 6), ordered
+            ``found``: whether to trust ``wTc`` (4, 4) with ``covariance`` (6, 6), ordered
             [rotation, translation]; ``why`` gives the reason in words.
 
         Raises:
@@ -138,7 +138,7 @@ class Map:
         require_seed(seed, "locate")
         require_rig_of_map(self.saved, rig, "the map")
         if not len(self.saved):
-            raise MapError("the map holds no landmark; make it anew")
+            raise MapError("the map holds no landmark; make it again")
         frontend = chosen_frontend(frontend)
         checked = checked_images(images, rig)
         with one_blas_thread():
@@ -187,7 +187,7 @@ def map_points(landmarks: LandmarkMap, database: LandmarkDatabase) -> MapPoints:
 
 
 def drives_of(saved: SavedMap) -> list[dict[str, Any]]:
-    """What the map says about the drives that made it, the last one last."""
+    """What the map records of the drives that made it, the last one last."""
     found = saved.about.get("drives")
     return [drive for drive in found if isinstance(drive, dict)] if isinstance(found, list) else []
 
@@ -201,7 +201,9 @@ def valid_of(saved: SavedMap) -> BoolArray:
     """(n,) landmarks seen as often as the strictest of the drives asked for (Se et al. 6.1)."""
     asked = [drive.get("valid_hits") or 0 for drive in drives_of(saved)]
     if not all(isinstance(hits, int) for hits in asked):
-        raise MapError(f"the map's drives have valid_hits {asked}, not whole numbers; make it anew")
+        raise MapError(
+            f"the map's drives have valid_hits {asked}, not whole numbers; make it again"
+        )
     return np.asarray(saved.hits >= max(asked, default=_VALID_HITS))
 
 

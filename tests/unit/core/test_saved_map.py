@@ -128,7 +128,7 @@ def test_the_same_map_gives_the_same_bytes(saved: SavedMap, file: Path, tmp_path
 def test_a_map_whose_drives_count_hits_in_words_is_refused(saved: SavedMap, tmp_path: Path) -> None:
     path = tmp_path / "a.fgmap"
     save_map(replace(saved, about={"drives": [{"valid_hits": "many"}]}), path)
-    with pytest.raises(MapError, match=r"valid_hits \['many'\], not whole numbers; make it anew"):
+    with pytest.raises(MapError, match=r"valid_hits \['many'\], not whole numbers; make it again"):
         fgslam.Map.load(path)
 
 
