@@ -452,8 +452,8 @@ def plain(value: Any) -> Any:
 # Sentences of remarks: all of their words stand here
 
 _UNSURE = (
-    "something large passes{or_odometry}. Without odometry that tells which is which the pose is "
-    "in doubt where that fills more of the view than the scene, for it may follow what passes "
+    "something large passes{or_odometry}. Without odometry that separates them the pose is "
+    "uncertain where that fills more of the view than the scene, for it may follow what passes "
     "(leave these frames out: --start, --stop)"
 )
 _MOTION = (
