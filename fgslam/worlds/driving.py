@@ -26,6 +26,7 @@ _STEP_M = 0.004
 _LEAST_RADIUS_M = 0.08
 # Part of a turn over which its curvature rises, and again falls.
 _RAMP = 0.3
+FRAME_RATE_HZ = 2.0  # of images
 # Speed used, as a fraction of the limits, where the number of frames is free.
 _CRUISE = 0.9
 MAX_ACCELERATION_M_S2 = 0.30  # along the path; gentle for a robot of the paper's size
@@ -248,7 +249,7 @@ def drive_along(path: PlanarPath, limits: DriveLimits, frames: int | None) -> Dr
     Raises:
         ConfigError: the path cannot be driven in so few frames.
     """
-    rate, max_turn = limits.frame_rate_hz, np.deg2rad(limits.max_turn_deg_s)
+    rate, max_turn = FRAME_RATE_HZ, np.deg2rad(limits.max_turn_deg_s)
     fastest = fastest_times(path, limits.max_speed_m_s, max_turn, MAX_ACCELERATION_M_S2)
     least = int(np.ceil(fastest[-1] * rate - 1e-9)) + 1
     if frames is None:

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.geometry import unit, wrap
-from fgslam.worlds.driving import Drive
+from fgslam.worlds.driving import FRAME_RATE_HZ, Drive
 from fgslam.worlds.patches import PatchArrays
 from fgslam.worlds.places import HOUSE
 from fgslam.worlds.settings import LabDriveSettings
@@ -145,7 +145,7 @@ def draw_poses(
     Raises:
         ConfigError: the frames are no whole number of bursts, or no place has room for one.
     """
-    burst, rate = settings.random_poses.burst, settings.frame_rate_hz
+    burst = settings.random_poses.burst
     frames = _POSES * burst if settings.frames is None else settings.frames
     if frames % burst:
         raise ConfigError(
@@ -161,7 +161,7 @@ def draw_poses(
         rng = np.random.default_rng([settings.random_poses.seed, _STREAM, k])
         bursts.append(_moved(_draw(space, reached, offsets, rng), robot))
     poses = np.concatenate(bursts)
-    timestamps = np.asarray(np.arange(frames) / rate)
+    timestamps = np.asarray(np.arange(frames) / FRAME_RATE_HZ)
 
     def planar(seconds: FloatArray) -> FloatArray:
         nearest = np.rint(np.asarray(seconds) * (1.0 / timestamps[1])).astype(np.int64)

@@ -191,6 +191,7 @@ def identity_values(settings: LabSettings) -> dict[str, Any]:
         "floor_m": driving.FLOOR_M,
         "floor_deg": driving.FLOOR_DEG,
     }
+    out["drive"]["frame_rate_hz"] = driving.FRAME_RATE_HZ
     out["drive"]["max_acceleration_m_s2"] = driving.MAX_ACCELERATION_M_S2
     out["drive"]["random_poses"] |= {"clearance_m": RANDOM_CLEARANCE_M, "step_m": BURST_STEP_M}
     walk = {"first_frame": effects.person, "frames": WALK_FRAMES, "distance_m": ACROSS_M}

@@ -13,7 +13,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.sensors import CameraRig
-from fgslam.worlds.driving import Drive, planar_poses
+from fgslam.worlds.driving import FRAME_RATE_HZ, Drive, planar_poses
 from fgslam.worlds.patches import (
     Patch,
     RayCaster,
@@ -82,8 +82,7 @@ def make_walk(settings: LabSettings, drive: Drive, rig: CameraRig) -> Walk | Non
         raise ConfigError(
             f"effects.person is {first}, but the drive has only {frames} frames; lower it"
         )
-    rate = settings.drive.frame_rate_hz
-    begins, ends = first / rate, (first + WALK_FRAMES - 1) / rate
+    begins, ends = first / FRAME_RATE_HZ, (first + WALK_FRAMES - 1) / FRAME_RATE_HZ
     camera = (drive.body_poses(np.array([0.5 * (begins + ends)]))[0] @ rig.bTc)[:3]
     right, ahead = camera[:2, 0], camera[:2, 2] / np.linalg.norm(camera[:2, 2])
     middle = camera[:2, 3] + ACROSS_M * ahead

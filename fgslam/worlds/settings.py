@@ -25,6 +25,21 @@ Baseline: TypeAlias = Annotated[float, Field(gt=0.0, le=2.0)]
 GreyLevels: TypeAlias = Annotated[float, Field(ge=0.0, le=50.0)]
 Frames: TypeAlias = Annotated[int, Field(ge=2, le=100_000)]
 Laps: TypeAlias = Annotated[int, Field(ge=1, le=1000)]
+Burst: TypeAlias = Annotated[int, Field(ge=1, le=100)]
+Chance: TypeAlias = Annotated[float, Field(gt=0.0, le=1.0)]
+Factor: TypeAlias = Annotated[float, Field(ge=-2.0, le=5.0)]
+Features: TypeAlias = Annotated[int, Field(ge=1, le=10_000)]
+Legs: TypeAlias = Annotated[int, Field(ge=1, le=100)]
+Persons: TypeAlias = Annotated[int, Field(ge=0, le=8)]
+Pixels: TypeAlias = Annotated[float, Field(ge=0.0, le=20.0)]
+Points: TypeAlias = Annotated[int, Field(ge=10, le=1_000_000)]
+Relative: TypeAlias = Annotated[float, Field(ge=0.0, le=0.08)]
+Spacing: TypeAlias = Annotated[float, Field(ge=0.5, le=8.0)]
+Speed: TypeAlias = Annotated[float, Field(gt=0.0, le=5.0)]
+Tilt: TypeAlias = Annotated[float, Field(ge=0.0, le=10.0)]
+Times: TypeAlias = Annotated[float, Field(ge=0.0, le=50.0)]
+Turn: TypeAlias = Annotated[float, Field(gt=0.0, le=45.0)]
+Wave: TypeAlias = Annotated[float, Field(ge=0.0, lt=0.9)]
 ScaleError: TypeAlias = Annotated[float, Field(ge=0.0, le=0.5)]
 _SCALE_ERROR = "deviation of the constant relative errors of way and turns, once a drive"
 PlaceName: TypeAlias = Literal["lab", "rooms", "corridors"]
@@ -51,21 +66,14 @@ class RandomPosesSettings:
     """Poses all over the free floor, in any heading: those of a robot that was carried away."""
 
     seed: Index = Field(default=0, description="of the poses; not the run's seed")
-    burst: Annotated[int, Field(ge=1, le=100)] = Field(
-        default=1, description="consecutive frames from each pose on, straight ahead"
-    )
+    burst: Burst = Field(default=1, description="frames from each pose on, straight ahead")
 
 
 @dataclass(frozen=True, config=STRICT)
 class DriveLimits:
-    """How fast the robot drives, and how often it takes images."""
+    """How fast the robot drives; it takes two images a second."""
 
-    frame_rate_hz: Annotated[float, Field(gt=0.0, le=120.0)] = Field(
-        default=2.0, description="frames a second"
-    )
-    max_speed_m_s: Annotated[float, Field(gt=0.0, le=5.0)] = Field(
-        default=0.40, description="limit, metres a second"
-    )
+    max_speed_m_s: Speed = Field(default=0.40, description="limit, metres a second")
     max_turn_deg_s: Degrees = Field(default=10.0, description="limit, degrees a second")
 
 
@@ -81,18 +89,12 @@ class LabDriveSettings(DriveLimits):
     frames: Frames | None = Field(
         default=249, description="number of frames; null: at nine tenths of the speed limits"
     )
-    laps: Laps = Field(
-        default=1, description="times around the room, for `laps`; rounds of a `tour`"
-    )
+    laps: Laps = Field(default=1, description="rounds, for `laps` and `tour`")
     waypoints_m: tuple[tuple[float, float], ...] = Field(
         default=(), description="(x, y) in the room, metres from its centre, for `waypoints`"
     )
-    closed: bool = Field(
-        default=False, description="for `waypoints`: return to the first point and heading"
-    )
-    random_poses: RandomPosesSettings = Field(
-        default=RandomPosesSettings(), description="for `random_poses`: how they are drawn"
-    )
+    closed: bool = Field(default=False, description="for `waypoints`: back to the first one")
+    random_poses: RandomPosesSettings = RandomPosesSettings()
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -100,9 +102,7 @@ class WheelOdometrySettings:
     """Drift of the wheel odometry (docs/datasets/rendered.md)."""
 
     scale_error: ScaleError = Field(default=0.01, description=_SCALE_ERROR)
-    noise: Annotated[float, Field(ge=0.0, le=50.0)] = Field(
-        default=1.0, description="times the noise along, across and of heading"
-    )
+    noise: Times = Field(default=1.0, description="times the noise along, across and of heading")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -168,24 +168,16 @@ class HouseCameraSettings:
 class HouseCalibrationSettings:
     """Errors of the mirror's calibration that the robot has; its images obey the true mirror."""
 
-    mirror: Annotated[float, Field(ge=0.0, le=0.08)] = Field(
-        default=0.0, description="relative, of xi and focal length; signs drawn"
-    )
-    centre_px: Annotated[float, Field(ge=0.0, le=20.0)] = Field(
-        default=0.0, description="of the mirror's centre; its direction is drawn"
-    )
+    mirror: Relative = Field(default=0.0, description="of xi and focal length; signs drawn")
+    centre_px: Pixels = Field(default=0.0, description="of the mirror's centre; direction drawn")
 
 
 @dataclass(frozen=True, config=STRICT)
 class HousePathSettings:
     """The reference path, laid by a planner from the seed."""
 
-    legs: Annotated[int, Field(ge=1, le=100)] = Field(
-        default=10, description="targets to reach one after another"
-    )
-    spacing_m: Annotated[float, Field(ge=0.5, le=8.0)] = Field(
-        default=3.0, description="between a target and the next, metres"
-    )
+    legs: Legs = Field(default=10, description="targets to reach one after another")
+    spacing_m: Spacing = Field(default=3.0, description="between a target and the next, metres")
     rooms: Literal["house", "hall"] = Field(
         default="house", description="`house`: from room to room; `hall`: within the largest"
     )
@@ -198,16 +190,10 @@ class OmniHouseSettings:
     kind: Literal["omni_house"] = "omni_house"
     camera: HouseCameraSettings = HouseCameraSettings()
     noise_grey: GreyLevels = Field(default=2.0, description="Gaussian image noise, grey levels")
-    people: Annotated[int, Field(ge=0, le=8)] = Field(
-        default=0, description="who walk about in the house"
-    )
+    people: Persons = Field(default=0, description="who walk about in the house")
     path: HousePathSettings = HousePathSettings()
-    exposure_wave: Annotated[float, Field(ge=0.0, lt=0.9)] = Field(
-        default=0.0, description="amplitude of a slow wave of the camera's gain"
-    )
-    tilt_deg: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
-        default=0.0, description="constant tilt of the camera; its side is drawn"
-    )
+    exposure_wave: Wave = Field(default=0.0, description="amplitude of a slow wave of the gain")
+    tilt_deg: Tilt = Field(default=0.0, description="of the camera, constant; its side is drawn")
     calibration: HouseCalibrationSettings = HouseCalibrationSettings()
 
 
@@ -223,9 +209,7 @@ class MeasurementWorldSettings:
         default="room",
         description="`room`: the lab's walls and furniture; `corridor`: walls along the way",
     )
-    landmarks: Annotated[int, Field(ge=10, le=1_000_000)] = Field(
-        default=2500, description="points in the room, or in 100 m of corridor"
-    )
+    landmarks: Points = Field(default=2500, description="in the room, or in 100 m of corridor")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -236,13 +220,10 @@ class MeasurementDriveSettings(DriveLimits):
         default="lab_loop", description="`lab_loop` the paper's; `laps`; `sharp_turns`"
     )
     frames: Frames | None = Field(
-        default=249,
-        description="number of frames; null: one way at nine tenths of the speed limits",
+        default=249, description="number of frames; null: at nine tenths of the speed limits"
     )
     laps: Laps = Field(default=1, description="rounds, for `laps`")
-    turn_deg_per_frame: Annotated[float, Field(gt=0.0, le=45.0)] = Field(
-        default=12.0, description="turn a frame, degrees, for `sharp_turns`"
-    )
+    turn_deg_per_frame: Turn = Field(default=12.0, description="for `sharp_turns`")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -252,12 +233,8 @@ class DetectionSettings:
     noise_scale: NonNegative = Field(
         default=1.0, description="drawn over stated noise, of pixels and odometry; 0: exact"
     )
-    features: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        default=100, description="most landmarks measured in a frame"
-    )
-    probability: Annotated[float, Field(gt=0.0, le=1.0)] = Field(
-        default=0.85, description="that a landmark in view is found in a frame"
-    )
+    features: Features = Field(default=100, description="most landmarks measured in a frame")
+    probability: Chance = Field(default=0.85, description="that a landmark in view is found")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -273,9 +250,7 @@ class OdometryFaultSettings:
 
     start: Count = Field(description="first step with the fault (into this frame)")
     frames: Count = Field(default=10, description="how many steps")
-    scale: Annotated[float, Field(ge=-2.0, le=5.0)] = Field(
-        default=0.5, description="reported over true motion, way and turn"
-    )
+    scale: Factor = Field(default=0.5, description="reported over true motion, way and turn")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -319,6 +294,4 @@ class SimulatedBearingsSettings:
         default=0.8, description="part of the way after which the drive ends"
     )
     images_per_s: Positive = Field(default=10.0, description="tracked images a second (paper: 10)")
-    lost_per_s: NonNegative = Field(
-        default=0.02, description="part of the tracks that get lost in a second"
-    )
+    lost_per_s: NonNegative = Field(default=0.02, description="part of the tracks, a second")

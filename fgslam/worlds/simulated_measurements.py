@@ -26,6 +26,7 @@ from fgslam.core.sensors import (
 )
 from fgslam.core.types import Trajectory
 from fgslam.worlds.driving import (
+    FRAME_RATE_HZ,
     drive_along,
     paper_loop,
     planar_poses,
@@ -318,7 +319,7 @@ def plan_measured_drive(
         )
     if settings.path == "sharp_turns":
         planar = _sharp_turns(settings)
-        stamps = np.arange(len(planar)) / settings.frame_rate_hz
+        stamps = np.arange(len(planar)) / FRAME_RATE_HZ
         return stamps, planar_poses(planar), None
     corners = None
     if place == "room":
@@ -339,7 +340,7 @@ def plan_measured_drive(
 
 def _sharp_turns(settings: MeasurementDriveSettings) -> FloatArray:
     """(n, 3) x, y, heading: spins on the spot and tight curves, round after round."""
-    step = _CRUISE * settings.max_speed_m_s / settings.frame_rate_hz
+    step = _CRUISE * settings.max_speed_m_s / FRAME_RATE_HZ
     turn = np.deg2rad(settings.turn_deg_per_frame)
     segments = []
     for way, degrees in _SHARP_HALF:  # in equal chords and turns, each within step and turn
