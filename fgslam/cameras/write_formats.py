@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ import yaml
 
 from fgslam.cameras.calib_json import raw_values
 from fgslam.cameras.lenses import Calibration, RawCamera, StatedView
+from fgslam.cameras.rig import rig_of
+from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.files import clear_output_errors, replacing, write_text
@@ -20,10 +22,7 @@ from fgslam.core.geometry import inverse
 
 
 def write_calibration(
-    calibration: Calibration,
-    path: Path,
-    view: StatedView | None = None,
-    form: str | None = None,
+    calibration: Calibration, path: Path, form: str | None = None, fov_deg: float | None = None
 ) -> str:
     """Writes a calibration; the name says the format, unless it is given.
 
@@ -33,8 +32,9 @@ def write_calibration(
     Args:
         calibration: what is written.
         path: the file or folder.
-        view: rectification of left and right camera for ROS, whose files must state one.
         form: one of :data:`FORMATS`; None: by the name.
+        fov_deg: horizontal angle of the rectified view, for ROS, whose files must state one; None:
+            as the calibration has it.
 
     Returns:
         The format in words.
@@ -52,43 +52,68 @@ def write_calibration(
         )
     if name not in FORMATS:
         raise CalibrationError(f"format {name!r} is not known; use {', '.join(FORMATS)}")
-    words, endings, write = FORMATS[name]
+    words, endings = FORMATS[name]
     if path.suffix.lower() not in endings:
         wanted = " or ".join(ending or "no ending, a folder" for ending in endings)
         raise CalibrationError(f"{path}: {words} is written as {wanted}; give such a name")
     if name != "fgslam":
         calibration.require_uncorrected(f"{words} cannot hold them")
-    write(calibration, path, view)
+    match name:
+        case "fgslam":
+            write_text(path, json.dumps(raw_values(calibration), indent=2) + "\n")
+        case "opencv":
+            _write_opencv(calibration, path)
+        case "kalibr":
+            _write_kalibr(calibration, path)
+        case "ros":
+            _write_ros(calibration, path, fov_deg)
     return words
 
 
-def _write_own(calibration: Calibration, path: Path, _: StatedView | None) -> None:
-    write_text(path, json.dumps(raw_values(calibration), indent=2) + "\n")
+FORMATS = {
+    "fgslam": ("calib.json of fgslam", (".json",)),
+    "opencv": ("OpenCV", (".yml", ".yaml", ".xml", ".json")),
+    "kalibr": ("Kalibr", (".yaml", ".yml")),
+    "ros": ("ROS camera_info, a folder", ("",)),
+}
+"""Formats that are written: in words, and the endings of their names."""
+_ENDINGS = {
+    ".json": "fgslam",
+    ".yml": "opencv",
+    ".xml": "opencv",
+    ".yaml": "kalibr",
+    "": "ros",
+}
 
 
-def _write_kalibr(calibration: Calibration, path: Path, _: StatedView | None) -> None:
+_KALIBR = {
+    "radtan": ("pinhole", "radtan", 0),
+    "equidistant": ("pinhole", "equidistant", 0),
+    "fov": ("pinhole", "fov", 0),
+    "omni": ("omni", "radtan", 1),
+    "ds": ("ds", "none", 2),
+    "eucm": ("eucm", "none", 2),
+}
+"""Its camera and distortion model, and how many of our parameters are among its intrinsics."""
+
+
+def _write_kalibr(calibration: Calibration, path: Path) -> None:
     chain: dict[str, dict[str, Any]] = {}
     for k, camera in enumerate(calibration.cameras):
-        own, distortion, kind = camera.distortion[:0], camera.distortion, camera.model
-        if camera.model in ("ds", "eucm"):
-            own, distortion, kind = distortion, distortion[:0], "none"
-        elif camera.model == "omni":
-            own, distortion, kind = distortion[:1], distortion[1:], "radtan"
-        elif camera.model == "radtan":
-            distortion = _shortened(camera, 4, "Kalibr")
-        elif camera.model not in ("equidistant", "fov"):
+        if camera.model not in _KALIBR:
             raise _refused(camera, "Kalibr")
+        model, distortion, own = _KALIBR[camera.model]
+        numbers = _shortened(camera, 4, "Kalibr") if camera.model == "radtan" else camera.distortion
         if camera.matrix[0, 1] or camera.matrix[1, 0]:
             raise CalibrationError(
                 f"{camera.name}: its pixels are skew, which Kalibr has no number for; write "
                 "calib.json"
             )
-        pinhole = camera.model in ("radtan", "equidistant", "fov")
         chain[f"cam{k}"] = {
-            "camera_model": "pinhole" if pinhole else camera.model,
-            "intrinsics": [*own.tolist(), *camera.intrinsics.tolist()],
-            "distortion_model": kind,
-            "distortion_coeffs": distortion.tolist(),
+            "camera_model": model,
+            "intrinsics": [*numbers[:own].tolist(), *camera.intrinsics.tolist()],
+            "distortion_model": distortion,
+            "distortion_coeffs": numbers[own:].tolist(),
             "resolution": list(camera.size),
             **({"rostopic": camera.topic} if camera.topic else {}),
         }
@@ -102,7 +127,7 @@ _OPENCV = {"radtan": "M", "equidistant": "K", "omni": "K"}
 """Letter of the matrices: cv2.fisheye's and cv2.omnidir's are K."""
 
 
-def _write_opencv(calibration: Calibration, path: Path, _: StatedView | None) -> None:
+def _write_opencv(calibration: Calibration, path: Path) -> None:
     first, second = _pair(calibration, "OpenCV's file")
     if first.size != second.size:
         sizes = " and ".join(f"{width}x{height}" for width, height in (first.size, second.size))
@@ -131,13 +156,21 @@ def _write_opencv(calibration: Calibration, path: Path, _: StatedView | None) ->
         storage.release()
 
 
-def _write_ros(calibration: Calibration, path: Path, view: StatedView | None) -> None:
+def _write_ros(calibration: Calibration, path: Path, fov_deg: float | None) -> None:
     cameras = _pair(calibration, "ROS")
+    view = calibration.view if fov_deg is None else None
     if view is None:
-        raise CalibrationError(f"{calibration.source}: is no stereo rig, of which ROS wants a pair")
+        rig = rig_of(calibration, fov_deg)
+        if rig.sources != (1, 0):
+            raise CalibrationError(
+                f"{calibration.source}: its first camera is the right one, and ROS wants the left "
+                "one first; choose them in that order: --cameras 1,0"
+            )
+        first, second = (rig.bTc[:3, :3].T @ camera.bTc[:3, :3] for camera in cameras)
+        matrix = intrinsic_matrix(rig.fx, rig.fy, rig.cx, rig.cy)
+        view = StatedView((first, second), matrix, (rig.width, rig.height))
     baseline = float(np.linalg.norm(calibration.offset(1, 0)[:3, 3]))
-    with clear_output_errors(path):
-        path.mkdir(exist_ok=True)
+    files = {}
     for k, (camera, name) in enumerate(zip(cameras, ("left", "right"), strict=True)):
         if camera.model == "equidistant":
             kind, coefficients = "equidistant", camera.distortion
@@ -149,7 +182,7 @@ def _write_ros(calibration: Calibration, path: Path, view: StatedView | None) ->
             raise _refused(camera, "ROS")
         projection = np.column_stack([view.matrix, np.zeros(3)])
         projection[0, 3] = -view.matrix[0, 0] * baseline * k
-        values = {
+        files[f"{name}.yaml"] = {
             "camera_name": name,
             "image_width": camera.width,
             "image_height": camera.height,
@@ -159,30 +192,15 @@ def _write_ros(calibration: Calibration, path: Path, view: StatedView | None) ->
             **_block("rectification_matrix", view.rotations[k]),
             **_block("projection_matrix", projection),
         }
-        write_text(path / f"{name}.yaml", yaml.safe_dump(values, sort_keys=False))
+    with clear_output_errors(path):
+        path.mkdir(exist_ok=True)
+    for name, values in files.items():
+        write_text(path / name, yaml.safe_dump(values, sort_keys=False))
 
 
 def _block(key: str, matrix: FloatArray) -> Mapping[str, Any]:
     rows, columns = matrix.shape
     return {key: {"rows": rows, "cols": columns, "data": matrix.ravel().tolist()}}
-
-
-FORMATS: dict[
-    str, tuple[str, tuple[str, ...], Callable[[Calibration, Path, StatedView | None], None]]
-] = {
-    "fgslam": ("calib.json of fgslam", (".json",), _write_own),
-    "opencv": ("OpenCV", (".yml", ".yaml", ".xml", ".json"), _write_opencv),
-    "kalibr": ("Kalibr", (".yaml", ".yml"), _write_kalibr),
-    "ros": ("ROS camera_info, a folder", ("",), _write_ros),
-}
-"""Formats that are written: in words, the endings of their names, and how."""
-_ENDINGS = {
-    ".json": "fgslam",
-    ".yml": "opencv",
-    ".xml": "opencv",
-    ".yaml": "kalibr",
-    "": "ros",
-}
 
 
 # --------------------------------------------------------------------------------------------

@@ -33,7 +33,7 @@ from fgslam.cameras.calibrate import (
     held_out_alone,
 )
 from fgslam.cameras.formats import pose_difference
-from fgslam.cameras.lenses import Calibration, StatedView
+from fgslam.cameras.lenses import Calibration
 from fgslam.cameras.omni import MirrorFrame
 from fgslam.cameras.rig import (
     StereoRig,
@@ -45,7 +45,6 @@ from fgslam.cameras.rig import (
     rig_of,
 )
 from fgslam.cameras.rings import calibrate_from_rings, find_mirror_circle
-from fgslam.cameras.trees import intrinsic_matrix
 from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
@@ -502,25 +501,8 @@ def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> lis
         raise CalibrationError(
             f"{found.source} does not state the images' size; give it: --size 640x480"
         )
-    for_ros = form == "ros" or (form is None and not out.suffix)
-    view = _view(found, asked.fov_deg) if for_ros and len(found.cameras) == 2 else None
-    words = write_calibration(found, out, view, form)
+    words = write_calibration(found, out, form, asked.fov_deg)
     return [f"{out}: {words}, {len(found.cameras)} cameras of {found.source}", *found.notes]
-
-
-def _view(found: Calibration, fov_deg: float | None) -> StatedView:
-    """The rectification of a pair, left camera first."""
-    if found.view is not None and fov_deg is None:
-        return found.view
-    rig = rig_of(found, fov_deg)
-    if rig.sources != (1, 0):
-        raise CalibrationError(
-            f"{found.source}: its first camera is the right one, and ROS wants the left one first; "
-            "choose them in that order: --cameras 1,0"
-        )
-    first, second = (rig.bTc[:3, :3].T @ camera.bTc[:3, :3] for camera in found.cameras)
-    matrix = intrinsic_matrix(rig.fx, rig.fy, rig.cx, rig.cy)
-    return StatedView((first, second), matrix, (rig.width, rig.height))
 
 
 # --------------------------------------------------------------------------------------------

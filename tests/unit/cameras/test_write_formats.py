@@ -104,7 +104,7 @@ def test_five_formats_one_after_another(tmp_path: Path) -> None:
         (calibration("ocam"), "a.yaml", None, "Kalibr has no model ocam"),
         (calibration(parameters=[0.1] * 5), "a.yaml", None, "no radial-tangential model of 5"),
         (calibration(), "a.csv", None, "no format ends like that; known: .json"),
-        (calibration("fov"), "a", None, "is no stereo rig"),
+        (calibration("fov"), "a", None, "ROS has no model fov"),
         (calibration(), "a.txt", "kalibr", "is written as .yaml or .yml"),
         (calibration(), "a.yaml", "ros", "is written as no ending, a folder"),
         (calibration(), "a.yaml", "okvis", "format 'okvis' is not known; use fgslam, opencv"),
