@@ -42,15 +42,13 @@ from fgslam.runs.units import (
     Stopped,
     UnitStore,
     holds_units,
-    perform,
 )
-from fgslam.runs.workers import Executor, Pool
+from fgslam.runs.workers import Executor, Failed, Pool
 
 _GROUND = ("log", "trials", "first_seed")
 """What a resumed run must find as it was, of its provenance, beside the data set's identity."""
 
 Status: TypeAlias = Literal["finished", "interrupted"]
-R = TypeVar("R", bound="RunResult")
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
 
@@ -129,8 +127,28 @@ class Context:
     executor: Executor
 
     def perform(self, stage: Stage[Argument, Result]) -> Done[Result]:
-        """Does what is missing of a stage; as :func:`fgslam.runs.units.perform`."""
-        return perform(stage, self.store, self.executor, self.progress, self.stopped)
+        """Does what is missing of a stage; what is done until a stop is kept.
+
+        Raises:
+            FgslamError: what a unit raised, or a unit's file cannot be written or read.
+        """
+        found: dict[int, Result] = self.store.load(stage.name, stage.kind)
+        missing = [k for k in range(stage.count) if k not in found]
+        blocks = [tuple(missing[k : k + stage.block]) for k in range(0, len(missing), stage.block)]
+        ended: list[tuple[tuple[int, ...], str]] = []
+        arguments = [stage.argument(block) for block in blocks]
+        done = len(found)
+        self.progress(stage.label, done, stage.count)
+        for index, result in self.executor.run(stage.work, arguments, self.stopped, stage.fresh):
+            block = blocks[index]
+            if isinstance(result, Failed):
+                ended.append((block, result.why))
+            else:
+                results = dict(zip(block, result, strict=True))
+                found |= self.store.add(stage.name, results, stage.kind)
+            done += len(block)
+            self.progress(stage.label, done, stage.count)
+        return Done({k: found[k] for k in sorted(found)}, sorted(ended))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,8 +232,20 @@ def run_task(
     """
     config = config.resolved()
     with Owner(folder) as owner:
-        existing = _claim(folder, existing, config, owner)
+        # What would be refused after minutes of rendering is refused now.
+        if existing == "resume" and folder.is_dir() and is_empty(folder):
+            existing = "refuse"  # it was killed before its first file
+        require_usable(folder, existing)
         resumed = existing == "resume"
+        if resumed:
+            if is_finished(folder):
+                raise OutputError(
+                    f"{folder}: nothing to resume (no unfinished units): the run has finished; use "
+                    "--overwrite to run again"
+                )
+            require_same(config, folder)
+        if is_run_folder(folder):
+            owner.take()
         task = opener(config, Opening(folder, resumed, progress))
         begin_folder(folder, existing, owner)
         if resumed:
@@ -229,28 +259,6 @@ def run_task(
             result = task.run(Context(folder, resumed, store, *loop))
         if result.status == "finished":
             store.remove()
-    return _with_owner_before(result, owner)
-
-
-def _claim(
-    folder: Path, existing: ExistingFolder, config: Experiment, owner: Owner
-) -> ExistingFolder:
-    """Refuses now what would be refused after minutes of rendering; what to do then.
-
-    A run that was killed before its first file is begun anew.
-    """
-    if existing == "resume" and folder.is_dir() and is_empty(folder):
-        existing = "refuse"
-    require_usable(folder, existing)
-    if existing == "resume":
-        require_unfinished(folder)
-        require_same(config, folder)
-    if is_run_folder(folder):
-        owner.take()
-    return existing
-
-
-def _with_owner_before(result: R, owner: Owner) -> R:
     if not owner.before:
         return result
     note = ("taken over", f"from {owner.before}, which had ended without finishing")
@@ -263,15 +271,6 @@ def is_finished(folder: Path) -> bool:
     left = [folder / STATE_FILE, folder / OWNER_NAME]  # the second by a process that was killed
     begun = holds_units(folder) or any(file.is_file() for file in left)
     return not begun and path.is_file() and read_metrics(path).get("status") != "interrupted"
-
-
-def require_unfinished(folder: Path) -> None:
-    """Raises OutputError where there is nothing left to do."""
-    if is_finished(folder):
-        raise OutputError(
-            f"{folder}: nothing to resume (no unfinished units): the run has finished; use "
-            "--overwrite to run again"
-        )
 
 
 def require_same(config: Experiment, folder: Path) -> None:

@@ -135,54 +135,16 @@ CAMERA_FILE = "camera.json"
 TRIALS_FILE = "trials.csv"
 TIMING_FILE = "trials_timing.csv"
 
-_ESTIMATOR_FILES = (
-    "online.tum",
-    "final.tum",
-    "covariance.csv",
-    "map.ply",
-    "frames.csv",
-    "noise.csv",
-)
-_RESULT_FILES = (
-    RUN_MARKER,
-    LOG_FILE,
-    STATE_FILE,
-    "ground_truth.tum",
-    "ground_truth_landmarks.csv",
-    METRICS_FILE,
-    "timing.csv",
-    CALIBRATION_FILE,
-    CAMERA_FILE,
-    "loops.csv",
-    COMPARISON_FILE,
-    TRIALS_FILE,
-    TIMING_FILE,
-    REPORT_FILE,
-    "view.rrd",
-    "map.fgmap",
-    # of homing runs
-    "pairs.csv",
-    "reference_pairs.csv",
-    "links.csv",
-    "localisation.csv",
-    "estimates.csv",
-    "routes.csv",
-    "map.npz",
-    "path_memory.npz",
-    "frames.csv",
-    "tracks.csv",
-    "legs.csv",
-    "commands.csv",
-    "trajectory.csv",
-    "route.fgpath",
-    "routes.fgmap",
-    "path_images.csv",
-    "follow.csv",
-    "logs/*.npz",
-    "units/*.npz",
-    "pictures/*.png",
-    *(f"*/{name}" for name in _ESTIMATOR_FILES),
-)
+# What a run writes, and so all that overwriting one may delete; comparisons of it go along.
+_RESULT_FILES = """
+    config.yaml measurements.npz checkpoint.npz units/*.npz metrics.json timing.csv report.html
+    view.rrd pictures/*.png ground_truth.tum ground_truth_landmarks.csv calibration.csv camera.json
+    loops.csv comparison.csv trials.csv trials_timing.csv map.fgmap localisation.csv
+    */online.tum */final.tum */covariance.csv */map.ply */frames.csv */noise.csv
+    pairs.csv reference_pairs.csv links.csv estimates.csv routes.csv map.npz path_memory.npz
+    frames.csv tracks.csv legs.csv commands.csv trajectory.csv logs/*.npz
+    route.fgpath routes.fgmap path_images.csv follow.csv
+"""
 
 
 class FolderKind(NamedTuple):
@@ -193,13 +155,15 @@ class FolderKind(NamedTuple):
     files: tuple[str, ...]
 
 
-# What a run writes, and so all that overwriting one may delete; comparisons of it go along.
 RUN = FolderKind(
     "run",
     RUN_MARKER,
     (
-        *_RESULT_FILES,
-        *(f"{inner}/{name}" for inner in ("compare", "trials", "first") for name in _RESULT_FILES),
+        *(
+            f"{inner}{name}"
+            for inner in ("", "compare/", "trials/", "first/")
+            for name in _RESULT_FILES.split()
+        ),
         "**/.*.partial*",
     ),
 )

@@ -11,13 +11,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
 from fgslam.core.store import UNFIT, load_arrays, pack, unpack, write_arrays
-from fgslam.runs.workers import Executor, Failed
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -41,7 +41,7 @@ class Stage(Generic[Argument, Result]):
         work: of a module's top level; the results of a block's units, in their order.
         argument: what a process is given for a block of units.
         kind: type of one unit's result.
-        blocks: divides the units that are missing into blocks.
+        block: units that are handed out, and kept, together.
         fresh: each block in a process that has done nothing before: its memory is measured.
     """
 
@@ -51,7 +51,7 @@ class Stage(Generic[Argument, Result]):
     work: Callable[[Argument], Sequence[Result]]
     argument: Callable[[tuple[int, ...]], Argument]
     kind: Any
-    blocks: Callable[[Sequence[int]], Sequence[Sequence[int]]]
+    block: int = 1
     fresh: bool = False
 
 
@@ -74,14 +74,10 @@ class Done(Generic[Result]):
         return [found[k] for k in sorted(found)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Each(Generic[Argument, Result]):
-    """Calls a function on each argument of a block; handed over to the process that does so."""
-
-    function: Callable[[Argument], Result]
-
-    def __call__(self, arguments: Sequence[Argument]) -> list[Result]:
-        return [self.function(argument) for argument in arguments]
+def _call_each(
+    function: Callable[[Argument], Result], arguments: Sequence[Argument]
+) -> list[Result]:
+    return [function(argument) for argument in arguments]
 
 
 def each_apart(
@@ -102,12 +98,12 @@ def each_apart(
         block: units that are handed out, and kept, together.
         fresh: each block in a process that has done nothing before: its memory is measured.
     """
-
-    def those(units: tuple[int, ...]) -> list[Argument]:
-        return [arguments[k] for k in units]
-
     name, label = names
-    return Stage(name, label, len(arguments), _Each(function), those, kind, in_blocks(block), fresh)
+    work = partial(_call_each, function)
+    return Stage(
+        name, label, len(arguments), work, lambda units: [arguments[k] for k in units],
+        kind, block, fresh,
+    )  # fmt: skip
 
 
 class UnitStore:
@@ -165,57 +161,3 @@ def holds_units(run: Path) -> bool:
 
 def _is_own(path: Path) -> bool:
     return path.is_file() and bool(_UNIT_FILE.fullmatch(path.name) or is_unfinished_file(path))
-
-
-def perform(
-    stage: Stage[Argument, Result],
-    store: UnitStore,
-    executor: Executor,
-    progress: Progress,
-    stopped: Stopped,
-) -> Done[Result]:
-    """Does what is missing of a stage.
-
-    Args:
-        stage: which units.
-        store: where finished ones are.
-        executor: does the blocks.
-        progress: called after each block that is done.
-        stopped: True ends it; what was done until then is kept.
-
-    Raises:
-        FgslamError: what a unit raised, or a unit's file cannot be written or read.
-    """
-    found: dict[int, Result] = store.load(stage.name, stage.kind)
-    missing = [k for k in range(stage.count) if k not in found]
-    blocks = [tuple(block) for block in stage.blocks(missing)]
-    ended: list[tuple[tuple[int, ...], str]] = []
-    progress(stage.label, len(found), stage.count)
-    arguments = [stage.argument(block) for block in blocks]
-    for index, result in executor.run(stage.work, arguments, stopped, stage.fresh):
-        block = blocks[index]
-        if isinstance(result, Failed):
-            ended.append((block, result.why))
-        else:
-            found |= store.add(stage.name, dict(zip(block, result, strict=True)), stage.kind)
-        lost = sum(len(block) for block, _ in ended)
-        progress(stage.label, len(found) + lost, stage.count)
-    return Done({k: found[k] for k in sorted(found)}, sorted(ended))
-
-
-def in_blocks(size: int) -> Callable[[Sequence[int]], list[Sequence[int]]]:
-    """Neighbours in blocks of at most so many."""
-
-    def divided(units: Sequence[int]) -> list[Sequence[int]]:
-        return [units[k : k + size] for k in range(0, len(units), size)]
-
-    return divided
-
-
-def interleaved(blocks: int) -> Callable[[Sequence[int]], list[Sequence[int]]]:
-    """At most so many blocks; neighbours in different ones, as their work is alike."""
-
-    def divided(units: Sequence[int]) -> list[Sequence[int]]:
-        return [units[k::blocks] for k in range(blocks) if units[k::blocks]]
-
-    return divided

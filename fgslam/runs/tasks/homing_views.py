@@ -53,7 +53,7 @@ from fgslam.report.homing_figures import (
 from fgslam.runs.config import HomingPairsConfig, TopologicalMapConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table, write_table
-from fgslam.runs.units import Stage, in_blocks, interleaved
+from fgslam.runs.units import Stage
 
 VIEWS_A_BLOCK = 4
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
@@ -456,7 +456,7 @@ def extract_features(
         work=_extract,
         argument=lambda units: (dataset, settings, units),
         kind=OmniFeatures,
-        blocks=in_blocks(VIEWS_A_BLOCK),
+        block=VIEWS_A_BLOCK,
     )
     done = context.perform(stage)
     if done.ended and not context.stopped():
@@ -544,7 +544,7 @@ def answer_pairs(
         work=_answer,
         argument=lambda units: replace(search, pairs=tuple(search.pairs[k] for k in units)),
         kind=PairAnswer,
-        blocks=interleaved(_BLOCKS_A_JOB * context.jobs),
+        block=max(1, -(-len(search.pairs) // (_BLOCKS_A_JOB * context.jobs))),
     )
     done = context.perform(stage)
     failures = [f"{len(units)} pairs: {why}" for units, why in done.ended]
