@@ -1,5 +1,8 @@
+"""Recordings opened by their settings, and with smaller or larger images."""
+
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +11,8 @@ import numpy as np
 import pytest
 from bags import stereo, write_bag
 from dataset_builders import (
+    CALIBRATION,
+    EUROC_SIZE,
     HEIGHT,
     WIDTH,
     euroc,
@@ -19,8 +24,10 @@ from dataset_builders import (
 )
 from pydantic import TypeAdapter, ValidationError
 
+from fgslam.core.errors import CalibrationError, FgslamError
 from fgslam.core.geometry import pose
 from fgslam.datasets.opening import open_recording
+from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import (
     ConstantVelocitySettings,
     EurocSettings,
@@ -31,6 +38,12 @@ from fgslam.datasets.settings import (
     SyntheticOdometrySettings,
 )
 from fgslam.runs.bare import bare_experiment
+from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.opening import open_sequence
+
+# --------------------------------------------------------------------------------------------
+# Opening
+
 
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -150,3 +163,202 @@ def test_settings_of_odometry_refuse_nonsense() -> None:
     ):
         with pytest.raises(ValidationError):
             adapter.validate_python(values)
+
+
+# --------------------------------------------------------------------------------------------
+# Resized
+
+
+SIDE_BY_SIDE = (pose(np.eye(3), np.zeros(3)), pose(np.eye(3), np.array([0.1, 0.0, 0.0])))
+
+
+def own(root: Path) -> Path:
+    """Our layout; Kalibr would state the same numbers."""
+    image_folder(root, 3)
+    return root
+
+
+def three(root: Path) -> Path:
+    return image_folder(root, 3, top=True)
+
+
+def loose(root: Path) -> Path:
+    for k in range(3):
+        save(root / f"left_{k}.png", picture(60 + k))
+        save(root / f"right_{k}.png", picture(10 + k))
+    write_calibration(root)
+    return root
+
+
+def grow(root: Path, across: float = 2.0, down: float = 2.0) -> None:
+    """The calibration of the same cameras' images enlarged; pixel centres are whole numbers."""
+    path = root / "calib.json"
+    values = json.loads(path.read_text(encoding="utf-8"))
+    for focal, middle, length, factor in (
+        ("fx", "cx", "width", across),
+        ("fy", "cy", "height", down),
+    ):
+        values[focal] *= factor
+        values[middle] = factor * (values[middle] + 0.5) - 0.5
+        values[length] = round(factor * values[length])
+    path.write_text(json.dumps(values), encoding="utf-8")
+
+
+def in_unit(root: Path, metres: float) -> None:
+    """The calibration of the same cameras with its lengths in a unit of so many metres."""
+    path = root / "calib.json"
+    values = json.loads(path.read_text(encoding="utf-8"))
+    for name in {"baseline_m", "vertical_baseline_m"} & set(values):
+        values[name] /= metres
+    path.write_text(json.dumps(values), encoding="utf-8")
+
+
+def opened(root: Path, *overrides: str) -> Recording:
+    config = bare_experiment(root, overrides=overrides).config
+    assert isinstance(config, ExperimentConfig)
+    found = open_sequence(config)
+    assert isinstance(found, Recording)
+    return found
+
+
+@pytest.mark.parametrize("make", [own, three, loose])
+def test_a_calibration_of_larger_images_is_scaled_only_when_asked(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    before = opened(root).rig
+    grow(root)
+    with pytest.raises(CalibrationError) as raised:
+        opened(root)
+    line = str(raised.value)
+    assert "\n" not in line
+    assert "is for images of 64x48 pixels, the images have 32x24" in line
+    assert "--set dataset.resized=true" in line
+    found = opened(root, "dataset.resized=true")
+    for name in ("width", "height", "fx", "fy", "cx", "cy", "baseline", "vertical_baseline"):
+        expected = getattr(before, name)
+        assert getattr(found.rig, name) == (expected and pytest.approx(expected, abs=1e-9))
+    assert int(found.frame(1).images[0][0, 0]) == 11
+
+
+@pytest.mark.parametrize("make", [own, loose])
+def test_another_shape_is_refused_even_when_asked(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    grow(root, 2.0, 1.5)
+    with pytest.raises(CalibrationError, match=r"64x36 pixels cannot be scaled.*cropped"):
+        opened(root, "dataset.resized=true")
+
+
+@pytest.mark.parametrize("make", [own, three, loose])
+@pytest.mark.parametrize("metres", [0.001, 0.025])
+def test_lengths_in_another_unit_are_noticed_and_mended(
+    tmp_path: Path, make: Callable[[Path], Path], metres: float
+) -> None:
+    """0.2 m are 200 m where millimetres are taken as metres, and 8 squares of 25 mm."""
+    root = make(tmp_path / "walk")
+    before = opened(root).rig
+    in_unit(root, metres)
+    (noticed,) = (note for note in opened(root).notes if "its unit is not the metre" in note)
+    assert f"the baseline is {before.baseline / metres:.4g} m" in noticed
+    assert "--unit 0.001 for millimetres, or the side of a square" in noticed
+    found = opened(root, f"dataset.unit_m={metres}")
+    assert not any("unit" in note for note in found.notes)
+    for name in ("baseline", "vertical_baseline"):
+        expected = getattr(before, name)
+        assert getattr(found.rig, name) == (expected and pytest.approx(expected, abs=1e-9))
+
+
+def test_a_unit_that_makes_one_camera_of_two_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"are 0\.2 mm apart, as one camera; .*\(--unit\)"):
+        opened(own(tmp_path / "walk"), "dataset.unit_m=0.001")
+
+
+def test_raw_cameras_are_scaled_as_well(tmp_path: Path) -> None:
+    root = euroc(tmp_path, SIDE_BY_SIDE)
+    focal = opened(root).rig.fx
+    for path in sorted((root / "mav0").glob("cam?/data/*.png")):
+        save(path, cv2.resize(cv2.imread(str(path), 0), None, fx=0.5, fy=0.5))
+    width, height = EUROC_SIZE
+    with pytest.raises(CalibrationError, match=f"{width}x{height} pixels, the images have 32x24"):
+        opened(root)
+    found = opened(root, "dataset.resized=true")
+    assert (found.rig.width, found.rig.height) == (WIDTH, HEIGHT)
+    assert found.rig.fx == pytest.approx(0.5 * focal, rel=0.03)
+    assert found.frame(0).images[0].shape == (HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("make", [own, three])
+def test_images_are_made_smaller_with_their_calibration(
+    tmp_path: Path, make: Callable[[Path], Path]
+) -> None:
+    root = make(tmp_path / "walk")
+    before, found = opened(root), opened(root, "dataset.scale=0.5")
+    expected = (16, 12, 15.0, 15.5, 7.5, 5.5, before.rig.baseline, before.rig.vertical_baseline)
+    rig = found.rig
+    numbers = (rig.width, rig.height, rig.fx, rig.fy, rig.cx, rig.cy, rig.baseline)
+    assert (*numbers, rig.vertical_baseline) == expected
+    large, small = before.frame(1), found.frame(1)
+    for one, other in zip(large.images, small.images, strict=True):
+        mean = one.reshape(12, 2, 16, 2).astype(float).mean(axis=(1, 3))
+        assert np.abs(other - mean).max() <= 0.5
+    assert found.colour(1)[0].shape == (12, 16, 3)
+    assert found.notes[0] == "images of 32x24 are made 16x12"
+    assert np.array_equal(found.timestamps, before.timestamps)
+
+
+def test_black_borders_keep_their_distance_when_images_are_made_smaller(tmp_path: Path) -> None:
+    root = image_folder(tmp_path / "walk", 3)
+    hidden = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    hidden[:, :8] = 0
+    save(root / "mask_left.png", hidden)
+    large, small = opened(root).frame(0), opened(root, "dataset.scale=0.5").frame(0)
+    assert large.margins[1][12, 20] == pytest.approx(13.0, abs=0.5)
+    assert small.margins[1][6, 10] == pytest.approx(6.5, abs=0.3)
+    assert small.margins[1].shape == small.images[1].shape
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [("0.1", "images of 3x2 pixels of 32x24"), ("0", "greater than 0")]
+)
+def test_a_scale_that_leaves_nothing_is_refused(tmp_path: Path, scale: str, words: str) -> None:
+    root = image_folder(tmp_path / "walk", 3)
+    with pytest.raises(FgslamError, match=words) as raised:
+        opened(root, f"dataset.scale={scale}")
+    assert "dataset.scale" in str(raised.value)
+
+
+def test_the_angle_of_the_rectified_view_may_be_chosen(tmp_path: Path) -> None:
+    for root in (own(tmp_path / "own"), euroc(tmp_path, SIDE_BY_SIDE)):
+        wide = opened(root, "dataset.fov_deg=100")
+        rig = wide.rig
+        assert rig.width / rig.fx == pytest.approx(2.0 * np.tan(np.radians(50.0)), abs=1e-6)
+        assert wide.frame(0).images[0].shape == (rig.height, rig.width)
+    with pytest.raises(FgslamError, match=r"fov_deg.*less than 170"):
+        opened(root, "dataset.fov_deg=175")
+
+
+@pytest.mark.parametrize(("share", "bits"), [(1, 8), (4, 10), (16, 12), (64, 14)])
+def test_a_folder_of_16_bit_images_is_scaled_by_the_bits_they_hold(
+    tmp_path: Path, share: int, bits: int
+) -> None:
+    for k in range(3):
+        for name, code in (("left", 60 + k), ("right", 10 + k)):
+            image = np.clip(picture(code), 0, 254).astype(np.uint16) * share
+            save(tmp_path / f"{name}_{k}.png", image)
+    write_calibration(tmp_path)
+    found = opened(tmp_path)
+    np.testing.assert_array_equal(found.frame(2).images[1], np.clip(picture(62), 0, 254))
+    np.testing.assert_array_equal(found.colour(2)[1][:, :, 0], np.clip(picture(62), 0, 254))
+    assert sum(f"pixels of 16 bits hold {bits}:" in note for note in found.notes) == 1
+
+
+def test_sixteen_bits_that_are_used_are_no_note(tmp_path: Path) -> None:
+    for name, code in (("left", 60), ("right", 10)):
+        save(tmp_path / f"{name}_0.png", picture(code).astype(np.uint16) << 8 | 0x7F)
+    write_calibration(tmp_path)
+    found = opened(tmp_path)
+    np.testing.assert_array_equal(found.frame(0).images[0], picture(10))
+    assert not any("bits" in note for note in found.notes)
+    assert found.rig.fx == CALIBRATION["fx"]
