@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, fields, replace
 from pathlib import Path
 from typing import Any
@@ -85,14 +85,16 @@ def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -
 def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
     """Counts over the frames that do not depend on truth."""
     times = recorder.known_times()
+    # Of sideways motion and yaw (Se et al. 5); none before frame 1.
+    correlations = correlation(np.array(recorder.online_covariances[1:]).reshape(-1, 6, 6))
     return {
         "status_counts": dict(sorted(Counter(recorder.column("status").tolist()).items())),
         "features": spread(recorder.column("features")),
         "stereo_matches": spread(recorder.column("stereo")),
         "landmark_matches": spread(recorder.column("inliers")[1:]),
-        "mean_residual_px": _median(recorder.column("mean_residual_px")),
-        "stereo_precision": _mean(recorder.column("stereo_precision")),
-        "correlation_x_yaw": _sideways_yaw(recorder),
+        "mean_residual_px": _of_known(np.median, recorder.column("mean_residual_px")),
+        "stereo_precision": _of_known(np.mean, recorder.column("stereo_precision")),
+        "correlation_x_yaw": float(np.median(correlations[:, 1, 3])) if len(correlations) else None,
         "located": asdict(located(recorder)),
         "frames_without_image": int(np.count_nonzero(recorder.column("status") == _NO_IMAGE)),
         "frame_problems": frame_problems(recorder),
@@ -145,23 +147,13 @@ def spread(counts: IntArray) -> JsonValue:
     }
 
 
-def _sideways_yaw(recorder: RunRecorder) -> float | None:
-    """Median correlation of sideways motion and yaw (Se et al. 5); None before frame 1."""
-    if len(recorder) < 2:
-        return None
-    found = correlation(np.array(recorder.online_covariances[1:]))
-    return float(np.median(found[:, 1, 3]))
-
-
-def _median(values: FloatArray) -> float | None:
+def _of_known(summary: Callable[[FloatArray], Any], values: FloatArray) -> float | None:
     known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else None
+    return float(summary(known)) if len(known) else None
 
 
-def _mean(values: FloatArray) -> float | None:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else None
-
+# ------------------------------------------------------------------------------------------
+# Loops closed
 
 LOOPS_FILE = "loops.csv"
 _NAMES = ("frame", "returned_to", *(f.name for f in fields(JudgedClosure)), "false")
