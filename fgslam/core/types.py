@@ -264,17 +264,10 @@ class Floor:
 # ------------------------------------------------------------------------------------------
 # Trajectories, and their files: TUM and KITTI files, and the covariances of their poses as CSV
 
-_TUM_FORMAT = "%.9f" + 7 * " %.12f"
-_EUROC_FORMAT = ",".join(7 * ["%.12f"])
 _EUROC_HEADER = (
     "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],"
     "q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"
 )
-_KITTI_FORMAT = " ".join(12 * ["%.12e"])
-_COVARIANCE_FORMAT = "%.9f" + 21 * ",%.9e"
-_TUM_COLUMNS = 8
-_KITTI_COLUMNS = 12
-_NOT_FINITE = "a number is not finite; repair or remove the line"
 _UPPER = np.triu_indices(6)
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _COVARIANCE_NAMES = [f"c_{_TANGENT[i]}_{_TANGENT[j]}" for i, j in zip(*_UPPER, strict=True)]
@@ -311,14 +304,32 @@ class Trajectory(Brief):
             OutputError: the suffix is another one, a pose is not finite, or writing failed.
         """
         path = Path(path)
-        texts = {".tum": _tum_text, ".kitti": _kitti_text, ".csv": _euroc_text}
-        if path.suffix.lower() not in texts:
+        bad = ~np.isfinite(self.poses).all(axis=(1, 2)) | ~np.isfinite(self.timestamps)
+        if bad.any():
+            row = int(np.argmax(bad))
             raise OutputError(
-                f"cannot write {path}: unknown trajectory format '{path.suffix}'; use .tum, .kitti "
-                "or .csv"
+                f"cannot write {path}: pose {row} (t = {self.timestamps[row]:.9f} s) is not "
+                "finite; the estimator diverged there, check its input before that time"
             )
-        _require_finite(path, self)
-        write_text(path, texts[path.suffix.lower()](self, remark))
+        text = f"# {remark}\n" if remark else ""
+        match path.suffix.lower():
+            case ".tum":
+                rows = np.column_stack([self.timestamps, pose_rows(self.poses, decimals=12)])
+                text += _rows_text(rows, "%.9f" + 7 * " %.12f")
+            case ".kitti":
+                text = _rows_text(self.poses[:, :3].reshape(-1, 12) + 0.0, " ".join(12 * ["%.12e"]))
+            case ".csv":
+                rows = pose_rows(self.poses, decimals=12)[:, [0, 1, 2, 6, 3, 4, 5]]
+                lines = _rows_text(rows, ",".join(7 * ["%.12f"])).splitlines()
+                stamps = np.rint(self.timestamps * 1e9).astype(np.int64).tolist()
+                pairs = zip(stamps, lines, strict=True)
+                text += _EUROC_HEADER + "".join(f"{stamp},{line}\n" for stamp, line in pairs)
+            case suffix:
+                raise OutputError(
+                    f"cannot write {path}: unknown trajectory format '{suffix}'; use .tum, .kitti "
+                    "or .csv"
+                )
+        write_text(path, text)
 
     @staticmethod
     def load(path: str | Path) -> Trajectory:
@@ -330,56 +341,36 @@ class Trajectory(Brief):
         """
         path = as_path(path, DatasetError)
         expected = "timestamp tx ty tz qx qy qz qw on each line"
-        values, lines = _parse_rows(
-            path,
-            read_text(path, remedy=f"check the path; it has {expected}"),
-            _TUM_COLUMNS,
-            expected,
-        )
-        _refuse(path, lines, np.asarray(~np.isfinite(values).all(axis=1)), _NOT_FINITE)
-        norms = np.linalg.norm(values[:, 4:], axis=1)
-        _refuse(path, lines, norms < 0.5, "the quaternion has no length; repair or remove the line")
+        text = read_text(path, remedy=f"check the path; it has {expected}")
+        values, lines = _parse_rows(path, text, 8, expected)
         backwards = np.concatenate([[False], np.diff(values[:, 0]) <= 0.0])
-        _refuse(path, lines, backwards, "the time stamp does not increase; sort or repair the file")
+        for bad, what in (
+            (~np.isfinite(values).all(axis=1), "a number is not finite; repair or remove the line"),
+            (
+                np.linalg.norm(values[:, 4:], axis=1) < 0.5,
+                "the quaternion has no length; repair or remove the line",
+            ),
+            (backwards, "the time stamp does not increase; sort or repair the file"),
+        ):
+            if bad.any():
+                raise DatasetError(f"{path}, line {lines[int(np.argmax(bad))]}: {what}")
         poses = np.empty((len(values), 4, 4))
         for out, row in zip(poses, values, strict=True):
             out[:] = pose(rotation_from_quaternion(row[4:]), row[1:4])
         return Trajectory(values[:, 0].copy(), poses)
 
 
-def _tum_text(trajectory: Trajectory, remark: str) -> str:
-    """Lines of `timestamp tx ty tz qx qy qz qw` (seconds, metres), as evo reads them."""
-    rows = np.column_stack([trajectory.timestamps, _printed_rows(trajectory)])
-    return _comment(remark) + _format_rows(rows, _TUM_FORMAT)
+def pose_rows(poses: FloatArray, decimals: int | None = None) -> FloatArray:
+    """(n, 7) x y z qx qy qz qw of poses (n, 4, 4), w not negative.
 
-
-def _euroc_text(trajectory: Trajectory, remark: str) -> str:
-    """EuRoC's ground-truth columns: nanoseconds, position, quaternion w first; of ``wTc``."""
-    rows = _printed_rows(trajectory)[:, [0, 1, 2, 6, 3, 4, 5]]
-    lines = _format_rows(rows, _EUROC_FORMAT).splitlines()
-    stamps = np.rint(trajectory.timestamps * 1e9).astype(np.int64).tolist()
-    text = (f"{stamp},{line}\n" for stamp, line in zip(stamps, lines, strict=True))
-    return _comment(remark) + _EUROC_HEADER + "".join(text)
-
-
-def _printed_rows(trajectory: Trajectory) -> FloatArray:
-    """:func:`pose_rows`, rounded as they are printed, without negative zeros."""
-    return _without_negative_zeros(pose_rows(trajectory.poses), decimals=12)
-
-
-def pose_rows(poses: FloatArray) -> FloatArray:
-    """(n, 7) x y z qx qy qz qw of poses (n, 4, 4), w not negative."""
-    rows = np.empty((len(poses), _TUM_COLUMNS - 1))
+    ``decimals``: rounded as they are printed, without negative zeros.
+    """
+    rows = np.empty((len(poses), 7))
     rows[:, :3] = poses[:, :3, 3]
     for row, aTb in zip(rows, poses, strict=True):
-        row[3:] = _canonical(quaternion_from_rotation(aTb[:3, :3]))
-    return rows
-
-
-def _kitti_text(trajectory: Trajectory, _: str) -> str:
-    """One row-major 3x4 ``wTc`` a line (metres), as KITTI odometry and evo read; no time stamps."""
-    rows = trajectory.poses[:, :3, :].reshape(len(trajectory), _KITTI_COLUMNS)
-    return _format_rows(rows + 0.0, _KITTI_FORMAT)
+        quaternion = quaternion_from_rotation(aTb[:3, :3])
+        row[3:] = -quaternion if quaternion[3] < 0.0 else quaternion
+    return rows if decimals is None else np.asarray(np.round(rows, decimals) + 0.0)
 
 
 # --------------------------------------------------------------------------------------------
@@ -398,9 +389,8 @@ def write_covariances(
         remark: put into a further comment line.
     """
     upper = covariances[:, _UPPER[0], _UPPER[1]]
-    rows = np.column_stack([timestamps, upper + 0.0])
-    header = _comment(remark) + _COVARIANCE_HEADER
-    write_text(path, header + _format_rows(rows, _COVARIANCE_FORMAT))
+    rows = _rows_text(np.column_stack([timestamps, upper + 0.0]), "%.9f" + 21 * ",%.9e")
+    write_text(path, (f"# {remark}\n" if remark else "") + _COVARIANCE_HEADER + rows)
 
 
 def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -420,34 +410,10 @@ def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
 # Rows of numbers
 
 
-def _comment(remark: str) -> str:
-    return f"# {remark}\n" if remark else ""
-
-
-def _format_rows(rows: FloatArray, row_format: str) -> str:
+def _rows_text(rows: FloatArray, row_format: str) -> str:
     buffer = io.StringIO()
     np.savetxt(buffer, rows, fmt=row_format)
     return buffer.getvalue()
-
-
-def _without_negative_zeros(values: FloatArray, decimals: int) -> FloatArray:
-    """Values rounded as they will be printed; adding zero turns -0 into 0."""
-    return np.asarray(np.round(values, decimals) + 0.0)
-
-
-def _canonical(quaternion: FloatArray) -> FloatArray:
-    """The one of the two quaternions (x, y, z, w) of a rotation that has w >= 0."""
-    return -quaternion if quaternion[3] < 0.0 else quaternion
-
-
-def _require_finite(path: Path, trajectory: Trajectory) -> None:
-    bad = ~np.isfinite(trajectory.poses).all(axis=(1, 2)) | ~np.isfinite(trajectory.timestamps)
-    if bad.any():
-        row = int(np.argmax(bad))
-        raise OutputError(
-            f"cannot write {path}: pose {row} (t = {trajectory.timestamps[row]:.9f} s) is not "
-            "finite; the estimator diverged there, check its input before that time"
-        )
 
 
 def _parse_rows(path: Path, text: str, columns: int, expected: str) -> tuple[FloatArray, IntArray]:
@@ -469,26 +435,6 @@ def _parse_rows(path: Path, text: str, columns: int, expected: str) -> tuple[Flo
         lines.append(number)
     values = np.array(rows, dtype=np.float64).reshape(-1, columns)
     return values, np.array(lines, dtype=np.int64)
-
-
-def _refuse(path: Path, lines: IntArray, bad: BoolArray, what: str) -> None:
-    if bad.any():
-        raise DatasetError(f"{path}, line {lines[int(np.argmax(bad))]}: {what}")
-
-
-__all__ = [
-    "EgoMotion",
-    "EgoMotionStatus",
-    "Estimate",
-    "LandmarkMap",
-    "Prediction",
-    "Relocalisation",
-    "RelocalisationStatus",
-    "Remark",
-    "Trajectory",
-    "UpdateStats",
-    "correlation",
-]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

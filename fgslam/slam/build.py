@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 
@@ -225,24 +225,15 @@ _ESSENTIAL = ("kind", "supports", "predict", "landmarks", "update", "estimate")
 """What the loop needs of an estimator; the protocol's other members serve resuming and tests."""
 
 
-def estimator_kinds() -> tuple[str, ...]:
-    """Names of the estimators, the simplest first."""
-    return tuple(str(settings.kind) for settings in _classes())
+_ESTIMATORS: dict[str, type[Any]] = {
+    one.kind: one for one in get_args(get_args(EstimatorSettings)[0])
+}
+_ODOMETRIES = get_args(get_args(OdometrySettings)[0])
 
 
 def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
     """True if the value is the settings of an estimator of this package."""
-    return isinstance(value, _classes())
-
-
-def _classes() -> tuple[type[Any], ...]:
-    return _members(EstimatorSettings)
-
-
-def _members(tagged: Any) -> tuple[type[Any], ...]:
-    """Settings classes of a tagged union."""
-    union, _ = get_args(tagged)
-    return get_args(union)
+    return isinstance(value, tuple(_ESTIMATORS.values()))
 
 
 def chosen_estimator(
@@ -253,22 +244,25 @@ def chosen_estimator(
     Raises:
         ConfigError: there is no such kind, or the object lacks members of an estimator.
     """
+    kinds = ", ".join(_ESTIMATORS)
     if isinstance(estimator, str):
-        return _named(estimator)
+        if estimator not in _ESTIMATORS:
+            close = difflib.get_close_matches(estimator, _ESTIMATORS, n=1, cutoff=0.4)
+            hint = f"did you mean {close[0]}? " if close else ""
+            raise ConfigError(f"estimator: no kind {estimator!r}; {hint}known: {kinds}")
+        return cast("EstimatorSettings", _ESTIMATORS[estimator]())
     if is_settings(estimator):
         return estimator
-    if isinstance(estimator, type):
+    give = f"give a kind ({kinds}), its settings, or an object with the members of fgslam.Estimator"
+    _require_members("estimator", estimator, _ESSENTIAL, give)
+    supports = getattr(estimator, "supports", None)
+    if not isinstance(supports, set | frozenset) or not all(
+        isinstance(one, MeasurementType) for one in supports
+    ):
         raise ConfigError(
-            f"estimator: {estimator.__name__} is a class; give an object of it, made for this rig"
+            f"estimator: supports of {type(estimator).__name__} is {supports!r}; give a frozenset "
+            "of fgslam.core.sensors.MeasurementType"
         )
-    lacking = [name for name in _ESSENTIAL if not hasattr(estimator, name)]
-    if lacking:
-        raise ConfigError(
-            f"estimator: {type(estimator).__name__} lacks {', '.join(lacking)}; give a kind "
-            f"({', '.join(estimator_kinds())}), its settings, or an object with the members of "
-            "fgslam.Estimator"
-        )
-    _require_supports(estimator)
     return cast("Estimator", estimator)
 
 
@@ -284,8 +278,10 @@ def chosen_frontend(given: FrontendSettings | Mapping[str, Any] | None) -> Front
     try:
         return adapter.validate_python(dict(given or {}))
     except (ValidationError, TypeError, ValueError) as error:
-        first = error.errors()[0] if isinstance(error, ValidationError) else None
-        what = "not a mapping" if first is None else f"{_dotted(first['loc'])}: {first['msg']}"
+        what = "not a mapping"
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise ConfigError(
             f"frontend: {what}; give settings by group, e.g. "
             '{"stereo": {"max_disparity_px": 80}}, as in the settings reference'
@@ -302,49 +298,24 @@ def chosen_odometry(
     """
     if given is None:
         return RecordedOdometrySettings()
-    if _is_odometry_settings(given):
-        return given
-    lacking = [name for name in MOTION_MEMBERS if not hasattr(given, name)]
-    if lacking or isinstance(given, type):
-        why = f"lacks {', '.join(lacking)}" if lacking else "is a class"
-        name = given.__name__ if isinstance(given, type) else type(given).__name__
-        raise ConfigError(
-            f"odometry: {name} {why}; give settings, e.g. "
-            "fgslam.datasets.settings.ConstantVelocitySettings(), or an object with the members of "
-            "fgslam.MotionModel"
+    if not isinstance(given, _ODOMETRIES):
+        give = (
+            "give settings, e.g. fgslam.datasets.settings.ConstantVelocitySettings(), or an object "
+            "with the members of fgslam.MotionModel"
         )
+        _require_members("odometry", given, MOTION_MEMBERS, give)
     return given
 
 
-def _is_odometry_settings(value: object) -> TypeGuard[OdometrySettings]:
-    return isinstance(value, _members(OdometrySettings))
-
-
-def _dotted(location: tuple[int | str, ...]) -> str:
-    return ".".join(map(str, location))
-
-
-def _require_supports(estimator: object) -> None:
-    supports = getattr(estimator, "supports", None)
-    known = isinstance(supports, set | frozenset) and all(
-        isinstance(one, MeasurementType) for one in supports
-    )
-    if not known:
+def _require_members(what: str, given: object, members: Sequence[str], give: str) -> None:
+    """Raises ConfigError for a class, and for an object that lacks members."""
+    if isinstance(given, type):
         raise ConfigError(
-            f"estimator: supports of {type(estimator).__name__} is {supports!r}; give a frozenset "
-            "of fgslam.core.sensors.MeasurementType"
+            f"{what}: {given.__name__} is a class; give an object of it, made for this rig"
         )
-
-
-def _named(kind: str) -> EstimatorSettings:
-    known = estimator_kinds()
-    if kind not in known:
-        close = difflib.get_close_matches(kind, known, n=1, cutoff=0.4)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise ConfigError(f"estimator: no kind {kind!r}; {hint}known: {', '.join(known)}")
-    adapter: TypeAdapter[Any] = TypeAdapter(EstimatorSettings)
-    settings: EstimatorSettings = adapter.validate_python({"kind": kind})
-    return settings
+    lacking = ", ".join(name for name in members if not hasattr(given, name))
+    if lacking:
+        raise ConfigError(f"{what}: {type(given).__name__} lacks {lacking}; {give}")
 
 
 _SOFT_HEIGHT_M, _SOFT_TILT_DEG = 0.005, 0.2  # deviations a frame of a soft floor
@@ -435,47 +406,43 @@ def make_estimator(
     """
     prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
     ego_motion = ego_motion or EgoMotionSettings()
-    estimator: FullEstimator
+    made: FullEstimator
     match settings:
         case DeadReckoningSettings():
             from fgslam.backend.filters.dead_reckoning import DeadReckoning
 
-            estimator = DeadReckoning(rig, prior)
+            return DeadReckoning(rig, prior)
         case LandmarkKalmanSettings():
             from fgslam.backend.filters.kalman import LandmarkKalman
 
-            estimator = LandmarkKalman(rig, settings, prior, ego_motion)
+            return LandmarkKalman(rig, settings, prior, ego_motion)
         case LandmarkKalmanGraphSettings():
             from fgslam.backend.filters.kalman_graph import LandmarkKalmanGraph
 
-            estimator = LandmarkKalmanGraph(rig, settings, prior, ego_motion)
+            return LandmarkKalmanGraph(rig, settings, prior, ego_motion)
+    floor = make_floor(rig, settings.floor, ego_motion.dof)
+    match settings:
         case EkfSettings():
             from fgslam.backend.filters.ekf import FullEkf
 
-            estimator = FullEkf(
-                rig, settings, make_floor(rig, settings.floor, ego_motion.dof), prior
-            )
+            made = FullEkf(rig, settings, floor, prior)
         case FixedLagSettings():
             from fgslam.backend.smoothers.lag import fixed_lag_smoother
 
-            floor = make_floor(rig, settings.floor, ego_motion.dof)
-            estimator = fixed_lag_smoother(rig, settings, floor, prior)
+            made = fixed_lag_smoother(rig, settings, floor, prior)
         case Isam2Settings():
             from fgslam.backend.smoothers.isam2 import isam2_smoother
 
-            floor = make_floor(rig, settings.floor, ego_motion.dof)
-            estimator = isam2_smoother(rig, settings, floor, prior)
+            made = isam2_smoother(rig, settings, floor, prior)
         case SlidingWindowSettings():
             from fgslam.backend.smoothers.lag import sliding_window_smoother
 
-            floor = make_floor(rig, settings.floor, ego_motion.dof)
-            estimator = sliding_window_smoother(rig, settings, floor, prior)
+            made = sliding_window_smoother(rig, settings, floor, prior)
         case BatchSettings():
             from fgslam.backend.smoothers.batch import batch_smoother
 
-            floor = make_floor(rig, settings.floor, ego_motion.dof)
-            estimator = batch_smoother(rig, settings, floor, prior)
-    return estimator
+            made = batch_smoother(rig, settings, floor, prior)
+    return made
 
 
 def made_or_given(

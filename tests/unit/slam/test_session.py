@@ -418,7 +418,7 @@ def test_a_motion_model_of_ones_own_predicts_and_is_in_the_log(views: Views) -> 
 
 
 def test_a_motion_model_that_is_none_is_refused(views: Views) -> None:
-    with pytest.raises(ConfigError, match=r"odometry: Standing is a class; give settings"):
+    with pytest.raises(ConfigError, match=r"odometry: Standing is a class; give an object"):
         session(views, odometry=Standing)
 
 
