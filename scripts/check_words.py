@@ -10,7 +10,14 @@ import re
 import sys
 from pathlib import Path
 
-CLEAN = ("fgslam/report", "fgslam/slam", "fgslam/datasets", "fgslam/evaluation", "README.md")
+CLEAN = (
+    "fgslam/cameras",
+    "fgslam/report",
+    "fgslam/slam",
+    "fgslam/datasets",
+    "fgslam/evaluation",
+    "README.md",
+)
 """Files and folders that hold none; the others follow."""
 
 WORDS = {

@@ -1,7 +1,7 @@
 """Calibration boards and where their corners are in an image: chessboard, ChArUco, AprilGrid.
 
 Found by OpenCV's detectors; points of a board are numbered, so that a board that is seen in part
-still tells which of them are seen.
+still identifies them.
 """
 
 from __future__ import annotations

@@ -133,8 +133,9 @@ def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
     values = read_json_object(path)
     if values.get("rectified") is False:
         raise CalibrationError(
-            f"{path} says that the images are not rectified; rectify them first (rows of the left "
-            "and right image must agree), or give the raw cameras' calibration by --camera FILE"
+            f"{path} states that the images are not rectified; rectify them first (rows of the "
+            "left and right image must agree), or give the raw cameras' calibration by --camera "
+            "FILE"
         )
     bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
     if "bTc" in values:

@@ -101,8 +101,8 @@ def calibrate(
     values, posed = _start(seen, size, model, len(views))
     used = posed[seen.image]
     if model != "radtan":
-        bends = len(INTRINSICS) + (1 if model == "omni" else 0)
-        values = _Fit(seen.select(used), values, size, model).least(_FIRST_STEPS, bends)
+        lens_from = len(INTRINSICS) + (1 if model == "omni" else 0)
+        values = _Fit(seen.select(used), values, size, model).least(_FIRST_STEPS, lens_from)
     for trimming in range(_TRIMMINGS):
         _require_views(seen, used)
         fit = _Fit(seen.select(used), values, size, model)
@@ -486,7 +486,7 @@ def camera_of(
 def board_pose(camera: RawCamera, points: FloatArray, pixels: FloatArray) -> FloatArray | None:
     """Pose (4, 4) of a board in the camera; None where too few of its corners have rays.
 
-    The rays are turned to look along their mean first: a board may lie beside the camera.
+    The rays are turned to look along their mean first: a board may lie next to the camera.
     """
     rays = camera.unproject(pixels)
     known = np.isfinite(rays).all(axis=1)
@@ -529,7 +529,7 @@ class HeldOut:
     Attributes:
         views: how many those were.
         rows_px: deviation of the rows of one corner in both rectified images, from the median of
-            their distances: a corner that was found wrongly says nothing of the calibration.
+            their distances: a corner that was found wrongly proves nothing about the calibration.
         square: median side of the board's squares as triangulated, metres.
         reach_m: depth at which an error of ``rows_px`` in disparity is :data:`DEPTH_SHARE` of it.
     """
@@ -615,7 +615,7 @@ class HeldOutAlone:
     Attributes:
         views: (k,) which of all views those were.
         off_px: deviation of a corner's distance, from the median of all: one that was found wrongly
-            says nothing of the calibration. The board's pose alone is fitted to each image.
+            proves nothing about the calibration. The board's pose alone is fitted to each image.
         each_px: (k,) root mean square distance in each image.
     """
 

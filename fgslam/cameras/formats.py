@@ -182,7 +182,7 @@ def read_opencv_pair(path: Path, tree: Tree, size: Size | None) -> Calibration:
         cameras.append(checked_camera(RawCamera(*size, matrix, parameters, bTc, name, model)))
     notes: tuple[str, ...] = ()
     if cameras[0].model == "equidistant" and "distortion_model" not in part:
-        notes = (f"four coefficients beside {matrices[0]}: taken as those of cv2.fisheye",)
+        notes = (f"four coefficients next to {matrices[0]}: taken as those of cv2.fisheye",)
     return Calibration(str(path), "OpenCV stereo calibration", tuple(cameras), True, None, notes)
 
 
@@ -330,7 +330,7 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
     """A rectified pair; the body is the left camera, looking ahead.
 
     ``keys`` are the lines of left and right camera; None: of the grey pair, or of the colour one
-    where only that has images beside the file.
+    where only that has images next to the file.
 
     Raises:
         CalibrationError: a line is missing or malformed, or the pair is not rectified.
@@ -373,7 +373,7 @@ def read_kitti(path: Path, size: Size | None, keys: tuple[str, str] | None = Non
 
 
 def pair_beside(path: Path) -> tuple[int, int] | None:
-    """Left and right camera whose folders of images lie beside a calib.txt; None: of no pair."""
+    """Left and right camera whose folders of images lie next to a calib.txt; None: of no pair."""
     for pair in _KITTI_PAIRS:
         if all((path.parent / f"image_{number}").is_dir() for number in pair):
             return pair
@@ -381,7 +381,7 @@ def pair_beside(path: Path) -> tuple[int, int] | None:
 
 
 def _kitti_keys(path: Path) -> tuple[str, str]:
-    """Lines of the pair whose images lie beside a calib.txt; of the grey one where none does."""
+    """Lines of the pair whose images lie next to a calib.txt; of the grey one where none does."""
     left, right = pair_beside(path) or _KITTI_PAIRS[0]
     return f"P{left}", f"P{right}"
 
@@ -399,7 +399,7 @@ def right_of_camera_0(path: Path) -> float:
 def left_on_inertial_unit(path: Path, keys: tuple[str, str]) -> FloatArray | None:
     """Pose (4, 4) of a raw drive's rectified left camera on the inertial unit.
 
-    By calib_cam_to_cam.txt and the two files beside it that lead over the laser scanner; None
+    By calib_cam_to_cam.txt and the two files next to it that lead over the laser scanner; None
     where those are absent.
 
     Raises:
@@ -413,8 +413,8 @@ def left_on_inertial_unit(path: Path, keys: tuple[str, str]) -> FloatArray | Non
     lines = _lines(path)
     upright = pose(lines.matrix("R_rect_00", 3, 3), np.zeros(3))
     left = lines.matrix(keys[0], 3, 4)
-    beside = pose(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
-    return np.asarray(inverse(reorthonormalise(upright @ to_camera @ to_scanner)) @ beside)
+    sideways = pose(np.eye(3), np.array([-left[0, 3] / left[0, 0], 0.0, 0.0]))
+    return np.asarray(inverse(reorthonormalise(upright @ to_camera @ to_scanner)) @ sideways)
 
 
 def _lines(path: Path) -> Values:
@@ -643,17 +643,17 @@ def _camodocal(path: Path, tree: Tree, bTc: FloatArray = ORIGIN) -> RawCamera:
 
 
 def _read_vins(path: Path, tree: Tree, _: Size | None) -> Calibration:
-    """Its cameras, each in a file of camodocal beside it; the body is the IMU."""
+    """Its cameras, each in a file of camodocal next to it; the body is the IMU."""
     part = Values(path, tree)
     cameras = []
     for k in (0, 1):
         if f"cam{k}_calib" not in part:
             continue
-        beside = path.parent / str(part.tree[f"cam{k}_calib"])
-        own = read_tree(beside)
+        file = path.parent / str(part.tree[f"cam{k}_calib"])
+        own = read_tree(file)
         if own is None or not is_camodocal(own):
-            raise part.refuse(f"cam{k}_calib names {beside}, which is no camera of camodocal")
-        cameras.append(_camodocal(beside, own, part.motion(f"body_T_cam{k}")))
+            raise part.refuse(f"cam{k}_calib names {file}, which is no camera of camodocal")
+        cameras.append(_camodocal(file, own, part.motion(f"body_T_cam{k}")))
     return Calibration(str(path), "VINS-Fusion configuration", tuple(cameras))
 
 
@@ -958,7 +958,7 @@ def is_opencv_half(tree: Tree) -> bool:
 
 
 def calibration_of_text(path: Path, text: str, size: Size | None) -> Calibration | None:
-    """What a file of other texts than keys and values says; None: it is of no such format."""
+    """What a file of other texts than keys and values states; None: it is of no such format."""
     found = (read(path, text, size) for recognises, read in _TEXTS if recognises(text))
     return next(found, None)
 

@@ -485,7 +485,7 @@ def _matrix_faults(matrix: FloatArray) -> Iterator[str]:
 
 
 def _camera_faults(camera: RawCamera) -> Iterator[str]:
-    """What no camera is, in words; of one whose size is not known less is said."""
+    """What no camera is, in words; fewer where its size is not known."""
     sizes, count = camera.lens.sizes, len(camera.distortion)
     size, centre, place = np.array(camera.size), camera.matrix[:2, 2], camera.bTc[:3, 3]
     shown = f"{camera.width}x{camera.height} pixels"
@@ -523,7 +523,7 @@ def _camera_faults(camera: RawCamera) -> Iterator[str]:
 
 
 # --------------------------------------------------------------------------------------------
-# What a calibration file says of several
+# What a calibration file states of several
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -543,7 +543,7 @@ class StatedView(Brief):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Brief):
-    """What a calibration file says.
+    """The contents of a calibration file.
 
     Attributes:
         source: the file.

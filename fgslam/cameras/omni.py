@@ -161,7 +161,7 @@ def unwrap_maps(source: OmniCamera, target: OmniCamera) -> tuple[Float32, Float3
 # --------------------------------------------------------------------------------------------
 # Unwrapped views: the equirectangular panorama and the cylinder; both are cameras themselves
 #
-# Columns run clockwise: the centre column looks forward, the first and the last one both look
+# Columns run clockwise: the centre column points forward, the first and the last one both point
 # backward, so a turn of the robot shifts the picture sideways.
 
 
@@ -181,7 +181,7 @@ def _column(rays: FloatArray, width: int) -> FloatArray:
 class Equirectangular:
     """Rows proportional to elevation.
 
-    Column u looks to bearing pi - 2 pi u / (width - 1), row v to elevation
+    Column u points to bearing pi - 2 pi u / (width - 1), row v to elevation
     ``top_elevation - v (top_elevation - bottom_elevation) / (height - 1)``; radians.
     """
 
@@ -221,7 +221,7 @@ class Cylinder:
     """Rows proportional to the tangent of elevation.
 
     A vertical line then keeps its straightness, and a column segment scales about the horizon's row
-    alone when its distance changes. Row v looks along tangent
+    alone when its distance changes. Row v points along tangent
     ``tan_top - v (tan_top - tan_bottom) / (height - 1)``.
     """
 
@@ -284,7 +284,7 @@ class MirrorFrame:
             centre, so 0 is right and -pi/2, the default, is up. This is where a camera that is
             turned on its axis is corrected.
         clockwise: whether bearings grow clockwise in the picture. True for the raw picture of an
-            upward-looking camera; False where it was mirrored, or the camera looks down.
+            upward-looking camera; False where it was mirrored, or the camera points down.
         affine: (c, d, e) of OCamCalib, for sensors that are skew or have oblong pixels: a point at
             (x, y) rows and columns from the centre is seen at (c x + d y, e x + y).
     """
@@ -548,7 +548,7 @@ class RadialPolynomial(InvertedCamera):
     radius, scaled so that the ring's inner and outer rim lie at -1 and 1, which keeps the fit well
     conditioned.
 
-    It falls with the radius where the picture's middle looks up: a mirror that is looked at from
+    It falls with the radius where the picture's middle points up: a mirror that is seen from
     above, or one with a second, flat mirror.
     """
 
@@ -625,7 +625,7 @@ def fit_radial_polynomial(
 
 
 # --------------------------------------------------------------------------------------------
-# A lens or mirror calibrated as an ordinary camera, that looks straight up or down
+# A lens or mirror calibrated as an ordinary camera, that points straight up or down
 
 
 AROUND = ("omni", "equidistant", "fov", "ds", "eucm", "ocam")
@@ -644,7 +644,7 @@ class LensCamera:
         matrix: (9,) intrinsics row by row.
         distortion: parameters of the lens.
         ring: inner and outer radius around the principal point that show the surroundings, pixels.
-        up: whether the picture's middle looks up; else down, as of a mirror above the camera.
+        up: whether the picture's middle points up; else down, as of a mirror above the camera.
         ahead, clockwise: as of :class:`MirrorFrame`.
 
     Raises:
@@ -725,7 +725,7 @@ class LensCamera:
 # --------------------------------------------------------------------------------------------
 # OCamCalib's polynomial camera (Scaramuzza, Martinelli and Siegwart 2006) and its result file
 #
-# A pixel at radius rho from the centre looks along (rho cos, rho sin, f(rho)), f a polynomial.
+# A pixel at radius rho from the centre points along (rho cos, rho sin, f(rho)), f a polynomial.
 # The file's inverse polynomial is a fit of its own, good to a fraction of a pixel; pixels are found
 # here by solving f exactly.
 
@@ -833,11 +833,11 @@ def read_ocamcalib(path: Path) -> OCamCalibration:
     entries, comment = [], ""  # lines of numbers, each with the comment before it
     text = read_text(path, CalibrationError, "give OCamCalib's calib_results.txt")
     for number, line in enumerate(text.splitlines(), 1):
-        values, _, beside = line.replace("%", "#").partition("#")  # MATLAB's comments, too
+        values, _, after = line.replace("%", "#").partition("#")  # MATLAB's comments, too
         words = values.replace(",", " ").split()
         if words:
             entries.append((f"{path}, line {number}", comment, words))
-        comment = "" if words else beside.strip(" \t#") or comment
+        comment = "" if words else after.strip(" \t#") or comment
     if len(entries) < 5:
         raise CalibrationError(
             f"{path} has {len(entries)} entries, an OCamCalib result has 5 (two polynomials, "

@@ -63,7 +63,7 @@ def load_camera(
 
     Args:
         source: the path of an OCamCalib result file (``calib_results.txt``), of a camera of
-            camodocal (MEI) or Kalibr whose middle looks down, of BloggieUnwarp's ``settings.txt``
+            camodocal (MEI) or Kalibr whose middle points down, of BloggieUnwarp's ``settings.txt``
             or of a YAML file of keys (of fgslam's .json, which does not say how the camera is
             mounted: ``kind: lens``, ``file``, ``middle``, ``clockwise``); or the keys themselves,
             as under ``dataset.camera`` of an experiment: ``{"kind": "mirror", "xi": 0.92}``; or the
@@ -263,13 +263,13 @@ def _stated_size(kind: str, calibrated: Size | None, size: Size | None) -> Size:
 
 
 def _find(file: str, folder: Path | None) -> Path:
-    beside = None if folder is None else folder / file
-    if beside is not None and beside.is_file():
-        return beside
+    local = None if folder is None else folder / file
+    if local is not None and local.is_file():
+        return local
     if not Path(file).is_file():
-        also = "" if beside is None else f", nor {beside}"
+        also = "" if local is None else f", nor {local}"
         raise CalibrationError(
-            f"camera.file: there is no calibration {file}{also}; put it beside the pictures, or "
+            f"camera.file: there is no calibration {file}{also}; put it next to the pictures, or "
             "give its path"
         )
     return Path(file)

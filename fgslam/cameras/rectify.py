@@ -24,7 +24,7 @@ from fgslam.core.sensors import CameraRig
 MapArray: TypeAlias = npt.NDArray[np.float32]
 
 _OUTSIDE = -1e4  # coordinate that is outside of any image, so that it stays black
-# A perspective view stretches its rim by 1 / cos^2: at 60 degrees off the axis by 4.
+# A perspective view magnifies its rim by 1 / cos^2: at 60 degrees off the axis by 4.
 _WIDEST_DEG = 120.0
 # The middle of the view keeps at least this share of the raw image's resolution.
 _LEAST_RESOLUTION = 0.9
@@ -39,7 +39,7 @@ class Rectifier(Brief):
         rig: the rectified rig, reference = right camera.
         maps: per camera (right, left[, top]) the columns and rows (h, w) to sample, float32.
         order: per camera, which of the images given as (right, left[, top]) is its own; another
-            order than 0, 1, 2 where the calibration says that what is called left is on the right.
+            order than 0, 1, 2 where what the calibration calls left is on the right.
         size: width and height of the raw images, pixels; None: those of the rig.
         shown: per camera, what of its raw image may be used (h, w), nonzero where it may; None:
             all of it. Empty: all of every image.

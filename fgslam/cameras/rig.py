@@ -1,6 +1,6 @@
 """The rectified stereo rig: as users describe it, or from a calibration file.
 
-From a file to a rig (:func:`load_rig`): what the file says (:func:`read_calibration_file`), which
+From a file to a rig (:func:`load_rig`): what the file states (:func:`read_calibration_file`), which
 of its cameras is which, and their common view (:func:`rig_of`).
 """
 
@@ -483,7 +483,7 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
 _LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
 # Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.
 _LONGEST_BASELINE_M = 3.0
-# Cosine of 45 degrees: beyond, a common image plane would stretch the views out of use.
+# Cosine of 45 degrees: beyond, a common image plane would magnify the rims out of use.
 _LEAST_COMMON_VIEW = 0.707
 # A stated view with less of the raw resolution than this has collapsed.
 _LEAST_STATED = 0.5
@@ -635,9 +635,9 @@ def _three(cameras: Sequence[RawCamera]) -> Placed:
     corner = min(range(3), key=lambda k: abs(cosines[k]))
     away = [_offset(camera, cameras[corner])[:2] for camera in cameras]
     others = [k for k in range(3) if k != corner]
-    beside = max(others, key=lambda k: abs(away[k][0]) - abs(away[k][1]))
-    above = next(k for k in others if k != beside)
-    left_side, upper_side = away[beside][0] < 0.0, away[above][1] < 0.0
+    adjacent = max(others, key=lambda k: abs(away[k][0]) - abs(away[k][1]))
+    above = next(k for k in others if k != adjacent)
+    left_side, upper_side = away[adjacent][0] < 0.0, away[above][1] < 0.0
     skew = 90.0 - np.degrees(np.arccos(np.clip(cosines[corner], -1.0, 1.0)))
     notes: tuple[str, ...] = ()
     if abs(skew) > _SKEW_DEG:
@@ -647,8 +647,8 @@ def _three(cameras: Sequence[RawCamera]) -> Placed:
         )
     if left_side == upper_side:
         turn = np.eye(3) if left_side else np.diag([-1.0, -1.0, 1.0])
-        return (corner, beside, above), turn, notes
-    return (corner, above, beside), _quarter_turn(upper_side), notes
+        return (corner, adjacent, above), turn, notes
+    return (corner, above, adjacent), _quarter_turn(upper_side), notes
 
 
 def _cosine(cameras: Sequence[RawCamera], corner: int) -> float:

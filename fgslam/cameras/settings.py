@@ -88,10 +88,10 @@ class HyperbolicMirrorSettings(MirrorMountSettings):
         default=-65.0,
         ge=-90.0,
         lt=90.0,
-        description="at the inner rim, used where it says so above",
+        description="at the inner rim, used where stated above",
     )
     outer_elevation_deg: float = Field(
-        default=25.0, gt=-90.0, lt=90.0, description="at the outer rim, used where it says so above"
+        default=25.0, gt=-90.0, lt=90.0, description="at the outer rim, used where stated above"
     )
 
 
@@ -103,10 +103,10 @@ class OCamCalibSettings(MirrorMountSettings):
     file: str = Field(
         default="calib_results.txt",
         min_length=1,
-        description="calib_results.txt, looked for beside the pictures, then from here",
+        description="calib_results.txt, looked for next to the pictures, then from here",
     )
     ring_px: Pair | None = Field(
-        default=None, description="inner and outer radius; null: as the file says"
+        default=None, description="inner and outer radius; null: as the file states"
     )
 
 
@@ -118,12 +118,12 @@ class LensSettings(MirrorMountSettings):
     file: str = Field(
         default="camera.yaml",
         min_length=1,
-        description="its calibration, looked for beside the pictures, then here",
+        description="its calibration, looked for next to the pictures, then here",
     )
     middle: Literal["down", "up"] = Field(
         default="down",
-        description="where the picture's middle looks: down as of a mirror above the camera, "
-        "up as of a fisheye that looks up",
+        description="where the picture's middle points: down as of a mirror above the camera, "
+        "up as of a fisheye that points up",
     )
     ring_px: Pair | None = Field(
         default=None, description="inner and outer radius; null: the largest circle in the picture"
@@ -162,7 +162,7 @@ class BloggieSettings:
     file: str = Field(
         default="bloggie_settings.txt",
         min_length=1,
-        description="settings.txt, looked for beside the video, then from here",
+        description="settings.txt, looked for next to the video, then from here",
     )
 
 

@@ -1,6 +1,6 @@
 """Calibration files as keys and values, and the tables that say which key holds which number.
 
-A :class:`Row` of a format's table says where a camera's size, intrinsics and lens are;
+A :class:`Row` of a format's table states where a camera's size, intrinsics and lens are;
 :func:`camera_of` reads them. Files are YAML, JSON and XML, with OpenCV's matrices as arrays.
 """
 

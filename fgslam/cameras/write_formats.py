@@ -24,7 +24,7 @@ from fgslam.core.geometry import inverse
 def write_calibration(
     calibration: Calibration, path: Path, form: str | None = None, fov_deg: float | None = None
 ) -> str:
-    """Writes a calibration; the name says the format, unless it is given.
+    """Writes a calibration; the name states the format, unless it is given.
 
     ``.json`` is fgslam's own, ``.yml`` and ``.xml`` OpenCV's, ``.yaml`` Kalibr's, and a name
     without an ending a folder with ``left.yaml`` and ``right.yaml`` of ROS.

@@ -211,5 +211,5 @@ def test_images_that_are_not_rectified(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     write_calibration(root, rectified=False)
     line = refused(root)
-    assert "says that the images are not rectified; rectify them first" in line
+    assert "states that the images are not rectified; rectify them first" in line
     assert "or give the raw cameras' calibration by --camera FILE" in line
