@@ -1,15 +1,28 @@
-"""What is sent to the viewer."""
+"""What is sent to the viewer; films: what is read of a followed route, and how fast they run."""
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+
 import numpy as np
+import pytest
 from numpy.testing import assert_array_equal
 
 from fgslam.core.arrays import FloatArray
+from fgslam.core.errors import ConfigError, DatasetError
 from fgslam.core.geometry import rotation_from_quaternion
 from fgslam.core.sensors import Increment, Observations, moved_pixels
 from fgslam.core.types import LandmarkMap
-from fgslam.runs.view import ChangedBlocks, half_axes, seen_pixels
+from fgslam.runs.view import (
+    ChangedBlocks,
+    Row,
+    command_text,
+    follow_rows,
+    frame_rate,
+    half_axes,
+    seen_pixels,
+)
 
 
 def landmarks(ids: list[int], positions: FloatArray) -> LandmarkMap:
@@ -84,3 +97,100 @@ def test_half_axes_rebuild_the_covariance() -> None:
         rebuilt = axes @ np.diag((half[k] / 3.0) ** 2) @ axes.T
         np.testing.assert_allclose(rebuilt, covariances[k], rtol=0, atol=1e-9)
     assert [part.shape for part in half_axes(np.empty((0, 3, 3)))] == [(0, 3), (0, 4)]
+
+
+# --------------------------------------------------------------------------------------------
+# Films
+
+ROW = {
+    "image": "3",
+    "name": "view_3.png",
+    "time_s": "1700000000.250000000",
+    "path_image": "2",
+    "path_image_name": "taught_2.png",
+    "probability": "0.9",
+    "target": "3",
+    "direction_deg": "12.5",
+    "sigma_direction_deg": "2",
+    "inliers": "41",
+    "v_mps": "0.3",
+    "omega_deg_s": "-4",
+    "state": "driving",
+    "refusal": "",
+    "to_target_m": "",
+}
+
+
+READ = ROW | {
+    "image": 3.0,
+    "time_s": 1700000000.25,
+    "path_image": 2.0,
+    "probability": 0.9,
+    "target": 3.0,
+    "direction_deg": 12.5,
+    "sigma_direction_deg": 2.0,
+    "v_mps": 0.3,
+    "omega_deg_s": -4.0,
+    "to_target_m": 8.0,
+}
+
+
+def table(path: Path, row: Row) -> Path:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        writer.writeheader()
+        writer.writerows([row, row])
+    return path
+
+
+def test_a_whole_follow_csv_is_read(tmp_path: Path) -> None:
+    assert follow_rows(table(tmp_path / "follow.csv", ROW | {"to_target_m": "8"})) == [READ, READ]
+    (row, _) = follow_rows(table(tmp_path / "follow.csv", ROW))
+    assert np.isnan(row["to_target_m"])
+
+
+@pytest.mark.parametrize(
+    ("column", "text"),
+    [("time_s", "12:30"), ("time_s", ""), ("time_s", "nan"), ("image", "1.5"), ("target", "x"),
+     ("direction_deg", "1\n2"), ("v_mps", "inf"), ("to_target_m", "y" * 500)],
+)  # fmt: skip
+def test_a_damaged_cell_of_follow_csv_is_named_in_one_line(
+    column: str, text: str, tmp_path: Path
+) -> None:
+    with pytest.raises(DatasetError, match=rf"line 2: {column} is '.*not a number") as caught:
+        follow_rows(table(tmp_path / "follow.csv", ROW | {column: text}))
+    assert str(caught.value).endswith("; follow the route again")
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("column", ["state", "target", "path_image_name", "inliers", "v_mps"])
+def test_a_column_that_follow_csv_lacks_is_named(column: str, tmp_path: Path) -> None:
+    rest = {name: text for name, text in ROW.items() if name != column}
+    with pytest.raises(DatasetError, match=f"follow.csv: lacks column {column}; follow the route"):
+        follow_rows(table(tmp_path / "follow.csv", rest))
+
+
+@pytest.mark.parametrize(
+    ("turn", "said"),
+    [(4.0, "4 degrees/s, left"), (-4.0, "4 degrees/s, right"), (0.0, "0 degrees/s"),
+     (-0.2, "0 degrees/s")],
+)  # fmt: skip
+def test_a_turn_has_a_side_unless_it_is_zero(turn: float, said: str) -> None:
+    assert f"omega {said}" in command_text(READ | {"omega_deg_s": turn}).splitlines()
+
+
+def test_a_film_runs_as_fast_as_the_recording_and_at_most_30_frames_a_second() -> None:
+    where = Path("run")
+    epoch = 1.7e9 + np.array([0.25, 0.35, 0.45])
+    assert frame_rate(epoch, "images", where) == pytest.approx(10.0, abs=1e-4)
+    assert frame_rate(np.arange(3) / 200.0, "images", where) == 30.0
+
+    with pytest.raises(ConfigError, match="a film needs two at least"):
+        frame_rate(np.zeros(1), "images", where)
+
+
+@pytest.mark.parametrize("times", [[5.0, 5.0, 5.0], [3.0, 2.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+def test_times_that_stand_still_give_no_rate(times: list[float]) -> None:
+    with pytest.raises(DatasetError, match="run: the times of its images do not increase"):
+        frame_rate(np.array(times), "images", Path("run"))
