@@ -101,10 +101,6 @@ class StereoRig(CameraRig):
         """Per camera, how far each rectified pixel is from what shows nothing; empty: all do."""
         return () if self.rectifier is None else self.rectifier.margins
 
-    def plain(self) -> CameraRig:
-        """The rectified rig alone, without what makes images its own."""
-        return CameraRig(**{name: getattr(self, name) for name in CameraRig.__dataclass_fields__})
-
     def rectified(self, images: tuple[Image, ...]) -> tuple[Image, ...]:
         """Rectified (right, left[, top]) of grey images (height, width) uint8 as the camera gives.
 

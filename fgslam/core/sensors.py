@@ -230,6 +230,10 @@ class CameraRig(Brief):
         across, down = np.degrees(2.0 * np.arctan(half)).tolist()
         return across, down
 
+    def plain(self) -> CameraRig:
+        """The rectified rig alone, without what a subclass adds: as files hold it."""
+        return CameraRig(**{name: getattr(self, name) for name in CameraRig.__dataclass_fields__})
+
     @property
     def cameras(self) -> int:
         """Number of cameras, 2 or 3."""

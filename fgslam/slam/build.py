@@ -192,7 +192,7 @@ def saved_map(
         landmarks = landmarks.without(places.ending)
     rows, patches = database.rows(landmarks.ids), database.patches(landmarks.ids)
     return SavedMap(
-        rig=rig,
+        rig=rig.plain(),
         landmarks=landmarks,
         appearances=database.appearances(landmarks.ids),
         hits=database.hits[rows],
@@ -325,7 +325,7 @@ _LOCATING_STREAM = 12  # of random numbers, next to those of the recording
 def as_measured(rig: CameraRig, settings: FrontendSettings) -> CameraRig:
     """The rig as the front-end measures with it: which images tell a place."""
     by_patches = settings.stereo.by_patches(rig.cameras)
-    return dataclasses.replace(rig, places="reference" if by_patches else "all")
+    return dataclasses.replace(rig.plain(), places="reference" if by_patches else "all")
 
 
 def make_stream(

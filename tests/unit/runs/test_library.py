@@ -340,3 +340,15 @@ def test_what_are_no_images_is_told_by_what_it_is(folder: Path, given: Any, word
     with pytest.raises(FrameError, match=words):
         slam.track(0.0, given)
     assert slam.numbering == fg.Slam(fg.open_recording(folder).rig).numbering  # nothing was taken
+
+
+def test_files_of_a_session_with_a_checked_rig_are_read_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    with fg.Slam(_rig()) as slam:
+        for k in range(2):
+            image = rng.integers(0, 256, (240, 320)).astype(np.uint8)
+            slam.track(0.1 * k, (image, image))
+        slam.log.save(tmp_path / "log.npz")
+        slam.result().map.save(tmp_path / "place.fgmap")
+    assert fg.Map.load(tmp_path / "place.fgmap").rig.baseline == 0.1
+    assert fg.MeasurementLog.load(tmp_path / "log.npz").rig.baseline == 0.1
