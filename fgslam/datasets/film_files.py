@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from itertools import islice
 from pathlib import Path
 
@@ -66,36 +66,25 @@ def _write_mp4(path: Path, frames: Iterable[Image], fps: float) -> int:
     finally:
         if writer is not None:
             writer.release()
-    _require_whole(path, count)
+    if count:  # its table of frames is written last: where the disk is full it lacks some
+        film = cv2.VideoCapture(str(path))
+        found = round(film.get(cv2.CAP_PROP_FRAME_COUNT)) if film.isOpened() else 0
+        film.release()
+        if found != count:
+            raise OSError(errno.ENOSPC, f"of {count} frames {found} were written")
     return count
-
-
-def _require_whole(path: Path, count: int) -> None:
-    """Raises OSError unless the film has ``count`` frames: its table of them is written last."""
-    if not count:
-        return
-    film = cv2.VideoCapture(str(path))
-    found = round(film.get(cv2.CAP_PROP_FRAME_COUNT)) if film.isOpened() else 0
-    film.release()
-    if found != count:
-        raise OSError(errno.ENOSPC, f"of {count} frames {found} were written")
 
 
 def _write_gif(path: Path, frames: Iterable[Image], fps: float) -> int:
     step = max(1, round(fps / _GIF_FPS))
-    pages = _pages(islice(frames, 0, None, step))
-    first = next(pages, None)
-    if first is None:
-        return 0
-    rest = list(pages)  # a palette each: a few hundred kilobytes
-    duration = round(1000.0 * step / fps)
-    first.save(path, save_all=True, append_images=rest, duration=duration, loop=0)
-    return 1 + len(rest)
-
-
-def _pages(frames: Iterable[Image]) -> Iterator[Pillow.Image]:
-    for frame in frames:
+    pages: list[Pillow.Image] = []
+    for frame in islice(frames, 0, None, step):
         page = Pillow.fromarray(frame)
         if page.width > _GIF_WIDTH:
             page = page.resize((_GIF_WIDTH, round(page.height * _GIF_WIDTH / page.width)))
-        yield page.quantize(64)
+        pages.append(page.quantize(64))  # a palette each: a few hundred kilobytes in all
+    if not pages:
+        return 0
+    duration = round(1000.0 * step / fps)
+    pages[0].save(path, save_all=True, append_images=pages[1:], duration=duration, loop=0)
+    return len(pages)

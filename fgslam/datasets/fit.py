@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import suppress
 
 import cv2
 import numpy as np
@@ -34,7 +35,12 @@ def fit_notes(load: Callable[[int], tuple[Image, ...]], count: int) -> tuple[str
             FrameError.
         count: how many frames there are.
     """
-    pairs = [images[:2] for images in _first(load, count)]
+    pairs: list[tuple[Image, ...]] = []
+    for index in range(min(count, _TRIED)):
+        with suppress(FrameError):
+            pairs.append(load(index)[:2])
+        if len(pairs) == _PAIRS:
+            break
     found = [_matched(*pair) for pair in pairs]
     if sum(map(len, found)) < _FEWEST_MATCHES:
         return ()
@@ -60,25 +66,15 @@ def fit_notes(load: Callable[[int], tuple[Image, ...]], count: int) -> tuple[str
     return ()
 
 
-def _first(load: Callable[[int], tuple[Image, ...]], count: int) -> Iterator[tuple[Image, ...]]:
-    found = 0
-    for index in range(min(count, _TRIED)):
-        try:
-            images = load(index)
-        except FrameError:
-            continue
-        yield images
-        found += 1
-        if found == _PAIRS:
-            return
-
-
 def _matched(right: Image, left: Image) -> FloatArray:
     """(n, 2) column and row in the left minus those in the right image, of features that match."""
     detector = cv2.SIFT.create(_FEATURES)
     factor = max(1, math.ceil(right.shape[1] / _WIDE_PX))
-    small = (_shrunk(image, factor) for image in (left, right))
-    (there, a), (here, b) = (detector.detectAndCompute(image, None) for image in small)
+    size = (right.shape[1] // factor, right.shape[0] // factor)
+    (there, a), (here, b) = (
+        detector.detectAndCompute(cv2.resize(image, size, interpolation=cv2.INTER_AREA), None)
+        for image in (left, right)
+    )
     if a is None or b is None or len(a) < 2 or len(b) < 2:
         return np.empty((0, 2))
     matcher = cv2.BFMatcher(cv2.NORM_L2)
@@ -90,10 +86,3 @@ def _matched(right: Image, left: Image) -> FloatArray:
     ]
     moved = [np.subtract(there[j].pt, here[i].pt) for i, j in kept]
     return np.asarray(factor * np.array(moved, np.float64).reshape(-1, 2))
-
-
-def _shrunk(image: Image, factor: int) -> Image:
-    size = (image.shape[1] // factor, image.shape[0] // factor)
-    if factor == 1:
-        return image
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

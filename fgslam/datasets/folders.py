@@ -114,7 +114,16 @@ def open_image_folder(
         calibration = Path(settings.camera_file)
     rig = _folder_rig(root, settings, calibration, cameras)
     numbers, stamps = _read_times(root / "times.txt")
-    images, noticed = open_frames(_frames(cameras, numbers), rig, root)
+    # An absent image gets the name that it should have.
+    suffixes = {folder: next(iter(found.values())).suffix for folder, found in cameras.items()}
+    files = [
+        tuple(
+            found.get(number, folder / f"{number:06d}{suffixes[folder]}")
+            for folder, found in cameras.items()
+        )
+        for number in numbers.tolist()
+    ]
+    images, noticed = open_frames(files, rig, root)
     odometry_file = find_odometry(root)
     rig, mounting = on_wheels(rig, settings, odometry_file)
     known = set(numbers.tolist())
@@ -132,16 +141,16 @@ def open_image_folder(
     identity = recording_identity(
         defining, (path for found in cameras.values() for path in found.values())
     )
-    recording = image_recording(
-        settings,
-        root.resolve().name,
-        rig,
-        stamps,
-        images,
-        identity,
-        (*mounting, *noticed, *notes),
-    )
-    truth = _read_truth(root, rig.baseline)
+    notes = [*mounting, *noticed, *notes]
+    name = root.resolve().name
+    recording = image_recording(settings, name, rig, stamps, images, identity, tuple(notes))
+    truth = None
+    for file, of_left in ((TRUTH_RIGHT, False), (TRUTH_LEFT, True)):
+        if truth is None and (root / file).is_file():
+            truth = read_tum(root / file)
+            if of_left:
+                poses = right_from_left_camera(truth.poses, rig.baseline)
+                truth = Trajectory(truth.timestamps, poses)
     return replace(
         recording,
         ground_truth=None if truth is None else trajectory_at_frames(truth, recording.timestamps),
@@ -215,27 +224,3 @@ def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
         )
     require_increasing(table, table.column(1))
     return numbers, table.column(1)
-
-
-def _frames(
-    cameras: dict[Path, dict[int, Path]], numbers: IntArray
-) -> tuple[tuple[Path, ...], ...]:
-    """Files of all frames; an absent one gets the name that it should have."""
-    suffixes = {folder: next(iter(images.values())).suffix for folder, images in cameras.items()}
-    return tuple(
-        tuple(
-            images.get(number, folder / f"{number:06d}{suffixes[folder]}")
-            for folder, images in cameras.items()
-        )
-        for number in numbers.tolist()
-    )
-
-
-def _read_truth(root: Path, baseline: float) -> Trajectory | None:
-    """True poses of the reference (right) camera at their own stamps, or None."""
-    if (root / TRUTH_RIGHT).is_file():
-        return read_tum(root / TRUTH_RIGHT)
-    if (root / TRUTH_LEFT).is_file():
-        left = read_tum(root / TRUTH_LEFT)
-        return Trajectory(left.timestamps, right_from_left_camera(left.poses, baseline))
-    return None
