@@ -157,13 +157,21 @@ class _Camera:
             sightings, pixels = Sightings.nothing(), np.empty((0, 2 * self._rig.cameras))
         else:
             sightings, pixels = self._look(wTc, g.transform_to_camera(wTc, self._world.points))
-        observations = self._observe(sightings, pixels)
+        count = len(pixels)
+        raw = np.full((count, 3, 2), np.nan)
+        raw[:, : self._rig.cameras] = pixels.reshape(count, self._rig.cameras, 2)
         return Increment(
             index=index,
             timestamp=timestamp,
             odometry=odometry,
-            observations=observations,
-            rejected=np.zeros(len(observations), np.bool_),
+            observations=Observations(
+                ids=np.concatenate([sightings.matched_ids, sightings.new_ids]),
+                measurement=pixels @ self._fuse.T,
+                covariance=np.tile(self._covariance, (count, 1, 1)),
+                pixels=raw,
+                is_new=np.arange(count) >= len(sightings.matched),
+            ),
+            rejected=np.zeros(count, np.bool_),
             missed_ids=sightings.missed_ids,
             pruned_ids=sightings.pruned_ids,
         )
@@ -179,7 +187,12 @@ class _Camera:
         detection = self._settings.detection
         sigma = PIXEL_SIGMA * detection.noise_scale
         noise = sigma * self._pixel_noise.standard_normal(exact.shape)
-        found = self._detect(view, self._measurable(exact + noise))
+        lucky, jitter = self._detection.uniform(size=(2, len(view)))
+        found = self._measurable(exact + noise) & (lucky < detection.probability)
+        if found.sum() > detection.features:  # the strongest of too many
+            strength = self._world.strength[view] + _STRENGTH_JITTER * jitter
+            weakest = np.argsort(np.where(found, -strength, np.inf), kind="stable")
+            found[weakest[detection.features :]] = False
         seen, expected = np.zeros((2, len(local)), np.bool_)
         seen[view[found]] = expected[view[inner]] = True
         sightings = self._book.take(seen, expected)
@@ -214,17 +227,6 @@ class _Camera:
     def _measurable(self, pixels: FloatArray) -> BoolArray:
         return np.asarray((pixels @ self._fuse.T)[:, 2] >= _LEAST_DISPARITY_PX)
 
-    def _detect(self, view: IntArray, measurable: BoolArray) -> BoolArray:
-        """Which of the points in view are found: by chance, and the strongest of too many."""
-        detection = self._settings.detection
-        lucky, jitter = self._detection.uniform(size=(2, len(view)))
-        found: BoolArray = measurable & (lucky < detection.probability)
-        if found.sum() > detection.features:
-            strength = self._world.strength[view] + _STRENGTH_JITTER * jitter
-            weakest = np.argsort(np.where(found, -strength, np.inf), kind="stable")
-            found[weakest[detection.features :]] = False
-        return found
-
     def _confuse(self, matched: FloatArray, in_view: FloatArray, noise: FloatArray) -> None:
         """Replaces some rows by another landmark's pixels or by anything in the image."""
         fraction, count, rig = self._settings.outlier_fraction, len(matched), self._rig
@@ -241,18 +243,6 @@ class _Camera:
         wrong = (draw[:, 0] < fraction) & self._measurable(shown)
         matched[wrong] = shown[wrong]
         self.wrong_matches += int(wrong.sum())
-
-    def _observe(self, sightings: Sightings, pixels: FloatArray) -> Observations:
-        count = len(pixels)
-        raw = np.full((count, 3, 2), np.nan)
-        raw[:, : self._rig.cameras] = pixels.reshape(count, self._rig.cameras, 2)
-        return Observations(
-            ids=np.concatenate([sightings.matched_ids, sightings.new_ids]),
-            measurement=pixels @ self._fuse.T,
-            covariance=np.tile(self._covariance, (count, 1, 1)),
-            pixels=raw,
-            is_new=np.arange(count) >= len(sightings.matched),
-        )
 
 
 # --------------------------------------------------------------------------------------------
