@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.measured import stored
 from benchmarks.rows import RESULTS, Record, Row, Section, load_record, shown_bound, shown_number
-from benchmarks.tables import Cell, Table, shown
+from benchmarks.tables import Cell, Table, grid, shown
 
 PAGES = Path(__file__).parents[1] / "docs" / "results"
 WIDTH = 118
@@ -175,16 +175,6 @@ def _cut(columns: Sequence[str], rows: list[tuple[str, ...]], width: int) -> lis
 def _picked(columns: Sequence[str], rows: list[tuple[str, ...]], part: list[int]) -> list[str]:
     keep = [0, *part]
     return grid([columns[k] for k in keep], [[row[k] for k in keep] for row in rows])
-
-
-def grid(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """A Markdown table without padding."""
-    line = "|" + "---|" * len(columns)
-    return [_line(columns), line, *(_line(row) for row in rows)]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
 
 
 def _cell(cell: Cell) -> str:

@@ -15,7 +15,7 @@ import cv2
 from fgslam.core.arrays import Image
 from fgslam.core.log import Frame, ImageSequence
 from fgslam.core.types import EgoMotionStatus, Trajectory
-from fgslam.evaluation.statistics import Alignment, TrajectoryError, evaluate_trajectory
+from fgslam.evaluation.statistics import evaluate_trajectory
 from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import EDGE_THRESHOLD, OCTAVE_LAYERS
 from fgslam.frontend.settings import FrontendSettings
@@ -156,20 +156,15 @@ def process(found: FoundFeatures, pipeline: SlamPipeline) -> Iterator[FrameRepor
         yield pipeline.process(frame, frame.i, timestamp, body)
 
 
-def trajectory_error(
-    pipeline: SlamPipeline, sequence: ImageSequence, alignment: Alignment = Alignment.SE3
-) -> TrajectoryError:
-    """Errors of the system's trajectory so far, as a run of it would state them."""
-    truth = sequence.ground_truth
-    known = None if truth is None else _as_kept(truth)
-    return evaluate_trajectory(pipeline.estimate().trajectory, known, alignment)
-
-
-def _as_kept(truth: Trajectory) -> Trajectory:
-    """The truth in the digits of a run's folder, by which a run and its replays are judged."""
-    with tempfile.TemporaryDirectory() as folder:
-        truth.save(Path(folder) / GROUND_TRUTH_FILE)
-        return Trajectory.load(Path(folder) / GROUND_TRUTH_FILE)
+def ate_m(pipeline: SlamPipeline, sequence: ImageSequence) -> float:
+    """ATE of the system's trajectory so far, as a run of it would state it; NaN without a truth."""
+    if sequence.ground_truth is None:
+        return float("nan")
+    with tempfile.TemporaryDirectory() as folder:  # a run's truth has the digits of its file
+        path = Path(folder) / GROUND_TRUTH_FILE
+        sequence.ground_truth.save(path)
+        found = evaluate_trajectory(pipeline.estimate().trajectory, Trajectory.load(path))
+    return float("nan") if found.ate_rmse_m is None else found.ate_rmse_m
 
 
 def say(text: str) -> None:

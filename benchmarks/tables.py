@@ -40,9 +40,8 @@ class Table:
 
     def markdown(self) -> str:
         """A Markdown table under its title, the notes below."""
-        lines = [f"### {self.title}", "", _line(self.columns), _line("---" for _ in self.columns)]
-        lines += [_line(map(shown, row)) for row in self.rows]
-        lines += [""] + [f"- {note}" for note in self.notes]
+        lines = [f"### {self.title}", "", *grid(self.columns, [map(shown, r) for r in self.rows])]
+        lines += ["", *(f"- {note}" for note in self.notes)]
         return "\n".join(lines).rstrip() + "\n"
 
     def as_columns(self) -> dict[str, list[Cell]]:
@@ -61,8 +60,11 @@ def shown(cell: Cell) -> str:
     return str(cell)
 
 
-def _line(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+def grid(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> list[str]:
+    """Lines of a Markdown table without padding."""
+    heads = list(columns)
+    lines = ["| " + " | ".join(cells) + " |" for cells in (heads, *rows)]
+    return [lines[0], "|" + "---|" * len(heads), *lines[1:]]
 
 
 def _finite(cell: Cell) -> Cell:

@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.runs import (
     FoundFeatures,
+    ate_m,
     experiment,
     find_features,
     make_system,
     process,
     say,
-    trajectory_error,
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, IntArray
@@ -148,13 +148,12 @@ def drive(
         EgoMotionSolver(found.sequence.rig, config.frontend.ego_motion),
     )
     reports = list(process(found, system))
-    error = trajectory_error(system, found.sequence).ate_rmse_m
     if not isinstance(found.sequence, RenderedLabSequence):
         raise ValueError(f"{config.name}: only of the rendered lab every true point is known")
     away = _landmark_errors(found.sequence, reports, system)
     return Outcome(
         located=1 + sum(report.tracking.status.measured for report in reports),
-        ate_cm=float("nan") if error is None else 100.0 * error,
+        ate_cm=100.0 * ate_m(system, found.sequence),
         right=float(np.mean(away <= _RIGHT_PX)),
         median_px=float(np.median(away)),
         p95_px=float(np.quantile(away, 0.95)),

@@ -11,11 +11,11 @@ from benchmarks.evidence.person import position_errors
 from benchmarks.runs import (
     EVERY_FRAME,
     FoundFeatures,
+    ate_m,
     experiment,
     find_features,
     make_system,
     process,
-    trajectory_error,
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -77,7 +77,6 @@ def run_blocked(found: FoundFeatures, overrides: Iterable[str]) -> BlockedRun:
             measured.append(k)
     before, after = maps[COVER[0] - 1], maps[COVER[1] - 1]
     errors = np.linalg.norm(position_errors(pipeline, found.sequence), axis=1)
-    ate = trajectory_error(pipeline, found.sequence).ate_rmse_m
     return BlockedRun(
         before=len(before),
         after=len(after),
@@ -85,7 +84,7 @@ def run_blocked(found: FoundFeatures, overrides: Iterable[str]) -> BlockedRun:
         found_at=measured[0],
         drift_m=float(errors[COVER[1] - 1]),
         error_m=float(errors[COVER[1] + 9]),
-        ate_m=float("nan") if ate is None else ate,
+        ate_m=ate_m(pipeline, found.sequence),
         end_m=float(errors[-1]),
     )
 

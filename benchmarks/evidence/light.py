@@ -13,12 +13,12 @@ import numpy as np
 from benchmarks.runs import (
     LOCATED,
     FoundFeatures,
+    ate_m,
     experiment,
     find_features,
     make_system,
     process,
     say,
-    trajectory_error,
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray, Image
@@ -158,13 +158,11 @@ def _row(config: ExperimentConfig, found: FoundFeatures) -> tuple[Cell, ...]:
     located = sum(report.tracking.status in LOCATED for report in reports)
     features = [len(image) for frame in found.frames for image in frame.features]
     matches = [len(report.stereo) for report in reports]
-    ate = trajectory_error(system, found.sequence).ate_rmse_m
-    error = None if ate is None else 100.0 * ate
     return (
         f"{located} of {len(reports)}",
         float(np.median(features)),
         float(np.median(matches)),
-        error,
+        100.0 * ate_m(system, found.sequence),
     )
 
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.runs import (
     EVERY_FRAME,
+    ate_m,
     experiment,
     find_features,
     make_system,
     process,
-    trajectory_error,
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
@@ -110,14 +110,11 @@ def run_person(overrides: Iterable[str] = ()) -> PersonRun:
     follower = _Follower(max(seen))
     for report in process(found, pipeline):
         follower.follow(report, seen.get(report.found.i))
-    ate = trajectory_error(pipeline, sequence).ate_rmse_m
-    if ate is None:
-        raise ValueError("the rendered lab has ground truth")
     return PersonRun(
         follower.lives(pipeline),
         np.array(follower.alive),
         position_errors(pipeline, sequence),
-        ate,
+        ate_m(pipeline, sequence),
         config.frontend.database.prune_after_misses,
         max(seen),
     )
@@ -188,8 +185,7 @@ def _errors_without() -> tuple[FloatArray, float]:
     pipeline = make_system(config, found.sequence)
     for _ in process(found, pipeline):
         pass
-    ate = trajectory_error(pipeline, found.sequence).ate_rmse_m
-    return position_errors(pipeline, found.sequence), float("nan") if ate is None else ate
+    return position_errors(pipeline, found.sequence), ate_m(pipeline, found.sequence)
 
 
 def _jump_table(run: PersonRun, without: tuple[FloatArray, float]) -> Table:

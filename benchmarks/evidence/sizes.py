@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.runs import (
     FoundFeatures,
+    ate_m,
     described,
     experiment,
     make_system,
     process,
     say,
-    trajectory_error,
 )
 from benchmarks.tables import Cell, Table
 from fgslam.core.log import ImageSequence
@@ -66,7 +66,7 @@ def _row(width: int, frames: int) -> tuple[Cell, ...]:
     reports = list(process(detected.found, system))
     rest = time.process_time() - start
     pixels = sequence.rig.width * sequence.rig.height * sequence.rig.cameras * len(reports)
-    ate = trajectory_error(system, sequence).ate_rmse_m
+    ate = ate_m(system, sequence)
     counts = [len(image) for frame in detected.found.frames for image in frame.features]
     return (
         width,
@@ -76,7 +76,7 @@ def _row(width: int, frames: int) -> tuple[Cell, ...]:
         float(np.median([_inliers(report) for report in reports[1:]])),
         1e9 * detected.seconds / pixels,
         rest / detected.seconds,
-        None if ate is None else 100.0 * ate,
+        100.0 * ate,
     )
 
 

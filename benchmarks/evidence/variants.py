@@ -11,12 +11,12 @@ import numpy as np
 from benchmarks.runs import (
     DATA,
     FoundFeatures,
+    ate_m,
     experiment,
     find_features,
     make_system,
     process,
     say,
-    trajectory_error,
 )
 from benchmarks.tables import Cell, Table
 
@@ -153,8 +153,7 @@ def outcome(
     config = experiment(name, overrides, data)
     pipeline = make_system(config, found.sequence)
     measured = [report.tracking.status.measured for report in process(found, pipeline)][1:]
-    ate = trajectory_error(pipeline, found.sequence).ate_rmse_m
-    return Outcome(float("nan") if ate is None else ate, float(np.mean(measured)))
+    return Outcome(ate_m(pipeline, found.sequence), float(np.mean(measured)))
 
 
 def _mean(outcomes: list[Outcome]) -> Outcome:
