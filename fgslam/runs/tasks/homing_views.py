@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -53,7 +53,7 @@ from fgslam.report.homing_figures import (
 from fgslam.runs.config import HomingPairsConfig, TopologicalMapConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table, write_table
-from fgslam.runs.units import Stage
+from fgslam.runs.units import Stage, each_apart
 
 VIEWS_A_BLOCK = 4
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
@@ -427,9 +427,6 @@ def view_names(views: OmniRecording) -> tuple[str, ...]:
     return tuple(str(number) for number in views.ids.tolist())
 
 
-_Block: TypeAlias = tuple[OmniDatasetSettings, OmniFeatureSettings | None, tuple[int, ...]]
-
-
 def extract_features(
     views: OmniRecording,
     dataset: OmniDatasetSettings,
@@ -449,35 +446,26 @@ def extract_features(
         OutputError: a process ended by itself, perhaps for lack of memory.
     """
     what = "features" if settings is not None else "plain SIFT"
-    stage = Stage(
-        name=what.replace(" ", "_"),
-        label=what,
-        count=len(views),
-        work=_extract,
-        argument=lambda units: (dataset, settings, units),
-        kind=OmniFeatures,
-        block=VIEWS_A_BLOCK,
-    )
-    done = context.perform(stage)
+    units = [(dataset, settings, i) for i in range(len(views))]
+    names = (what.replace(" ", "_"), what)
+    done = context.perform(each_apart(names, _extract, units, OmniFeatures, VIEWS_A_BLOCK))
     if done.ended and not context.stopped():
         raise OutputError(f"features of {views.name}: {done.ended[0][1]}")
     gap = next((k for k in range(len(views)) if k not in done.results), len(views))
     return [done.results[k] for k in range(gap)]
 
 
-def _extract(block: _Block) -> list[OmniFeatures]:
-    dataset, settings, views = block
+def _extract(unit: tuple[OmniDatasetSettings, OmniFeatureSettings | None, int]) -> OmniFeatures:
+    dataset, settings, i = unit
     recording = open_omni(dataset)
-    if settings is not None:
-        extractor = _extractor(dataset, settings)
-        return [extractor.extract(recording.image(i)) for i in views]
-    plain = (plain_sift(recording.camera, recording.image(i)) for i in views)
-    return [OmniFeatures(features, empty_segments()) for features in plain]
+    if settings is None:
+        return OmniFeatures(plain_sift(recording.camera, recording.image(i)), empty_segments())
+    return _extractor(dataset, settings).extract(recording.image(i))
 
 
 @lru_cache(maxsize=1)
 def _extractor(dataset: OmniDatasetSettings, settings: OmniFeatureSettings) -> OmniFeatureExtractor:
-    """Its maps take as long as an image's features; a process does several blocks of views."""
+    """Its maps take as long as an image's features; a process does several views."""
     return OmniFeatureExtractor(open_omni(dataset).camera, settings)
 
 
