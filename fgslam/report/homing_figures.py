@@ -90,7 +90,7 @@ def sorted_errors(errors: Mapping[str, FloatArray], unit: str, words: tuple[str,
 
 
 def claimed_against_true(
-    claimed: Mapping[str, FloatArray], true: Mapping[str, FloatArray], key: str = "claimed"
+    claimed: Mapping[str, FloatArray], true: Mapping[str, FloatArray]
 ) -> Figure:
     """Errors in degrees against the stated standard deviations, one cloud a series."""
     if not any(map(len, claimed.values())):
@@ -109,7 +109,7 @@ def claimed_against_true(
         traces.append(line(f"{k:.0f} sigma", ray, GREY, 1.0, "dot"))
     from_zero = {"rangemode": "tozero"}
     return Figure(
-        key,
+        "claimed",
         "Stated and true errors",
         "Each answer: the standard deviation that it states, and how far off it is. Dotted: one, "
         "two and three standard deviations; one in twenty answers may lie above the second.",
@@ -373,9 +373,7 @@ class Drive:
     outlines: tuple[FloatArray, ...] = ()
 
 
-def drive_figure(
-    drive: Drive, key: str = "drive", heading: str = "The drive, from above"
-) -> Figure:
+def drive_figure(drive: Drive, heading: str = "The drive, from above") -> Figure:
     """The true trajectory past its targets, and the robot at each moment."""
     traces = []
     if drive.outlines:
@@ -412,7 +410,7 @@ def drive_figure(
             ]
         )
     return Figure(
-        key,
+        "drive",
         heading,
         "The path as it was truly driven, coloured by the leg. Squares: where the target images "
         f"were taken, with a tick ahead and a circle of {PASS_RADIUS_M:g} m. The robot's arrow "
@@ -425,16 +423,13 @@ def drive_figure(
     )
 
 
-def catchment_figure(
-    offsets: FloatArray, succeeded: BoolArray, labels: Sequence[str], key: str = "catchment"
-) -> Figure:
+def catchment_figure(offsets: FloatArray, succeeded: BoolArray, labels: Sequence[str]) -> Figure:
     """From where homing arrives.
 
     Args:
         offsets: (n, 2) starts relative to the target, metres, target's heading up the page.
         succeeded: (n,) whether it arrived.
         labels: shown at the pointer, one each.
-        key: unique in the page.
     """
     hover = "%{text}<br>%{y:.2f} m ahead, %{x:.2f} m right<extra></extra>"
     traces: list[Any] = [dots("target", np.zeros((1, 2)), GREY, 14.0, "square-open")]
@@ -450,7 +445,7 @@ def catchment_figure(
     if not len(offsets):
         traces = []
     return Figure(
-        key,
+        "catchment",
         "From where homing succeeds",
         "Starts relative to their target (square), whose heading is up the page. Dots: homing "
         "arrived; crosses: it did not.",

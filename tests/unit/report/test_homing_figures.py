@@ -1,18 +1,12 @@
-"""The page of homing runs as text and values."""
+"""Figures of homing: what they draw."""
 
 from __future__ import annotations
 
-import base64
-import gzip
-import json
-import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from homing_pages import FEATURES, drive, estimates, page, truth
-from reports import HOSTILE
+from homing_pages import FEATURES, drive, estimates, truth
 
 from fgslam.core.arrays import FloatArray
 from fgslam.report.content import Figure
@@ -27,7 +21,6 @@ from fgslam.report.homing_figures import (
     sorted_errors,
     unfolded,
 )
-from fgslam.report.page import render, write_html
 
 
 def points(found: Any) -> FloatArray:
@@ -112,26 +105,6 @@ def test_distribution_counts_missing_answers() -> None:
 
 def test_no_answer_draws_no_cloud() -> None:
     assert not claimed_against_true({"a": np.zeros(0)}, {"a": np.zeros(0)}).has_numbers
-
-
-def test_the_page_is_whole_repeatable_and_small(tmp_path: Path) -> None:
-    write_html(tmp_path / "a.html", page())
-    write_html(tmp_path / "b.html", page())
-    content = (tmp_path / "a.html").read_bytes()
-    assert content == (tmp_path / "b.html").read_bytes()
-    assert len(content) < 3e6
-    text = content.decode("utf-8")
-    for key in ("local-map", "drive", "direction", "claimed", "catchment"):
-        assert f'id="plot-{key}"' in text
-
-
-def test_nothing_from_outside_is_markup() -> None:
-    text = render(page(HOSTILE))
-    assert "<script>alert" not in text
-    values = re.search(r'id="figures"[^>]*>(.*?)</script>', text, re.DOTALL)
-    assert values is not None
-    found = json.loads(gzip.decompress(base64.b64decode(values.group(1))))
-    assert set(found) >= {"local-map", "drive"}
 
 
 def test_a_chain_unfolds_to_a_line() -> None:
