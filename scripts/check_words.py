@@ -12,6 +12,7 @@ from pathlib import Path
 
 CLEAN = (
     "fgslam/cameras",
+    "fgslam/core",
     "fgslam/report",
     "fgslam/slam",
     "fgslam/datasets",

@@ -142,7 +142,7 @@ class TwoViewVector:
         covariance: (2, 2) of (direction, rotation).
         inliers: (n,) of the matches that were given.
         competing_support: inliers of the best *different* solution; 0 for none.
-        doubt: probability that a different solution is the better one, 0.5 at most.
+        wrong_probability: probability that a different solution is the better one, 0.5 at most.
     """
 
     direction: float
@@ -150,7 +150,7 @@ class TwoViewVector:
     covariance: FloatArray
     inliers: BoolArray
     competing_support: int
-    doubt: float = 0.0
+    wrong_probability: float = 0.0
 
     @property
     def support(self) -> int:

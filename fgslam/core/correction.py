@@ -1,4 +1,4 @@
-"""What a lens model leaves of each image's displacement beside the terms of a rig's correction.
+"""What a lens model leaves of each image's displacement that is in no term of a rig's correction.
 
 A random field over each image: smooth, as large in columns as in rows, and without what the terms
 of :data:`fgslam.core.correction.TERMS` follow. Its modes are those of Karhunen and Loeve, on a
@@ -36,11 +36,11 @@ TERMS = (
     "decentring_x_outer",  # the same times r^2: Brown's third decentring value, along each axis
     "decentring_y_outer",
 )
-"""Of each camera beside the reference, in units of the focal length."""
+"""Of each camera but the reference, in units of the focal length."""
 
 _EARLY_TERMS = 9
 """How many of TERMS are taken off a frame before it is matched. The others, and COMMON, take a
-drive to be told apart from its motion: whole graphs have them."""
+drive to be distinguished from its motion: whole graphs have them."""
 
 COMMON = ("radial",)
 """What is estimated of all cameras alike, the reference among them."""
@@ -348,8 +348,8 @@ def _between(modes: _Modes, pixels: FloatArray) -> FloatArray:
     row, low = _steps(modes.down, pixels[:, 1])
     out = np.zeros((len(pixels), *modes.values.shape[1:]))
     for below, share_row in ((0, 1.0 - low), (1, low)):
-        for beside, share_column in ((0, 1.0 - right), (1, right)):
-            node = (row + below) * len(modes.across) + column + beside
+        for next_column, share_column in ((0, 1.0 - right), (1, right)):
+            node = (row + below) * len(modes.across) + column + next_column
             out += (share_row * share_column)[:, None, None] * modes.values[node]
     return out
 

@@ -1,6 +1,6 @@
 """Files: written whole or not at all, and texts of other tools read line by line.
 
-Every file is written beside its place and then renamed over it, which POSIX does in one step: an
+Every file is written next to its place and then renamed over it, which POSIX does in one step: an
 interrupted run leaves the previous version or none, never half a file.
 """
 
@@ -39,7 +39,7 @@ _WRITER = re.compile(r"\.(\d+)-\d+\.partial")
 
 @contextmanager
 def clear_output_errors(path: Path) -> Iterator[None]:
-    """Turn an OSError about ``path`` into an OutputError of one line that says what to do."""
+    """Turn an OSError about ``path`` into an OutputError of one line with what to do."""
     try:
         yield
     except OSError as error:
@@ -50,7 +50,7 @@ def clear_output_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it takes the place of ``path`` when all went well.
+    """A path next to ``path`` to write to; it takes the place of ``path`` when all went well.
 
     Args:
         path: the file to write; its folder must exist.
@@ -130,7 +130,7 @@ def _beside(path: Path) -> Path:
 
 
 def is_unfinished_file(path: Path) -> bool:
-    """Whether a process that was killed while writing left this file beside its place."""
+    """Whether a process that was killed while writing left this file next to its place."""
     return path.name.startswith(".") and ".partial" in path.name and path.is_file()
 
 
@@ -142,7 +142,7 @@ def remove_unfinished_files(folder: Path) -> None:
 
 
 def remove_left_behind(path: Path) -> None:
-    """Removes what a process that was killed while writing ``path`` left beside it.
+    """Removes what a process that was killed while writing ``path`` left next to it.
 
     For files outside run folders that take long to write; of this process nothing is touched.
     """
@@ -298,7 +298,7 @@ _KINDS = (
 
 
 def shown_in(folder: Path) -> list[Path]:
-    """What a folder holds, sorted, but for hidden files: macOS puts a ``._NAME`` beside NAME."""
+    """What a folder holds, sorted, but for hidden files: macOS puts a ``._NAME`` next to NAME."""
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
 
 

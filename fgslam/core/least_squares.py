@@ -81,8 +81,8 @@ class Damping:
     def __init__(self, least: float = 1e-9) -> None:
         """None yet; it ends below ``least``.
 
-        Where an undamped step leads astray, damping must fall from one step to the next: steps
-        that are tried undamped in vain each time, and then damped as before, creep.
+        Where an undamped step does not lower the cost, damping must fall from one step to the next:
+        steps that are tried undamped in vain each time, and then damped as before, creep.
         """
         self.last = 0.0
         self._least = least
@@ -112,7 +112,7 @@ class Damping:
 
 
 KERNEL = 2.0
-"""Spreads of the residuals at which Cauchy's kernel bends."""
+"""Spreads of the residuals at which Cauchy's kernel turns from square to logarithm."""
 
 _ROUNDS = 6
 

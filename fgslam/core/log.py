@@ -171,9 +171,9 @@ def _require_measured(log: MeasurementLog) -> None:
             raise ValueError(f"frame {step.index}: arrays of its observations differ in length")
         if len(np.unique(seen.ids)) < n:
             raise ValueError(f"frame {step.index} observes a landmark twice")
-        if astray := [loop.frame for loop in step.loops if not 0 <= loop.frame < k]:
+        if forward := [loop.frame for loop in step.loops if not 0 <= loop.frame < k]:
             raise ValueError(
-                f"a loop closure of frame {k} leads to frame {astray[0]}, which does not come "
+                f"a loop closure of frame {k} leads to frame {forward[0]}, which does not come "
                 "before it"
             )
         if step.rig_correction is not None and step.rig_correction.shape != (terms,):

@@ -44,7 +44,7 @@ def room_bytes() -> int | None:
 
 
 def is_shortage(error: BaseException) -> bool:
-    """True of an error that says that there is no memory left, whichever library raised it.
+    """True of an error for lack of memory, whichever library raised it.
 
     Not of this package's own errors: their text repeats names of files and settings.
     """

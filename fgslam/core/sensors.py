@@ -303,7 +303,7 @@ both images disagree by 0.09 to 0.19 px, those of SIFT's matches by 0.16 to 0.27
 def pixel_covariance(cameras: int, places: RigPlaces) -> FloatArray:
     """(2 * cameras, 2 * cameras) of (c, r) per camera, by the variance of a SIFT coordinate.
 
-    Where the reference alone tells the places (:attr:`CameraRig.places`), its error is in all
+    Where the reference alone gives the places (:attr:`CameraRig.places`), its error is in all
     coordinates alike, and the other images add that of the shift.
     """
     own = np.eye(2 * cameras)
@@ -344,7 +344,7 @@ _NEARLY_ITSELF = 1.0 + 2.0 * np.cos(np.deg2rad(45.0))
 
 
 def body_is_camera(bTc: FloatArray) -> bool:
-    """Whether the body is the camera itself, raw or rectified: nothing says how it is mounted."""
+    """Whether the body is the camera itself, raw or rectified: how it is mounted is unknown."""
     return bool(np.trace(bTc[:3, :3]) > _NEARLY_ITSELF)
 
 

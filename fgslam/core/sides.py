@@ -57,7 +57,7 @@ def camera_pairs(names: Iterable[str], any_number: bool = True) -> tuple[tuple[s
 def camera_trio(names: Iterable[str]) -> tuple[str, ...]:
     """Of three names that differ in the side alone those of left, right and third; () of others.
 
-    The third is called top, or t beside l and r; or all three have numbers of cameras that follow
+    The third is called top, or t with l and r; or all three have numbers of cameras that follow
     each other, cam0 to cam2. Other numbers count the clips that one camera recorded.
     """
     given = set(names)
@@ -70,7 +70,7 @@ def camera_trio(names: Iterable[str]) -> tuple[str, ...]:
 
 
 def _called_top(left: str) -> set[str]:
-    """Names of a third camera beside a left one, in lower case."""
+    """Names of a third camera by that of a left one, in lower case."""
     found = [m for pattern in (_WORD, _LETTER) for m in pattern.finditer(left)]
     top = {1: "t", 4: "top"}
     return {f"{left[: m.start(1)]}{top[len(m[1])]}{left[m.end(1) :]}".lower() for m in found
@@ -93,7 +93,7 @@ def _without(name: str, match: re.Match[str]) -> str:
 
 
 def without_side(name: str, camera_number: bool = False) -> str:
-    """A file's name without what tells its camera's side: words, letters, or a camera's number."""
+    """A file's name without its camera's side: words, letters, or a camera's number."""
     for pattern in (_WORD, _LETTER, *([_CAMERA_NUMBER] if camera_number else [])):
         name = pattern.sub("", name)
     return name

@@ -275,7 +275,7 @@ class _Unpacking:
         return [made(items[a:b]) for a, b in pairwise(ends)]
 
     def composed(self, node: Any, members: tuple[Any, ...], now: Sequence[Any]) -> list[Any]:
-        """Dataclasses and named tuples anew; parts with their state put back."""
+        """Dataclasses and named tuples, made; parts with their state put back."""
         if "class" in node:
             made = next((m for m in members if getattr(m, "__name__", "") == node["class"]), None)
             if made is None:

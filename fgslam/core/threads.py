@@ -69,7 +69,7 @@ _LIMITS = BlasLimits()
 def one_blas_thread() -> Iterator[None]:
     """Every loaded BLAS works on one thread inside; usable as a decorator, too.
 
-    Whatever the environment says (``OPENBLAS_NUM_THREADS``); what was set before comes back, once
+    Whatever the environment states (``OPENBLAS_NUM_THREADS``); what was set before comes back, once
     all threads that are inside have left.
     """
     limits = _LIMITS.enter()

@@ -523,7 +523,7 @@ class EgoMotion(Brief):
         weighted_at: (4, 4) pose at which the last minimisation's weights were evaluated; None
             where nothing was minimised.
         noise: variance over the stated one that its measurements were taken to have.
-        misfit: the same, as the median of its matches' residuals has it; NaN where none says.
+        misfit: the same, as the median of its matches' residuals has it; NaN where there are none.
     """
 
     wTc: FloatArray

@@ -327,7 +327,9 @@ class PathPlaces:
         sigma = float(np.sqrt(answer.covariance[0, 0] + answer.covariance[1, 1]))
         limit = max(_CONTRADICTION, _SIGMAS * sigma)
         first = not np.isfinite(aim.across)
-        open_ = answer.doubt > 1.0 - SURE if first else _away(across, aim.across) > limit
+        open_ = (
+            answer.wrong_probability > 1.0 - SURE if first else _away(across, aim.across) > limit
+        )
         if open_ and not self._confirmed(aim, across, limit):
             why = "fits another direction nearly as well" if first else "contradicts those before"
             return None, f"{why}, needs other images that agree"

@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import stats
 
-from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray, Rows
+from fgslam.core.arrays import (
+    FloatArray,
+    GrowingColumns,
+    IntArray,
+    Rows,
+    chi_square_quantile,
+    student_quantile,
+)
 from fgslam.core.store import pack, unpack
 from fgslam.core.types import LandmarkMap, Trajectory
 
@@ -124,3 +132,16 @@ def test_a_snapshot_is_not_touched_by_what_follows() -> None:
     assert back["name"].tolist() == [0, 1, 2, 3, 4]
     back["name"][0] = 9
     assert state["name"][0] == 0
+
+
+def test_quantiles_are_those_of_scipy_to_the_bit() -> None:
+    probabilities = np.array([1e-6, 0.0005, 0.025, 0.5, 0.6827, 0.975, 0.99, 0.999])
+    for dof in (1, 2, 3, 6, 7.5, 150, 2880):
+        np.testing.assert_array_equal(
+            chi_square_quantile(probabilities, dof), stats.chi2.ppf(probabilities, dof)
+        )
+        np.testing.assert_array_equal(
+            student_quantile(probabilities, dof), stats.t.ppf(probabilities, dof)
+        )
+    dofs = np.array([3, 6, 12])
+    np.testing.assert_array_equal(chi_square_quantile(0.99, dofs), stats.chi2.ppf(0.99, dofs))

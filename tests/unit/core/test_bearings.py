@@ -11,7 +11,7 @@ import pytest
 from homings import trial
 from simulated import assert_same_value
 
-from fgslam.core.bearings import BearingLog
+from fgslam.core.bearings import BearingLog, among
 from fgslam.core.errors import MeasurementLogError
 
 
@@ -71,3 +71,12 @@ def test_values_that_no_homing_measures_are_refused(
     log.save(tmp_path / "a.npz")
     with pytest.raises(MeasurementLogError, match=rf"a\.npz: {words}; run again"):
         BearingLog.load(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_identities_are_looked_up(seed: int) -> None:
+    """Beyond either end, none, all, and with none to look up or to be found."""
+    rng = np.random.default_rng(seed)
+    ids = rng.integers(0, 30, seed)
+    others = np.unique(rng.integers(5, 25, (3 * seed) % 25))
+    np.testing.assert_array_equal(among(ids, others), np.isin(ids, others))
