@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
-import pandas as pd
 
 from fgslam.core.files import make_subfolder
 from fgslam.evaluation.statistics import JsonValue
@@ -22,6 +21,9 @@ from fgslam.report.content import (
 )
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import METRICS_FILE, REPORT_FILE, RUN_MARKER, versions
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 R = TypeVar("R", bound=RunResult)
 
