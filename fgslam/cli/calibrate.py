@@ -22,7 +22,7 @@ calibrate_app = typer.Typer(
     help="Calibrate cameras from images of a board, a mirror from one of rings.",
     no_args_is_help=True,
 )
-camera_app = typer.Typer(help="Calibration files: what one says, and the same in another format.")
+camera_app = typer.Typer(help="Calibration files: what one states, and the same in another format.")
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def omni(
     Args:
         images (IMAGES): folder of the board's images
         lens: omni (unified model of mirrors and fisheyes, Mei) or equidistant
-        mount: mirror (above the camera), or up or down, where a fisheye looks
+        mount: mirror (above the camera), or up or down, where a fisheye points
         out (FILE): where to write it, .yaml, for --camera; numbers in *_lens.json
         overwrite: replace an earlier one
         board: that is seen
@@ -225,7 +225,7 @@ class FileOptions:
 
 @command(camera_app)
 def show(file: Path, given: FileOptions, out: Path | None = None, overwrite: bool = False) -> None:
-    """Say what a calibration file says: cameras, fields of view, baselines, rectified view.
+    """Report what a calibration file states: cameras, fields of view, baselines, rectified view.
 
     Args:
         file (FILE): calibration file, or the folder that holds one

@@ -46,7 +46,7 @@ from fgslam.runs.units import (
 from fgslam.runs.workers import Executor, Failed, Pool
 
 _GROUND = ("log", "trials", "first_seed")
-"""What a resumed run must find as it was, of its provenance, beside the data set's identity."""
+"""What a resumed run must find as it was, of its provenance, next to the data set's identity."""
 
 Status: TypeAlias = Literal["finished", "interrupted"]
 R_co = TypeVar("R_co", bound="RunResult", covariant=True)
@@ -71,7 +71,7 @@ class LocatedShare:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """How a run ended, and what is said of it: terminal and page show the same.
+    """How a run ended, and what is shown of it: terminal and page show the same.
 
     Attributes:
         config: what was run.
@@ -156,7 +156,7 @@ class Task(Generic[R_co]):
     """An experiment whose data is open; nothing is done or written yet.
 
     Attributes:
-        provenance: what config.yaml says of the data, beside the versions; its `dataset` has an
+        provenance: what config.yaml states of the data, next to the versions; its `dataset` has an
             `identity` where the data can change.
         run: does what is missing and writes all files of the run folder; raises FgslamError of
             any kind, with a message for the user.
@@ -181,7 +181,7 @@ class Identified(Protocol):
 
 
 def provenance_of(recording: Identified) -> dict[str, Any]:
-    """What config.yaml says of a recording, from which a changed one is told on resuming."""
+    """What config.yaml states of a recording, by which a changed one is recognised on resuming."""
     return {"dataset": {"name": recording.name, "identity": recording.identity}}
 
 
@@ -224,7 +224,7 @@ def run_task(
         existing: what to do where it holds a run already.
         progress: called after each step of the work.
         stopped: asked after each step; True ends the run early, resumable, with all files valid.
-        jobs: processes at a time; None: as the configuration says, else one.
+        jobs: processes at a time; None: as configured, else one.
         executor: does the units; None: processes of this machine.
 
     Raises:

@@ -191,7 +191,7 @@ def run(
         metrics.json), and what `fgslam run` would print.
 
     Raises:
-        FgslamError: of any kind, with one line that says what to do.
+        FgslamError: of any kind, with one line that states what to do.
     """
     calibration = None if camera is None else Path(camera)
     config, _ = experiment_of(
@@ -238,7 +238,7 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
         How it ended: `status`, `table()` as a data frame, `failures` by number of the case.
 
     Raises:
-        FgslamError: of any kind, with one line that says what to do.
+        FgslamError: of any kind, with one line that states what to do.
     """
     given = [experiments] if isinstance(experiments, str | Path) else list(experiments)
     plan = make_plan(
@@ -265,7 +265,7 @@ def replay(
 
     Returns:
         Trajectory, covariances and map, with numbers of every frame. An estimator that fails ends
-        its replay, not the program: ``failure`` says where and why.
+        its replay, not the program: ``failure`` states where and why.
 
     Raises:
         ConfigError: no such estimator.

@@ -85,7 +85,7 @@ def open_slam_comparison(
 
 
 def named(config: ExperimentConfig) -> str:
-    """The run's name over tables; that its odometry was made from the truth is said there."""
+    """The run's name over tables; marked where its odometry was made from the truth."""
     return with_marks(config.name, [SYNTHETIC if config.remark else ""])
 
 
@@ -147,14 +147,14 @@ def write_comparison(
     about: Mapping[str, JsonValue],
     run: Path,
 ) -> RunResult:
-    """metrics.json, comparison.csv and report.html of estimators, and what is said of them.
+    """metrics.json, comparison.csv and report.html of estimators, and the result that shows them.
 
     Args:
         context: its folder holds the estimators' own files.
         config: of the run.
         frames: in its log.
         metrics: by title.
-        about: what metrics.json says beside them, after the run's name and status.
+        about: further values of metrics.json, after the run's name and status.
         run: folder of the run.
     """
     out = context.folder

@@ -509,7 +509,7 @@ class SweepTable(NamedTuple):
 
 
 def make_table(plan: Plan, found: Iterable[tuple[int, CaseResult | str]]) -> SweepTable:
-    """The table of cases by their numbers; a text says why a case has no result."""
+    """The table of cases by their numbers; a text is the reason why a case has no result."""
     names = (CASE, EXPERIMENT, *(axis.key for axis in plan.axes), ESTIMATOR)
     keys: list[tuple[Any, ...]] = []
     numbers: list[Mapping[str, Any]] = []
@@ -574,7 +574,7 @@ class Comparison(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What the table says of its metrics.
+    """What the table shows of its metrics.
 
     Attributes:
         frame: the rows, with columns `variant`, a combination of settings and an estimator, and
@@ -841,7 +841,7 @@ def run_sweep(
         existing: what to do where it holds a sweep: `resume` does what is missing, also of axes
             that have become longer.
         metric: column of the table that curves and tests are of; None: the first that is known.
-        watch: who is told, and who may end it; the cases so far are kept and in the table.
+        watch: receives progress, and may end it; the cases so far are kept and in the table.
 
     Raises:
         FgslamError: a case is impossible, the recording cannot be opened, or the results cannot be
@@ -895,19 +895,19 @@ def run_sweep(
     lines = summarise(findings, len(cases), done, len(failures))
     if complete:
         write_sweep_page(folder / REPORT_FILE, lines, failures, findings, plan.description)
-    told = [("failed", f"case {k}: {why}") for k, why in sorted(failures.items())]
-    if len(told) > _FAILURES_SHOWN:
-        more = len(told) - _FAILURES_SHOWN
-        told = [*told[:_FAILURES_SHOWN], ("failed", f"and {more} more, see {TABLE_FILE}")]
+    labelled = [("failed", f"case {k}: {why}") for k, why in sorted(failures.items())]
+    if len(labelled) > _FAILURES_SHOWN:
+        more = len(labelled) - _FAILURES_SHOWN
+        labelled = [*labelled[:_FAILURES_SHOWN], ("failed", f"and {more} more, see {TABLE_FILE}")]
     if lost:
-        told.append(("scheduler", "it has gone, and what was under way with it"))
+        labelled.append(("scheduler", "it has gone, and what was under way with it"))
     return SweepResult(
         config,
         folder,
         "finished" if complete else "interrupted",
         lines=lines,
         tables=() if findings is None else (table_of_means(findings),),
-        particulars=(*told, ("table", str(folder / TABLE_FILE))),
+        particulars=(*labelled, ("table", str(folder / TABLE_FILE))),
         failed=bool(failures),
         reached=f"after {done + len(failures)} of {len(cases)} cases",
         cases=len(cases),

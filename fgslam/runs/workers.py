@@ -335,14 +335,14 @@ def _local_cluster() -> Iterator[LocalCluster]:
             # A unit waits at the scheduler, not behind one that may end the worker.
             "distributed.scheduler.worker-saturation": 1.0,
             "distributed.scheduler.allowed-failures": 1,
-            # One that is restarted would be given up if it was away 15 s after an earlier restart.
+            # One that is restarted would be dropped if it was away 15 s after an earlier restart.
             "distributed.deploy.lost-worker-timeout": "1 day",
-            "distributed.worker.profile.enabled": False,  # 100 looks a second
+            "distributed.worker.profile.enabled": False,  # 100 samples a second
             "distributed.admin.large-graph-warning-threshold": "100GB",
         }
         stack.enter_context(dask.config.set(rules))
         # Workers run functions of this package only. multiprocessing would run the caller's script
-        # again in them, and one without a guard on its name would begin anew there.
+        # again in them, and one without a guard on its name would begin again there.
         stack.callback(sys.modules.__setitem__, "__main__", main)
         sys.modules["__main__"] = types.ModuleType("__main__")
         # Who is started inside never hears Ctrl-C, which is this process's to answer; the thread
