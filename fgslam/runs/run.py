@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,60 +80,32 @@ def run_experiment(
     return run_task(opener_of(config, watch), config, folder, existing, progress, stopped)
 
 
-def opener_of(  # noqa: PLR0911 - one a task
-    config: Experiment, watch: Watch | None = None
-) -> Opener[RunResult]:
+_TASKS: tuple[tuple[type[Experiment], str, str], ...] = (
+    (LocalisationConfig, "localisation", "open_localisation"),
+    (HomingPairsConfig, "homing_views", "open_pairs"),
+    (TopologicalMapConfig, "homing_views", "open_topological_map"),
+    (OmniVideoConfig, "homing_video", "open_video"),
+    (TeachConfig, "routes", "open_teaching"),
+    (FollowConfig, "routes", "open_following"),
+    (JoinConfig, "routes", "open_joining"),
+    (HomingTrialsConfig, "homing_replay", "open_trials"),
+    (DrivingConfig, "homing_drives", "open_drives"),
+)
+"""Of each kind of configuration the module of :mod:`fgslam.runs.tasks`, and what opens its data."""
+
+
+def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResult]:
     """What opens the data of a configuration; each task is imported when it is run."""
-    match config:
-        case ExperimentConfig(on_measurements=True):
+    if isinstance(config, ExperimentConfig):
+        if config.on_measurements:
             from fgslam.runs.tasks.slam_measurements import open_measurements_task
 
             return open_measurements_task
-        case ExperimentConfig():
-            from fgslam.runs.tasks.slam import open_slam
+        from fgslam.runs.tasks.slam import open_slam
 
-            return partial(open_slam, watch=watch)
-        case LocalisationConfig():
-            from fgslam.runs.tasks.localisation import open_localisation
-
-            return open_localisation
-        case HomingPairsConfig():
-            from fgslam.runs.tasks.homing_views import open_pairs
-
-            return open_pairs
-        case TopologicalMapConfig():
-            from fgslam.runs.tasks.homing_views import open_topological_map
-
-            return open_topological_map
-        case OmniVideoConfig():
-            from fgslam.runs.tasks.homing_video import open_video
-
-            return open_video
-        case TeachConfig() | FollowConfig() | JoinConfig():
-            return _opener_of_routes(config)
-        case HomingTrialsConfig():
-            from fgslam.runs.tasks.homing_replay import open_trials
-
-            return open_trials
-        case DrivingConfig():
-            from fgslam.runs.tasks.homing_drives import open_drives
-
-            return open_drives
-        case _:
-            raise ConfigError(f"task {config.task_name}: cannot be run")
-
-
-def _opener_of_routes(config: TeachConfig | FollowConfig | JoinConfig) -> Opener[RunResult]:
-    match config:
-        case TeachConfig():
-            from fgslam.runs.tasks.routes import open_teaching
-
-            return open_teaching
-        case FollowConfig():
-            from fgslam.runs.tasks.routes import open_following
-
-            return open_following
-        case JoinConfig():
-            from fgslam.runs.tasks.routes import open_joining
-
-            return open_joining
+        return partial(open_slam, watch=watch)
+    for kind, module, name in _TASKS:
+        if isinstance(config, kind):
+            opener: Opener[RunResult] = getattr(import_module(f"fgslam.runs.tasks.{module}"), name)
+            return opener
+    raise ConfigError(f"task {config.task_name}: cannot be run")
