@@ -12,6 +12,7 @@ from pathlib import Path
 
 CLEAN = (
     "fgslam/cameras",
+    "fgslam/cli",
     "fgslam/core",
     "fgslam/report",
     "fgslam/slam",
