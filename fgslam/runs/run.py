@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -80,18 +80,20 @@ def run_experiment(
     return run_task(opener_of(config, watch), config, folder, existing, progress, stopped)
 
 
-_TASKS: tuple[tuple[type[Experiment], str, str], ...] = (
-    (LocalisationConfig, "localisation", "open_localisation"),
-    (HomingPairsConfig, "homing_views", "open_pairs"),
-    (TopologicalMapConfig, "homing_views", "open_topological_map"),
-    (OmniVideoConfig, "homing_video", "open_video"),
-    (TeachConfig, "routes", "open_teaching"),
-    (FollowConfig, "routes", "open_following"),
-    (JoinConfig, "routes", "open_joining"),
-    (HomingTrialsConfig, "homing_replay", "open_trials"),
-    (DrivingConfig, "homing_drives", "open_drives"),
-)
-"""Of each kind of configuration the module of :mod:`fgslam.runs.tasks`, and what opens its data."""
+_TASKS: Mapping[type[Experiment], Callable[[], Opener[RunResult]]] = {
+    LocalisationConfig: lambda: import_module("fgslam.runs.tasks.localisation").open_localisation,
+    HomingPairsConfig: lambda: import_module("fgslam.runs.tasks.homing_views").open_pairs,
+    TopologicalMapConfig: lambda: (
+        import_module("fgslam.runs.tasks.homing_views").open_topological_map
+    ),
+    OmniVideoConfig: lambda: import_module("fgslam.runs.tasks.homing_video").open_video,
+    TeachConfig: lambda: import_module("fgslam.runs.tasks.routes").open_teaching,
+    FollowConfig: lambda: import_module("fgslam.runs.tasks.routes").open_following,
+    JoinConfig: lambda: import_module("fgslam.runs.tasks.routes").open_joining,
+    HomingTrialsConfig: lambda: import_module("fgslam.runs.tasks.homing_replay").open_trials,
+    DrivingConfig: lambda: import_module("fgslam.runs.tasks.homing_drives").open_drives,
+}
+"""What gives the opener of each kind of configuration; a task is imported when it is run."""
 
 
 def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResult]:
@@ -104,8 +106,7 @@ def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResul
         from fgslam.runs.tasks.slam import open_slam
 
         return partial(open_slam, watch=watch)
-    for kind, module, name in _TASKS:
+    for kind, opener in _TASKS.items():
         if isinstance(config, kind):
-            opener: Opener[RunResult] = getattr(import_module(f"fgslam.runs.tasks.{module}"), name)
-            return opener
+            return opener()
     raise ConfigError(f"task {config.task_name}: cannot be run")
