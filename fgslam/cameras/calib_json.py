@@ -71,6 +71,7 @@ def read_own(path: Path, tree: Tree, _: Size | None) -> Calibration:
         cameras.append(camera_of(part, _OWN, part.motion("bTc"), name))
     view, stated = None, Values(path, tree).inside("rectified_view")
     if stated.tree:
+        _require_perspective(path, stated.tree.get("kind", "perspective"))
         rotations = stated.numbers("rotations", 9 * len(cameras)).reshape(-1, 3, 3)
         if not all(is_rigid(pose(rotation, np.zeros(3))) for rotation in rotations):
             raise stated.refuse("rotations has one that is no rotation; correct the file")
@@ -137,6 +138,7 @@ def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
             "left and right image must agree), or give the raw cameras' calibration by --camera "
             "FILE"
         )
+    _require_perspective(path, values.get("view", "perspective"))
     bTc = BODY_FORWARD_LEFT_UP_FROM_CAMERA
     if "bTc" in values:
         found = flat_numbers(values["bTc"])
@@ -159,6 +161,15 @@ def read_rectified(path: Path, three_cameras: bool) -> CameraRig:
         ),
         bTc=bTc,
     )
+
+
+def _require_perspective(path: Path, view: Any) -> None:
+    """Refuses the cylindrical views of earlier versions: read as planes they would be wrong."""
+    if view != "perspective":
+        raise CalibrationError(
+            f"{path}: its view is {view!r}, and only perspective views are read; rectify the raw "
+            "images again, with the raw cameras' calibration"
+        )
 
 
 def as_calibrated(

@@ -154,6 +154,21 @@ def test_raw_cameras_without_a_correction_keep_their_view(tmp_path: Path) -> Non
     assert after.angles_deg == pytest.approx(before.angles_deg)
 
 
+def test_a_cylindrical_view_of_earlier_versions_is_refused(tmp_path: Path) -> None:
+    before = load_rig(raw_pair(tmp_path))
+    path = tmp_path / "of_raw.json"
+    write_corrected(path, RigCorrection.none(before.plain()), before.rectifier)
+    values = json.loads(path.read_text())
+    values["rectified_view"]["kind"] = "cylindrical"
+    path.write_text(json.dumps(values))
+    rectified = tmp_path / "calib.json"
+    numbers = {"width": 160, "height": 120, "fx": 130, "fy": 130, "cx": 79.5, "cy": 59.5}
+    rectified.write_text(json.dumps(numbers | {"baseline_m": 0.1, "view": "cylindrical"}))
+    for file in (path, rectified):
+        with pytest.raises(CalibrationError, match="only perspective views are read"):
+            load_rig(file)
+
+
 @pytest.mark.parametrize("asked", [{}, {"fov_deg": 50.0}], ids=str)
 def test_a_correction_of_raw_cameras_is_undone_in_their_raw_images(
     asked: dict[str, Any], tmp_path: Path
