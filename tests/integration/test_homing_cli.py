@@ -172,7 +172,7 @@ def test_other_commands_say_that_it_is_homing(
     line = mistake(capfd, monkeypatch, "export", trials, "--graph", trials / "x.g2o")
     assert "is a run of task homing_trials, not of SLAM" in line
     named = line.partition("as they are: ")[2].strip().split(", ")
-    assert named == ["metrics.json", "trials.csv", "trials_timing.csv", "logs/*.npz"]
+    assert set(named) == {"metrics.json", "trials.csv", "trials_timing.csv", "logs/*.npz"}
 
 
 def test_the_page_of_slam_never_takes_the_place_of_homing_s(trials: Path) -> None:
