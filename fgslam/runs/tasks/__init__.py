@@ -1,1 +1,1 @@
-"""What each kind of experiment does: one module a task, and its parts beside it."""
+"""What each kind of experiment does: one module a task, and its parts next to it."""

@@ -103,19 +103,19 @@ def _run_pairs(config: HomingPairsConfig, views: OmniRecording, context: Context
             f"Plain SIFT with at least {PLAIN_INLIERS} inliers answers {reference['answered']}."
         )
     answered = [answer for answer in answers if answer.answered]
-    doubts = -np.array([answer.inliers for answer in answered])
+    uncertainty = -np.array([answer.inliers for answer in answered])
     figures: list[Figure] = []
     if views.poses is None:
         lines.append("How accurate they are is not known: there are no true poses.")
     else:
         errors = pair_errors(answers, views.poses, views.rooms)
-        doubts = worst(errors)
+        uncertainty = worst(errors)
         figures = list(_pair_figures(errors, answers, views.poses, view_names(views)))
         if len(errors):
             lines.append(
                 f"The median error is {errors.direction.abs().median():.2f} degrees of the "
                 f"direction and {errors.rotation.abs().median():.2f} of the rotation; the worst "
-                f"answer is off by {doubts.max():.1f} degrees."
+                f"answer is off by {uncertainty.max():.1f} degrees."
             )
     result = RunResult(
         config,
@@ -127,7 +127,7 @@ def _run_pairs(config: HomingPairsConfig, views: OmniRecording, context: Context
         reached=f"after {len(answers)} of {every} pairs",
     )
     subtitle = f"{len(answers)} pairs of {len(features)} views of {views.name}"
-    pictures = draw_doubtful(folder, views, search, answered, doubts, config.output.pictures)
+    pictures = draw_uncertain(folder, views, search, answered, uncertainty, config.output.pictures)
     return finish(result, numbers, subtitle, figures, pictures)
 
 
@@ -220,13 +220,13 @@ def _run_map(config: TopologicalMapConfig, views: OmniRecording, context: Contex
     )
     by_pair = {(one.a, one.b): one for one in found}
     linked = [by_pair[link.a, link.b] for link in topology.links]
-    doubts = -np.array([link.support for link in topology.links])
+    uncertainty = -np.array([link.support for link in topology.links])
     return finish(
         result,
         numbers,
         f"{len(topology)} views of {views.name}",
         (map_figure(topology, views.poses),),
-        draw_doubtful(folder, views, search, linked, doubts, config.output.pictures),
+        draw_uncertain(folder, views, search, linked, uncertainty, config.output.pictures),
     )
 
 
@@ -757,19 +757,19 @@ def _link_label(names: Sequence[str], link: Link) -> str:
     return f"{ends}: {link.support} inliers, rotation {np.rad2deg(link.rotation):.0f} degrees"
 
 
-def draw_doubtful(
+def draw_uncertain(
     folder: Path,
     views: OmniRecording,
     search: PairSearch,
     answered: Sequence[PairAnswer],
-    doubts: FloatArray | IntArray,
+    uncertainty: FloatArray | IntArray,
     count: int,
 ) -> tuple[Picture, ...]:
     """Draws at most ``count`` answers: half the most doubtful, half spread over the rest.
 
-    ``doubts`` (n,): errors, or inliers, negated.
+    ``uncertainty`` (n,): errors, or inliers, negated.
     """
-    order = np.argsort(-doubts, kind="stable")
+    order = np.argsort(-uncertainty, kind="stable")
     first, rest = order[: (count + 1) // 2], order[(count + 1) // 2 :]
     spread = rest[np.linspace(0, len(rest) - 1, min(count // 2, len(rest))).round().astype(int)]
     return tuple(_draw_pair(folder, views, search, answered[i]) for i in (*first, *spread))

@@ -179,7 +179,7 @@ def ask_all(
     relocaliser.learn(landmarks, appearances)
     floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
     truth = truth_in_map(given.saved, sequence, config.as_experiment())
-    sights = TrueSights(given.saved, landmarks, sequence, frontend)
+    in_view = TrueSights(given.saved, landmarks, sequence, frontend)
 
     def ask(found: list[FeatureFrame], sighted: Sighted) -> Attempt:
         """One query: consecutive frames, the last of which is to be located."""
@@ -228,7 +228,7 @@ def ask_all(
     context.progress("localising", len(done), queries)
     saved = time.perf_counter()
     for k, found in _queries(config, sequence, first):
-        sighted = sights.of(found[-1].i, truth.poses[found[-1].i])
+        sighted = in_view.of(found[-1].i, truth.poses[found[-1].i])
         fresh[k] = tuple(ask(found[len(found) - n :], sighted) for n in wanted.frames)
         context.progress("localising", len(done) + len(fresh), queries)
         stopped = context.stopped()
@@ -756,7 +756,7 @@ def _config_of(wanted: Wanted, made_with: Mapping[str, Any]) -> LocalisationConf
         require_no_camera(wanted.recording, wanted.camera)
         given = load_experiment(wanted.recording, overrides)
         if not isinstance(given, ExperimentConfig | LocalisationConfig):
-            load_config(wanted.recording)  # says which task this cannot do
+            load_config(wanted.recording)  # states which task this cannot do
             raise ConfigError(f"{where}: holds no recording of stereo images; give another")
         values, overrides = given.as_values(), ()
     else:

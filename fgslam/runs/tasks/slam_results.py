@@ -76,8 +76,8 @@ from fgslam.slam.session import Session
 
 _LEAST_SIGHTINGS = 3
 _SAME_SURFACE = 0.03
-"""Relative spread of the four depths around a pixel, and bend of the inverse depth from pixel to
-pixel, that one surface may have."""
+"""Relative spread of the four depths around a pixel, and curvature of the inverse depth from pixel
+to pixel, that one surface may have."""
 
 _NORMAL_MAD = 1.4826  # median absolute deviation to standard deviation, normal distribution
 _MEDIAN_TO_MEAN = 1.2533  # standard error of a median over that of the mean
@@ -162,10 +162,10 @@ def at_edges(depth: FloatArray, pixels: FloatArray) -> BoolArray:
     On a plane the inverse depth is linear in the image; at a jump its second difference is large.
     """
     inverse = 1.0 / depth
-    bend = np.zeros_like(inverse)
-    bend[:, 1:-1] = np.abs(np.diff(inverse, 2, axis=1))
-    bend[1:-1] = np.maximum(bend[1:-1], np.abs(np.diff(inverse, 2, axis=0)))
-    jumps = ~(bend <= _SAME_SURFACE * inverse)  # an unknown depth is no surface
+    curvature = np.zeros_like(inverse)
+    curvature[:, 1:-1] = np.abs(np.diff(inverse, 2, axis=1))
+    curvature[1:-1] = np.maximum(curvature[1:-1], np.abs(np.diff(inverse, 2, axis=0)))
+    jumps = ~(curvature <= _SAME_SURFACE * inverse)  # an unknown depth is no surface
     count = np.zeros((depth.shape[0] + 1, depth.shape[1] + 1), np.int64)
     count[1:, 1:] = jumps.cumsum(axis=0).cumsum(axis=1)
     column, row = np.rint(pixels).astype(np.int64).T
@@ -388,7 +388,7 @@ def alignment_slack(aligned: FloatArray, own: FloatArray) -> float:
 
 
 # ------------------------------------------------------------------------------------------
-# What a run says of its rig's calibration: calibration.csv, numbers, one sentence
+# What a run finds of its rig's calibration: calibration.csv, numbers, one sentence
 
 _SURE_SIGMAS = 3.0  # a change of fewer of its own sigmas is not reported
 _LEAST_FIELD_PX = 0.1  # of a field that is reported: recordings of good rigs show up to so much
