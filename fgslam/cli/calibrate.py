@@ -220,7 +220,7 @@ class FileOptions:
 
         for path in outputs:
             require_output(path, overwrite, [file, *([] if self.second is None else [self.second])])
-        return Asked(file, **vars(self))
+        return Asked(file, self.second, self.size, self.scale, self.unit, self.fov, self.cameras)
 
 
 @command(camera_app)
