@@ -880,9 +880,11 @@ def run_sweep(
                 progress("cases", had, len(cases))
                 begun = time.monotonic()
                 if begun > due:
-                    so_far = find(write_table(), plan, metric)
-                    if so_far is not None:
-                        shown(table_of_means(so_far, _VARIANTS_WHILE_RUNNING))
+                    table = write_table()
+                    # The metric's first number may be that of a later case.
+                    with suppress(ConfigError):
+                        if so_far := find(table, plan, metric):
+                            shown(table_of_means(so_far, _VARIANTS_WHILE_RUNNING))
                     took = time.monotonic() - begun
                     due = begun + max(_TABLE_EVERY_S, _TABLE_SHARE * took)
             table = write_table()

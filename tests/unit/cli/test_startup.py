@@ -133,3 +133,16 @@ def test_a_run_in_the_least_memory_that_is_allowed_finishes(tmp_path: Path) -> N
     done = limited_to(1_200_000_000, "run", "lab_trials", *given)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_a_film_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+    """What FFmpeg writes to the standard error by itself is no line of ours."""
+    (tmp_path / "damaged.mp4").write_bytes(b"rubbish")
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "fgslam", "inspect", str(tmp_path / "damaged.mp4")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("fgslam: ")
+    assert done.stderr.count("\n") == 1
