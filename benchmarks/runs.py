@@ -16,9 +16,8 @@ from fgslam.core.arrays import Image
 from fgslam.core.log import Frame, ImageSequence
 from fgslam.core.types import EgoMotionStatus, Trajectory
 from fgslam.evaluation.statistics import evaluate_trajectory
-from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import EDGE_THRESHOLD, OCTAVE_LAYERS
-from fgslam.frontend.settings import FrontendSettings
+from fgslam.frontend.settings import FrontendSettings, SiftSettings
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import run_task
 from fgslam.runs.opening import open_sequence

@@ -13,7 +13,7 @@ from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.log import ImageSequence
 from fgslam.datasets.rendered import RenderedLabSequence
-from fgslam.frontend.features.settings import Appearance
+from fgslam.frontend.settings import Appearance
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.config import ExperimentConfig
 from fgslam.slam.feature_stream import FeatureFrame

@@ -22,7 +22,7 @@ from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import Alignment, evaluate_trajectory
-from fgslam.frontend.features.settings import SiftSettings
+from fgslam.frontend.settings import SiftSettings
 
 ESTIMATOR = "isam2"
 _RAW_EVERY = 5  # frames between those on which SIFT alone is timed

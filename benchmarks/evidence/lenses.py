@@ -25,12 +25,14 @@ from benchmarks.tables import Cell, Table
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import (
+    KERNEL,
+    GaussNewton,
+    Linearised,
     inverse_spd3,
     project,
     projection_jacobian,
     triangulate,
 )
-from fgslam.core.least_squares import KERNEL, GaussNewton, Linearised
 from fgslam.core.sensors import CameraRig, Increment, Observations
 from fgslam.core.threads import one_blas_thread
 from fgslam.runs.config import ExperimentConfig

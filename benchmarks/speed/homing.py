@@ -18,16 +18,12 @@ from numpy.typing import NDArray
 
 from benchmarks.speed.drives import cpu_seconds, interleaved
 from fgslam.backend.homing.estimators import make_homing_estimator
-from fgslam.backend.homing.settings import (
-    HomingEkfSettings,
-    HomingEstimatorSettings,
-    HomingGraphSettings,
-)
+from fgslam.backend.settings import HomingEkfSettings, HomingEstimatorSettings, HomingGraphSettings
 from fgslam.core.arrays import Image
 from fgslam.core.bearings import OmniFeatures, TrackedBearings
 from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni import OmniFeatureExtractor
-from fgslam.frontend.features.settings import OmniFeatureSettings
+from fgslam.frontend.settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd
 from fgslam.homing.settings import FrontEndSettings, HomingControlSettings

@@ -17,7 +17,7 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image, Rows, chi_square_quantile, middle
 from fgslam.core.correction import IMPLAUSIBLE_PX, TERMS, camera_displacements, prior_information
-from fgslam.core.least_squares import KERNEL, cauchy_fit
+from fgslam.core.geometry import KERNEL, cauchy_fit
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import Kept
 from fgslam.core.types import Remark

@@ -3,13 +3,92 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, Count, Degrees, NonNegative, Positive, Share
-from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
+
+# ------------------------------------------------------------------------------------------
+# Settings of features: SIFT, how descriptors are compared, omnidirectional features
+
+Appearance: TypeAlias = Literal["descriptor", "paper"]
+
+
+@dataclass(frozen=True, config=STRICT)
+class SiftSettings:
+    """SIFT features of one image (Se et al. 2.1)."""
+
+    contrast_threshold: NonNegative = Field(
+        default=0.03, description="OpenCV's contrast threshold, halved inside"
+    )
+    contrast: Literal["relative", "absolute"] = Field(
+        default="relative",
+        description="`relative`: the threshold falls with an image's contrast, down to its noise",
+    )
+    base_sigma_px: float = Field(
+        default=1.6, gt=0.5, le=3.0, description="Gaussian of the first level, doubled image"
+    )
+    max_features: int = Field(
+        default=0,
+        ge=0,
+        le=1_000_000,
+        description="keep this many of the strongest features; 0 keeps all",
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class AppearanceSettings:
+    """Use of SIFT descriptors, which the 2001 paper does without."""
+
+    mode: Appearance = Field(
+        default="descriptor",
+        description="`descriptor`: the closest admissible wins; `paper`: none are used",
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class UprightSiftSettings:
+    """Rotation-reduced SIFT (III-A1)."""
+
+    contrast_threshold: NonNegative = Field(
+        default=0.015, description="OpenCV's contrast threshold (its default is 0.04)"
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniMatchingSettings:
+    """Matching of two views' features (III-A)."""
+
+    ratio: float = Field(
+        default=0.9,
+        gt=0.0,
+        le=1.0,
+        description="SIFT: nearest over second nearest distance below this",
+    )
+    root: bool = Field(
+        default=True,
+        description="compare square roots of descriptors (Arandjelovic, Zisserman 2012)",
+    )
+    max_colour_distance: Positive = Field(
+        default=0.2, description="Euclidean, of (C_RB, C_RG, C_GB); larger ones are discarded"
+    )
+    planar_gates: bool = Field(
+        default=True, description="leave out candidates that no planar motion explains"
+    )
+
+
+@dataclass(frozen=True, config=STRICT)
+class OmniFeatureSettings:
+    """All of the omnidirectional features."""
+
+    sift: UprightSiftSettings = UprightSiftSettings()
+    matching: OmniMatchingSettings = OmniMatchingSettings()
+    kinds: Literal["both", "sift", "columns"] = Field(
+        default="both", description="which features are sought; the paper uses both kinds together"
+    )
+
 
 _ROWS_PX = 2.0
 """Rows that partners may be apart and be found by comparing row with row: in the rendered lab as
@@ -216,4 +295,50 @@ class FrontendSettings:
     self_calibration: bool = Field(
         default=True,
         description="correct the rig's calibration from the drive; needs stereo.measurement fused",
+    )
+
+
+# ------------------------------------------------------------------------------------------
+# Settings of the homing vector: RANSAC, refinement, and when to refuse
+
+
+@dataclass(frozen=True, config=STRICT)
+class HomingVectorSettings:
+    """Two-point RANSAC, refinement by least squares, refusals (III-B)."""
+
+    samples: Count = Field(default=200, description="at most so many samples (paper: 200)")
+    confidence: float = Field(
+        default=0.999, gt=0.0, lt=1.0, description="probability at which sampling stops earlier"
+    )
+    tilt_sigma_deg: NonNegative = Field(
+        default=0.5, description="prior of the camera's roll and pitch"
+    )
+    height_sigma: NonNegative = Field(
+        default=0.01, description="difference of the cameras' heights, in legs; estimated, too"
+    )
+    min_inliers: int = Field(default=8, ge=3, description="fewer are refused")
+    max_false_alarms: Positive = Field(
+        default=1e-9, description="expected number of such vectors if all matches were wrong"
+    )
+    rival_log_odds: NonNegative = Field(
+        default=15.0,
+        description="least lead (natural log) over any different solution; else ambiguous",
+    )
+    rival_angle_deg: Positive = Field(
+        default=15.0, description="solutions closer than this are one and the same"
+    )
+    max_direction_sigma_deg: Positive = Field(
+        default=12.0, description="less certain directions are refused"
+    )
+    second_look: bool = Field(
+        default=True,
+        description="match unclear images again with all candidates, at a third of a second",
+    )
+    direction_floor_deg: NonNegative = Field(
+        default=0.0,
+        description="added to the direction's sigma in quadrature, as for stitched panoramas",
+    )
+    rotation_floor_deg: NonNegative = Field(default=0.0, description="likewise for the rotation")
+    at_target_parallax_deg: NonNegative = Field(
+        default=0.5, description="median parallax below which both views are from one place"
     )

@@ -27,9 +27,8 @@ from fgslam.core.sensors import (
 from fgslam.core.types import PATCH_PX, Features, StereoFeatures
 from fgslam.frontend.features.matching import alike, choose, pairs_within
 from fgslam.frontend.features.patches import ReferencePatches, align, anchor
-from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.features.sift import FineImage
-from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.settings import AppearanceSettings, StereoSettings
 
 Linear: TypeAlias = tuple[FloatArray, FloatArray]
 """A map (3, 2 * cameras) from pixels to (column, row, disparity), and their covariance (3, 3)."""

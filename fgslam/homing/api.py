@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fgslam.backend.homing.estimators import homing_settings_of, make_homing_estimator
-from fgslam.backend.homing.settings import HomingEstimatorKind
+from fgslam.backend.settings import HomingEstimatorKind
 from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import ByteArray, Image
 from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason, TwoViewVector
@@ -28,10 +28,9 @@ from fgslam.core.errors import (
 )
 from fgslam.core.settings import make_settings
 from fgslam.frontend.features.omni import OmniFeatureExtractor
-from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.features.sift import colour_image
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings
 from fgslam.homing.controller import HomingChain, LegOutcome
 from fgslam.homing.front_end import make_front_end, unusable
 from fgslam.homing.places import PathPlaces
@@ -57,7 +56,7 @@ class HomingVector:
             camera: of all images, see :func:`fgslam.load_camera`.
             features: extraction and matching; None: the defaults.
             seed: of RANSAC's samples; the same images then give the same answer.
-            settings: of :class:`fgslam.frontend.homing.settings.HomingVectorSettings`, as under
+            settings: of :class:`fgslam.frontend.settings.HomingVectorSettings`, as under
                 ``homing_vector`` of an experiment: ``samples=1000``.
 
         Raises:

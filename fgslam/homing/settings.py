@@ -12,8 +12,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from fgslam.core.settings import STRICT, Index, NonNegative, Positive
-from fgslam.frontend.features.settings import OmniFeatureSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -19,8 +19,8 @@ from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.store import FileKind
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.sift import colour_image
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.homing.front_end import unusable
 from fgslam.homing.links import (
     UNORDERED,

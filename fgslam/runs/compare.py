@@ -14,14 +14,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fgslam.backend.homing.settings import (
+from fgslam.backend.settings import (
     AverageLandmarkVectorSettings,
+    EstimatorSettings,
     HomingEkfSettings,
     HomingGraphSettings,
     PaperEkfSettings,
     SnapshotSettings,
 )
-from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.report.content import TextTable
 from fgslam.runs.config import (

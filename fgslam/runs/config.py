@@ -19,8 +19,12 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic.dataclasses import dataclass as settings
 from pydantic_core import ErrorDetails
 
-from fgslam.backend.homing.settings import HomingEstimatorSettings, HomingGraphSettings
-from fgslam.backend.settings import EstimatorSettings, LandmarkKalmanSettings
+from fgslam.backend.settings import (
+    EstimatorSettings,
+    HomingEstimatorSettings,
+    HomingGraphSettings,
+    LandmarkKalmanSettings,
+)
 from fgslam.core.errors import ConfigError, shortened
 from fgslam.core.settings import STRICT, Count, Degrees, Index, NonNegative, Positive
 from fgslam.core.yaml_text import plain_values, read_yaml
@@ -33,9 +37,7 @@ from fgslam.datasets.settings import (
     RecordedOdometrySettings,
     SimulatedBearingsSettings,
 )
-from fgslam.frontend.features.settings import OmniFeatureSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
-from fgslam.frontend.settings import FrontendSettings
+from fgslam.frontend.settings import FrontendSettings, HomingVectorSettings, OmniFeatureSettings
 from fgslam.homing.settings import (
     HomingBehaviourSettings,
     LocalisationSettings,

@@ -86,7 +86,7 @@ _TASKS: Mapping[type[Experiment], Callable[[], Opener[RunResult]]] = {
     TopologicalMapConfig: lambda: (
         import_module("fgslam.runs.tasks.homing_views").open_topological_map
     ),
-    OmniVideoConfig: lambda: import_module("fgslam.runs.tasks.homing_video").open_video,
+    OmniVideoConfig: lambda: import_module("fgslam.runs.tasks.homing_drives").open_video,
     TeachConfig: lambda: import_module("fgslam.runs.tasks.routes").open_teaching,
     FollowConfig: lambda: import_module("fgslam.runs.tasks.routes").open_following,
     JoinConfig: lambda: import_module("fgslam.runs.tasks.routes").open_joining,

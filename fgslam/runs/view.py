@@ -26,9 +26,9 @@ from fgslam.core.files import remove_left_behind, replacing, require_output
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CAMERA_NAMES, Increment, moved_pixels, vertical_of
 from fgslam.core.types import EgoMotionStatus, LandmarkMap, Trajectory
-from fgslam.datasets.film_files import require_film_suffix, write_film
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.opening import open_omni
+from fgslam.datasets.video import require_film_suffix, write_film
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.homing.route import PathMemory
 from fgslam.report.content import (

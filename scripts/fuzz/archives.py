@@ -17,9 +17,9 @@ from fgslam.core.bearings import BearingLog, HomingStart, TwoViewVector
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
 from fgslam.core.store import pack, write_arrays
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector
+from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.homing.route import MetricPoses
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import simulate_homing

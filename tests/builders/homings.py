@@ -8,9 +8,9 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray
 from fgslam.core.bearings import HomingStart, HomingTruth, TrackedBearings, TwoViewVector
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector
+from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.worlds.settings import SimulatedBearingsSettings
 from fgslam.worlds.simulated_bearings import NO_OUTLIERS, HomingOutliers, simulate_homing
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fgslam.backend.homing.estimators import make_homing_estimator
-from fgslam.backend.homing.settings import HomingEkfSettings, HomingEstimatorSettings
+from fgslam.backend.settings import HomingEkfSettings, HomingEstimatorSettings
 from fgslam.core.arrays import ByteArray, FloatArray, IntArray
 from fgslam.core.bearings import (
     BearingMatches,
@@ -26,7 +26,7 @@ from fgslam.core.bearings import (
     UprightFeatures,
 )
 from fgslam.core.geometry import bearings, compose, wrap
-from fgslam.frontend.homing.settings import HomingVectorSettings
+from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.homing.active import Sighting
 from fgslam.homing.closed_loop import Driver, DriveRecord, follow
 from fgslam.homing.controller import HomingChain

@@ -12,7 +12,7 @@ from homings import Trial, trial
 
 from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.parts import HomingEstimator
-from fgslam.backend.homing.settings import (
+from fgslam.backend.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingEstimatorSettings,

@@ -29,7 +29,7 @@ REFUSED = 2
 _STEPS = {
     "fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK": 2,
     "fgslam.runs.tasks.homing_replay.TRIALS_A_BLOCK": 1,
-    "fgslam.runs.tasks.homing_video.SAVE_EVERY_S": 0.0,
+    "fgslam.runs.tasks.homing_drives.SAVE_EVERY_S": 0.0,
     "fgslam.runs.tasks.localisation.SAVE_EVERY_S": 0.0,
     "fgslam.report.pictures.DPI": 50,
 }

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from landmark_world import drive_path, make_follower, winding_path
 
-from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.backend.settings import HomingGraphSettings
 from fgslam.core.bearings import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.closed_loop import (

@@ -14,7 +14,6 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.bearings import BearingMatches
 from fgslam.core.geometry import between
 from fgslam.frontend.features.omni import OmniFeatureExtractor
-from fgslam.frontend.features.settings import OmniFeatureSettings
 from fgslam.frontend.homing.two_view import (
     PLAIN_MATCHING,
     EpipolarTest,
@@ -22,6 +21,7 @@ from fgslam.frontend.homing.two_view import (
     match_sift,
     plain_sift,
 )
+from fgslam.frontend.settings import OmniFeatureSettings
 
 pytestmark = pytest.mark.data
 

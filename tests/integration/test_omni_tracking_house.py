@@ -9,9 +9,9 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.bearings import BearingMatches
 from fgslam.core.geometry import wrap
 from fgslam.frontend.features.omni import OmniFeatureExtractor
-from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable
 from fgslam.frontend.homing.two_view import match_features
+from fgslam.frontend.settings import OmniFeatureSettings, OmniMatchingSettings
 from fgslam.worlds.house import CAMERA_HEIGHT_M, OmniWorld
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 

@@ -15,11 +15,10 @@ from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniVideoSettings
 from fgslam.frontend.features.omni import OmniFeatureExtractor
-from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.tracking import ReplenishedTracker
 from fgslam.frontend.homing.two_view import match_features
 from fgslam.frontend.homing.vector import estimate_homing_vector
+from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings, OmniMatchingSettings
 
 pytestmark = pytest.mark.data
 

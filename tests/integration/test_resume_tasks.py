@@ -237,7 +237,7 @@ def _small_steps(in_this_process: None, monkeypatch: pytest.MonkeyPatch) -> None
     """Units in this process, few in a block, and every state saved."""
     monkeypatch.setattr("fgslam.runs.tasks.homing_views.VIEWS_A_BLOCK", 2)
     monkeypatch.setattr("fgslam.runs.tasks.homing_replay.TRIALS_A_BLOCK", 1)
-    monkeypatch.setattr("fgslam.runs.tasks.homing_video.SAVE_EVERY_S", 0.0)
+    monkeypatch.setattr("fgslam.runs.tasks.homing_drives.SAVE_EVERY_S", 0.0)
     monkeypatch.setattr("fgslam.runs.tasks.localisation.SAVE_EVERY_S", 0.0)
 
 

@@ -16,7 +16,7 @@ from fgslam.frontend.features.matching import (
     pairs_within,
     unambiguous,
 )
-from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.settings import AppearanceSettings
 
 # Halves and quarters: sums and differences are exact, so borders are met exactly.
 quarters = st.integers(-40, 40).map(lambda n: n / 4.0)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from fgslam.backend.homing.parts import TrackedFeatures
-from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
+from fgslam.backend.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings, among
 from fgslam.core.errors import EstimatorError

@@ -11,7 +11,7 @@ from fgslam.backend.homing.ekf import HomingEkf
 from fgslam.backend.homing.graph import HomingGraph
 from fgslam.backend.homing.paper_ekf import PaperEkf
 from fgslam.backend.homing.parts import HomingEstimator, TrackedFeatures
-from fgslam.backend.homing.settings import (
+from fgslam.backend.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingEstimatorKind,

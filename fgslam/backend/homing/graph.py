@@ -30,11 +30,10 @@ from fgslam.backend.homing.parts import (
     TrackedFeatures,
 )
 from fgslam.backend.homing.schur import SchurSolver
-from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.backend.settings import HomingGraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.bearings import HomingEstimate, HomingStart, TrackedBearings, among
-from fgslam.core.geometry import compose, unit, wrap
-from fgslam.core.least_squares import GaussNewton, Linearised
+from fgslam.core.geometry import GaussNewton, Linearised, compose, unit, wrap
 from fgslam.factors.bearing import bearing, bearing_jacobians, polar_points, triangulated
 
 _PRIOR_DISTANCES = 2.0  # deviation of the weak prior on a landmark's place, in initial distances

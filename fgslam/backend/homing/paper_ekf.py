@@ -21,7 +21,7 @@ from fgslam.backend.homing.ekf import (
     state_of,
     updated,
 )
-from fgslam.backend.homing.settings import PaperEkfSettings
+from fgslam.backend.settings import PaperEkfSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.bearings import HomingStart
 from fgslam.factors.bearing import target_jacobian, target_pose

@@ -26,8 +26,7 @@ from fgslam.backend.homing.parts import (
 )
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import wrap, wrapped_pose
-from fgslam.core.least_squares import Damping
+from fgslam.core.geometry import Damping, wrap, wrapped_pose
 from fgslam.factors.bearing import (
     STIFF,
     ChainMotion,

@@ -30,8 +30,7 @@ from fgslam.backend.smoothers.elimination import (
 )
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import adjoint, compose_covariance, inverse
-from fgslam.core.least_squares import Damping
+from fgslam.core.geometry import Damping, adjoint, compose_covariance, inverse
 from fgslam.core.sensors import BiasEffect, CameraRig, Odometry
 from fgslam.factors.graphs import is_pose, number
 from fgslam.factors.landmark import FROM_MEASUREMENT, LinearRows, linearised, residuals, whitening

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray
 from fgslam.core.geometry import wrap
 from fgslam.core.types import Words
-from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.settings import AppearanceSettings
 
 # ------------------------------------------------------------------------------------------
 # Nearest SIFT descriptors among many, by a fixed vocabulary

@@ -26,7 +26,7 @@ from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, Image, IntArray
 from fgslam.core.bearings import ColumnSegments, OmniFeatures, UprightFeatures
 from fgslam.core.errors import FrameError
 from fgslam.core.geometry import wrap
-from fgslam.frontend.features.settings import OmniFeatureSettings, UprightSiftSettings
+from fgslam.frontend.settings import OmniFeatureSettings, UprightSiftSettings
 
 # ------------------------------------------------------------------------------------------
 # Colour moments of patches and segments: eq. 1 of Goedemé et al., with centred bands

@@ -17,7 +17,7 @@ from scipy.linalg import hadamard
 from fgslam.core.arrays import ByteArray, FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.types import Features
-from fgslam.frontend.features.settings import Appearance, SiftSettings
+from fgslam.frontend.settings import Appearance, SiftSettings
 
 # ------------------------------------------------------------------------------------------
 # What an image's exposure leaves of its contrast: the measure that detection is relative to

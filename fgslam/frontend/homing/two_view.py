@@ -40,10 +40,9 @@ from fgslam.core.bearings import (
     TwoViewVector,
     UprightFeatures,
 )
-from fgslam.core.geometry import skew, wrap
-from fgslam.core.least_squares import GaussNewton, Linearised
+from fgslam.core.geometry import GaussNewton, Linearised, skew, wrap
 from fgslam.frontend.features.omni import up_in_image, whitened
-from fgslam.frontend.features.settings import OmniMatchingSettings
+from fgslam.frontend.settings import OmniMatchingSettings
 
 LEAST_SEPARATION = np.deg2rad(5.0)
 """Bearing difference that two features need in one of the views: less is one vertical line."""

@@ -24,8 +24,6 @@ from fgslam.core.bearings import (
     UprightFeatures,
 )
 from fgslam.core.geometry import circular_median, unit, wrap
-from fgslam.frontend.features.settings import OmniMatchingSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import (
     COMMON_CHANCE,
     EpipolarTest,
@@ -42,6 +40,7 @@ from fgslam.frontend.homing.two_view import (
     solve_two_point,
     spread_over,
 )
+from fgslam.frontend.settings import HomingVectorSettings, OmniMatchingSettings
 
 LEAST_PARALLAX = np.deg2rad(3.0)  # of two rays; below, the signs of the distances are noise
 

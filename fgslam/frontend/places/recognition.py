@@ -30,7 +30,7 @@ from fgslam.core.types import (
     UpdateStats,
 )
 from fgslam.frontend.features.matching import choose
-from fgslam.frontend.features.settings import AppearanceSettings
+from fgslam.frontend.settings import AppearanceSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem, Resection
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
 

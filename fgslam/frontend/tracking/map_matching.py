@@ -20,8 +20,7 @@ from fgslam.core.geometry import (
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Prediction, StereoFeatures
 from fgslam.frontend.features.matching import alike, pairs_within, pick, resembling
-from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.settings import DatabaseSettings, MapMatchingSettings
+from fgslam.frontend.settings import AppearanceSettings, DatabaseSettings, MapMatchingSettings
 
 Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 """(k,) landmarks, features, and distances of their descriptors."""

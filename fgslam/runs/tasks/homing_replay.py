@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from fgslam.backend.homing.estimators import make_homing_estimator
-from fgslam.backend.homing.settings import HomingEstimatorSettings
+from fgslam.backend.settings import HomingEstimatorSettings
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.bearings import (
     BearingLog,
@@ -33,9 +33,9 @@ from fgslam.core.files import make_subfolder
 from fgslam.datasets.opening import open_simulated_homing
 from fgslam.evaluation.homing import HomingErrors, HomingSummary, homing_errors, summarise_homings
 from fgslam.evaluation.statistics import JsonValue, UpdateTime
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import make_local_map
 from fgslam.frontend.homing.vector import estimate_homing_vector
+from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.report.content import Cell, Column, Figure, TextTable, write_csv
 from fgslam.report.homing_figures import Line, curve_figure, local_map_figure, sorted_errors
 from fgslam.runs.config import HomingExperiment, HomingTrialsConfig

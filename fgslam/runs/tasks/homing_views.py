@@ -35,10 +35,9 @@ from fgslam.datasets.opening import open_checked, open_omni
 from fgslam.datasets.settings import OmniDatasetSettings
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.frontend.features.omni import OmniFeatureExtractor, empty_segments
-from fgslam.frontend.features.settings import OmniFeatureSettings, OmniMatchingSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import PLAIN_MATCHING, plain_sift
 from fgslam.frontend.homing.vector import pair_generator, vector_between
+from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings, OmniMatchingSettings
 from fgslam.homing.links import UNORDERED, Answer, Link, Pair, VisualWords, Walks, sift_inliers
 from fgslam.homing.places import Localiser
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers

@@ -10,7 +10,7 @@ from numpy.linalg import LinAlgError
 from scipy.optimize import least_squares
 
 from fgslam.core.arrays import FloatArray
-from fgslam.core.least_squares import Damping, GaussNewton, Linearised
+from fgslam.core.geometry import Damping, GaussNewton, Linearised
 
 TIMES = np.linspace(0.0, 2.0, 30)
 TRUE = np.array([[2.0, 0.7], [0.5, 1.5]])

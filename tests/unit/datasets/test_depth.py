@@ -18,8 +18,7 @@ from fgslam.datasets.layouts import recognise_layout
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.recording import Recording
 from fgslam.datasets.settings import RgbdSettings
-from fgslam.frontend.features.settings import AppearanceSettings
-from fgslam.frontend.settings import StereoSettings
+from fgslam.frontend.settings import AppearanceSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.bare import bare_experiment
 

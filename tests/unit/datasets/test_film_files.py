@@ -15,7 +15,7 @@ from PIL import Image as Pillow
 
 from fgslam.core.arrays import Image
 from fgslam.core.errors import OutputError
-from fgslam.datasets.film_files import write_film
+from fgslam.datasets.video import write_film
 
 
 def greys(n: int, width: int = 64) -> list[Image]:

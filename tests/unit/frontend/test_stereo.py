@@ -20,9 +20,13 @@ from fgslam.core.sensors import SHIFT_SHARE, CameraRig
 from fgslam.core.settings import RigPlaces
 from fgslam.core.types import Features, StereoFeatures
 from fgslam.frontend.features import matching
-from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.settings import FrontendSettings, StereoSettings
+from fgslam.frontend.settings import (
+    AppearanceSettings,
+    FrontendSettings,
+    SiftSettings,
+    StereoSettings,
+)
 from fgslam.frontend.stereo import PatchStereo, StereoMatcher, measurement_map
 from fgslam.slam.build import as_measured, make_describer, make_stereo
 

@@ -122,7 +122,7 @@ WRONG: dict[str, tuple[Callable[[], object], type[FgslamError], str]] = {
     "features": (
         lambda: fg.teach([picture(0)], CAMERA, features="sift"),  # type: ignore[arg-type]
         ConfigError,
-        "settings are a str; give a fgslam.frontend.features.settings.OmniFeatureSettings",
+        "settings are a str; give a fgslam.frontend.settings.OmniFeatureSettings",
     ),
     "front-end": (
         lambda: _follower(front_end={}),

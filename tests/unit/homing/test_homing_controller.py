@@ -11,7 +11,7 @@ from homing import make_matches
 from landmark_world import DARK, Setting, drive_path, make_follower, winding_path
 
 from fgslam.backend.homing.estimators import make_homing_estimator
-from fgslam.backend.homing.settings import (
+from fgslam.backend.settings import (
     AverageLandmarkVectorSettings,
     HomingEkfSettings,
     HomingEstimatorSettings,

@@ -18,8 +18,8 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.errors import CalibrationError, StoredMapError
 from fgslam.core.geometry import between, wrap
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.vector import estimate_homing_vector
+from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.homing.links import (
     LONE_SUPPORT,
     MIN_SUPPORT,

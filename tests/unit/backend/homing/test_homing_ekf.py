@@ -22,7 +22,7 @@ from fgslam.backend.homing.ekf import (
 )
 from fgslam.backend.homing.estimators import AverageDisplacement, AverageLandmarkVector
 from fgslam.backend.homing.paper_ekf import PaperEkf, seen_from_target, separate_initial_state
-from fgslam.backend.homing.settings import HomingEkfSettings, PaperEkfSettings
+from fgslam.backend.settings import HomingEkfSettings, PaperEkfSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.bearings import HomingStart, LocalMap, TrackedBearings, TwoViewVector
 from fgslam.core.errors import EstimatorError

@@ -12,7 +12,7 @@ from homings import Trial, trial
 from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.backend.homing.graph import HomingGraph
 from fgslam.backend.homing.schur import Factored, SchurSolver, State
-from fgslam.backend.homing.settings import HomingGraphSettings
+from fgslam.backend.settings import HomingGraphSettings
 from fgslam.core.arrays import FloatArray
 from fgslam.core.bearings import HomingEstimate
 from fgslam.core.errors import EstimatorError

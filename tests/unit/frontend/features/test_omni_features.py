@@ -29,10 +29,6 @@ from fgslam.frontend.features.omni import (
     whitened,
     wrapping_period,
 )
-from fgslam.frontend.features.settings import (
-    OmniFeatureSettings,
-    OmniMatchingSettings,
-)
 from fgslam.frontend.homing.two_view import (
     PLAIN_MATCHING,
     consistent_tangents,
@@ -42,6 +38,7 @@ from fgslam.frontend.homing.two_view import (
     nearest_segments,
     plain_sift,
 )
+from fgslam.frontend.settings import OmniFeatureSettings, OmniMatchingSettings
 
 # ------------------------------------------------------------------------------------------
 # Colour moments: eq. 1 as printed, as corrected, and over rectangles

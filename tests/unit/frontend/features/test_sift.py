@@ -19,7 +19,6 @@ from fgslam.core.geometry import wrap
 from fgslam.core.types import Features
 from fgslam.frontend.features import sift
 from fgslam.frontend.features.matching import descriptor_distance
-from fgslam.frontend.features.settings import SiftSettings
 from fgslam.frontend.features.sift import (
     EDGE_THRESHOLD,
     OCTAVE_LAYERS,
@@ -27,6 +26,7 @@ from fgslam.frontend.features.sift import (
     as_bytes,
     grey_image,
 )
+from fgslam.frontend.settings import SiftSettings
 
 # ------------------------------------------------------------------------------------------
 # SIFT extraction (Se et al. 2.1)

@@ -22,8 +22,6 @@ from fgslam.core.bearings import (
 )
 from fgslam.core.geometry import bearings, wrap
 from fgslam.frontend.features.omni import empty_segments
-from fgslam.frontend.features.settings import OmniMatchingSettings
-from fgslam.frontend.homing.settings import HomingVectorSettings
 from fgslam.frontend.homing.two_view import (
     EpipolarTest,
     HomingRefinement,
@@ -46,6 +44,7 @@ from fgslam.frontend.homing.vector import (
     pair_generator,
     vector_between,
 )
+from fgslam.frontend.settings import HomingVectorSettings, OmniMatchingSettings
 
 HALF_DEGREE = np.deg2rad(0.5)
 SETTINGS = HomingVectorSettings()

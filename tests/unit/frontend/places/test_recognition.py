@@ -40,7 +40,6 @@ from fgslam.core.types import (
 )
 from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.features.matching import AppearanceIndex
-from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.places import known_map
 from fgslam.frontend.places.known_map import Tentative
 from fgslam.frontend.places.recognition import (
@@ -60,7 +59,7 @@ from fgslam.frontend.places.relocalisation import (
     Refined,
     accept,
 )
-from fgslam.frontend.settings import EgoMotionSettings, RelocalisationSettings
+from fgslam.frontend.settings import AppearanceSettings, EgoMotionSettings, RelocalisationSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.slam.build import make_estimator

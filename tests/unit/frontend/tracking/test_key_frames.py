@@ -22,9 +22,8 @@ from fgslam.core.types import (
     StereoFeatures,
 )
 from fgslam.frontend.features.patches import ReferencePatches, crowding
-from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.features.sift import FineImage
-from fgslam.frontend.settings import DatabaseSettings, StereoSettings
+from fgslam.frontend.settings import AppearanceSettings, DatabaseSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.frontend.tracking.key_frames import (
     NOISE_SHARE,

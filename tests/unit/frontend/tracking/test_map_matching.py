@@ -17,9 +17,13 @@ from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.geometry import transform_to_camera, wrap
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import StereoFeatures
-from fgslam.frontend.features.settings import AppearanceSettings, SiftSettings
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.settings import DatabaseSettings, MapMatchingSettings
+from fgslam.frontend.settings import (
+    AppearanceSettings,
+    DatabaseSettings,
+    MapMatchingSettings,
+    SiftSettings,
+)
 from fgslam.frontend.tracking import map_matching
 from fgslam.frontend.tracking.map_matching import (
     BORDER_PX,

@@ -20,8 +20,8 @@ from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.sensors import CameraRig
 from fgslam.core.store import TREE, restore, state_of
 from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction
-from fgslam.frontend.features.settings import AppearanceSettings
 from fgslam.frontend.settings import (
+    AppearanceSettings,
     DatabaseSettings,
     EgoMotionSettings,
     FrontendSettings,
