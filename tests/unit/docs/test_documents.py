@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -99,3 +100,28 @@ def test_modules_that_a_page_names_exist(page: Path) -> None:
     stale = [name for name in named if not any(path.endswith(name) for path in MODULES)]
     stale += [room for room in rooms if not (ROOT / room).is_dir()]
     assert not sorted(stale)
+
+
+@pytest.mark.parametrize("page", EVERY, ids=ids)
+def test_dotted_names_on_a_page_can_be_imported(page: Path) -> None:
+    if page.name == "CHANGELOG.md":  # names what has been
+        return
+    text = page.read_text(encoding="utf-8")
+    names = sorted(set(re.findall(r"`(fgslam(?:\.[A-Za-z_]\w*)+)`", text)))
+    assert not [name for name in names if not is_importable(name)]
+
+
+def is_importable(name: str) -> bool:
+    """Whether a module, or a name in one, or an attribute of such a name, is there."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        try:
+            found: object = import_module(".".join(parts[:end]))
+        except ImportError:
+            continue
+        for attribute in parts[end:]:
+            if not hasattr(found, attribute):
+                return False
+            found = getattr(found, attribute)
+        return True
+    return False
