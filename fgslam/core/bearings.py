@@ -389,8 +389,8 @@ def _require_measured(log: BearingLog) -> None:
         if len({len(array) for array in (image.ids, image.bearing, image.sigma_bearing)}) > 1:
             raise ValueError(f"image {k}: its arrays differ in length")
         require_finite(f"bearings of image {k}", image.bearing)
-        if not (image.sigma_bearing > 0.0).all():
-            raise ValueError(f"image {k}: a deviation of a bearing is not positive")
+        if not ((image.sigma_bearing > 0.0) & np.isfinite(image.sigma_bearing)).all():
+            raise ValueError(f"image {k}: a deviation of a bearing is no positive number")
 
 
 LOG = FileKind(

@@ -117,7 +117,7 @@ class StereoFeatures(Rows):
 
 
 Words = npt.NDArray[np.int16]
-"""(v,) the cell of the vocabulary (``frontend.features.vocabulary``) of each descriptor."""
+"""(v,) the cell of the vocabulary (``frontend/features/vocabulary.npz``) of each descriptor."""
 
 
 PATCH_PX = 15

@@ -45,7 +45,7 @@ Progress = Callable[[int, int], None]
 
 
 class RenderedLabSequence:
-    """A drive through a rendered place; implements :class:`fgslam.core.log.Sequence`.
+    """A drive through a rendered place; implements :class:`fgslam.core.log.ImageSequence`.
 
     The world frame of the ground truth is the reference camera's pose at the first frame of the
     drive; of random poses, at that of the place's own drive.

@@ -26,7 +26,7 @@ from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.bearings import BearingMatches, OmniFeatures, Refusal, RefusalReason, TwoViewVector
 from fgslam.core.errors import StoredMapError
 from fgslam.core.geometry import circular_median, is_rigid, wrap
-from fgslam.core.store import FileKind, require_covariances
+from fgslam.core.store import FileKind, require_covariances, require_finite
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.vector import pair_generator
 from fgslam.homing.active import parallax
@@ -441,7 +441,12 @@ class StoredPath:
         return PathMemory(images, self.names, camera, self.metric)
 
     def require_sound(self) -> None:
-        """Raises ValueError for poses that SLAM does not find, or of other images."""
+        """Raises ValueError for names or poses of other images, and poses that SLAM cannot find."""
+        if len(self.names) != len(self.images):
+            raise ValueError("not one name an image")
+        for k, one in enumerate(self.images):
+            for values in (one.sift.colour, one.columns.tangents, one.columns.descriptors):
+                require_finite(f"features of image {k}", values)
         if self.metric is None:
             return
         poses, covariances, n = self.metric.poses, self.metric.covariances, len(self.images)

@@ -16,7 +16,7 @@ from fgslam.cameras.omni import OmniCamera
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.bearings import OmniFeatures, Refusal, RefusalReason
 from fgslam.core.errors import CalibrationError, StoredMapError
-from fgslam.core.store import FileKind
+from fgslam.core.store import FileKind, require_covariances, require_finite
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.features.sift import colour_image
 from fgslam.frontend.homing.vector import pair_generator, vector_between
@@ -149,14 +149,29 @@ class _StoredMap:
     costs: FloatArray
 
     def require_sound(self) -> None:
-        """Raises ValueError where names are not unique, or links lead to no place of the map."""
+        """Raises ValueError for names that are not unique, and links that no map has."""
+        self.places.require_sound()
         n = len(self.places.images)
         if len(set(self.places.names)) < n:
             raise ValueError("two places have one name")
         if not all(0 <= link.a < link.b < n for link in self.links):
             raise ValueError("a link leads to no place")
+        if len({(link.a, link.b) for link in self.links}) < len(self.links):
+            raise ValueError("two links join the same places")
         if self.costs.shape != (len(self.links),) or not (self.costs > 0.0).all():
             raise ValueError("not one cost a link")
+        require_finite("costs", self.costs)
+        for link in self.links:
+            # Without angles: a step that was driven; with the rotation alone: images of one place.
+            turned = bool(np.isnan([link.direction, link.back]).all())
+            angles = [] if turned else [link.direction, link.back]
+            angles += [link.rotation] if link.support or not turned else []
+            require_finite("angles of a link", np.array(angles))
+            if link.support < 0:
+                raise ValueError("a link has fewer inliers than none")
+            if not turned:
+                both = np.array([link.covariance, link.back_covariance])
+                require_covariances("covariances of a link", both)
 
 
 FILE = FileKind(

@@ -708,7 +708,10 @@ class RenderCache:
         """Images of one frame, or None where the file is absent, foreign, cut or damaged."""
         if not self.present(index):
             return None
-        content = self.path(index).read_bytes()
+        try:
+            content = self.path(index).read_bytes()
+        except OSError:
+            return None
         header, pixels = content[: _HEADER.size], content[_HEADER.size :]
         if header != self._header(pixels):
             return None

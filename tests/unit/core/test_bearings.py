@@ -44,6 +44,10 @@ def no_deviation(log: BearingLog) -> None:
     log.images[1] = replace(log.images[1], sigma_bearing=log.images[1].sigma_bearing * 0.0)
 
 
+def no_finite_deviation(log: BearingLog) -> None:
+    log.images[1] = replace(log.images[1], sigma_bearing=log.images[1].sigma_bearing + np.inf)
+
+
 def one_twice(log: BearingLog) -> None:
     log.images[1] = replace(log.images[1], ids=log.images[1].ids * 0)
 
@@ -58,7 +62,8 @@ def one_too_few(log: BearingLog) -> None:
         (start_at_nan, "times of the images: a number is not finite"),
         (negative_covariance, "vector: number 0 is no covariance"),
         (nan_bearing, "bearings of image 1: a number is not finite"),
-        (no_deviation, "image 1: a deviation of a bearing is not positive"),
+        (no_deviation, "image 1: a deviation of a bearing is no positive number"),
+        (no_finite_deviation, "image 1: a deviation of a bearing is no positive number"),
         (one_twice, "image 1 shows a feature twice"),
         (one_too_few, "image 1: its arrays differ in length"),
         (lambda log: log.images.reverse(), "times of the images is out of order"),

@@ -316,6 +316,13 @@ def some_features(seed: int, sift: int = 300, columns: int = 150) -> OmniFeature
 EMPTY = OmniFeatures(some_features(0, 0).sift, no_columns())
 
 
+def test_a_file_with_names_of_other_images_is_refused(tmp_path: Path) -> None:
+    memory = PathMemory.of([EMPTY, EMPTY], ["a", "b"])
+    replace(memory, names=("a",)).save(tmp_path / "path.npz")
+    with pytest.raises(StoredMapError, match="not one name an image"):
+        PathMemory.load(tmp_path / "path.npz")
+
+
 def test_features_come_back_within_their_rounding(tmp_path: Path) -> None:
     """Descriptors to the bit, angles to half a step, deviations and sizes to 3 %."""
     memory = PathMemory.of([some_features(1), EMPTY, some_features(2, 40, 0)], ["a", "b", "ü"])

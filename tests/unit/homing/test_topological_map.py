@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -681,7 +682,17 @@ def test_wrong_routes_and_places_are_refused(
 
 def test_values_that_no_map_has_are_refused(joined: RouteMap, tmp_path: Path) -> None:
     topology, path = joined.topology, tmp_path / "bad.fgmap"
+    first, *others = topology.links
+
+    def with_first(**values: Any) -> TopologicalMap:
+        return replace(topology, links=(replace(first, **values), *others))
+
     for other, words in (
+        (with_first(rotation=np.inf), "angles of a link: a number is not finite"),
+        (with_first(support=-1), "a link has fewer inliers than none"),
+        (with_first(covariance=-np.eye(2)), "covariances of a link: number 0 is no covariance"),
+        (replace(topology, links=(first, first, *others[1:])), "two links join the same places"),
+        (replace(topology, costs=np.inf * topology.costs), "costs: a number is not finite"),
         (replace(topology, links=(topology.links[0].reversed(),)), "a link leads to no place"),
         (replace(topology, costs=-topology.costs), "not one cost a link"),
         (replace(topology, costs=topology.costs[1:]), "not one cost a link"),
