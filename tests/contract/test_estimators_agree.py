@@ -340,7 +340,8 @@ def by_information(
 # With their own settings, on ordinary noise
 
 
-@pytest.mark.parametrize("drives", [3, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("drives", [3, 6])
 def test_all_smoothers_end_within_a_fraction_of_the_error_of_each_other(drives: int) -> None:
     """Kernels, gates and keyframes cost a little, on measurements that are all right."""
     ratios = []

@@ -77,6 +77,7 @@ def test_frames_pushed_into_the_session_of_a_recording_give_the_run_s_poses(
     assert (tmp_path / "pushed.tum").read_bytes() == expected
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_a_drone_that_turns_by_tens_of_degrees_a_frame_is_located(
     shared_data: Path, tmp_path: Path

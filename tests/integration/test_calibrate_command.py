@@ -224,6 +224,7 @@ def drawn_boards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_fisheye_is_calibrated_from_images_of_a_board(
     drawn_boards: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

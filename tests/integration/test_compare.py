@@ -239,7 +239,10 @@ def test_two_runs_are_compared_side_by_side(
     assert (out / plain.name / "odometry" / "final.tum").is_file()
 
 
-@pytest.mark.parametrize("existing", [(), ("--overwrite",), ("--resume",)])
+@pytest.mark.parametrize(
+    "existing",
+    [pytest.param((), marks=pytest.mark.slow), ("--overwrite",), ("--resume",)],
+)
 def test_the_command_that_an_interrupted_comparison_shows_goes_on_with_it(
     plain: Path,
     tmp_path: Path,

@@ -232,7 +232,9 @@ def bagged(shared_data: Path) -> Recording:
     return open_recording(EurocSettings(path=str(shared_data / "stereo_raw" / "euroc_V1_01_cut")))
 
 
-@pytest.mark.parametrize("name", BAGS)
+@pytest.mark.parametrize(
+    "name", ["SQLite", *(pytest.param(n, marks=pytest.mark.slow) for n in BAGS if n != "SQLite")]
+)
 def test_bags_hold_the_pictures_and_stamps_of_their_source(
     shared_data: Path, bagged: Recording, name: str
 ) -> None:

@@ -316,6 +316,7 @@ def test_second_visit_finds_some_furniture_moved_and_the_rest_as_it_was() -> Non
 # ---------------------------------------------------------------- what SIFT sees
 
 
+@pytest.mark.slow
 def test_sift_finds_what_the_paper_found() -> None:
     """100 to 300 features in a typical image; the three images within 15 % of each other."""
     sequence = RenderedLabSequence(LabSettings(), seed=3, stride=20)

@@ -335,7 +335,13 @@ def test_errors_together_are_found_by_the_other_kinds_of_rig(rig: CameraRig) -> 
     # 99 % of means lie within: of 48 degrees of freedom; of 450 (of 600 a little more)
     [(4, 0.55, 1.60), pytest.param(50, 0.84, 1.18, marks=pytest.mark.slow)],
 )
-@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
+@pytest.mark.parametrize(
+    "rig",
+    [
+        pytest.param(rig, marks=() if name == "two cameras" else pytest.mark.slow, id=name)
+        for name, rig in RIGS.items()
+    ],
+)
 def test_the_error_of_the_correction_is_what_its_covariance_says(
     rig: CameraRig, seeds: int, low: float, high: float
 ) -> None:
