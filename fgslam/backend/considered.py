@@ -1,9 +1,18 @@
 """Consider covariance (Schmidt 1966): what is not estimated, in the covariances reported.
 
 Errors that the newest pose and the landmarks have in common are columns, one column a cause: a term
-of the rig's calibration, or one drawn sample of all noise. What a filter does to its estimates, to
-first order it does to each column; covariances are products of columns, and so have the
-correlations that no filter of single landmarks keeps. Estimates stay as they are.
+of the rig's calibration, or one drawn sample of all noise. The columns of the newest pose (6, m)
+are how far a unit of each cause moves its tangent vector, to first order; those of a landmark
+(3, m) how far it moves its position. What a filter does to its estimates it does to each column;
+covariances are products of columns, and so have the correlations that no filter of single
+landmarks keeps. Estimates stay as they are.
+
+Two estimators of errors keep such columns:
+
+* :class:`ConsiderCovariance`, beside a filter that keeps all correlations and a smoother's tracker:
+  the rig's terms alone, as derivatives; what they add to the covariances that are there.
+* :class:`SampledErrors`, beside the filter of single landmarks: the rig's terms and samples of all
+  noise, through the filter's own gains; they replace its covariances.
 """
 
 from __future__ import annotations
@@ -58,13 +67,13 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 
 class ErrorColumns:
-    """Columns (6, m) of the newest pose and (n, 3, m) of landmarks.
+    """Columns (6, m) of the newest pose and (n, 3, m) of landmarks: what both estimators keep.
 
     Those of a landmark stay in one place while it is there: what comes and goes costs what it is,
     whatever the map.
     """
 
-    _gain: Kept[FloatArray]
+    _pose_columns: Kept[FloatArray]
     _order: Kept[GrowingColumns]
     _map: Kept[GrowingColumns]
     _free: Kept[IntArray]
@@ -78,10 +87,10 @@ class ErrorColumns:
             more: what else is kept by landmark, arrays (0, ...).
         """
         self._held = False
-        self._gain = np.zeros((6, count))
+        self._pose_columns = np.zeros((6, count))
         self._order = GrowingColumns(ids=np.empty(0, np.int64), row=np.empty(0, np.int64))
         """Identities, ascending, and the rows that are theirs in the map; free ones are nobody's"""
-        self._map = GrowingColumns(gain=np.empty((0, 3, count), kind), **more)
+        self._map = GrowingColumns(columns=np.empty((0, 3, count), kind), **more)
         self._free = np.empty(0, np.int64)
 
     def hold_map(self) -> None:
@@ -132,8 +141,8 @@ class ErrorColumns:
     def _of_map(self, ids: IntArray) -> FloatArray:
         """(k, 3, m) columns of landmarks, as far as they are reported."""
         if self._held:
-            return np.zeros((len(ids), *self._map["gain"].shape[1:]))
-        return self.kept("gain", ids)
+            return np.zeros((len(ids), *self._map["columns"].shape[1:]))
+        return self.kept("columns", ids)
 
     def kept(self, name: str, ids: IntArray) -> FloatArray:
         """(k, ...) what is kept of landmarks under a name; zero of unknown ones."""
@@ -245,14 +254,14 @@ class ConsiderCovariance(ErrorColumns):
         if rig is None or not self.present:
             return
         if self._wTc is not None:
-            self._gain = adjoint(inverse(inverse(self._wTc) @ wTc)) @ self._gain
+            self._pose_columns = adjoint(inverse(inverse(self._wTc) @ wTc)) @ self._pose_columns
         kept = increment.observations.select(~increment.rejected)
         near = kept.measurement[:, 2] > _LEAST_DISPARITY_PX
         seen = _Linearised.of(rig, self._terms, kept.select(near), wTc)
         rows, known = self.rows(seen.ids)
         if self._wTc is not None and known.sum() >= _LEAST_MATCHES:
             basis = self._floor.basis(wTc) if self._floor.rigid_dof < 6 else np.eye(6)
-            self._gain = seen.select(known).pose_gain(*self._at(rows[known]), basis)
+            self._pose_columns = seen.select(known).pose_columns(*self._at(rows[known]), basis)
         self._update(seen.select(known), rows[known])
         self._add(seen.select(~known))
         self.forget(increment.pruned_ids)
@@ -262,7 +271,7 @@ class ConsiderCovariance(ErrorColumns):
         """(6, 6) what the terms add to the newest pose's covariance; zero where they are known."""
         if self._terms.deviations is None:
             return _NONE  # one for all frames: a smoother keeps that of each
-        root = self._gain @ self._terms.deviations
+        root = self._pose_columns @ self._terms.deviations
         return np.asarray(root @ root.T)
 
     def pose(self, newest: Prediction) -> Prediction:
@@ -276,8 +285,8 @@ class ConsiderCovariance(ErrorColumns):
         covariance = self._terms.covariance
         if covariance is None or self._held:
             return known
-        gain = self.kept("gain", known.ids)
-        more = gain @ covariance @ np.swapaxes(gain, 1, 2)
+        columns = self.kept("columns", known.ids)
+        more = columns @ covariance @ np.swapaxes(columns, 1, 2)
         return dataclasses.replace(known, covariances=known.covariances + more)
 
     def joint(self, ids: IntArray, covariance: FloatArray) -> FloatArray:
@@ -285,28 +294,30 @@ class ConsiderCovariance(ErrorColumns):
         terms = self._terms.covariance
         if terms is None:
             return covariance
-        gain = np.concatenate([self._gain, self._of_map(ids).reshape(-1, self._terms.count)])
-        return np.asarray(covariance + gain @ terms @ gain.T)
+        columns = np.concatenate(
+            [self._pose_columns, self._of_map(ids).reshape(-1, self._terms.count)]
+        )
+        return np.asarray(covariance + columns @ terms @ columns.T)
 
     # ----------------------------------------------------------------------------------------
 
     def _at(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        return self._map["gain"][rows], self._map["information"][rows]
+        return self._map["columns"][rows], self._map["information"][rows]
 
     def _update(self, seen: _Linearised, rows: IntArray) -> None:
-        gain, information = self._at(rows)
+        columns, information = self._at(rows)
         pull, added = seen.landmark_information()
         information = information + added
-        off = seen.off(self._gain) - seen.by_point @ gain
-        self._map["gain"][rows] = gain + np.linalg.solve(information, pull @ off)
+        off = seen.off(self._pose_columns) - seen.by_point @ columns
+        self._map["columns"][rows] = columns + np.linalg.solve(information, pull @ off)
         self._map["information"][rows] = information
 
     def _add(self, seen: _Linearised) -> None:
         """Landmarks where their first measurement has them; identities ascend."""
         if len(seen.ids):
-            gain = np.linalg.solve(seen.by_point, seen.off(self._gain))
+            columns = np.linalg.solve(seen.by_point, seen.off(self._pose_columns))
             information = seen.landmark_information()[1]
-            self.append({"ids": seen.ids, "gain": gain, "information": information})
+            self.append({"ids": seen.ids, "columns": columns, "information": information})
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -328,16 +339,18 @@ class _Linearised(Rows):
         shift = terms.shifts(seen.measurement)
         return _Linearised(seen.ids, shift, by_pose, by_point, seen.covariance)
 
-    def off(self, pose_gain: FloatArray) -> FloatArray:
+    def off(self, pose_columns: FloatArray) -> FloatArray:
         """(k, 3, q) what of the measurements' shifts the pose does not follow."""
-        return np.asarray(self.shift - self.by_pose @ pose_gain)
+        return np.asarray(self.shift - self.by_pose @ pose_columns)
 
     def landmark_information(self) -> tuple[FloatArray, FloatArray]:
         """What residuals pull landmarks by (k, 3, 3), and their information (k, 3, 3)."""
         pull = np.swapaxes(self.by_point, 1, 2) @ np.linalg.inv(self.covariance)
         return pull, pull @ self.by_point
 
-    def pose_gain(self, gain: FloatArray, information: FloatArray, basis: FloatArray) -> FloatArray:
+    def pose_columns(
+        self, columns: FloatArray, information: FloatArray, basis: FloatArray
+    ) -> FloatArray:
         """(6, q) derivative of the pose that fits landmarks of these derivatives best.
 
         ``basis`` (6, d) spans the directions that the pose has.
@@ -348,7 +361,7 @@ class _Linearised(Rows):
         pull = np.swapaxes(by_pose, 1, 2) @ np.linalg.inv(expected)
         normal, freedom = (pull @ by_pose).sum(axis=0), basis.shape[1]
         normal += _LEAST_INFORMATION * np.trace(normal) / freedom * np.eye(freedom)
-        off = self.shift - self.by_point @ gain
+        off = self.shift - self.by_point @ columns
         return np.asarray(basis @ np.linalg.solve(normal, (pull @ off).sum(axis=0)))
 
 
@@ -409,7 +422,7 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class TrackedStep:
     """How a frame's pose was found.
 
     Attributes:
@@ -502,7 +515,7 @@ class SampledErrors(ErrorColumns):
 
     # -- what the filter does, done to the columns ---------------------------------------------
 
-    def track(self, step: Step, used: Observations, landmarks: LandmarkMap) -> None:
+    def track(self, step: TrackedStep, used: Observations, landmarks: LandmarkMap) -> None:
         """From the last pose to a frame's, by the matches (k) that it is of, before these move."""
         if self._off:
             return
@@ -512,33 +525,37 @@ class SampledErrors(ErrorColumns):
         self._taken = step.tracking.noise
         wTc, problem = step.tracking.wTc, PoseProblem.of(landmarks, used)
         carried, noise = step.added()
-        moved = carried @ self._gain
+        moved = carried @ self._pose_columns
         moved[:, self._count :] += symmetric_root(noise) @ self._signs(1, 6)[0]
         columns = self.linearised(wTc, problem)
         self._enter(used.ids, columns, problem.point_covariances, moved)
         rows, _ = self.rows(used.ids)
-        self._seen = rows, columns, self._map["gain"][rows].astype(np.float64)
-        self._gain = self._on_floor(wTc, moved)
+        self._seen = rows, columns, self._map["columns"][rows].astype(np.float64)
+        self._pose_columns = self._on_floor(wTc, moved)
         if step.measured:
             by_prediction, by_measurement = self._solver.gain(
                 wTc, step.expected, problem, self._taken
             )
-            self._gain = by_prediction @ moved + columns.following(by_measurement, self._seen[2])
+            self._pose_columns = by_prediction @ moved + columns.following(
+                by_measurement, self._seen[2]
+            )
 
     def filter(self, share: FloatArray) -> None:
         """Matched landmarks move to where the frame has them by the share (k, 3, 3) of the way."""
         if self._seen is not None:
             rows, columns, before = self._seen
-            self._map["gain"][rows] = before + share @ (columns.placed(self._gain) - before)
+            self._map["columns"][rows] = before + share @ (
+                columns.placed(self._pose_columns) - before
+            )
 
     def add(self, ids: IntArray, placed: PoseProblem, wTc: FloatArray) -> None:
         """New landmarks, where the frame at ``wTc`` has them."""
         if not self._off:
             points = transform_to_camera(wTc, placed.points)
             near = in_front(points) & (np.abs(points).max(axis=1) < _FARTHEST_M)
-            gain = np.zeros((len(ids), 3, self._count + SAMPLES))
-            gain[near] = self.linearised(wTc, placed.select(near)).placed(self._gain)
-            self.append({"ids": ids, "gain": gain})
+            columns = np.zeros((len(ids), 3, self._count + SAMPLES))
+            columns[near] = self.linearised(wTc, placed.select(near)).placed(self._pose_columns)
+            self.append({"ids": ids, "columns": columns})
 
     def close(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, moved: Moved
@@ -554,10 +571,14 @@ class SampledErrors(ErrorColumns):
         if self._off:
             return
         rows, known = self.rows(landmarks.ids)
-        self._map["gain"][rows[known]] = moved.rotations[known] @ self._map["gain"][rows[known]]
-        apart = adjoint(wTc) @ (self._gain - self._returned(loop, landmarks, wTc, moved.homes))
-        self._gain = self._on_floor(
-            wTc, self._gain - adjoint(inverse(wTc)) @ moved.shares[-1] @ apart
+        self._map["columns"][rows[known]] = (
+            moved.rotations[known] @ self._map["columns"][rows[known]]
+        )
+        apart = adjoint(wTc) @ (
+            self._pose_columns - self._returned(loop, landmarks, wTc, moved.homes)
+        )
+        self._pose_columns = self._on_floor(
+            wTc, self._pose_columns - adjoint(inverse(wTc)) @ moved.shares[-1] @ apart
         )
         homes = np.where(known, moved.homes, -1)
         order = np.argsort(homes, kind="stable")[np.count_nonzero(homes < 0) :]
@@ -565,7 +586,7 @@ class SampledErrors(ErrorColumns):
         for of_home in np.split(order, ends[:-1]) if len(order) else ():
             motion = moved.shares[homes[of_home[0]]] @ apart
             points = skew(landmarks.positions[of_home])
-            self._map["gain"][rows[of_home]] -= motion[3:] - points @ motion[:3]
+            self._map["columns"][rows[of_home]] -= motion[3:] - points @ motion[:3]
 
     # -- what is reported ----------------------------------------------------------------------
 
@@ -573,16 +594,18 @@ class SampledErrors(ErrorColumns):
         """The newest pose with the covariance of its errors."""
         if self._off:
             return newest
-        return Prediction(newest.wTc, self._covariances(self._gain, self._solver.floor.rigid_dof))
+        return Prediction(
+            newest.wTc, self._covariances(self._pose_columns, self._solver.floor.rigid_dof)
+        )
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with the covariances of their errors; those without keep what they have."""
-        gain = self._of_map(known.ids)
-        have = np.any(gain, axis=(1, 2))
+        columns = self._of_map(known.ids)
+        have = np.any(columns, axis=(1, 2))
         if self._held or not have.any():
             return known
         covariances = known.covariances.copy()
-        covariances[have] = self._covariances(gain[have], 3)
+        covariances[have] = self._covariances(columns[have], 3)
         return dataclasses.replace(known, covariances=covariances)
 
     def joint(self, pose: FloatArray, known: LandmarkMap) -> FloatArray:
@@ -596,7 +619,7 @@ class SampledErrors(ErrorColumns):
         own = block_diagonal(np.ones((6, 6)), np.ones((len(known), 3, 3)))
         landmarks = self._weighed(self._of_map(known.ids), 3)
         columns = np.concatenate(
-            [self._weighed(self._gain, self._solver.floor.rigid_dof), *landmarks]
+            [self._weighed(self._pose_columns, self._solver.floor.rigid_dof), *landmarks]
         )
         kept = SAMPLES / (SAMPLES + len(blocks))
         return np.where(own > 0.0, blocks, kept * (columns @ columns.T))
@@ -635,9 +658,9 @@ class SampledErrors(ErrorColumns):
         """
         new = ~self.rows(ids)[1]
         if new.any():
-            gain = columns.select(new).placed(pose)
-            gain[:, :, self._count :] = self._drawn(covariances[new])
-            self.append({"ids": ids[new], "gain": gain})
+            placed = columns.select(new).placed(pose)
+            placed[:, :, self._count :] = self._drawn(covariances[new])
+            self.append({"ids": ids[new], "columns": placed})
 
     def _returned(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, homes: IntArray
@@ -648,13 +671,13 @@ class SampledErrors(ErrorColumns):
         problem = PoseProblem.of(landmarks, seen)
         ahead = in_front(transform_to_camera(wTc, problem.points))
         if ahead.sum() < _LEAST_PLACING:
-            gain = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
-            gain[:, self._count :] += symmetric_root(loop.covariance) @ self._signs(1, 6)[0]
-            return gain
+            errors = adjoint(inverse(wTc)) @ self._of_place(loop.frame, landmarks, homes)
+            errors[:, self._count :] += symmetric_root(loop.covariance) @ self._signs(1, 6)[0]
+            return errors
         problem = problem.select(ahead)
         columns = self.linearised(wTc, problem)
         by_measurement = self._solver.gain(wTc, Prediction(wTc, FREE), problem, self._taken)[1]
-        return columns.following(by_measurement, self.kept("gain", seen.ids[ahead]))
+        return columns.following(by_measurement, self.kept("columns", seen.ids[ahead]))
 
     def _of_place(self, frame: int, landmarks: LandmarkMap, homes: IntArray) -> FloatArray:
         """Errors (6, m) of a frame's place as a motion of the world, by landmarks first seen there.
@@ -670,7 +693,7 @@ class SampledErrors(ErrorColumns):
         weights = np.asarray(np.linalg.inv(near.covariances + lacking(near.covariances)))
         turned = np.swapaxes(by_motion, 1, 2) @ weights
         information = (turned @ by_motion).sum(axis=0)
-        pull = (turned @ self.kept("gain", near.ids)).sum(axis=0)
+        pull = (turned @ self.kept("columns", near.ids)).sum(axis=0)
         return np.asarray(np.linalg.pinv(information, hermitian=True) @ pull)
 
     def _on_floor(self, wTc: FloatArray, columns: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from fgslam.backend.considered import Moved, SampledErrors, Step, lacking, shares
+from fgslam.backend.considered import Moved, SampledErrors, TrackedStep, lacking, shares
 from fgslam.backend.filters.filtered import FilteredTrajectory, moved
 from fgslam.backend.filters.landmark_update import (
     MISS_GROWTH_M,
@@ -102,29 +102,15 @@ class LandmarkKalman:
         self._applied = np.empty(0)  # correction of the rig in the last frame
         self._disparity_sigma = np.inf  # of a measurement of the last frame that had any, pixels
 
-    @property
-    def keeps_maps(self) -> bool:
-        """True: the pose is that of the least squares, whether landmarks are updated or not."""
-        return True
-
-    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
-        """Takes a saved map over; no loop of this drive moves its landmarks."""
-        unseen = np.full(len(landmarks), -1)
-        self._rows.load(landmarks, hits, unseen, unseen)
-        self._fixed = fixed
-        if fixed:
-            self._errors.hold_map()
-
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``."""
         return moved(self._current, odometry)
 
-    def landmarks(self) -> LandmarkMap:
-        """Current landmarks, until the next update; the arrays are read only by agreement."""
-        return self._rows.map()
-
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Pose from the tracking; matched landmarks filtered, missed ones grown, new ones added.
+
+        By their types in the frame (4.1): II was expected and missed, III matched, IV is new; all
+        others, type I, stay as they are.
 
         Then loops are closed: the reported pose is the corrected one, with the covariance of the
         closure, which is its uncertainty relative to the place returned to.
@@ -156,6 +142,111 @@ class LandmarkKalman:
         return UpdateStats(
             current.wTc, current.covariance, len(self._rows), nis, 3 * len(used), closed
         )
+
+    def _step(self, increment: Increment, tracking: EgoMotion) -> TrackedStep:
+        """The step to a frame, before it is taken."""
+        frame, before = len(self._past), self._current
+        if not frame:
+            before = Prediction(before.wTc, np.zeros((6, 6)))
+        return TrackedStep(frame, increment, tracking, before, self.predict(increment.odometry))
+
+    def _update_matched(self, observed: Observations) -> float:
+        """Updates matched landmarks; their innovation squared."""
+        if not len(observed):
+            return float("nan")
+        held, kind = self._rows, self._settings.update
+        rows = held.rows(observed.ids)
+        held.lasts[rows] = len(self._past)
+        known = Landmarks(held.positions[rows], held.covariances[rows])
+        counts = held.counts[rows].astype(np.float64)
+        found = self._frame.update(kind, known, counts, observed)
+        if not self._fixed:
+            held.positions[rows], held.covariances[rows] = found.positions, found.covariances
+            share = moved_share(kind, known.covariances, found.covariances, counts)
+            self._errors.filter(share)
+            held.counts[rows] += 1
+        return found.nis
+
+    @property
+    def _frame(self) -> FrameUpdate:
+        """The updates by the last frame."""
+        return self.updates(self._rig, self._current.wTc, self._by_pose)
+
+    def _add(self, observed: Observations, frame: int) -> None:
+        """Adds new landmarks (type IV) where this frame sees them."""
+        if not len(observed):
+            return
+        positions, covariances = self._frame.place(observed)
+        self._rows.add(observed.ids, positions, covariances, frame)
+        placed = PoseProblem(positions, covariances, observed.measurement, observed.covariance)
+        self._errors.add(observed.ids, placed, self._current.wTc)
+
+    def _record(
+        self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray
+    ) -> None:
+        """Keeps the step to this frame, for later loops, and which old landmarks placed it."""
+        step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
+        free = increment.relocalised or starts_new_part(increment, tracking)
+        self._drive.step(step, tracking, increment.odometry, free)
+        homes = self._rows.homes[self._rows.rows(used)]
+        self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
+
+    def _close(self, increment: Increment, loop: LoopClosure) -> bool:
+        """Moves the drive and the map to where the loop has them; False if it is refused."""
+        poses = self._drive.close(loop, self._current.wTc, f"frame {increment.index}")
+        if poses is None:
+            return False
+        moved_by = changes(np.array(self._past.poses), poses)
+        self._past.poses[:] = list(poses)
+        self._current = Prediction(poses[-1], loop.covariance)
+        self._past.covariances[-1] = loop.covariance
+        by_landmark = home_changes(self._rows.homes, moved_by)
+        self._rows.positions[:] = transported(by_landmark, self._rows.positions)
+        self._rows.covariances[:] = rotated(by_landmark, self._rows.covariances)
+        taken = shares(self._drive.chain, loop)
+        moved = Moved(by_landmark[:, :3, :3], self._rows.homes, taken)
+        self._errors.close(loop, self._rows.map(), poses[-1], moved)
+        return True
+
+    def landmarks(self) -> LandmarkMap:
+        """Current landmarks, until the next update; the arrays are read only by agreement."""
+        return self._rows.map()
+
+    def estimate(self) -> Estimate:
+        """Trajectory as filtered, corrected by loops, and the map."""
+        rows = self._rows
+        held = LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy())
+        return Estimate(
+            self._past.trajectory(),
+            self._past.pose_covariances(),
+            self._errors.landmarks(held),
+            tuple(self._drive.remarks),
+            noise_factor=1.0,
+        )
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Covariances (k, 3, 3) of the named landmarks."""
+        return self._errors.landmarks(self._rows.map().select(self._rows.rows(ids))).covariances
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Pose and landmarks, as reported; those that stay as they are are independent."""
+        known = self._errors.landmarks(self._rows.map().select(self._rows.rows(ids)))
+        return self._errors.joint(self._errors.pose(self._current).covariance, known)
+
+    # -- for loops, saved maps and smoothers ---------------------------------------------------
+
+    @property
+    def keeps_maps(self) -> bool:
+        """True: the pose is that of the least squares, whether landmarks are updated or not."""
+        return True
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes a saved map over; no loop of this drive moves its landmarks."""
+        unseen = np.full(len(landmarks), -1)
+        self._rows.load(landmarks, hits, unseen, unseen)
+        self._fixed = fixed
+        if fixed:
+            self._errors.hold_map()
 
     @property
     def homes(self) -> IntArray:
@@ -202,94 +293,6 @@ class LandmarkKalman:
             return None
         self._rows.positions[known] = moved
         return change
-
-    def estimate(self) -> Estimate:
-        """Trajectory as filtered, corrected by loops, and the map."""
-        rows = self._rows
-        held = LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy())
-        return Estimate(
-            self._past.trajectory(),
-            self._past.pose_covariances(),
-            self._errors.landmarks(held),
-            tuple(self._drive.remarks),
-            noise_factor=1.0,
-        )
-
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Covariances (k, 3, 3) of the named landmarks."""
-        return self._errors.landmarks(self._rows.map().select(self._rows.rows(ids))).covariances
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Pose and landmarks, as reported; those that stay as they are are independent."""
-        known = self._errors.landmarks(self._rows.map().select(self._rows.rows(ids)))
-        return self._errors.joint(self._errors.pose(self._current).covariance, known)
-
-    # ----------------------------------------------------------------------------------------
-
-    def _step(self, increment: Increment, tracking: EgoMotion) -> Step:
-        """The step to a frame, before it is taken."""
-        frame, before = len(self._past), self._current
-        if not frame:
-            before = Prediction(before.wTc, np.zeros((6, 6)))
-        return Step(frame, increment, tracking, before, self.predict(increment.odometry))
-
-    def _record(
-        self, increment: Increment, tracking: EgoMotion, before: Prediction, used: IntArray
-    ) -> None:
-        """Keeps the step to this frame, for later loops, and which old landmarks placed it."""
-        step = inverse(before.wTc) @ tracking.wTc if len(self._past) else tracking.wTc
-        free = increment.relocalised or starts_new_part(increment, tracking)
-        self._drive.step(step, tracking, increment.odometry, free)
-        homes = self._rows.homes[self._rows.rows(used)]
-        self._drive.tie(homes, self._past.poses, tracking, increment.relocalised)
-
-    def _close(self, increment: Increment, loop: LoopClosure) -> bool:
-        """Moves the drive and the map to where the loop has them; False if it is refused."""
-        poses = self._drive.close(loop, self._current.wTc, f"frame {increment.index}")
-        if poses is None:
-            return False
-        moved_by = changes(np.array(self._past.poses), poses)
-        self._past.poses[:] = list(poses)
-        self._current = Prediction(poses[-1], loop.covariance)
-        self._past.covariances[-1] = loop.covariance
-        by_landmark = home_changes(self._rows.homes, moved_by)
-        self._rows.positions[:] = transported(by_landmark, self._rows.positions)
-        self._rows.covariances[:] = rotated(by_landmark, self._rows.covariances)
-        taken = shares(self._drive.chain, loop)
-        moved = Moved(by_landmark[:, :3, :3], self._rows.homes, taken)
-        self._errors.close(loop, self._rows.map(), poses[-1], moved)
-        return True
-
-    @property
-    def _frame(self) -> FrameUpdate:
-        """The updates by the last frame."""
-        return self.updates(self._rig, self._current.wTc, self._by_pose)
-
-    def _update_matched(self, observed: Observations) -> float:
-        """Updates matched landmarks; their innovation squared."""
-        if not len(observed):
-            return float("nan")
-        held, kind = self._rows, self._settings.update
-        rows = held.rows(observed.ids)
-        held.lasts[rows] = len(self._past)
-        known = Landmarks(held.positions[rows], held.covariances[rows])
-        counts = held.counts[rows].astype(np.float64)
-        found = self._frame.update(kind, known, counts, observed)
-        if not self._fixed:
-            held.positions[rows], held.covariances[rows] = found.positions, found.covariances
-            share = moved_share(kind, known.covariances, found.covariances, counts)
-            self._errors.filter(share)
-            held.counts[rows] += 1
-        return found.nis
-
-    def _add(self, observed: Observations, frame: int) -> None:
-        """Adds new landmarks (type IV) where this frame sees them."""
-        if not len(observed):
-            return
-        positions, covariances = self._frame.place(observed)
-        self._rows.add(observed.ids, positions, covariances, frame)
-        placed = PoseProblem(positions, covariances, observed.measurement, observed.covariance)
-        self._errors.add(observed.ids, placed, self._current.wTc)
 
 
 def moved_share(

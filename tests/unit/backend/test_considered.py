@@ -71,32 +71,32 @@ def test_columns_are_their_landmarks_whatever_comes_and_goes() -> None:
         for identity in gone.tolist():
             del expected[identity]
         ids = np.setdiff1d(rng.integers(0, 200, rng.integers(0, 12)), sorted(expected))
-        gain = rng.standard_normal((len(ids), 3, _COUNT))
-        columns.append({"ids": ids, "gain": gain})
-        expected |= dict(zip(ids.tolist(), gain, strict=True))
+        new = rng.standard_normal((len(ids), 3, _COUNT))
+        columns.append({"ids": ids, "columns": new})
+        expected |= dict(zip(ids.tolist(), new, strict=True))
         state = state_of(columns)
         assert state["order/ids"].tolist() == sorted(expected)
-        kept = state["map/gain"][state["order/row"]]
+        kept = state["map/columns"][state["order/row"]]
         assert np.array_equal(kept, [expected[i] for i in sorted(expected)])
     again = ErrorColumns(_COUNT)
-    again.append({"ids": np.array([7]), "gain": np.ones((1, 3, _COUNT))})
+    again.append({"ids": np.array([7]), "columns": np.ones((1, 3, _COUNT))})
     restore(again, state)
     asked = np.array([*sorted(expected), 999])
     found = [*(expected[i] for i in sorted(expected)), np.zeros((3, _COUNT))]
-    assert np.array_equal(again.kept("gain", asked), found)
+    assert np.array_equal(again.kept("columns", asked), found)
 
 
 def test_what_comes_and_goes_moves_no_other_landmark_and_takes_the_room_that_is_free() -> None:
     """So a frame costs what it sees, not what the map holds."""
     columns = ErrorColumns(_COUNT)
-    columns.append({"ids": np.arange(100), "gain": np.zeros((100, 3, _COUNT))})
+    columns.append({"ids": np.arange(100), "columns": np.zeros((100, 3, _COUNT))})
     kept = np.arange(50, 100)
     before = columns.rows(kept)[0]
     columns.forget(np.arange(0, 50, 2))
-    columns.append({"ids": np.arange(100, 125), "gain": np.ones((25, 3, _COUNT))})
-    columns.append({"ids": np.array([0]), "gain": np.ones((1, 3, _COUNT))})
+    columns.append({"ids": np.arange(100, 125), "columns": np.ones((25, 3, _COUNT))})
+    columns.append({"ids": np.array([0]), "columns": np.ones((1, 3, _COUNT))})
     assert np.array_equal(columns.rows(kept)[0], before)
-    assert len(state_of(columns)["map/gain"]) == 101
+    assert len(state_of(columns)["map/columns"]) == 101
 
 
 # ------------------------------------------------------------------------------------------
@@ -229,12 +229,12 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
     moved = played([with_pattern(each, size) for each in increments], update=update)
     step = g.se3_log(g.inverse(plain.predict(None).wTc) @ moved.predict(None).wTc) / size
     state = state_of(plain)
-    column = state["errors/gain"][:, -1]
+    column = state["errors/pose_columns"][:, -1]
     np.testing.assert_allclose(column, step, rtol=0.0, atol=1e-2 * np.abs(step).max())
     before, after = plain.landmarks(), moved.landmarks()
     shift = (after.positions - before.positions) / size
     np.testing.assert_array_equal(state["errors/order/ids"], before.ids)
-    columns = state["errors/map/gain"][state["errors/order/row"], :, -1]
+    columns = state["errors/map/columns"][state["errors/order/row"], :, -1]
     np.testing.assert_allclose(columns, shift, rtol=0.0, atol=1e-2 * np.abs(shift).max())
 
 
@@ -245,10 +245,10 @@ def test_covariances_of_few_samples_are_stated_larger_so_that_the_nees_is_right(
     state = state_of(errors)
     found = []
     for _ in range(400):
-        columns = np.zeros_like(state["gain"])
+        columns = np.zeros_like(state["pose_columns"])
         columns[:, -SAMPLES:] = rng.standard_normal((6, SAMPLES))
         error = rng.standard_normal((1, 6))
-        restore(errors, state | {"gain": columns})
+        restore(errors, state | {"pose_columns": columns})
         found.append(nees(error, errors.pose(FIRST).covariance[None]).values[0])
     assert np.mean(found) / 6.0 == pytest.approx(1.0, abs=0.1)
 
@@ -519,7 +519,7 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
     moved = first.measurement + shifts(RIG, first.measurement, field=True) @ by
     before, after = g.triangulate(RIG, first.measurement), g.triangulate(RIG, moved)
     turned = (after - before) @ drawn(3, frames=12).poses[0][:3, :3].T
-    gain = state_of(driven(1))["map/gain"][..., : len(SHARED)] @ by[OF_SHARED]
+    gain = state_of(driven(1))["map/columns"][..., : len(SHARED)] @ by[OF_SHARED]
     np.testing.assert_allclose(gain, turned, rtol=1e-3, atol=1e-4 * np.abs(turned).max())
 
 
