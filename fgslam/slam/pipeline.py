@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -17,6 +14,7 @@ from fgslam.backend.protocol import Estimator, NoiseEstimating, predicted, recal
 from fgslam.core.arrays import IntArray
 from fgslam.core.correction import RigCorrection
 from fgslam.core.sensors import Increment, LoopClosure, Odometry
+from fgslam.core.stopwatch import Stopwatch, timed
 from fgslam.core.store import Kept, has_state, put_back, snapshot
 from fgslam.core.types import (
     EgoMotion,
@@ -41,122 +39,9 @@ if TYPE_CHECKING:
     from fgslam.frontend.places.recognition import PlaceRecognition
 
 
-# ------------------------------------------------------------------------------------------
-# The noise that each frame was estimated with, where the drive itself shows how large it is
-
-
-class FrameNoise(NamedTuple):
-    """Noise in use in one frame; NaN where the frame had no noise of the kind.
-
-    Attributes:
-        rotation_sigma_dps2, translation_sigma_mps2: deviation of the random acceleration by which
-            the velocity is taken to change, root mean square of the three axes; of frames that no
-            odometry measured, the translation also where a gyroscope measured the rotation.
-        gyroscope_factor: on the stated deviation of a gyroscope's turn.
-        match_factor: on the stated deviations of measurements, where the frame's pose was found.
-        single_factor: on the same, as an estimator's graph judges single measurements by.
-        correlated_factor: on the same, as the graph weighs measurements by: errors that persist
-            from frame to frame count for more than independent ones.
-    """
-
-    rotation_sigma_dps2: float = math.nan
-    translation_sigma_mps2: float = math.nan
-    gyroscope_factor: float = math.nan
-    match_factor: float = math.nan
-    single_factor: float = math.nan
-    correlated_factor: float = math.nan
-
-
-def noise_in_use(
-    motion: MotionModel, odometry: Odometry | None, matches: MatchNoise, estimator: Estimator
-) -> FrameNoise:
-    """The noise of a frame that the estimator has taken in, and that nothing has learnt from yet.
-
-    Args:
-        motion: the model that gave ``odometry``; one that is not of this package has no noise here.
-        odometry: what the frame was predicted with.
-        matches: what the ego-motion takes the noise of matches to be.
-        estimator: after its update.
-    """
-    rotation, translation = _of_motion(motion, odometry)
-    single, correlated = (
-        estimator.noise_factors if isinstance(estimator, NoiseEstimating) else (math.nan, math.nan)
-    )
-    turned = odometry is not None and odometry.turned
-    return FrameNoise(
-        rotation_sigma_dps2=rotation,
-        translation_sigma_mps2=translation,
-        gyroscope_factor=(
-            motion.gyroscope_factor if turned and isinstance(motion, OdometryMotion) else math.nan
-        ),
-        match_factor=math.sqrt(matches.variance),
-        single_factor=single,
-        correlated_factor=correlated,
-    )
-
-
-def _of_motion(motion: MotionModel, odometry: Odometry | None) -> tuple[float, float]:
-    """Deviations of the acceleration, degrees/s^2 and m/s^2, where the step stands on it."""
-    if odometry is None or odometry.measured:
-        return math.nan, math.nan
-    if not isinstance(motion, ConstantVelocityMotion | OdometryMotion):
-        return math.nan, math.nan
-    rotation, translation = np.sqrt(motion.acceleration_variance.reshape(2, 3).mean(axis=1))
-    return math.nan if odometry.turned else math.degrees(rotation), float(translation)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FrameReport:
-    """What one frame gave, for outputs and pictures; ``stereo`` is what all images show."""
-
-    found: FeatureFrame
-    stereo: StereoFeatures
-    increment: Increment
-    tracking: EgoMotion
-    stats: UpdateStats
-    stage_ms: dict[str, float]
-    noise: FrameNoise
-
-
-class Stopwatch:
-    """Milliseconds by stage, within one frame."""
-
-    def __init__(self) -> None:
-        """No stage yet."""
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Adds the time that the block takes to a stage."""
-        start = time.perf_counter()
-        yield
-        self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (time.perf_counter() - start)
-
-
 def no_ids() -> IntArray:
     """No landmark's identity."""
     return np.empty(0, np.int64)
-
-
-Step = TypeVar("Step", bound=Callable[..., Any])
-
-
-def timed(stage: str) -> Callable[[Step], Step]:
-    """Decorator of a step of the loop, whose time it adds to a stage of the frame."""
-
-    def decorate(step: Step) -> Step:
-        @functools.wraps(step)
-        def run(self: SlamPipeline, *arguments: Any) -> Any:
-            with self.watch_of_frame.stage(stage):
-                return step(self, *arguments)
-
-        return cast("Step", run)
-
-    return decorate
-
-
-Snapshot: TypeAlias = list[tuple[Any, Any]]
-"""Parts, and their states before a frame, for the rollback where its features cannot be found."""
 
 
 @dataclass(slots=True, eq=False)
@@ -230,33 +115,6 @@ class SlamPipeline:
         self._calibrate(increment, stats)
         times = self.watch_of_frame.ms
         return FrameReport(frame, stereo, increment, matched.ego_motion, stats, times, noise)
-
-    def can_initialise(self, frame: FeatureFrame, least: int) -> bool:
-        """Whether a map could begin with the frame: it has ``least`` stereo matches, or more.
-
-        Not with images that the watch refuses: what they match is chance, or of two moments.
-        """
-        if frame.frame is None:
-            return False
-        if self.watch is not None:
-            before = snapshot(self.watch)
-            refused = self._check_cameras(frame, frame.i).refused
-            put_back(self.watch, before)  # the frame comes again
-            if refused:
-                return False
-        first = self._find_features(dataclasses.replace(frame, i=0), None, [])
-        self._tried = first, self._match_stereo(first)
-        return len(self._tried[1].whole) >= least
-
-    def estimate(self) -> Estimate:
-        """The estimator's, with frames bridged that nothing measured between located ones.
-
-        Landmarks that have ended are not among it.
-        """
-        found = self.estimator.estimate()
-        if len(self._ended):
-            found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
-        return bridged(found, self.tracker.parts)
 
     # -- the steps, in their order -------------------------------------------------------------
 
@@ -456,6 +314,35 @@ class SlamPipeline:
     def _correction(self) -> RigCorrection | None:
         return None if self.calibration is None else self.calibration.found.applied
 
+    # -- before and between the frames ---------------------------------------------------------
+
+    def can_initialise(self, frame: FeatureFrame, least: int) -> bool:
+        """Whether a map could begin with the frame: it has ``least`` stereo matches, or more.
+
+        Not with images that the watch refuses: what they match is chance, or of two moments.
+        """
+        if frame.frame is None:
+            return False
+        if self.watch is not None:
+            before = snapshot(self.watch)
+            refused = self._check_cameras(frame, frame.i).refused
+            put_back(self.watch, before)  # the frame comes again
+            if refused:
+                return False
+        first = self._find_features(dataclasses.replace(frame, i=0), None, [])
+        self._tried = first, self._match_stereo(first)
+        return len(self._tried[1].whole) >= least
+
+    def estimate(self) -> Estimate:
+        """The estimator's, with frames bridged that nothing measured between located ones.
+
+        Landmarks that have ended are not among it.
+        """
+        found = self.estimator.estimate()
+        if len(self._ended):
+            found = dataclasses.replace(found, landmarks=found.landmarks.without(self._ended))
+        return bridged(found, self.tracker.parts)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matched:
@@ -465,6 +352,23 @@ class Matched:
     association: Association
     loops: tuple[LoopClosure, ...] = ()
     relocalised: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameReport:
+    """What one frame gave, for outputs and pictures; ``stereo`` is what all images show."""
+
+    found: FeatureFrame
+    stereo: StereoFeatures
+    increment: Increment
+    tracking: EgoMotion
+    stats: UpdateStats
+    stage_ms: dict[str, float]
+    noise: FrameNoise
+
+
+Snapshot: TypeAlias = list[tuple[Any, Any]]
+"""Parts, and their states before a frame, for the rollback where its features cannot be found."""
 
 
 def observe(
@@ -488,3 +392,67 @@ def _anchored(increment: Increment, tracking: EgoMotion, stats: UpdateStats) -> 
 
 def _known(odometry: Odometry | None) -> bool:
     return odometry is not None and odometry.measured
+
+
+# ------------------------------------------------------------------------------------------
+# The noise that each frame was estimated with, where the drive itself shows how large it is
+
+
+class FrameNoise(NamedTuple):
+    """Noise in use in one frame; NaN where the frame had no noise of the kind.
+
+    Attributes:
+        rotation_sigma_dps2, translation_sigma_mps2: deviation of the random acceleration by which
+            the velocity is taken to change, root mean square of the three axes; of frames that no
+            odometry measured, the translation also where a gyroscope measured the rotation.
+        gyroscope_factor: on the stated deviation of a gyroscope's turn.
+        match_factor: on the stated deviations of measurements, where the frame's pose was found.
+        single_factor: on the same, as an estimator's graph judges single measurements by.
+        correlated_factor: on the same, as the graph weighs measurements by: errors that persist
+            from frame to frame count for more than independent ones.
+    """
+
+    rotation_sigma_dps2: float = math.nan
+    translation_sigma_mps2: float = math.nan
+    gyroscope_factor: float = math.nan
+    match_factor: float = math.nan
+    single_factor: float = math.nan
+    correlated_factor: float = math.nan
+
+
+def noise_in_use(
+    motion: MotionModel, odometry: Odometry | None, matches: MatchNoise, estimator: Estimator
+) -> FrameNoise:
+    """The noise of a frame that the estimator has taken in, and that nothing has learnt from yet.
+
+    Args:
+        motion: the model that gave ``odometry``; one that is not of this package has no noise here.
+        odometry: what the frame was predicted with.
+        matches: what the ego-motion takes the noise of matches to be.
+        estimator: after its update.
+    """
+    rotation, translation = _of_motion(motion, odometry)
+    single, correlated = (
+        estimator.noise_factors if isinstance(estimator, NoiseEstimating) else (math.nan, math.nan)
+    )
+    turned = odometry is not None and odometry.turned
+    return FrameNoise(
+        rotation_sigma_dps2=rotation,
+        translation_sigma_mps2=translation,
+        gyroscope_factor=(
+            motion.gyroscope_factor if turned and isinstance(motion, OdometryMotion) else math.nan
+        ),
+        match_factor=math.sqrt(matches.variance),
+        single_factor=single,
+        correlated_factor=correlated,
+    )
+
+
+def _of_motion(motion: MotionModel, odometry: Odometry | None) -> tuple[float, float]:
+    """Deviations of the acceleration, degrees/s^2 and m/s^2, where the step stands on it."""
+    if odometry is None or odometry.measured:
+        return math.nan, math.nan
+    if not isinstance(motion, ConstantVelocityMotion | OdometryMotion):
+        return math.nan, math.nan
+    rotation, translation = np.sqrt(motion.acceleration_variance.reshape(2, 3).mean(axis=1))
+    return math.nan if odometry.turned else math.degrees(rotation), float(translation)

@@ -25,6 +25,7 @@ from fgslam.core.arrays import Brief, FloatArray
 from fgslam.core.errors import ConfigError, MeasurementLogError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, MeasurementType, Observations
+from fgslam.core.stopwatch import Stopwatch
 from fgslam.core.threads import one_blas_thread
 from fgslam.core.types import (
     EgoMotion,
@@ -42,7 +43,7 @@ from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.slam.bridging import bridged
 from fgslam.slam.build import Arrival, made_or_given, take_over
 from fgslam.slam.motion import ConstantVelocityMotion, MotionModel
-from fgslam.slam.pipeline import FrameNoise, Stopwatch, noise_in_use, observe
+from fgslam.slam.pipeline import FrameNoise, noise_in_use, observe
 from fgslam.slam.results import ESTIMATOR_FAULTS, estimate_of_failed, reason
 
 _PROC_STATUS = Path("/proc/self/status")
