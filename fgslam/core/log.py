@@ -28,71 +28,6 @@ from fgslam.core.settings import RigPlaces
 from fgslam.core.store import FileKind, require_ascending, require_covariances, require_finite
 from fgslam.core.types import Trajectory
 
-# ------------------------------------------------------------------------------------------
-# Whether numbers can be those of a camera rig, wherever they come from
-
-_FOCAL_RANGE = 1000.0
-"""Of focal length and image size: at one end a telescope, at the other no picture."""
-
-
-def rig_fault(rig: CameraRig) -> str:
-    """Why the numbers cannot be those of a rig, and what to give; empty where they can."""
-    for name in ("width", "height"):
-        value = getattr(rig, name)
-        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value <= 0:
-            return f"{name} is {value!r}; give the images' size in pixels"
-    for name in ("fx", "fy", "baseline", "vertical_baseline"):
-        if fault := _length_fault(rig, name):
-            return fault
-    for name in ("fx", "fy"):
-        value, size = getattr(rig, name), max(rig.width, rig.height)
-        if not size / _FOCAL_RANGE <= value <= size * _FOCAL_RANGE:
-            return (
-                f"{name} is {value!r} for images of {rig.width}x{rig.height} pixels; give the "
-                "focal length in pixels of these images"
-            )
-    for name, extent in (("cx", rig.width), ("cy", rig.height)):
-        value = getattr(rig, name)
-        # Cropped images may have it outside, but hardly by more than their own size.
-        if not is_finite_number(value) or not -extent <= value <= 2 * extent:
-            return (
-                f"{name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
-                "give the principal point (column, row) in pixels of these images"
-            )
-    return _mounting_fault(rig)
-
-
-def _mounting_fault(rig: CameraRig) -> str:
-    if not isinstance(rig.exact, bool | np.bool_):
-        return f"exact is {rig.exact!r}; give True for a rig known without error, as a rendered one"
-    if rig.places not in get_args(RigPlaces):
-        return f"places is {rig.places!r}; give {' or '.join(get_args(RigPlaces))}"
-    if not is_rigid(np.asarray(rig.bTc, np.float64)):
-        return (
-            "bTc must be a rigid motion (4, 4), the pose of the right camera in the body; "
-            "correct it, or leave it out"
-        )
-    return ""
-
-
-def _length_fault(rig: CameraRig, name: str) -> str:
-    value = getattr(rig, name)
-    if name == "vertical_baseline" and value is None:
-        return ""
-    if is_finite_number(value) and value > 0.0:
-        return ""
-    what = (
-        "the distance between the cameras in metres; one camera alone cannot measure depth, "
-        "and a negative one means that left and right are swapped"
-        if "baseline" in name
-        else "the focal length in pixels"
-    )
-    return f"{name} is {value!r}, not a positive number; give {what}"
-
-
-# ------------------------------------------------------------------------------------------
-# The measurement log: everything that estimators consume, replayable without images
-
 
 @dataclass(slots=True, eq=False, repr=False)
 class MeasurementLog(Brief):
@@ -158,6 +93,16 @@ class MeasurementLog(Brief):
         return LOG.load(path)
 
 
+def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
+    """What of a step was measured: all of it, its turn, or nothing."""
+    if odometry is None or odometry.measured:
+        return odometry
+    if odometry.turned:
+        turn = odometry.motion[:3, :3], odometry.covariance[:3, :3]
+        return Odometry.turn(*turn, odometry.bias)
+    return None
+
+
 def _require_measured(log: MeasurementLog) -> None:
     """Raises ValueError for what no run measures: a log may be made by anyone."""
     if fault := rig_fault(log.rig):
@@ -219,48 +164,8 @@ LOG = FileKind(
 )
 
 
-def _without_stand_in(odometry: Odometry | None) -> Odometry | None:
-    """What of a step was measured: all of it, its turn, or nothing."""
-    if odometry is None or odometry.measured:
-        return odometry
-    if odometry.turned:
-        turn = odometry.motion[:3, :3], odometry.covariance[:3, :3]
-        return Odometry.turn(*turn, odometry.bias)
-    return None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """The images of one instant, in the order right, left[, top]; grey, uint8, (height, width).
-
-    ``index`` counts the recording's own frames (before ``start``/``stop``/``stride``). ``margins``
-    are (height, width) of each camera: how far a pixel is from what shows nothing, a black border
-    or what a mask hides, in pixels; empty where all images are full.
-    """
-
-    index: int
-    timestamp: float
-    images: tuple[Image, ...]
-    margins: tuple[npt.NDArray[np.float32], ...] = ()
-
-    def digest(self) -> int:
-        """64 bits of the images' contents: by them a frame is known again in any recording."""
-        content = hashlib.blake2b(digest_size=8)
-        for image in self.images:
-            content.update(np.ascontiguousarray(image).data)
-        return int.from_bytes(content.digest(), "little", signed=True)
-
-
-def clearance(margin: npt.NDArray[np.float32], places: FloatArray) -> FloatArray:
-    """How far (n,) places (n, 2) (column, row) are from what shows nothing, pixels.
-
-    Args:
-        margin: (height, width) of the image, as in :class:`Frame`.
-        places: those outside the image are judged by its nearest pixel.
-    """
-    height, width = margin.shape
-    column, row = np.rint(places).astype(np.int64).T
-    return np.asarray(margin[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
+# ------------------------------------------------------------------------------------------
+# Recordings of images
 
 
 @runtime_checkable
@@ -309,6 +214,67 @@ class ImageSequence(Protocol):
     def notes(self) -> tuple[str, ...]:
         """What was tolerated when opening the recording, in words (missing frames and the like)."""
         ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """The images of one instant, in the order right, left[, top]; grey, uint8, (height, width).
+
+    ``index`` counts the recording's own frames (before ``start``/``stop``/``stride``). ``margins``
+    are (height, width) of each camera: how far a pixel is from what shows nothing, a black border
+    or what a mask hides, in pixels; empty where all images are full.
+    """
+
+    index: int
+    timestamp: float
+    images: tuple[Image, ...]
+    margins: tuple[npt.NDArray[np.float32], ...] = ()
+
+    def digest(self) -> int:
+        """64 bits of the images' contents: by them a frame is known again in any recording."""
+        content = hashlib.blake2b(digest_size=8)
+        for image in self.images:
+            content.update(np.ascontiguousarray(image).data)
+        return int.from_bytes(content.digest(), "little", signed=True)
+
+
+def clearance(margin: npt.NDArray[np.float32], places: FloatArray) -> FloatArray:
+    """How far (n,) places (n, 2) (column, row) are from what shows nothing, pixels.
+
+    Args:
+        margin: (height, width) of the image, as in :class:`Frame`.
+        places: those outside the image are judged by its nearest pixel.
+    """
+    height, width = margin.shape
+    column, row = np.rint(places).astype(np.int64).T
+    return np.asarray(margin[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)])
+
+
+# ------------------------------------------------------------------------------------------
+# Recordings of measurements
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementRecording:
+    """Measurements with identities, replayable by any estimator without a front-end.
+
+    Attributes:
+        name: short name for titles.
+        identity: hexadecimal digest of what defines the recording.
+        log: sensor, motion model and one increment a frame.
+        ground_truth: true ``wTc`` of the reference camera or sensor, in a world of the
+            recording's choice; None where there is none.
+        landmark_truth: true landmark positions in that same world, or None. A landmark that moves
+            during the recording is not in it.
+        notes: what was tolerated, left out or simulated, in words.
+    """
+
+    name: str
+    identity: str
+    log: MeasurementLog
+    ground_truth: Trajectory | None
+    landmark_truth: LandmarkTruth | None
+    notes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,24 +339,63 @@ def read_landmark_truth(path: Path) -> tuple[LandmarkTruth, FloatArray]:
     return LandmarkTruth(ids, values[:, :3].copy()), values[:, 3].copy()
 
 
-@dataclass(frozen=True, eq=False)
-class MeasurementRecording:
-    """Measurements with identities, replayable by any estimator without a front-end.
+# ------------------------------------------------------------------------------------------
+# Whether numbers can be those of a camera rig, wherever they come from
 
-    Attributes:
-        name: short name for titles.
-        identity: hexadecimal digest of what defines the recording.
-        log: sensor, motion model and one increment a frame.
-        ground_truth: true ``wTc`` of the reference camera or sensor, in a world of the
-            recording's choice; None where there is none.
-        landmark_truth: true landmark positions in that same world, or None. A landmark that moves
-            during the recording is not in it.
-        notes: what was tolerated, left out or simulated, in words.
-    """
+_FOCAL_RANGE = 1000.0
+"""Of focal length and image size: at one end a telescope, at the other no picture."""
 
-    name: str
-    identity: str
-    log: MeasurementLog
-    ground_truth: Trajectory | None
-    landmark_truth: LandmarkTruth | None
-    notes: tuple[str, ...]
+
+def rig_fault(rig: CameraRig) -> str:
+    """Why the numbers cannot be those of a rig, and what to give; empty where they can."""
+    for name in ("width", "height"):
+        value = getattr(rig, name)
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value <= 0:
+            return f"{name} is {value!r}; give the images' size in pixels"
+    for name in ("fx", "fy", "baseline", "vertical_baseline"):
+        if fault := _length_fault(rig, name):
+            return fault
+    for name in ("fx", "fy"):
+        value, size = getattr(rig, name), max(rig.width, rig.height)
+        if not size / _FOCAL_RANGE <= value <= size * _FOCAL_RANGE:
+            return (
+                f"{name} is {value!r} for images of {rig.width}x{rig.height} pixels; give the "
+                "focal length in pixels of these images"
+            )
+    for name, extent in (("cx", rig.width), ("cy", rig.height)):
+        value = getattr(rig, name)
+        # Cropped images may have it outside, but hardly by more than their own size.
+        if not is_finite_number(value) or not -extent <= value <= 2 * extent:
+            return (
+                f"{name} is {value!r}, far from the image of {rig.width}x{rig.height} pixels; "
+                "give the principal point (column, row) in pixels of these images"
+            )
+    return _mounting_fault(rig)
+
+
+def _length_fault(rig: CameraRig, name: str) -> str:
+    value = getattr(rig, name)
+    if name == "vertical_baseline" and value is None:
+        return ""
+    if is_finite_number(value) and value > 0.0:
+        return ""
+    what = (
+        "the distance between the cameras in metres; one camera alone cannot measure depth, "
+        "and a negative one means that left and right are swapped"
+        if "baseline" in name
+        else "the focal length in pixels"
+    )
+    return f"{name} is {value!r}, not a positive number; give {what}"
+
+
+def _mounting_fault(rig: CameraRig) -> str:
+    if not isinstance(rig.exact, bool | np.bool_):
+        return f"exact is {rig.exact!r}; give True for a rig known without error, as a rendered one"
+    if rig.places not in get_args(RigPlaces):
+        return f"places is {rig.places!r}; give {' or '.join(get_args(RigPlaces))}"
+    if not is_rigid(np.asarray(rig.bTc, np.float64)):
+        return (
+            "bTc must be a rigid motion (4, 4), the pose of the right camera in the body; "
+            "correct it, or leave it out"
+        )
+    return ""

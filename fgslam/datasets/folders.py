@@ -1,6 +1,6 @@
 """Folders of images: our own layout, and any two folders, or one with the side in the names.
 
-docs/datasets/images.md, docs/datasets/images.md.
+docs/datasets/images.md.
 """
 
 from __future__ import annotations
@@ -43,50 +43,8 @@ from fgslam.datasets.times import (
     trajectory_at_frames,
 )
 
-# --------------------------------------------------------------------------------------------
-# Any two cameras
-
-
-def open_loose_images(
-    settings: LooseImagesSettings, odometry: RecordedOdometrySettings
-) -> Recording:
-    """Open images of two cameras that lie in two folders, or in one with the side in their names.
-
-    Raises:
-        DatasetError: there are no two cameras, their images do not pair, or times are malformed.
-        CalibrationError: there is no calibration, or it is none of these images.
-    """
-    given = Path(settings.path)
-    folder, files = (given, None) if given.is_dir() else (given.parent, files_of(given))
-    cameras = find_cameras(folder, files)
-    if cameras is None:
-        raise DatasetError(
-            f"{given}: no images of a left and a right camera: two folders such as left/ and "
-            "right/, or names such as *_left.png and *_right.png; one camera alone is not enough"
-        )
-    root = cameras.folder
-    pairs, unpaired = pair_files(cameras)
-    right = [pair[0] for pair in pairs]
-    own = right[0].parent
-    stamps, assumed, lists = stamps_of(right, (own, own.parent, root), settings.fps, cameras.right)
-    rig = calibrated_rig(settings, root, first_size(right))
-    rig = numbered(rig) if cameras.numbered else rig
-    images, noticed = open_frames(pairs, rig, root)
-    odometry_file = find_odometry(root)
-    rig, mounting = on_wheels(rig, settings, odometry_file)
-    also = ", ".join(" with ".join(pair) for pair in cameras.others)
-    others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
-    defining = [*lists, *filter(None, [odometry_file])]
-    identity = recording_identity(defining, (path for pair in pairs for path in pair))
-    notes = (*mounting, *noticed, *others, *unpaired, *assumed)
-    name = root.resolve().name
-    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
-    return replace(recording, odometry_source=file_odometry(odometry_file, odometry))
-
-
-# --------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # Our own layout: left/, right/[, top/], calib.json, times.txt
-
 
 TRUTH_LEFT = "gt_left_cam.txt"
 TRUTH_RIGHT = "gt_right_cam.txt"
@@ -224,3 +182,44 @@ def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
         )
     require_increasing(table, table.column(1))
     return numbers, table.column(1)
+
+
+# ------------------------------------------------------------------------------------------
+# Any two cameras
+
+
+def open_loose_images(
+    settings: LooseImagesSettings, odometry: RecordedOdometrySettings
+) -> Recording:
+    """Open images of two cameras that lie in two folders, or in one with the side in their names.
+
+    Raises:
+        DatasetError: there are no two cameras, their images do not pair, or times are malformed.
+        CalibrationError: there is no calibration, or it is none of these images.
+    """
+    given = Path(settings.path)
+    folder, files = (given, None) if given.is_dir() else (given.parent, files_of(given))
+    cameras = find_cameras(folder, files)
+    if cameras is None:
+        raise DatasetError(
+            f"{given}: no images of a left and a right camera: two folders such as left/ and "
+            "right/, or names such as *_left.png and *_right.png; one camera alone is not enough"
+        )
+    root = cameras.folder
+    pairs, unpaired = pair_files(cameras)
+    right = [pair[0] for pair in pairs]
+    own = right[0].parent
+    stamps, assumed, lists = stamps_of(right, (own, own.parent, root), settings.fps, cameras.right)
+    rig = calibrated_rig(settings, root, first_size(right))
+    rig = numbered(rig) if cameras.numbered else rig
+    images, noticed = open_frames(pairs, rig, root)
+    odometry_file = find_odometry(root)
+    rig, mounting = on_wheels(rig, settings, odometry_file)
+    also = ", ".join(" with ".join(pair) for pair in cameras.others)
+    others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
+    defining = [*lists, *filter(None, [odometry_file])]
+    identity = recording_identity(defining, (path for pair in pairs for path in pair))
+    notes = (*mounting, *noticed, *others, *unpaired, *assumed)
+    name = root.resolve().name
+    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
+    return replace(recording, odometry_source=file_odometry(odometry_file, odometry))

@@ -22,7 +22,129 @@ ImageLoader: TypeAlias = Callable[[int, bool], tuple[Image, ...]]
 """Images (right, left[, top]) of one of the recording's own frames, grey or, where the flag is set,
 in red, green, blue if it has colour; raises FrameError."""
 
-# --------------------------------------------------------------------------------------------
+
+# ------------------------------------------------------------------------------------------
+# Files of frames
+
+_NAMED_IN_NOTES = 5
+
+
+def open_frames(
+    paths: Sequence[tuple[Path, ...]], rig: StereoRig, where: Path
+) -> tuple[ImageLoader, tuple[str, ...]]:
+    """What reads and rectifies the images of a frame, and what was noticed.
+
+    The first readable frame is checked.
+
+    Args:
+        paths: per frame the files of right, left[, top] camera; they need not exist.
+        rig: of the cameras.
+        where: the recording, in messages.
+
+    Raises:
+        DatasetError: no frame can be read, or the cameras' images differ in size.
+        CalibrationError: their size is not the calibrated one.
+    """
+    bits, size, notes = 16, rig.image_size, []
+    if paths:  # else it is refused where frames are selected
+        _check_sizes(paths, size, where)
+        right = [frame[0] for frame in paths]
+        bits, held = bits_of(right)
+        notes += [*held, *mosaic_note(len(right), lambda k: read_grey_image(right[k], bits))]
+    # Existence only: damage shows when reading.
+    missing = [
+        (k, name)
+        for k, frame in enumerate(paths)
+        for name, path in zip(CAMERA_NAMES, frame, strict=False)
+        if not path.is_file()
+    ]
+    if missing:
+        first = ", ".join(f"{k} ({camera})" for k, camera in missing[:_NAMED_IN_NOTES])
+        more = ", ..." if len(missing) > _NAMED_IN_NOTES else ""
+        count = len({k for k, _ in missing})
+        notes.append(f"{count} of {len(paths)} frames lack an image: {first}{more}")
+
+    def load(index: int, colour: bool) -> tuple[Image, ...]:
+        read = read_colour_image if colour else read_grey_image
+        images = (require_size(read(p, bits), f"image {p}", *size) for p in paths[index])
+        return rig.rectified(tuple(images))
+
+    return load, tuple(notes)
+
+
+def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where: Path) -> None:
+    images, fault = None, None
+    for frame in paths:
+        try:
+            images = [read_grey_image(path) for path in frame]
+        except FrameError as error:
+            fault = fault or error
+            continue
+        break
+    if images is None:
+        there = all(path.exists() for path in paths[0])
+        why = (
+            f"of the first: {fault}" if there else "check that the file names fit the list of times"
+        )
+        raise DatasetError(
+            f"{where}: not one of {len(paths)} frames has a readable image from each of "
+            f"{len(paths[0])} cameras; {why}"
+        )
+    sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
+    if len(set(sizes)) > 1:
+        named = ", ".join(f"{n} {s}" for n, s in zip(CAMERA_NAMES, sizes, strict=False))
+        raise DatasetError(
+            f"{where}: the cameras' images differ in size ({named}); all must be rectified to one "
+            "size: resize the larger ones, and calibrate them so"
+        )
+    if sizes[0] != f"{size[0]}x{size[1]}":
+        raise CalibrationError(
+            f"{where}: images are {sizes[0]} but the calibration states {size[0]}x{size[1]}"
+            "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
+        )
+
+
+def list_numbered_images(folder: Path) -> dict[int, Path]:
+    """Images of a folder by the number that is their name (``000012.png`` is 12).
+
+    Raises:
+        DatasetError: two images carry the same number.
+    """
+    numbered: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in IMAGE_SUFFIXES or not path.stem.isdecimal():
+            continue
+        number = int(path.stem)
+        if number in numbered:
+            raise DatasetError(
+                f"{folder} has two images of frame {number}: {numbered[number].name} and "
+                f"{path.name}; remove one"
+            )
+        numbered[number] = path
+    return numbered
+
+
+def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
+    """Width and height of the first image that can be read; None without any."""
+    for path in paths:
+        try:
+            height, width = read_grey_image(path).shape
+        except FrameError:
+            continue
+        return width, height
+    return None
+
+
+def require_folder(path: Path, what: str) -> None:
+    """Raises DatasetError unless the folder exists."""
+    if not path.is_dir():
+        raise DatasetError(
+            f"{what} {path} does not exist; check dataset.path and the layout, or say where the "
+            "recording is: --set dataset.path=FOLDER"
+        )
+
+
+# ------------------------------------------------------------------------------------------
 # One image
 
 
@@ -64,6 +186,16 @@ def without_unknown(depth: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.where(depth == np.iinfo(np.uint16).max, np.uint16(0), depth)
 
 
+def _bytes_of(path: Path) -> bytes:
+    remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
+    if path.exists() and not path.is_file():
+        require_file(path, FrameError, remedy)  # reading a pipe waits, a device may have no end
+    try:
+        return path.read_bytes()
+    except OSError as cause:
+        raise FrameError(f"image {path} cannot be read: {cause.strerror}; {remedy}") from cause
+
+
 def decode_grey(data: bytes, name: str, bits: int = 16) -> Image:
     """Grey image (height, width), uint8, of an encoded image's bytes.
 
@@ -91,32 +223,6 @@ def decode_stored(data: bytes, name: str) -> npt.NDArray[Any]:
     return _decoded(data, name, cv2.IMREAD_UNCHANGED)
 
 
-def encoded_png(image: Image) -> bytes:
-    """A grey image, or one in red, green, blue, as a PNG file."""
-    shown = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".png", shown)[1])
-
-
-def require_size(image: Image, name: str, width: int, height: int) -> Image:
-    """The image itself. Raises FrameError where it has another size than calibrated."""
-    if image.shape[:2] != (height, width):
-        raise FrameError(
-            f"{name} is {image.shape[1]}x{image.shape[0]} but the calibration states "
-            f"{width}x{height}; restore the right file"
-        )
-    return image
-
-
-def _bytes_of(path: Path) -> bytes:
-    remedy = "restore the file, or leave the frame out with dataset.start/stop/stride"
-    if path.exists() and not path.is_file():
-        require_file(path, FrameError, remedy)  # reading a pipe waits, a device may have no end
-    try:
-        return path.read_bytes()
-    except OSError as cause:
-        raise FrameError(f"image {path} cannot be read: {cause.strerror}; {remedy}") from cause
-
-
 def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
     if fault := _fault_of_bytes(data):
         remedy = "" if ";" in fault else "; copy the file again from its source"
@@ -130,59 +236,27 @@ def _decoded(data: bytes, name: str, mode: int) -> npt.NDArray[Any]:
     return image
 
 
-# --------------------------------------------------------------------------------------------
-# What is wrong with the bytes of a file, before a decoder would fill in grey
+def require_size(image: Image, name: str, width: int, height: int) -> Image:
+    """The image itself. Raises FrameError where it has another size than calibrated."""
+    if image.shape[:2] != (height, width):
+        raise FrameError(
+            f"{name} is {image.shape[1]}x{image.shape[0]} but the calibration states "
+            f"{width}x{height}; restore the right file"
+        )
+    return image
 
 
-_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_TAIL = 64  # some writers pad a JPEG after its end marker
-# The largest cameras have that many; SIFT would need 30 GB for one such image.
-_MOST_PIXELS = 100_000_000
+def encoded_png(image: Image) -> bytes:
+    """A grey image, or one in red, green, blue, as a PNG file."""
+    shown = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return bytes(cv2.imencode(".png", shown)[1])
 
 
-def _fault_of_bytes(data: bytes) -> str | None:
-    if not data:
-        return "is empty"
-    if data.startswith(_PNG_SIGNATURE):
-        return _png_fault(data)
-    if data.startswith(_JPEG_START):
-        return None if _JPEG_END in data[-_JPEG_TAIL:] else "is truncated (no end marker)"
-    if data.startswith(b"version https://git-lfs"):
-        return "is a pointer of Git LFS; get the image itself: git lfs pull"
-    return None
-
-
-def _png_fault(data: bytes) -> str | None:
-    """What is wrong with the chunks of a PNG file."""
-    at = len(_PNG_SIGNATURE)
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        kind, end = data[at + 4 : at + 8], at + 8 + length
-        if end + 4 > len(data):
-            break
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return f"is damaged (checksum of its {kind.decode('latin-1')} chunk)"
-        if kind == b"IHDR":  # a few bytes of header may stand for gigabytes
-            width, height = (int.from_bytes(data[k : k + 4], "big") for k in (at + 8, at + 12))
-            if not 0 < width * height <= _MOST_PIXELS:
-                most = f"{_MOST_PIXELS / 1e6:.0f} megapixels"
-                return f"claims to be {width}x{height}, at most {most} are read"
-        if kind == b"acTL":
-            return "is animated; give one file an image"
-        if kind == b"IEND":
-            return None
-        at = end + 4
-    return f"is truncated at {len(data)} bytes"
-
-
-# --------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # More than eight bits; mosaics of colours
-
 
 _BITS = (8, 10, 12, 14, 16)
 """Of the sensors whose pixels are stored in 16."""
-
 _SAMPLED_FRAMES = 9  # from first to last, by which it is decided how many bits are used
 _MOSAIC = 1.2
 """Neighbours' difference over that of the next but one: 0.50 to 0.87 in 97 grey pictures, 1.00 in
@@ -274,123 +348,46 @@ def _neighbour_ratio(image: Image) -> float:
     return min(ratios)
 
 
-# --------------------------------------------------------------------------------------------
-# Files of frames
+# ------------------------------------------------------------------------------------------
+# What is wrong with the bytes of a file, before a decoder would fill in grey
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_JPEG_TAIL = 64  # some writers pad a JPEG after its end marker
+# The largest cameras have that many; SIFT would need 30 GB for one such image.
+_MOST_PIXELS = 100_000_000
 
 
-def list_numbered_images(folder: Path) -> dict[int, Path]:
-    """Images of a folder by the number that is their name (``000012.png`` is 12).
-
-    Raises:
-        DatasetError: two images carry the same number.
-    """
-    numbered: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in IMAGE_SUFFIXES or not path.stem.isdecimal():
-            continue
-        number = int(path.stem)
-        if number in numbered:
-            raise DatasetError(
-                f"{folder} has two images of frame {number}: {numbered[number].name} and "
-                f"{path.name}; remove one"
-            )
-        numbered[number] = path
-    return numbered
-
-
-def first_size(paths: Iterable[Path]) -> tuple[int, int] | None:
-    """Width and height of the first image that can be read; None without any."""
-    for path in paths:
-        try:
-            height, width = read_grey_image(path).shape
-        except FrameError:
-            continue
-        return width, height
+def _fault_of_bytes(data: bytes) -> str | None:
+    if not data:
+        return "is empty"
+    if data.startswith(_PNG_SIGNATURE):
+        return _png_fault(data)
+    if data.startswith(_JPEG_START):
+        return None if _JPEG_END in data[-_JPEG_TAIL:] else "is truncated (no end marker)"
+    if data.startswith(b"version https://git-lfs"):
+        return "is a pointer of Git LFS; get the image itself: git lfs pull"
     return None
 
 
-def require_folder(path: Path, what: str) -> None:
-    """Raises DatasetError unless the folder exists."""
-    if not path.is_dir():
-        raise DatasetError(
-            f"{what} {path} does not exist; check dataset.path and the layout, or say where the "
-            "recording is: --set dataset.path=FOLDER"
-        )
-
-
-def open_frames(
-    paths: Sequence[tuple[Path, ...]], rig: StereoRig, where: Path
-) -> tuple[ImageLoader, tuple[str, ...]]:
-    """What reads and rectifies the images of a frame, and what was noticed.
-
-    The first readable frame is checked.
-
-    Args:
-        paths: per frame the files of right, left[, top] camera; they need not exist.
-        rig: of the cameras.
-        where: the recording, in messages.
-
-    Raises:
-        DatasetError: no frame can be read, or the cameras' images differ in size.
-        CalibrationError: their size is not the calibrated one.
-    """
-    bits, size, notes = 16, rig.image_size, []
-    if paths:  # else it is refused where frames are selected
-        _check_sizes(paths, size, where)
-        right = [frame[0] for frame in paths]
-        bits, held = bits_of(right)
-        notes += [*held, *mosaic_note(len(right), lambda k: read_grey_image(right[k], bits))]
-    # Existence only: damage shows when reading.
-    missing = [
-        (k, name)
-        for k, frame in enumerate(paths)
-        for name, path in zip(CAMERA_NAMES, frame, strict=False)
-        if not path.is_file()
-    ]
-    if missing:
-        first = ", ".join(f"{k} ({camera})" for k, camera in missing[:_NAMED_IN_NOTES])
-        more = ", ..." if len(missing) > _NAMED_IN_NOTES else ""
-        count = len({k for k, _ in missing})
-        notes.append(f"{count} of {len(paths)} frames lack an image: {first}{more}")
-
-    def load(index: int, colour: bool) -> tuple[Image, ...]:
-        read = read_colour_image if colour else read_grey_image
-        images = (require_size(read(p, bits), f"image {p}", *size) for p in paths[index])
-        return rig.rectified(tuple(images))
-
-    return load, tuple(notes)
-
-
-_NAMED_IN_NOTES = 5
-
-
-def _check_sizes(paths: Sequence[tuple[Path, ...]], size: tuple[int, int], where: Path) -> None:
-    images, fault = None, None
-    for frame in paths:
-        try:
-            images = [read_grey_image(path) for path in frame]
-        except FrameError as error:
-            fault = fault or error
-            continue
-        break
-    if images is None:
-        there = all(path.exists() for path in paths[0])
-        why = (
-            f"of the first: {fault}" if there else "check that the file names fit the list of times"
-        )
-        raise DatasetError(
-            f"{where}: not one of {len(paths)} frames has a readable image from each of "
-            f"{len(paths[0])} cameras; {why}"
-        )
-    sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in images]
-    if len(set(sizes)) > 1:
-        named = ", ".join(f"{n} {s}" for n, s in zip(CAMERA_NAMES, sizes, strict=False))
-        raise DatasetError(
-            f"{where}: the cameras' images differ in size ({named}); all must be rectified to one "
-            "size: resize the larger ones, and calibrate them so"
-        )
-    if sizes[0] != f"{size[0]}x{size[1]}":
-        raise CalibrationError(
-            f"{where}: images are {sizes[0]} but the calibration states {size[0]}x{size[1]}"
-            "; if the images were resized, scale fx, fy, cx, cy, width and height alike"
-        )
+def _png_fault(data: bytes) -> str | None:
+    """What is wrong with the chunks of a PNG file."""
+    at = len(_PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        kind, end = data[at + 4 : at + 8], at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return f"is damaged (checksum of its {kind.decode('latin-1')} chunk)"
+        if kind == b"IHDR":  # a few bytes of header may stand for gigabytes
+            width, height = (int.from_bytes(data[k : k + 4], "big") for k in (at + 8, at + 12))
+            if not 0 < width * height <= _MOST_PIXELS:
+                most = f"{_MOST_PIXELS / 1e6:.0f} megapixels"
+                return f"claims to be {width}x{height}, at most {most} are read"
+        if kind == b"acTL":
+            return "is animated; give one file an image"
+        if kind == b"IEND":
+            return None
+        at = end + 4
+    return f"is truncated at {len(data)} bytes"

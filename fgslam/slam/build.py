@@ -1,4 +1,4 @@
-"""Builds the parts of a session from what a user names; the only place that distinguishes kinds.
+"""Builds the parts of a session by their settings, from what a user names or hands over.
 
 An estimator is imported when its kind is made: a filter needs no solver of graphs.
 """

@@ -52,11 +52,326 @@ from fgslam.slam.results import (
     session_remarks,
 )
 
-# ------------------------------------------------------------------------------------------
-# Input of a session, checked before it touches any state
-
 Images: TypeAlias = Sequence[npt.ArrayLike]
 """Images (left, right[, top]) of one instant."""
+
+
+class Session:
+    """Simultaneous localisation and mapping over stereo frames (Se, Lowe and Little 2001).
+
+    Frames are handed in by :meth:`track`, which never needs the next one; :meth:`result` may be
+    asked for at any time and changes nothing of what follows. Sessions are independent: several
+    may run side by side in one process, each used by one thread at a time. A frame that is refused
+    leaves the session as it was.
+
+    The world is the right camera's first frame: x right, y down, z forward, metres. Frames before
+    the first one that shows enough to begin a map are left out of every result when that one comes,
+    unless odometry was measured to it: nothing shows where they lie.
+
+    Attributes:
+        rig: the cameras.
+        frontend: settings of features, matching and tracking.
+        numbering: number in its recording of the first frame tracked, and the step to the next;
+            the log keeps them.
+        pipeline: the parts: stereo matching, tracking, motion model, estimator, place recognition.
+        recorder: everything computed so far, frame by frame.
+    """
+
+    def __init__(
+        self,
+        rig: CameraRig,
+        estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
+        *,
+        frontend: FrontendSettings | Mapping[str, Any] | None = None,
+        odometry: OdometrySettings | MotionModel | None = None,
+        features: FeatureExtractor | None = None,
+        seed: int = 0,
+        beginning: Arrival | MapStart | None = None,
+    ) -> None:
+        """Begins with an empty map, or in a saved one.
+
+        Args:
+            rig: the rectified cameras, two or three.
+            estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
+                `ekf`, `fixed_lag`, `sliding_window`, `isam2` or `batch`), settings of one, or an
+                own object with the members of :class:`fgslam.backend.protocol.Estimator`.
+            frontend: settings of features, matching and tracking; None for the defaults; a mapping
+                for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
+            odometry: what predicts the motion. None: the odometry that is handed in, and constant
+                velocity over frames without any. With `constant_velocity` what is handed in is
+                ignored. Or an own object with the members of
+                :class:`fgslam.slam.motion.MotionModel`, for this session alone.
+            features: an own extractor, from a grey image (height, width) uint8 to
+                :class:`~fgslam.core.types.Features`; it is called from several threads, with two
+                cameras for the right image alone (``frontend.stereo.others``). None for SIFT.
+            seed: of everything random: samples of place recognition.
+            beginning: a saved map: with the first frame's place in it, or to be located in by the
+                first frames. Those before the first one that could be located have no pose.
+
+        Raises:
+            CalibrationError: the rig is impossible.
+            ConfigError: no such estimator, it cannot use what will be measured or begin in a map,
+                the seed is negative, or a setting of the front-end is not known or not usable.
+            MapError: other cameras made the map, or it is empty.
+        """
+        require_rig(rig)
+        require_seed(seed, "session")
+        frontend = chosen_frontend(frontend)
+        odometry = chosen_odometry(odometry)
+        self.rig = rig
+        self.frontend = frontend
+        self.numbering = (0, 1)
+        chosen = chosen_estimator(estimator)
+        self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed)
+        self._start: MapStart | None = None
+        own = is_settings(chosen) and not hasattr(odometry, "between")
+        self._movable = beginning is None and own
+        if isinstance(beginning, MapStart):
+            beginning = self._begun(beginning, chosen, seed)
+        self.describer = make_describer(rig, frontend, checked_extractor(features))
+        self.pipeline = self._made(beginning)
+        sensor = as_measured(rig, frontend)
+        self.recorder = RunRecorder(MeasurementLog(sensor, description_of(self.pipeline.motion)))
+        self._left_out = _LeftOut()
+        self._seen = FirstImages()
+        self._margins = rig.margins if isinstance(rig, StereoRig) else ()
+        self._odometry = odometry
+        self._ended = ""
+        self._failed = False
+
+    # -- frames --------------------------------------------------------------------------------
+
+    def track(
+        self,
+        t: float,
+        images: Images | None,
+        odometry: Odometry | FloatArray | npt.ArrayLike | None = None,
+    ) -> Step:
+        """Takes in the next frame; returns its pose and what was matched.
+
+        Args:
+            t: time stamp in seconds, later than the last frame's.
+            images: (left, right) or (left, right, top), taken at the same moment and rectified, or
+                raw where the rig was loaded with its rectification:
+                (height, width) grey or (height, width, 3) red, green, blue; uint8, or uint16 of
+                which the upper eight bits count; any memory layout. None where the cameras gave
+                nothing: the frame is then placed by the odometry alone.
+            odometry: motion of the robot's body since the last frame: a (4, 4) pose of the body now
+                in its frame before, metres, with the noise of the odometry settings; or an
+                :class:`Odometry` with its own covariance. None where none was measured: constant
+                velocity. That of the first frame is ignored.
+
+        Raises:
+            FrameError: wrong number, size, type or shape of images, or the time does not increase.
+            OdometryError: the odometry is not finite, of another shape, or no rigid motion.
+            SessionError: the session is closed, or its estimator failed before.
+            EstimatorError: the estimator failed in this frame; the session is then at its end,
+                with :meth:`result` of the frames before. So it is after any other exception that
+                an estimator of your own raises.
+        """
+        self._require_open()
+        i = self._left_out.count if self._start is not None else len(self.recorder)
+        timestamp = later_time(t, self._last_time(), "session", FrameError)
+        body = checked_odometry(odometry, self._odometry) if i else None
+        checked = None if images is None else checked_images(images, self.rig)
+        frame = None if checked is None else Frame(i, timestamp, checked, self._margins)
+        with one_blas_thread():
+            bare = undescribed(i, frame)
+            every = self.frontend.tracking == "sift"
+            found = self.describer.complete(bare) if every or self._start is not None else bare
+            if images is not None:
+                self._seen.add(found, any_uint16(images))
+            if self._start is None:
+                now = found
+                if self.begins_anew(found, body):
+                    # An extractor that fails does so before anything has changed.
+                    now, body = self.describer.of_reference(replace(found, i=0)), None
+                    self._begin_anew(timestamp)
+                report = self.advance(now, timestamp, body)
+                if images is not None and not found.features:
+                    self._seen.add(report.found, any_uint16(images))
+                return Step.of(report)
+            if not self._arrives(self._start, found, timestamp):
+                return Step.not_located(timestamp, len(self.pipeline.tracker.database))
+            first = found if every else bare  # then measured as every key frame is
+            return Step.of(self.advance(replace(first, i=0), timestamp))
+
+    def advance(
+        self,
+        found: FeatureFrame,
+        timestamp: float,
+        body: Odometry | None = None,
+        index: int | None = None,
+        wait_ms: float = 0.0,
+        precision_of: Callable[[FrameReport], float] | None = None,
+    ) -> FrameReport:
+        """Takes in a frame whose features are known: what :meth:`track` does after finding them.
+
+        Args:
+            found: the frame and its features; ``found.i`` counts the session's frames.
+            timestamp: seconds.
+            body: odometry of the body, checked.
+            index: number of the frame in its recording, for the log; None: by ``numbering``.
+            wait_ms: time that the loop waited for this frame, for the record.
+            precision_of: fraction of right stereo matches, where truth is known.
+        """
+        self._require_open()
+        first, stride = self.numbering
+        index = first + stride * found.i if index is None else index
+        try:
+            report = self.pipeline.process(found, index, timestamp, self._usable(body))
+            precision = float("nan") if precision_of is None else precision_of(report)
+            self.recorder.add(report, wait_ms, precision)
+        except BaseException as error:
+            if self.pipeline.rewound:
+                raise
+            # Parts of the frame may be recorded: going on would estimate something else.
+            self._failed = True
+            self._ended = f"it failed at t = {timestamp:.6f} s ({' '.join(str(error).split())})"
+            raise
+        return report
+
+    def _require_open(self) -> None:
+        if self._ended:
+            raise SessionError(f"the session takes no more frames: {self._ended}; make a new one")
+
+    def _last_time(self) -> float | None:
+        increments = self.recorder.log.increments
+        return increments[-1].timestamp if increments else self._left_out.timestamp
+
+    def _usable(self, body: Odometry | None) -> Odometry | None:
+        return body if self.pipeline.motion.uses_odometry else None
+
+    def begins_anew(self, found: FeatureFrame, body: Odometry | None) -> bool:
+        """Whether the world begins with this frame, and those before it are to be left out.
+
+        They had too few stereo matches to place a frame after them, this one has enough, and no
+        odometry measured how the camera moved to it.
+
+        Args:
+            found: the frame; its features are found where it came without.
+            body: odometry of the body since the last frame, as for :meth:`advance`.
+        """
+        least, known = self.frontend.ego_motion.min_matches, self._usable(body)
+        if not (self._movable and len(self)) or (known is not None and not known.turned):
+            return False
+        if self.recorder.most_stereo >= least:
+            return False
+        return self.pipeline.can_initialise(found, least)
+
+    def _begin_anew(self, timestamp: float) -> None:
+        """Leaves out all frames so far: the next one is the first."""
+        count = len(self)
+        self._left_out = _LeftOut(self._left_out.count + count, timestamp)
+        self.log.increments.clear()
+        self.recorder = RunRecorder(self.log, left_out=self._left_out.count)
+        self._begin(None, count)
+
+    def _begin(self, arrival: Arrival | None, count: int) -> None:
+        """New parts, for a session that begins after ``count`` frames."""
+        self.pipeline = self._made(arrival)
+        first, stride = self.numbering
+        self.numbering = (first + stride * count, stride)
+
+    def _made(self, beginning: Arrival | None) -> SlamPipeline:
+        pipeline = self._make(beginning)
+        pipeline.describe = self.describer.complete
+        pipeline.describe_reference = self.describer.of_reference
+        return pipeline
+
+    def _begun(
+        self, start: MapStart, estimator: EstimatorSettings | Estimator, seed: int
+    ) -> Arrival:
+        """The first pose in a saved map; until a frame is located, that of the map's world."""
+        if not is_settings(estimator):
+            raise ConfigError(
+                "estimator: an own estimator begins at a pose of its own, not where the first "
+                "frame is located in the map; give a kind or its settings"
+            )
+        start.require_usable(self.rig)
+        known = start.known()
+        if known is not None:
+            return known
+        self._start, self._map = start, start.name
+        self._locate = make_locator(self.rig, self.frontend, start.saved, seed)
+        return start.at(np.eye(4), relocalised=True)
+
+    def _arrives(self, start: MapStart, found: FeatureFrame, timestamp: float) -> bool:
+        """True if the frame can be located in the map: the session then begins with it."""
+        left_out, why = self._left_out, found.problem
+        if found.frame is not None:
+            located = self._locate(found)
+            why = located.why
+            if located.found:
+                self._begin(start.at(located.wTc, relocalised=True), left_out.count)
+                self._start = None
+                return True
+        self._left_out = _LeftOut(left_out.count + 1, timestamp, why)
+        return False
+
+    def __len__(self) -> int:
+        """Frames so far."""
+        return len(self.recorder)
+
+    # -- results -------------------------------------------------------------------------------
+
+    def result(self) -> SessionResult:
+        """Trajectory, covariances and map as known now; tracking may go on afterwards.
+
+        Raises:
+            SessionError: there is no frame yet.
+        """
+        left_out = self._left_out
+        if not len(self.recorder):
+            raise SessionError(self._why_empty())
+        notes = session_remarks(self.pipeline, self.recorder, self._seen)
+        if left_out.count:
+            notes = (*notes, Remark("left_out", values={"count": left_out.count}))
+        with one_blas_thread():
+            return result_of(self.pipeline, self.recorder, notes, self._failed)
+
+    def _why_empty(self) -> str:
+        if self._failed:
+            return f"the session has no result: {self._ended}"
+        left_out = self._left_out
+        if left_out.count:
+            why = "; ".join(filter(None, (left_out.why, self._seen.fault())))
+            return f"none of {left_out.count} frames could be located in {self._map}: {why}"
+        return "no frame has been tracked yet; call track first"
+
+    @property
+    def failed(self) -> bool:
+        """True if a frame failed half-way: the parts may know more than the record does."""
+        return self._failed
+
+    @property
+    def log(self) -> MeasurementLog:
+        """Measurements of all frames so far, which any estimator can replay."""
+        return self.recorder.log
+
+    def close(self) -> None:
+        """Ends the session and its threads; results can still be asked for."""
+        self._ended = self._ended or "it is closed"
+        self.describer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """Frames before the first that was located in the map: how many, the last one's time, why."""
+
+    count: int = 0
+    timestamp: float | None = None
+    why: str = ""
+
+
+# ------------------------------------------------------------------------------------------
+# Input of a session, checked before it touches any state
 
 _NAMES = ("left", "right", "top")
 _SYMMETRY = 1e-6  # relative: covariances that were added up in another order
@@ -70,11 +385,6 @@ def checked_extractor(features: FeatureExtractor | None) -> FeatureExtractor | N
             "to fgslam.Features, or None for SIFT"
         )
     return features
-
-
-def _is_colour(image: np.ndarray) -> bool:
-    """Whether an array is one image with colours, and not several images."""
-    return image.ndim == 3 and image.shape[2] in (3, 4)
 
 
 def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
@@ -116,6 +426,11 @@ def checked_images(images: Images, rig: CameraRig) -> tuple[Image, ...]:
     left, right, *top = grey
     inside = (right, left, *top)
     return rig.rectified(inside) if isinstance(rig, StereoRig) else inside
+
+
+def _is_colour(image: np.ndarray) -> bool:
+    """Whether an array is one image with colours, and not several images."""
+    return image.ndim == 3 and image.shape[2] in (3, 4)
 
 
 def checked_odometry(
@@ -250,319 +565,3 @@ def _joined(first: BodyMotion, second: BodyMotion) -> BodyMotion:
 
 def _motion(odometry: BodyMotion) -> FloatArray:
     return np.asarray(odometry.motion if isinstance(odometry, Odometry) else odometry, np.float64)
-
-
-@dataclass(frozen=True)
-class _LeftOut:
-    """Frames before the first that was located in the map: how many, the last one's time, why."""
-
-    count: int = 0
-    timestamp: float | None = None
-    why: str = ""
-
-
-class Session:
-    """Simultaneous localisation and mapping over stereo frames (Se, Lowe and Little 2001).
-
-    Frames are handed in by :meth:`track`, which never needs the next one; :meth:`result` may be
-    asked for at any time and changes nothing of what follows. Sessions are independent: several
-    may run side by side in one process, each used by one thread at a time. A frame that is refused
-    leaves the session as it was.
-
-    The world is the right camera's first frame: x right, y down, z forward, metres. Frames before
-    the first one that shows enough to begin a map are left out of every result when that one comes,
-    unless odometry was measured to it: nothing shows where they lie.
-
-    Attributes:
-        rig: the cameras.
-        frontend: settings of features, matching and tracking.
-        numbering: number in its recording of the first frame tracked, and the step to the next;
-            the log keeps them.
-        pipeline: the parts: stereo matching, tracking, motion model, estimator, place recognition.
-        recorder: everything computed so far, frame by frame.
-    """
-
-    def __init__(
-        self,
-        rig: CameraRig,
-        estimator: str | EstimatorSettings | Estimator = DEFAULT_ESTIMATOR,
-        *,
-        frontend: FrontendSettings | Mapping[str, Any] | None = None,
-        odometry: OdometrySettings | MotionModel | None = None,
-        features: FeatureExtractor | None = None,
-        seed: int = 0,
-        beginning: Arrival | MapStart | None = None,
-    ) -> None:
-        """Begins with an empty map, or in a saved one.
-
-        Args:
-            rig: the rectified cameras, two or three.
-            estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
-                `ekf`, `fixed_lag`, `sliding_window`, `isam2` or `batch`), settings of one, or an
-                own object with the members of :class:`fgslam.backend.protocol.Estimator`.
-            frontend: settings of features, matching and tracking; None for the defaults; a mapping
-                for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
-            odometry: what predicts the motion. None: the odometry that is handed in, and constant
-                velocity over frames without any. With `constant_velocity` what is handed in is
-                ignored. Or an own object with the members of
-                :class:`fgslam.slam.motion.MotionModel`, for this session alone.
-            features: an own extractor, from a grey image (height, width) uint8 to
-                :class:`~fgslam.core.types.Features`; it is called from several threads, with two
-                cameras for the right image alone (``frontend.stereo.others``). None for SIFT.
-            seed: of everything random: samples of place recognition.
-            beginning: a saved map: with the first frame's place in it, or to be located in by the
-                first frames. Those before the first one that could be located have no pose.
-
-        Raises:
-            CalibrationError: the rig is impossible.
-            ConfigError: no such estimator, it cannot use what will be measured or begin in a map,
-                the seed is negative, or a setting of the front-end is not known or not usable.
-            MapError: other cameras made the map, or it is empty.
-        """
-        require_rig(rig)
-        require_seed(seed, "session")
-        frontend = chosen_frontend(frontend)
-        odometry = chosen_odometry(odometry)
-        self.rig = rig
-        self.frontend = frontend
-        self.numbering = (0, 1)
-        chosen = chosen_estimator(estimator)
-        self._make = partial(make_pipeline, rig, frontend, odometry, chosen, seed)
-        self._start: MapStart | None = None
-        own = is_settings(chosen) and not hasattr(odometry, "between")
-        self._movable = beginning is None and own
-        if isinstance(beginning, MapStart):
-            beginning = self._begun(beginning, chosen, seed)
-        self.describer = make_describer(rig, frontend, checked_extractor(features))
-        self.pipeline = self._made(beginning)
-        sensor = as_measured(rig, frontend)
-        self.recorder = RunRecorder(MeasurementLog(sensor, description_of(self.pipeline.motion)))
-        self._left_out = _LeftOut()
-        self._seen = FirstImages()
-        self._margins = rig.margins if isinstance(rig, StereoRig) else ()
-        self._odometry = odometry
-        self._ended = ""
-        self._failed = False
-
-    def _made(self, beginning: Arrival | None) -> SlamPipeline:
-        pipeline = self._make(beginning)
-        pipeline.describe = self.describer.complete
-        pipeline.describe_reference = self.describer.of_reference
-        return pipeline
-
-    def _begun(
-        self, start: MapStart, estimator: EstimatorSettings | Estimator, seed: int
-    ) -> Arrival:
-        """The first pose in a saved map; until a frame is located, that of the map's world."""
-        if not is_settings(estimator):
-            raise ConfigError(
-                "estimator: an own estimator begins at a pose of its own, not where the first "
-                "frame is located in the map; give a kind or its settings"
-            )
-        start.require_usable(self.rig)
-        known = start.known()
-        if known is not None:
-            return known
-        self._start, self._map = start, start.name
-        self._locate = make_locator(self.rig, self.frontend, start.saved, seed)
-        return start.at(np.eye(4), relocalised=True)
-
-    # -- frames ------------------------------------------------------------------------------
-
-    def track(
-        self,
-        t: float,
-        images: Images | None,
-        odometry: Odometry | FloatArray | npt.ArrayLike | None = None,
-    ) -> Step:
-        """Takes in the next frame; returns its pose and what was matched.
-
-        Args:
-            t: time stamp in seconds, later than the last frame's.
-            images: (left, right) or (left, right, top), taken at the same moment and rectified, or
-                raw where the rig was loaded with its rectification:
-                (height, width) grey or (height, width, 3) red, green, blue; uint8, or uint16 of
-                which the upper eight bits count; any memory layout. None where the cameras gave
-                nothing: the frame is then placed by the odometry alone.
-            odometry: motion of the robot's body since the last frame: a (4, 4) pose of the body now
-                in its frame before, metres, with the noise of the odometry settings; or an
-                :class:`Odometry` with its own covariance. None where none was measured: constant
-                velocity. That of the first frame is ignored.
-
-        Raises:
-            FrameError: wrong number, size, type or shape of images, or the time does not increase.
-            OdometryError: the odometry is not finite, of another shape, or no rigid motion.
-            SessionError: the session is closed, or its estimator failed before.
-            EstimatorError: the estimator failed in this frame; the session is then at its end,
-                with :meth:`result` of the frames before. So it is after any other exception that
-                an estimator of your own raises.
-        """
-        self._require_open()
-        i = self._left_out.count if self._start is not None else len(self.recorder)
-        timestamp = later_time(t, self._last_time(), "session", FrameError)
-        body = checked_odometry(odometry, self._odometry) if i else None
-        checked = None if images is None else checked_images(images, self.rig)
-        frame = None if checked is None else Frame(i, timestamp, checked, self._margins)
-        with one_blas_thread():
-            bare = undescribed(i, frame)
-            every = self.frontend.tracking == "sift"
-            found = self.describer.complete(bare) if every or self._start is not None else bare
-            if images is not None:
-                self._seen.add(found, any_uint16(images))
-            if self._start is None:
-                now = found
-                if self.begins_anew(found, body):
-                    # An extractor that fails does so before anything has changed.
-                    now, body = self.describer.of_reference(replace(found, i=0)), None
-                    self._begin_anew(timestamp)
-                report = self.advance(now, timestamp, body)
-                if images is not None and not found.features:
-                    self._seen.add(report.found, any_uint16(images))
-                return Step.of(report)
-            if not self._arrives(self._start, found, timestamp):
-                return Step.not_located(timestamp, len(self.pipeline.tracker.database))
-            first = found if every else bare  # then measured as every key frame is
-            return Step.of(self.advance(replace(first, i=0), timestamp))
-
-    def _arrives(self, start: MapStart, found: FeatureFrame, timestamp: float) -> bool:
-        """True if the frame can be located in the map: the session then begins with it."""
-        left_out, why = self._left_out, found.problem
-        if found.frame is not None:
-            located = self._locate(found)
-            why = located.why
-            if located.found:
-                self._begin(start.at(located.wTc, relocalised=True), left_out.count)
-                self._start = None
-                return True
-        self._left_out = _LeftOut(left_out.count + 1, timestamp, why)
-        return False
-
-    def begins_anew(self, found: FeatureFrame, body: Odometry | None) -> bool:
-        """Whether the world begins with this frame, and those before it are to be left out.
-
-        They had too few stereo matches to place a frame after them, this one has enough, and no
-        odometry measured how the camera moved to it.
-
-        Args:
-            found: the frame; its features are found where it came without.
-            body: odometry of the body since the last frame, as for :meth:`advance`.
-        """
-        least, known = self.frontend.ego_motion.min_matches, self._usable(body)
-        if not (self._movable and len(self)) or (known is not None and not known.turned):
-            return False
-        if self.recorder.most_stereo >= least:
-            return False
-        return self.pipeline.can_initialise(found, least)
-
-    def _begin_anew(self, timestamp: float) -> None:
-        """Leaves out all frames so far: the next one is the first."""
-        count = len(self)
-        self._left_out = _LeftOut(self._left_out.count + count, timestamp)
-        self.log.increments.clear()
-        self.recorder = RunRecorder(self.log, left_out=self._left_out.count)
-        self._begin(None, count)
-
-    def _begin(self, arrival: Arrival | None, count: int) -> None:
-        """New parts, for a session that begins after ``count`` frames."""
-        self.pipeline = self._made(arrival)
-        first, stride = self.numbering
-        self.numbering = (first + stride * count, stride)
-
-    def advance(
-        self,
-        found: FeatureFrame,
-        timestamp: float,
-        body: Odometry | None = None,
-        index: int | None = None,
-        wait_ms: float = 0.0,
-        precision_of: Callable[[FrameReport], float] | None = None,
-    ) -> FrameReport:
-        """Takes in a frame whose features are known: what :meth:`track` does after finding them.
-
-        Args:
-            found: the frame and its features; ``found.i`` counts the session's frames.
-            timestamp: seconds.
-            body: odometry of the body, checked.
-            index: number of the frame in its recording, for the log; None: by ``numbering``.
-            wait_ms: time that the loop waited for this frame, for the record.
-            precision_of: fraction of right stereo matches, where truth is known.
-        """
-        self._require_open()
-        first, stride = self.numbering
-        index = first + stride * found.i if index is None else index
-        try:
-            report = self.pipeline.process(found, index, timestamp, self._usable(body))
-            precision = float("nan") if precision_of is None else precision_of(report)
-            self.recorder.add(report, wait_ms, precision)
-        except BaseException as error:
-            if self.pipeline.rewound:
-                raise
-            # Parts of the frame may be recorded: going on would estimate something else.
-            self._failed = True
-            self._ended = f"it failed at t = {timestamp:.6f} s ({' '.join(str(error).split())})"
-            raise
-        return report
-
-    def __len__(self) -> int:
-        """Frames so far."""
-        return len(self.recorder)
-
-    # -- results -----------------------------------------------------------------------------
-
-    @property
-    def failed(self) -> bool:
-        """True if a frame failed half-way: the parts may know more than the record does."""
-        return self._failed
-
-    @property
-    def log(self) -> MeasurementLog:
-        """Measurements of all frames so far, which any estimator can replay."""
-        return self.recorder.log
-
-    def result(self) -> SessionResult:
-        """Trajectory, covariances and map as known now; tracking may go on afterwards.
-
-        Raises:
-            SessionError: there is no frame yet.
-        """
-        left_out = self._left_out
-        if not len(self.recorder):
-            raise SessionError(self._why_empty())
-        notes = session_remarks(self.pipeline, self.recorder, self._seen)
-        if left_out.count:
-            notes = (*notes, Remark("left_out", values={"count": left_out.count}))
-        with one_blas_thread():
-            return result_of(self.pipeline, self.recorder, notes, self._failed)
-
-    def close(self) -> None:
-        """Ends the session and its threads; results can still be asked for."""
-        self._ended = self._ended or "it is closed"
-        self.describer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    # ----------------------------------------------------------------------------------------
-
-    def _why_empty(self) -> str:
-        if self._failed:
-            return f"the session has no result: {self._ended}"
-        left_out = self._left_out
-        if left_out.count:
-            why = "; ".join(filter(None, (left_out.why, self._seen.fault())))
-            return f"none of {left_out.count} frames could be located in {self._map}: {why}"
-        return "no frame has been tracked yet; call track first"
-
-    def _require_open(self) -> None:
-        if self._ended:
-            raise SessionError(f"the session takes no more frames: {self._ended}; make a new one")
-
-    def _last_time(self) -> float | None:
-        increments = self.recorder.log.increments
-        return increments[-1].timestamp if increments else self._left_out.timestamp
-
-    def _usable(self, body: Odometry | None) -> Odometry | None:
-        return body if self.pipeline.motion.uses_odometry else None

@@ -109,6 +109,73 @@ def correct(
     return Correction(step, gain, half, nis, count, len(matches))
 
 
+def _with_landmarks(
+    covariance: GrowingCovariance, front: FloatArray, matches: Matches
+) -> tuple[FloatArray, FloatArray]:
+    """``P H^T`` (n, 3k) and ``H P H^T + R`` (3k, 3k) of the matches."""
+    n, k = len(front), len(matches)
+    rows = rows_of(matches.blocks)
+    columns = covariance.columns(rows.ravel())
+    columns[:FRONT] = front[rows.ravel()].T
+    by_block = columns.reshape(n, k, 3).swapaxes(0, 1) @ matches.by_landmark.swapaxes(1, 2)
+    by_pose = matches.by_pose.reshape(-1, FRONT)
+    cross = by_block.swapaxes(0, 1).reshape(n, 3 * k) + front @ by_pose.T
+    s = by_pose @ cross[:FRONT] + (matches.by_landmark @ cross[rows]).reshape(3 * k, 3 * k)
+    s = 0.5 * (s + s.T)
+    s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] += matches.noise
+    return cross, s
+
+
+def _within_gate(matches: Matches, s: FloatArray, gate_sigmas: float) -> BoolArray:
+    """Mask (k,) of matches whose own innovation is within the gate of its own covariance."""
+    k = len(matches)
+    if gate_sigmas == 0.0 or not k:
+        return np.ones(k, np.bool_)
+    own = s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+    roots = _root(own, "an innovation's covariance")
+    whitened = np.linalg.solve(roots, matches.innovation[:, :, None])[:, :, 0]
+    return np.asarray((whitened**2).sum(axis=1) <= gate_sigmas**2)
+
+
+def _with_floor(
+    cross: FloatArray, s: FloatArray, front: FloatArray, floor: FloorMeasurement
+) -> tuple[FloatArray, FloatArray]:
+    """The same with the floor's rows after the matches'."""
+    if not len(floor.innovation):
+        return cross, s
+    joint = floor.jacobian @ cross[:FRONT]
+    by_floor = front @ floor.jacobian.T
+    own = floor.jacobian @ by_floor[:FRONT] + np.diag(floor.variance)
+    return np.hstack([cross, by_floor]), np.block([[s, joint.T], [joint, own]])
+
+
+def _root(matrices: FloatArray, what: str) -> FloatArray:
+    """Cholesky's lower factors (..., n, n)."""
+    try:
+        root = np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        raise DivergedError(f"{what} is not positive definite") from None
+    if not np.isfinite(root).all():
+        raise DivergedError(f"{what} is not finite")
+    return np.asarray(root)
+
+
+def _require_definite(
+    covariance: GrowingCovariance, front: FloatArray, gain: FloatArray, half: FloatArray
+) -> None:
+    """Raises DivergedError where the pose's block, or a landmark's, would not be a covariance."""
+    pose = front[:FRONT] - gain[:FRONT] @ half[:FRONT].T - half[:FRONT] @ gain[:FRONT].T
+    if not np.isfinite(pose).all():
+        raise DivergedError("the pose's covariance is not finite")
+    variances = np.linalg.eigvalsh(pose)
+    if variances[0] < -_NEGATIVE * max(variances[-1], 1e-300):
+        raise DivergedError("the pose's covariance is not positive")
+    count, m = (len(gain) - FRONT) // 3, gain.shape[1]
+    lost = gain[FRONT:].reshape(count, 3, m) @ half[FRONT:].reshape(count, 3, m).swapaxes(1, 2)
+    before = covariance.diagonal_blocks(np.arange(count))
+    _root(before - lost - lost.swapaxes(1, 2), "a landmark's covariance")
+
+
 def correct_iterated(
     covariance: GrowingCovariance, matches_at: Callable[[FloatArray], Matches], fixed: bool
 ) -> Correction:
@@ -138,23 +205,6 @@ def correct_iterated(
             return found
         step = found.step
     raise DivergedError(f"the correction does not settle ({change:.2g} after {_ITERATIONS} steps)")
-
-
-def _with_landmarks(
-    covariance: GrowingCovariance, front: FloatArray, matches: Matches
-) -> tuple[FloatArray, FloatArray]:
-    """``P H^T`` (n, 3k) and ``H P H^T + R`` (3k, 3k) of the matches."""
-    n, k = len(front), len(matches)
-    rows = rows_of(matches.blocks)
-    columns = covariance.columns(rows.ravel())
-    columns[:FRONT] = front[rows.ravel()].T
-    by_block = columns.reshape(n, k, 3).swapaxes(0, 1) @ matches.by_landmark.swapaxes(1, 2)
-    by_pose = matches.by_pose.reshape(-1, FRONT)
-    cross = by_block.swapaxes(0, 1).reshape(n, 3 * k) + front @ by_pose.T
-    s = by_pose @ cross[:FRONT] + (matches.by_landmark @ cross[rows]).reshape(3 * k, 3 * k)
-    s = 0.5 * (s + s.T)
-    s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)] += matches.noise
-    return cross, s
 
 
 class FullEkf:
@@ -195,33 +245,10 @@ class FullEkf:
         self._map: LandmarkMap | None = None
         self._fixed = False
 
-    @property
-    def keeps_maps(self) -> bool:
-        """True: as in Schmidt's filter, landmarks may be uncertain and yet not be changed."""
-        return True
-
-    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
-        """Takes a saved map over. Raises EstimatorError beyond `max_landmarks`."""
-        self._require_space("the saved map", len(landmarks))
-        self._covariance.append_independent(landmarks.covariances)
-        self._ids, self._positions = landmarks.ids, landmarks.positions
-        self._fixed = fixed
-        if fixed:
-            self._considered.hold_map()
-        self._map = None
-
     def predict(self, odometry: Odometry | None) -> Prediction:
         """Pose after the camera moved by ``odometry``, on the floor if that is hard."""
         wTc, front = self._moved(odometry)
         return Prediction(wTc, front[:FRONT])
-
-    def landmarks(self) -> LandmarkMap:
-        """Landmarks with their marginal covariances."""
-        if self._map is None:
-            order = np.argsort(self._ids, kind="stable")
-            covariances = self._covariance.diagonal_blocks(order)
-            self._map = LandmarkMap(self._ids[order], self._positions[order], covariances)
-        return self._map
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Predicts, corrects by all matches at once, drops the pruned, adds the new.
@@ -267,40 +294,6 @@ class FullEkf:
         return UpdateStats(
             current.wTc, current.covariance, len(self._ids), found.nis, found.nis_dof, closed
         )
-
-    def estimate(self) -> Estimate:
-        """Trajectory as filtered, and the map."""
-        remarks = []
-        if self._gated:
-            remarks.append(
-                f"{self._gated} of {self._matched} matches left out: innovation beyond "
-                f"{self._settings.gate_sigmas:g} standard deviations"
-            )
-        if self._skipped:
-            remarks.append(
-                f"{self._skipped} observations left out: landmark unknown, at infinity or behind"
-            )
-        return Estimate(
-            self._past.trajectory(),
-            self._past.pose_covariances(),
-            self._considered.landmarks(self.landmarks()),
-            (*remarks, *self._remarks),
-            noise_factor=1.0,
-        )
-
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Marginal covariances (k, 3, 3) of the named landmarks."""
-        held = self.landmarks()
-        return self._considered.landmarks(held.select(held.rows(ids))).covariances
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance of the last pose and the named landmarks, the rig's terms included."""
-        rows = rows_of(self._blocks(ids)).ravel()
-        return self._considered.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
-
-    def remake(self) -> None:
-        """The map is made anew of what was put back."""
-        self._map = None
 
     # -- what may fail, before anything is changed ---------------------------------------------
 
@@ -450,8 +443,67 @@ class FullEkf:
         known = LandmarkMap(self._ids[order], self._positions, np.empty(0))
         return order[known.rows(ids)]
 
+    # -- what is reported, and a saved map -----------------------------------------------------
 
-# --------------------------------------------------------------------------------------------
+    def landmarks(self) -> LandmarkMap:
+        """Landmarks with their marginal covariances."""
+        if self._map is None:
+            order = np.argsort(self._ids, kind="stable")
+            covariances = self._covariance.diagonal_blocks(order)
+            self._map = LandmarkMap(self._ids[order], self._positions[order], covariances)
+        return self._map
+
+    def estimate(self) -> Estimate:
+        """Trajectory as filtered, and the map."""
+        remarks = []
+        if self._gated:
+            remarks.append(
+                f"{self._gated} of {self._matched} matches left out: innovation beyond "
+                f"{self._settings.gate_sigmas:g} standard deviations"
+            )
+        if self._skipped:
+            remarks.append(
+                f"{self._skipped} observations left out: landmark unknown, at infinity or behind"
+            )
+        return Estimate(
+            self._past.trajectory(),
+            self._past.pose_covariances(),
+            self._considered.landmarks(self.landmarks()),
+            (*remarks, *self._remarks),
+            noise_factor=1.0,
+        )
+
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Marginal covariances (k, 3, 3) of the named landmarks."""
+        held = self.landmarks()
+        return self._considered.landmarks(held.select(held.rows(ids))).covariances
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Joint covariance of the last pose and the named landmarks, the rig's terms included."""
+        rows = rows_of(self._blocks(ids)).ravel()
+        return self._considered.joint(ids, self._covariance.square(np.r_[:FRONT, rows]))
+
+    @property
+    def keeps_maps(self) -> bool:
+        """True: as in Schmidt's filter, landmarks may be uncertain and yet not be changed."""
+        return True
+
+    def begin_in(self, landmarks: LandmarkMap, hits: IntArray, fixed: bool) -> None:
+        """Takes a saved map over. Raises EstimatorError beyond `max_landmarks`."""
+        self._require_space("the saved map", len(landmarks))
+        self._covariance.append_independent(landmarks.covariances)
+        self._ids, self._positions = landmarks.ids, landmarks.positions
+        self._fixed = fixed
+        if fixed:
+            self._considered.hold_map()
+        self._map = None
+
+    def remake(self) -> None:
+        """The map is made anew of what was put back."""
+        self._map = None
+
+
+# ------------------------------------------------------------------------------------------
 # What a correction is made of
 
 
@@ -576,57 +628,7 @@ class DivergedError(Exception):
     """A matrix that is no covariance any more, named; the filter makes an EstimatorError of it."""
 
 
-def _within_gate(matches: Matches, s: FloatArray, gate_sigmas: float) -> BoolArray:
-    """Mask (k,) of matches whose own innovation is within the gate of its own covariance."""
-    k = len(matches)
-    if gate_sigmas == 0.0 or not k:
-        return np.ones(k, np.bool_)
-    own = s.reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
-    roots = _root(own, "an innovation's covariance")
-    whitened = np.linalg.solve(roots, matches.innovation[:, :, None])[:, :, 0]
-    return np.asarray((whitened**2).sum(axis=1) <= gate_sigmas**2)
-
-
-def _with_floor(
-    cross: FloatArray, s: FloatArray, front: FloatArray, floor: FloorMeasurement
-) -> tuple[FloatArray, FloatArray]:
-    """The same with the floor's rows after the matches'."""
-    if not len(floor.innovation):
-        return cross, s
-    joint = floor.jacobian @ cross[:FRONT]
-    by_floor = front @ floor.jacobian.T
-    own = floor.jacobian @ by_floor[:FRONT] + np.diag(floor.variance)
-    return np.hstack([cross, by_floor]), np.block([[s, joint.T], [joint, own]])
-
-
-def _require_definite(
-    covariance: GrowingCovariance, front: FloatArray, gain: FloatArray, half: FloatArray
-) -> None:
-    """Raises DivergedError where the pose's block, or a landmark's, would not be a covariance."""
-    pose = front[:FRONT] - gain[:FRONT] @ half[:FRONT].T - half[:FRONT] @ gain[:FRONT].T
-    if not np.isfinite(pose).all():
-        raise DivergedError("the pose's covariance is not finite")
-    variances = np.linalg.eigvalsh(pose)
-    if variances[0] < -_NEGATIVE * max(variances[-1], 1e-300):
-        raise DivergedError("the pose's covariance is not positive")
-    count, m = (len(gain) - FRONT) // 3, gain.shape[1]
-    lost = gain[FRONT:].reshape(count, 3, m) @ half[FRONT:].reshape(count, 3, m).swapaxes(1, 2)
-    before = covariance.diagonal_blocks(np.arange(count))
-    _root(before - lost - lost.swapaxes(1, 2), "a landmark's covariance")
-
-
-def _root(matrices: FloatArray, what: str) -> FloatArray:
-    """Cholesky's lower factors (..., n, n)."""
-    try:
-        root = np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        raise DivergedError(f"{what} is not positive definite") from None
-    if not np.isfinite(root).all():
-        raise DivergedError(f"{what} is not finite")
-    return np.asarray(root)
-
-
-# --------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # The joint covariance
 
 

@@ -39,15 +39,6 @@ _REPAIRS = 20  # landmarks taken out in one update before the graph itself must 
 _SINGLE = 3  # of these, before Cholesky's rounding is suspected
 
 
-def isam2_smoother(
-    sensor: CameraRig, settings: Isam2Settings, floor: Floor, prior: Prediction
-) -> MapSmoother:
-    """Estimator of kind ``isam2``, at the prior pose with an empty map."""
-    problem = GraphProblem.of(sensor, settings, floor, prior)
-    segments = Segments(sensor, settings.keyframe_every)
-    return MapSmoother(problem, Isam2Solver(problem, settings), segments)
-
-
 class Isam2Solver(WholeGraphSolver):
     """Updates GTSAM's Bayes tree every few frames; in between the tracker answers.
 
@@ -74,19 +65,6 @@ class Isam2Solver(WholeGraphSolver):
         self.new_values.insert(new.values)
         self._answer = None
 
-    def recalibrate(self, change: RigChange) -> None:
-        """Builds the tree anew, of the new measurements."""
-        super().recalibrate(change)
-        together = gtsam.Values(self.values)
-        together.insert(self.new_values)
-        if together.empty():
-            return
-        self._graph, self.new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        try:
-            self._rebuild(together)
-        except RuntimeError as error:
-            self._repair(together, error)
-
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
         """Updates the tree where the last update lies `update_every` frames back."""
         if closes_loop or (frame and frame - self._updated < self._settings.update_every):
@@ -97,44 +75,6 @@ class Isam2Solver(WholeGraphSolver):
         return Smoothed(
             self.values, Prediction(poses_of_frame(self.values, last), self._covariance(last))
         )
-
-    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
-        """Updates the tree with the loop, or builds it anew where the loop moves the map."""
-        self._updated = self.builder.frames[-1]
-        self._flush()
-        found = self._accepted(loop, drive, what, _without_loop)
-        if found is None:
-            return None
-        self._join(found.values)
-        return self._after_loop(self._covariance(self.builder.frames[-1]))
-
-    def solve_whole(self) -> Refined:
-        """The minimum from the tree's values, with those of frames that wait."""
-        values = gtsam.Values(self.values)
-        values.insert(self.new_values)
-        return refine(self.builder, values, self._minimise)
-
-    def _join(self, found: Any | None) -> None:
-        """Goes on with the graph that has the loop; from these values where they are given."""
-        if found is None:
-            graph = gtsam.NonlinearFactorGraph()
-            graph.add(self.loops.last_factor())
-            self._update(graph, gtsam.Values())
-            return
-        try:
-            self._rebuild(found)
-        except RuntimeError as error:
-            self._repair(found, error)
-
-    # ----------------------------------------------------------------------------------------
-
-    def new_tree(self) -> Any:
-        """An empty Bayes tree."""
-        method, factorization = (
-            gtsam.ISAM2GaussNewtonParams(),
-            "QR" if self._with_qr else "CHOLESKY",
-        )
-        return gtsam.ISAM2(isam2_parameters(method, factorization))
 
     def _flush(self) -> None:
         """Brings the frames since the last update in."""
@@ -163,6 +103,65 @@ class Isam2Solver(WholeGraphSolver):
             groups.insert2(pose_key(frame), 1)
         return groups
 
+    def _covariance(self, frame: int) -> FloatArray:
+        """Marginal of a pose; where the tree cannot tell it, it is built anew first."""
+        try:
+            covariance = np.asarray(self.tree.marginalCovariance(pose_key(frame)))
+        except RuntimeError as error:
+            self._repair(self.values, error)
+            covariance = self._marginal_again(frame)
+        pose = poses_of_frame(self.values, frame)
+        return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
+
+    def _marginal_again(self, frame: int) -> FloatArray:
+        try:
+            return np.asarray(self.tree.marginalCovariance(pose_key(frame)))
+        except RuntimeError as error:
+            raise self._failed(error) from None
+
+    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+        """Updates the tree with the loop, or builds it anew where the loop moves the map."""
+        self._updated = self.builder.frames[-1]
+        self._flush()
+        found = self._accepted(loop, drive, what, _without_loop)
+        if found is None:
+            return None
+        self._join(found.values)
+        return self._after_loop(self._covariance(self.builder.frames[-1]))
+
+    def _join(self, found: Any | None) -> None:
+        """Goes on with the graph that has the loop; from these values where they are given."""
+        if found is None:
+            graph = gtsam.NonlinearFactorGraph()
+            graph.add(self.loops.last_factor())
+            self._update(graph, gtsam.Values())
+            return
+        try:
+            self._rebuild(found)
+        except RuntimeError as error:
+            self._repair(found, error)
+
+    def solve_whole(self) -> Refined:
+        """The minimum from the tree's values, with those of frames that wait."""
+        values = gtsam.Values(self.values)
+        values.insert(self.new_values)
+        return refine(self.builder, values, self._minimise)
+
+    def recalibrate(self, change: RigChange) -> None:
+        """Builds the tree anew, of the new measurements."""
+        super().recalibrate(change)
+        together = gtsam.Values(self.values)
+        together.insert(self.new_values)
+        if together.empty():
+            return
+        self._graph, self.new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        try:
+            self._rebuild(together)
+        except RuntimeError as error:
+            self._repair(together, error)
+
+    # -- where the tree cannot be solved -------------------------------------------------------
+
     def _repair(self, values: Any, error: Exception) -> None:
         """Builds the solver anew from the last good values, without the landmark that failed.
 
@@ -187,6 +186,11 @@ class Isam2Solver(WholeGraphSolver):
         except RuntimeError as error:
             return error
         return None
+
+    def _rebuild(self, values: Any) -> None:
+        self.tree = self.new_tree()
+        self.tree.update(self.builder.kept_factors(), values, [], self._groups())
+        self.values = self.tree.calculateEstimate()
 
     def _mended(self, values: Any, error: Exception, several: bool) -> bool:
         """Whether something was done about what the error names.
@@ -238,26 +242,13 @@ class Isam2Solver(WholeGraphSolver):
             "built anew from the last estimate"
         )
 
-    def _rebuild(self, values: Any) -> None:
-        self.tree = self.new_tree()
-        self.tree.update(self.builder.kept_factors(), values, [], self._groups())
-        self.values = self.tree.calculateEstimate()
-
-    def _covariance(self, frame: int) -> FloatArray:
-        """Marginal of a pose; where the tree cannot tell it, it is built anew first."""
-        try:
-            covariance = np.asarray(self.tree.marginalCovariance(pose_key(frame)))
-        except RuntimeError as error:
-            self._repair(self.values, error)
-            covariance = self._marginal_again(frame)
-        pose = poses_of_frame(self.values, frame)
-        return np.asarray(allowed_parts(self._floor, pose[None], covariance[None])[0])
-
-    def _marginal_again(self, frame: int) -> FloatArray:
-        try:
-            return np.asarray(self.tree.marginalCovariance(pose_key(frame)))
-        except RuntimeError as error:
-            raise self._failed(error) from None
+    def new_tree(self) -> Any:
+        """An empty Bayes tree."""
+        method, factorization = (
+            gtsam.ISAM2GaussNewtonParams(),
+            "QR" if self._with_qr else "CHOLESKY",
+        )
+        return gtsam.ISAM2(isam2_parameters(method, factorization))
 
 
 def _without_loop(graph: WholeGraph, state: State) -> State:
@@ -266,3 +257,12 @@ def _without_loop(graph: WholeGraph, state: State) -> State:
     That is no variable of the tree, whose values lie far from the minimum of a graph that has it.
     """
     return state if graph.rest.turns is None else solved(graph, state)
+
+
+def isam2_smoother(
+    sensor: CameraRig, settings: Isam2Settings, floor: Floor, prior: Prediction
+) -> MapSmoother:
+    """Estimator of kind ``isam2``, at the prior pose with an empty map."""
+    problem = GraphProblem.of(sensor, settings, floor, prior)
+    segments = Segments(sensor, settings.keyframe_every)
+    return MapSmoother(problem, Isam2Solver(problem, settings), segments)

@@ -62,158 +62,6 @@ from fgslam.core.types import (
 )
 from fgslam.factors.graphs import landmarks_in, pose_key, poses_of_frame
 
-# ------------------------------------------------------------------------------------------
-# The tracker's map beside the graph's: what it takes over from a solution, and what is reported
-
-
-class TrackerMap:
-    """Keeps the tracker's map in step with the graph's."""
-
-    def __init__(
-        self, sensor: CameraRig, tracker: LandmarkKalman, admission: LandmarkAdmission
-    ) -> None:
-        """The two maps, both still empty."""
-        self._sensor = sensor
-        self._tracker = tracker
-        self._admission = admission
-        self._anchors: dict[int, FloatArray] = {}
-
-    def entered(self, frame: int, wTc: FloatArray) -> None:
-        """Notes the pose (4, 4) with which a frame entered the graph."""
-        self._anchors[frame] = wTc
-
-    def take_over(self, smoothed: Smoothed, current: Prediction) -> None:
-        """Lets the tracker go on from a solution, at its ``current`` pose.
-
-        Landmarks that the graph knows nothing of stay; where a loop moved the map they
-        move along with the last pose, near which they are, unless they are a saved map's.
-        """
-        ids, variables, frames = self._admission.recent(smoothed.since)
-        inside = variables >= 0
-        waiting_ids, waiting_positions = self._waiting(
-            smoothed.values, ids[~inside], frames[~inside]
-        )
-        ids, positions = self._in_graph(smoothed.values, ids[inside], variables[inside])
-        ids = np.concatenate([ids, waiting_ids])
-        positions = np.concatenate([positions, waiting_positions])
-        if smoothed.by_loop:
-            known = self._tracker.landmarks()
-            rest = np.flatnonzero(~np.isin(known.ids, ids) & (self._tracker.homes >= 0))
-            moved = current.wTc @ inverse(self._tracker.predict(None).wTc)
-            ids = np.concatenate([ids, known.ids[rest]])
-            positions = np.concatenate(
-                [positions, transform_to_world(moved, known.positions[rest])]
-            )
-        self._tracker.correct(current, ids, positions)
-
-    def reported(self, answer: Solution) -> LandmarkMap:
-        """The tracker's landmarks where the graph has them; those that wait, from their pose."""
-        known = self._tracker.landmarks()
-        positions, covariances = known.positions.copy(), known.covariances.copy()
-        waiting: dict[int, list[tuple[int, Sighting]]] = {}
-        for row, identity in enumerate(known.ids.tolist()):
-            track = self._admission.tracks.get(identity)
-            if track is None:
-                continue
-            if track.variable in answer.points:
-                positions[row] = answer.points[track.variable]
-                covariances[row] = answer.point_covariances[track.variable]
-            elif track.left_at is not None:
-                positions[row], covariances[row] = track.left_at
-            else:
-                waiting.setdefault(track.last.frame, []).append((row, track.last))
-        for frame, seen in waiting.items():
-            rows = [row for row, _ in seen]
-            found = self._seen_from(answer, frame, [sighting for _, sighting in seen])
-            positions[rows], covariances[rows] = found
-        return LandmarkMap(known.ids.copy(), positions, covariances)  # theirs change later
-
-    def _in_graph(
-        self, values: Any, ids: IntArray, wanted: IntArray
-    ) -> tuple[IntArray, FloatArray]:
-        """Those landmarks (k,) of the tracker that ``values`` hold by variables (k,); positions."""
-        inside = isinstance(values, WindowValues)
-        variables, positions = values.landmarks() if inside else landmarks_in(values)
-        known = np.isin(wanted, variables) & np.isin(ids, self._tracker.landmarks().ids)
-        return ids[known], positions[np.searchsorted(variables, wanted[known])]
-
-    def _waiting(self, values: Any, ids: IntArray, frames: IntArray) -> tuple[IntArray, FloatArray]:
-        """Landmarks (k,) outside the graph, moved along with the frames (k,) that saw them last."""
-        present = [f for f in np.unique(frames).tolist() if values.exists(pose_key(f))]
-        anchors = {frame: poses_of_frame(values, frame) for frame in present}
-        order = np.argsort(frames, kind="stable")
-        order = order[np.isin(frames[order], present)]
-        ids, frames = ids[order], frames[order]
-        known = self._tracker.landmarks()
-        positions = known.positions[known.rows(ids)]
-        first = np.searchsorted(frames, [*present, np.inf])
-        for k, (frame, wTc) in enumerate(anchors.items()):
-            # One just taken out of the graph is where the graph had it, and follows from here.
-            moved = wTc @ inverse(self._anchors.get(frame, wTc))
-            own = slice(first[k], first[k + 1])
-            positions[own] = transform_to_world(moved, positions[own])
-        self._anchors = anchors
-        return ids, positions
-
-    def _seen_from(
-        self, answer: Solution, frame: int, sightings: list[Sighting]
-    ) -> tuple[FloatArray, FloatArray]:
-        """Positions (k, 3) and covariances (k, 3, 3) of landmarks, each by one sighting of it."""
-        measured = np.array([sighting.measurement for sighting in sightings])
-        covariances = np.array([sighting.covariance for sighting in sightings])
-        pose_covariance = answer.pose_covariances[frame]
-        return placed(self._sensor, answer.poses[frame], measured, covariances, pose_covariance)
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class GraphProblem:
-    """Where a run takes place, what its graph is made by, and from where it starts.
-
-    Attributes:
-        sensor: the cameras.
-        settings: of the graph.
-        floor: on which the robot stays.
-        prior: pose of the first frame and its covariance.
-        tracker: the filter in front.
-        builder: of the graph.
-    """
-
-    sensor: CameraRig
-    settings: GraphSettings
-    floor: Floor
-    prior: Prediction
-    tracker: LandmarkKalman
-    builder: GraphBuilder
-
-    @staticmethod
-    def of(
-        sensor: CameraRig,
-        settings: GraphSettings,
-        floor: Floor,
-        prior: Prediction,
-        remember: bool = True,
-    ) -> GraphProblem:
-        """A tracker and a builder at the prior, both empty; ``remember`` as GraphBuilder's."""
-        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
-        builder = GraphBuilder(sensor, settings, floor, prior, remember)
-        return GraphProblem(sensor, settings, floor, prior, tracker, builder)
-
-
-class Input(NamedTuple):
-    """What an update was given."""
-
-    increment: Increment
-    tracking: EgoMotion
-
-    @property
-    def used(self) -> Input:
-        """With that alone of the tracking which a smoother uses: the same from a log."""
-        found = self.tracking
-        measured = found.status.measured
-        status = EgoMotionStatus.OK if measured else EgoMotionStatus.TOO_FEW_MATCHES
-        kept = found.wTc, found.covariance, found.inliers, found.residuals, status, 0
-        return Input(self.increment, EgoMotion(*kept, noise=found.noise))
-
 
 class Smoother:
     """A smoothing estimator, on :class:`fgslam.backend.protocol.Estimator`."""
@@ -241,27 +89,6 @@ class Smoother:
         self._eras: list[int] = []
         self._doubt = ConsiderCovariance(problem.sensor, problem.floor)
         self._doubts: list[FloatArray] = []  # (6, 6) a frame: added to its pose when it came
-
-    # -- the method ----------------------------------------------------------------------------
-
-    @property
-    def kind(self) -> str:
-        """The solver's."""
-        return self.solver.kind
-
-    @property
-    def noise_factors(self) -> tuple[float, float]:
-        """Factors on stated deviations: of a single measurement, and as the graph weighs them."""
-        noise = self.builder.noise
-        return float(np.sqrt(noise.spread)), float(np.sqrt(noise.power))
-
-    def predict(self, odometry: Odometry | None) -> Prediction:
-        """Pose after the camera moved by ``odometry``."""
-        return self.tracker.predict(odometry)
-
-    def landmarks(self) -> LandmarkMap:
-        """Smoothed landmarks with what is known of them given the poses."""
-        return self.tracker.landmarks()
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Tracks the frame, adds it to the graph, solves the graph if it is time to.
@@ -294,68 +121,6 @@ class Smoother:
         self._doubts.append(self._doubt.of_pose())
         covariance = current.covariance + self._doubts[-1]
         return dataclasses.replace(stats, wTc=current.wTc, covariance=covariance, closed=closed)
-
-    def recalibrate(self, correction: FloatArray) -> None:
-        """Where the tracker's map moves, corrects all that was measured so far anew."""
-        change = self.tracker.recalibrate(correction)
-        if change is None:
-            return
-        self._answer = None
-        self.builder.recalibrate(change)
-        if self._segments is not None:
-            self._segments.recalibrate(change)
-        self.solver.recalibrate(change)
-
-    def estimate(self) -> Estimate:
-        """All poses and landmarks as the graph has them now, with their marginals."""
-        if not len(self.inputs):
-            return self.tracker.estimate()
-        answer = self._solved()
-        covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
-        if self._doubt.present and not answer.considers_rig:
-            covariances = covariances + np.array(self._doubts)
-            landmarks = self._doubt.landmarks(landmarks)
-        return Estimate(
-            Trajectory(np.array([one.increment.timestamp for one in self.inputs]), answer.poses),
-            covariances,
-            landmarks,
-            (*self.solver.remarks, *self.builder.admission.remarks, *answer.remarks),
-            noise_factor=float(np.sqrt(self.builder.noise.power * answer.noise_ratio)),
-            gyroscope=answer.gyroscope,
-        )
-
-    def landmark_covariances(self, ids: IntArray) -> FloatArray:
-        """Marginal covariances (k, 3, 3) of the named landmarks."""
-        self.tracker.landmarks().rows(ids)
-        found = self.estimate().landmarks
-        return found.covariances[found.rows(ids)]
-
-    def joint_covariance(self, ids: IntArray) -> FloatArray:
-        """Joint covariance of the last pose and the named landmarks."""
-        self.tracker.landmarks().rows(ids)
-        tracks = [self.builder.admission.tracks.get(i) for i in ids.tolist()]
-        variables = [-1 if track is None else track.variable for track in tracks]
-        outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
-        if outside:
-            raise EstimatorError(
-                f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
-                "its marginal instead"
-            )
-        joint = self._at_last_frame(self.solver.joint(variables))
-        if self._doubt.present and not self._solved().considers_rig:
-            joint = self._doubt.joint(ids, joint)
-        return joint
-
-    def state(self) -> StateArrays:
-        """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
-        return pack([one.used for one in self.inputs])
-
-    def restore(self, state: StateArrays) -> None:
-        """Repeats all updates of :meth:`state`."""
-        if len(self.inputs):
-            raise EstimatorError("only a new estimator can be restored")
-        for increment, tracking in unpack(state, list[Input]):
-            self.update(increment, tracking)
 
     # -- its steps -----------------------------------------------------------------------------
 
@@ -471,6 +236,45 @@ class Smoother:
         since = weighed * tracking.covariance
         return Prediction(now.wTc, self._floor.allowed_part(now.wTc, drift + since))
 
+    # -- what is asked of it -------------------------------------------------------------------
+
+    @property
+    def kind(self) -> str:
+        """The solver's."""
+        return self.solver.kind
+
+    @property
+    def noise_factors(self) -> tuple[float, float]:
+        """Factors on stated deviations: of a single measurement, and as the graph weighs them."""
+        noise = self.builder.noise
+        return float(np.sqrt(noise.spread)), float(np.sqrt(noise.power))
+
+    def predict(self, odometry: Odometry | None) -> Prediction:
+        """Pose after the camera moved by ``odometry``."""
+        return self.tracker.predict(odometry)
+
+    def landmarks(self) -> LandmarkMap:
+        """Smoothed landmarks with what is known of them given the poses."""
+        return self.tracker.landmarks()
+
+    def estimate(self) -> Estimate:
+        """All poses and landmarks as the graph has them now, with their marginals."""
+        if not len(self.inputs):
+            return self.tracker.estimate()
+        answer = self._solved()
+        covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
+        if self._doubt.present and not answer.considers_rig:
+            covariances = covariances + np.array(self._doubts)
+            landmarks = self._doubt.landmarks(landmarks)
+        return Estimate(
+            Trajectory(np.array([one.increment.timestamp for one in self.inputs]), answer.poses),
+            covariances,
+            landmarks,
+            (*self.solver.remarks, *self.builder.admission.remarks, *answer.remarks),
+            noise_factor=float(np.sqrt(self.builder.noise.power * answer.noise_ratio)),
+            gyroscope=answer.gyroscope,
+        )
+
     def _solved(self) -> Solution:
         """The graph's answer, with the poses of frames between keyframes."""
         if self._answer is None:
@@ -485,6 +289,28 @@ class Smoother:
                 )
         return self._answer
 
+    def landmark_covariances(self, ids: IntArray) -> FloatArray:
+        """Marginal covariances (k, 3, 3) of the named landmarks."""
+        self.tracker.landmarks().rows(ids)
+        found = self.estimate().landmarks
+        return found.covariances[found.rows(ids)]
+
+    def joint_covariance(self, ids: IntArray) -> FloatArray:
+        """Joint covariance of the last pose and the named landmarks."""
+        self.tracker.landmarks().rows(ids)
+        tracks = [self.builder.admission.tracks.get(i) for i in ids.tolist()]
+        variables = [-1 if track is None else track.variable for track in tracks]
+        outside = [i for i, v in zip(ids.tolist(), variables, strict=True) if v < 0]
+        if outside:
+            raise EstimatorError(
+                f"landmark {outside[0]} waits outside the graph until it is constrained; ask for "
+                "its marginal instead"
+            )
+        joint = self._at_last_frame(self.solver.joint(variables))
+        if self._doubt.present and not self._solved().considers_rig:
+            joint = self._doubt.joint(ids, joint)
+        return joint
+
     def _at_last_frame(self, joint: FloatArray) -> FloatArray:
         """A joint covariance with the graph's last pose, carried on to the last frame's."""
         entered, last = self.builder.frames[-1], len(self.inputs) - 1
@@ -496,6 +322,34 @@ class Smoother:
         joint = congruence(carry, joint)
         joint[:6, :6] = answer.pose_covariances[last]
         return joint
+
+    def recalibrate(self, correction: FloatArray) -> None:
+        """Where the tracker's map moves, corrects all that was measured so far anew."""
+        change = self.tracker.recalibrate(correction)
+        if change is None:
+            return
+        self._answer = None
+        self.builder.recalibrate(change)
+        if self._segments is not None:
+            self._segments.recalibrate(change)
+        self.solver.recalibrate(change)
+
+    def state(self) -> StateArrays:
+        """Everything that was put in: a solver's inside has no arrays, but repeats to the bit."""
+        return pack([one.used for one in self.inputs])
+
+    def restore(self, state: StateArrays) -> None:
+        """Repeats all updates of :meth:`state`."""
+        if len(self.inputs):
+            raise EstimatorError("only a new estimator can be restored")
+        for increment, tracking in unpack(state, list[Input]):
+            self.update(increment, tracking)
+
+
+def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
+    """The present frame's pose, as far from the one that entered last as it was tracked."""
+    covariance = congruence(adjoint(inverse(motion)), last.covariance)
+    return Prediction(reorthonormalise(last.wTc @ motion), covariance)
 
 
 class MapSmoother(Smoother):
@@ -512,7 +366,154 @@ class MapSmoother(Smoother):
         self.builder.admission.know(landmarks)
 
 
-def _moved_on(last: Prediction, motion: FloatArray) -> Prediction:
-    """The present frame's pose, as far from the one that entered last as it was tracked."""
-    covariance = congruence(adjoint(inverse(motion)), last.covariance)
-    return Prediction(reorthonormalise(last.wTc @ motion), covariance)
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class GraphProblem:
+    """Where a run takes place, what its graph is made by, and from where it starts.
+
+    Attributes:
+        sensor: the cameras.
+        settings: of the graph.
+        floor: on which the robot stays.
+        prior: pose of the first frame and its covariance.
+        tracker: the filter in front.
+        builder: of the graph.
+    """
+
+    sensor: CameraRig
+    settings: GraphSettings
+    floor: Floor
+    prior: Prediction
+    tracker: LandmarkKalman
+    builder: GraphBuilder
+
+    @staticmethod
+    def of(
+        sensor: CameraRig,
+        settings: GraphSettings,
+        floor: Floor,
+        prior: Prediction,
+        remember: bool = True,
+    ) -> GraphProblem:
+        """A tracker and a builder at the prior, both empty; ``remember`` as GraphBuilder's."""
+        tracker = LandmarkKalman(sensor, LandmarkKalmanSettings(), prior)
+        builder = GraphBuilder(sensor, settings, floor, prior, remember)
+        return GraphProblem(sensor, settings, floor, prior, tracker, builder)
+
+
+class Input(NamedTuple):
+    """What an update was given."""
+
+    increment: Increment
+    tracking: EgoMotion
+
+    @property
+    def used(self) -> Input:
+        """With that alone of the tracking which a smoother uses: the same from a log."""
+        found = self.tracking
+        measured = found.status.measured
+        status = EgoMotionStatus.OK if measured else EgoMotionStatus.TOO_FEW_MATCHES
+        kept = found.wTc, found.covariance, found.inliers, found.residuals, status, 0
+        return Input(self.increment, EgoMotion(*kept, noise=found.noise))
+
+
+# ------------------------------------------------------------------------------------------
+# The tracker's map beside the graph's: what it takes over from a solution, and what is reported
+
+
+class TrackerMap:
+    """Keeps the tracker's map in step with the graph's."""
+
+    def __init__(
+        self, sensor: CameraRig, tracker: LandmarkKalman, admission: LandmarkAdmission
+    ) -> None:
+        """The two maps, both still empty."""
+        self._sensor = sensor
+        self._tracker = tracker
+        self._admission = admission
+        self._anchors: dict[int, FloatArray] = {}
+
+    def entered(self, frame: int, wTc: FloatArray) -> None:
+        """Notes the pose (4, 4) with which a frame entered the graph."""
+        self._anchors[frame] = wTc
+
+    def take_over(self, smoothed: Smoothed, current: Prediction) -> None:
+        """Lets the tracker go on from a solution, at its ``current`` pose.
+
+        Landmarks that the graph knows nothing of stay; where a loop moved the map they
+        move along with the last pose, near which they are, unless they are a saved map's.
+        """
+        ids, variables, frames = self._admission.recent(smoothed.since)
+        inside = variables >= 0
+        waiting_ids, waiting_positions = self._waiting(
+            smoothed.values, ids[~inside], frames[~inside]
+        )
+        ids, positions = self._in_graph(smoothed.values, ids[inside], variables[inside])
+        ids = np.concatenate([ids, waiting_ids])
+        positions = np.concatenate([positions, waiting_positions])
+        if smoothed.by_loop:
+            known = self._tracker.landmarks()
+            rest = np.flatnonzero(~np.isin(known.ids, ids) & (self._tracker.homes >= 0))
+            moved = current.wTc @ inverse(self._tracker.predict(None).wTc)
+            ids = np.concatenate([ids, known.ids[rest]])
+            positions = np.concatenate(
+                [positions, transform_to_world(moved, known.positions[rest])]
+            )
+        self._tracker.correct(current, ids, positions)
+
+    def reported(self, answer: Solution) -> LandmarkMap:
+        """The tracker's landmarks where the graph has them; those that wait, from their pose."""
+        known = self._tracker.landmarks()
+        positions, covariances = known.positions.copy(), known.covariances.copy()
+        waiting: dict[int, list[tuple[int, Sighting]]] = {}
+        for row, identity in enumerate(known.ids.tolist()):
+            track = self._admission.tracks.get(identity)
+            if track is None:
+                continue
+            if track.variable in answer.points:
+                positions[row] = answer.points[track.variable]
+                covariances[row] = answer.point_covariances[track.variable]
+            elif track.left_at is not None:
+                positions[row], covariances[row] = track.left_at
+            else:
+                waiting.setdefault(track.last.frame, []).append((row, track.last))
+        for frame, seen in waiting.items():
+            rows = [row for row, _ in seen]
+            found = self._seen_from(answer, frame, [sighting for _, sighting in seen])
+            positions[rows], covariances[rows] = found
+        return LandmarkMap(known.ids.copy(), positions, covariances)  # theirs change later
+
+    def _in_graph(
+        self, values: Any, ids: IntArray, wanted: IntArray
+    ) -> tuple[IntArray, FloatArray]:
+        """Those landmarks (k,) of the tracker that ``values`` hold by variables (k,); positions."""
+        inside = isinstance(values, WindowValues)
+        variables, positions = values.landmarks() if inside else landmarks_in(values)
+        known = np.isin(wanted, variables) & np.isin(ids, self._tracker.landmarks().ids)
+        return ids[known], positions[np.searchsorted(variables, wanted[known])]
+
+    def _waiting(self, values: Any, ids: IntArray, frames: IntArray) -> tuple[IntArray, FloatArray]:
+        """Landmarks (k,) outside the graph, moved along with the frames (k,) that saw them last."""
+        present = [f for f in np.unique(frames).tolist() if values.exists(pose_key(f))]
+        anchors = {frame: poses_of_frame(values, frame) for frame in present}
+        order = np.argsort(frames, kind="stable")
+        order = order[np.isin(frames[order], present)]
+        ids, frames = ids[order], frames[order]
+        known = self._tracker.landmarks()
+        positions = known.positions[known.rows(ids)]
+        first = np.searchsorted(frames, [*present, np.inf])
+        for k, (frame, wTc) in enumerate(anchors.items()):
+            # One just taken out of the graph is where the graph had it, and follows from here.
+            moved = wTc @ inverse(self._anchors.get(frame, wTc))
+            own = slice(first[k], first[k + 1])
+            positions[own] = transform_to_world(moved, positions[own])
+        self._anchors = anchors
+        return ids, positions
+
+    def _seen_from(
+        self, answer: Solution, frame: int, sightings: list[Sighting]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Positions (k, 3) and covariances (k, 3, 3) of landmarks, each by one sighting of it."""
+        measured = np.array([sighting.measurement for sighting in sightings])
+        covariances = np.array([sighting.covariance for sighting in sightings])
+        pose_covariance = answer.pose_covariances[frame]
+        return placed(self._sensor, answer.poses[frame], measured, covariances, pose_covariance)

@@ -37,38 +37,6 @@ from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.settings import EgoMotionSettings
 
-# ------------------------------------------------------------------------------------------
-# How large the errors of matches are, from how a drive's frames fit the map
-
-_FRAMES = 30  # latest ones that count: as many sightings as the longest track that is judged
-_STATED = 2  # frames that the stated noise counts for: three must contradict it
-_DOUBTED = 2.0
-"""Variance over the stated one from which on that is not believed: a gate of four deviations loses
-one right match in twenty."""
-
-
-class MatchNoise:
-    """Variance of a drive's measurements over the stated one."""
-
-    _latest: Kept[deque[float]]
-
-    def __init__(self) -> None:
-        """As stated, until frames contradict it."""
-        self._latest = deque(maxlen=_FRAMES)
-
-    @property
-    def variance(self) -> float:
-        """Over the stated one; one where that may well be true, and never less."""
-        told = sorted([*(1.0,) * _STATED, *self._latest])
-        found = told[(len(told) - 1) // 2]  # of two in the middle the lower
-        return found if found > _DOUBTED else 1.0
-
-    def learn(self, tracking: EgoMotion) -> None:
-        """Takes in a frame; one that was not measured says nothing."""
-        if not math.isnan(tracking.misfit):
-            self._latest.append(tracking.misfit)
-
-
 _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
@@ -78,48 +46,6 @@ MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
 _CAP_SIGMAS = 6.0  # deviations of the prediction that a correction may amount to
 _MAX_DAMPING = 1e8
 _LEAST_CURVATURE = 1e-10  # of the Hessian with unit diagonal; below it the pose is undetermined
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PoseProblem(Rows):
-    """Matches of one frame: landmark positions and covariances, measurements and theirs.
-
-    Attributes:
-        points: (k, 3) world, metres.
-        point_covariances: (k, 3, 3).
-        measurement: (k, 3) (column, row, disparity), pixels.
-        measurement_covariance: (k, 3, 3).
-    """
-
-    points: FloatArray
-    point_covariances: FloatArray
-    measurement: FloatArray
-    measurement_covariance: FloatArray
-
-    @staticmethod
-    def of(landmarks: LandmarkMap, observed: Observations) -> PoseProblem:
-        """The observations of landmarks that are in the map. KeyError for one that is not."""
-        rows = landmarks.rows(observed.ids)
-        return PoseProblem(
-            landmarks.positions[rows],
-            landmarks.covariances[rows],
-            observed.measurement,
-            observed.covariance,
-        )
-
-    @staticmethod
-    def empty() -> PoseProblem:
-        """No match at all."""
-        vectors, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
-        return PoseProblem(vectors, matrices, vectors, matrices)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Minimum:
-    wTc: FloatArray
-    hessian: FloatArray
-    converged: bool
-    iterations: int
 
 
 class EgoMotionSolver:
@@ -168,32 +94,30 @@ class EgoMotionSolver:
         noise = self.noise.variance
         return dataclasses.replace(found, weighted_at=weighted_at, noise=noise, misfit=misfit)
 
-    def gain(
-        self, wTc: FloatArray, prediction: Prediction, problem: PoseProblem, noise: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """How the solution follows what it is found from, to first order.
+    def _information(
+        self, wTc: FloatArray, problem: PoseProblem, noise: float | None = None
+    ) -> FloatArray:
+        """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused.
 
-        Args:
-            wTc: (4, 4) the solution.
-            prediction: that it was stabilised towards.
-            problem: the inliers.
-            noise: variance over the stated one that they were taken to have.
-
-        Returns:
-            Derivatives of the pose's tangent vector by the prediction's (6, 6), and by the
-            measurements (k, 6, 3): ``(sum J^T W J + P^-1)^-1`` times ``P^-1`` and ``J^T W``.
+        The stated ones times ``noise``, by default as known now: landmarks are made of such
+        measurements, and theirs are too small by as much.
         """
-        points = transform_to_camera(wTc, problem.points)
-        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
-        pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem, noise)
-        known = np.zeros((6, 6))
-        if self._settings.prior:
-            known = _prior_information(prediction.covariance)
-        hessian = (pull @ jacobian).sum(axis=0) + known
-        covariance = self._covariance(wTc, hessian)
-        return covariance @ known, covariance @ pull
-
-    # ----------------------------------------------------------------------------------------
+        settings = self._settings
+        if settings.weighting == "uniform":
+            covariance = np.tile(np.eye(3), (len(problem), 1, 1))
+        else:
+            covariance = problem.measurement_covariance
+        if settings.weighting == "landmark":
+            points = transform_to_camera(wTc, problem.points)
+            points[~in_front(points)] = (0.0, 0.0, 1.0)  # of no use
+            jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
+            covariance = covariance + congruence(jacobian, problem.point_covariances)
+        covariance = covariance * (self.noise.variance if noise is None else noise)
+        if settings.residuals == "image_disparity":
+            return inverse_spd3(covariance)
+        out = np.zeros_like(covariance)
+        out[:, :2, :2] = np.linalg.inv(covariance[:, :2, :2])
+        return out
 
     def _minimise(
         self,
@@ -227,40 +151,6 @@ class EgoMotionSolver:
                 break
             wTc = moved_apart(best, step)
         return _Minimum(best, hessian, self._determined(best, hessian), iteration)
-
-    def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
-        """True if the matches (and the prior) determine all degrees of freedom."""
-        basis = self.floor.basis(wTc)
-        reduced = basis.T @ hessian @ basis
-        size = np.sqrt(np.diagonal(reduced))
-        if not (size > 0.0).all():
-            return False
-        return bool(np.linalg.eigvalsh(reduced / np.outer(size, size))[0] > _LEAST_CURVATURE)
-
-    def _information(
-        self, wTc: FloatArray, problem: PoseProblem, noise: float | None = None
-    ) -> FloatArray:
-        """Inverse covariances (k, 3, 3) of the residuals; the disparity's row 0 if unused.
-
-        The stated ones times ``noise``, by default as known now: landmarks are made of such
-        measurements, and theirs are too small by as much.
-        """
-        settings = self._settings
-        if settings.weighting == "uniform":
-            covariance = np.tile(np.eye(3), (len(problem), 1, 1))
-        else:
-            covariance = problem.measurement_covariance
-        if settings.weighting == "landmark":
-            points = transform_to_camera(wTc, problem.points)
-            points[~in_front(points)] = (0.0, 0.0, 1.0)  # of no use
-            jacobian = projection_jacobian(self.sensor, points) @ wTc[:3, :3].T
-            covariance = covariance + congruence(jacobian, problem.point_covariances)
-        covariance = covariance * (self.noise.variance if noise is None else noise)
-        if settings.residuals == "image_disparity":
-            return inverse_spd3(covariance)
-        out = np.zeros_like(covariance)
-        out[:, :2, :2] = np.linalg.inv(covariance[:, :2, :2])
-        return out
 
     def _linearise(
         self, wTc: FloatArray, problem: PoseProblem, information: FloatArray, robust: bool
@@ -303,6 +193,27 @@ class EgoMotionSolver:
         except np.linalg.LinAlgError:
             return None
 
+    def _determined(self, wTc: FloatArray, hessian: FloatArray) -> bool:
+        """True if the matches (and the prior) determine all degrees of freedom."""
+        basis = self.floor.basis(wTc)
+        reduced = basis.T @ hessian @ basis
+        size = np.sqrt(np.diagonal(reduced))
+        if not (size > 0.0).all():
+            return False
+        return bool(np.linalg.eigvalsh(reduced / np.outer(size, size))[0] > _LEAST_CURVATURE)
+
+    def _measured(self, wTc: FloatArray, problem: PoseProblem) -> tuple[FloatArray, FloatArray]:
+        """Residuals (..., k, 3), and distances (..., k) in the image; inf if behind."""
+        every = transform_to_camera(wTc, problem.points)
+        points = every.reshape(-1, 3)
+        behind = ~in_front(points)
+        points[behind] = (0.0, 0.0, 1.0)
+        measurement = np.broadcast_to(problem.measurement, every.shape).reshape(-1, 3)
+        residual = project(self.sensor, points) - measurement
+        across, down = residual[:, 0], residual[:, 1]
+        distance = np.where(behind, np.inf, np.sqrt(across * across + down * down))
+        return residual.reshape(every.shape), distance.reshape(every.shape[:-1])
+
     @property
     def farthest(self) -> float:
         """Largest image residual of an inlier, pixels."""
@@ -316,19 +227,6 @@ class EgoMotionSolver:
             squared = _squared(residual[near], information[near])
             near[near] = squared <= self._settings.outlier_sigmas**2
         return near
-
-    def _misfit(self, residual: FloatArray, distance: FloatArray, information: FloatArray) -> float:
-        """Variance of the residuals over the stated one, by the median of their squares.
-
-        NaN where matches are not judged by their deviations, or none is ahead.
-        """
-        if not self._judges:
-            return math.nan
-        ahead = np.isfinite(distance)
-        if not ahead.any():
-            return math.nan
-        squared = _squared(residual[ahead], information[ahead])
-        return self.noise.variance * float(np.median(squared)) / self._median
 
     def _finish(
         self,
@@ -392,6 +290,19 @@ class EgoMotionSolver:
             iterations=0,
         )
 
+    def _misfit(self, residual: FloatArray, distance: FloatArray, information: FloatArray) -> float:
+        """Variance of the residuals over the stated one, by the median of their squares.
+
+        NaN where matches are not judged by their deviations, or none is ahead.
+        """
+        if not self._judges:
+            return math.nan
+        ahead = np.isfinite(distance)
+        if not ahead.any():
+            return math.nan
+        squared = _squared(residual[ahead], information[ahead])
+        return self.noise.variance * float(np.median(squared)) / self._median
+
     def image_residuals(self, wTc: FloatArray, problem: PoseProblem) -> FloatArray:
         """The paper's E (..., k), distance of projection and measurement in the image; inf behind.
 
@@ -399,24 +310,30 @@ class EgoMotionSolver:
         """
         return self._measured(wTc, problem)[1]
 
-    def _measured(self, wTc: FloatArray, problem: PoseProblem) -> tuple[FloatArray, FloatArray]:
-        """Residuals (..., k, 3), and distances (..., k) in the image; inf if behind."""
-        every = transform_to_camera(wTc, problem.points)
-        points = every.reshape(-1, 3)
-        behind = ~in_front(points)
-        points[behind] = (0.0, 0.0, 1.0)
-        measurement = np.broadcast_to(problem.measurement, every.shape).reshape(-1, 3)
-        residual = project(self.sensor, points) - measurement
-        across, down = residual[:, 0], residual[:, 1]
-        distance = np.where(behind, np.inf, np.sqrt(across * across + down * down))
-        return residual.reshape(every.shape), distance.reshape(every.shape[:-1])
+    def gain(
+        self, wTc: FloatArray, prediction: Prediction, problem: PoseProblem, noise: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """How the solution follows what it is found from, to first order.
 
+        Args:
+            wTc: (4, 4) the solution.
+            prediction: that it was stabilised towards.
+            problem: the inliers.
+            noise: variance over the stated one that they were taken to have.
 
-def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
-    """Ego-motion equal to the prediction, for a frame without matches."""
-    return EgoMotion(
-        prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
-    )
+        Returns:
+            Derivatives of the pose's tangent vector by the prediction's (6, 6), and by the
+            measurements (k, 6, 3): ``(sum J^T W J + P^-1)^-1`` times ``P^-1`` and ``J^T W``.
+        """
+        points = transform_to_camera(wTc, problem.points)
+        jacobian = projection_jacobian(self.sensor, points) @ point_pose_jacobian(points)
+        pull = np.swapaxes(jacobian, 1, 2) @ self._information(wTc, problem, noise)
+        known = np.zeros((6, 6))
+        if self._settings.prior:
+            known = _prior_information(prediction.covariance)
+        hessian = (pull @ jacobian).sum(axis=0) + known
+        covariance = self._covariance(wTc, hessian)
+        return covariance @ known, covariance @ pull
 
 
 def _squared(residual: FloatArray, information: FloatArray) -> FloatArray:
@@ -451,6 +368,87 @@ def _add_prior(
         hessian + weighted @ jacobian,
         gradient + weighted @ deviation,
     )
+
+
+def unmeasured(prediction: Prediction, status: EgoMotionStatus) -> EgoMotion:
+    """Ego-motion equal to the prediction, for a frame without matches."""
+    return EgoMotion(
+        prediction.wTc, prediction.covariance, np.empty(0, np.bool_), np.empty(0), status, 0
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseProblem(Rows):
+    """Matches of one frame: landmark positions and covariances, measurements and theirs.
+
+    Attributes:
+        points: (k, 3) world, metres.
+        point_covariances: (k, 3, 3).
+        measurement: (k, 3) (column, row, disparity), pixels.
+        measurement_covariance: (k, 3, 3).
+    """
+
+    points: FloatArray
+    point_covariances: FloatArray
+    measurement: FloatArray
+    measurement_covariance: FloatArray
+
+    @staticmethod
+    def of(landmarks: LandmarkMap, observed: Observations) -> PoseProblem:
+        """The observations of landmarks that are in the map. KeyError for one that is not."""
+        rows = landmarks.rows(observed.ids)
+        return PoseProblem(
+            landmarks.positions[rows],
+            landmarks.covariances[rows],
+            observed.measurement,
+            observed.covariance,
+        )
+
+    @staticmethod
+    def empty() -> PoseProblem:
+        """No match at all."""
+        vectors, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
+        return PoseProblem(vectors, matrices, vectors, matrices)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Minimum:
+    wTc: FloatArray
+    hessian: FloatArray
+    converged: bool
+    iterations: int
+
+
+# ------------------------------------------------------------------------------------------
+# How large the errors of matches are, from how a drive's frames fit the map
+
+_FRAMES = 30  # latest ones that count: as many sightings as the longest track that is judged
+_STATED = 2  # frames that the stated noise counts for: three must contradict it
+_DOUBTED = 2.0
+"""Variance over the stated one from which on that is not believed: a gate of four deviations loses
+one right match in twenty."""
+
+
+class MatchNoise:
+    """Variance of a drive's measurements over the stated one."""
+
+    _latest: Kept[deque[float]]
+
+    def __init__(self) -> None:
+        """As stated, until frames contradict it."""
+        self._latest = deque(maxlen=_FRAMES)
+
+    @property
+    def variance(self) -> float:
+        """Over the stated one; one where that may well be true, and never less."""
+        told = sorted([*(1.0,) * _STATED, *self._latest])
+        found = told[(len(told) - 1) // 2]  # of two in the middle the lower
+        return found if found > _DOUBTED else 1.0
+
+    def learn(self, tracking: EgoMotion) -> None:
+        """Takes in a frame; one that was not measured says nothing."""
+        if not math.isnan(tracking.misfit):
+            self._latest.append(tracking.misfit)
 
 
 # ------------------------------------------------------------------------------------------

@@ -26,10 +26,123 @@ Pairs: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 """(k,) landmarks, features, and distances of their descriptors."""
 Wanted: TypeAlias = Callable[[IntArray, FloatArray], BoolArray]
 """Of rows (k,) of the map and their distances by which sizes shrink: which to consider at all."""
-BORDER_PX = 8.0  # nearer to an image's edge a landmark is not missed
-CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
-_NEAREST_M = 0.1
-_SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
+_SCALE_RATIO = 1.5
+"""Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
+WINDOW_PX = 5.0  # side of the search window in the image, as in Se et al. 3.1
+REFINE_SHIFT_PX = 0.25 * WINDOW_PX
+"""Landmarks that a first pose shifts by more, in the median, are matched anew around it. Measured:
+on steps that the odometry foretells within it (roads) a second matching changes nothing."""
+_DISPARITY_PX = 2.0  # largest difference from the predicted disparity, likewise before widening
+MAX_WINDOW_PX = 80.0
+"""Side that widening may not exceed, also of the disparity gate: a quarter of 320 px, beyond
+which most candidates are of other landmarks."""
+_ORIENTATION_DEG = 20.0  # largest difference to the predicted orientation, as between images
+
+
+class MapMatcher:
+    """Search window, disparity, scale and orientation gates, then the appearance."""
+
+    def __init__(self, settings: MapMatchingSettings, appearance: AppearanceSettings) -> None:
+        """Takes the gates and the use of descriptors."""
+        self._settings = settings
+        self._appearance = appearance
+        self._limit = 0.5 * MAX_WINDOW_PX
+
+    def match(
+        self,
+        expected: ExpectedLandmarks,
+        features: StereoFeatures,
+        uncertainty: FloatArray | None = None,
+    ) -> MapMatches:
+        """Matches one frame.
+
+        Args:
+            expected: landmarks in view with predicted characteristics.
+            features: the frame's stereo features.
+            uncertainty: (v, 3) standard deviations of the predicted (column, row, disparity) by
+                which the gates are widened; None keeps the fixed window.
+        """
+        return self._match_within(expected, features, self._reach(len(expected), uncertainty))
+
+    def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
+        """Half widths (v, 3) of the gates in column, row and disparity."""
+        half = 0.5 * WINDOW_PX
+        base = np.array([half, half, _DISPARITY_PX])
+        if uncertainty is None:
+            return np.tile(base, (count, 1))
+        widened = base + self._settings.widen_sigmas * uncertainty
+        return np.asarray(np.minimum(widened, np.maximum(self._limit, base)))
+
+    def _match_within(
+        self, expected: ExpectedLandmarks, features: StereoFeatures, reach: FloatArray
+    ) -> MapMatches:
+        i, j = pairs_within(expected.measurement[:, 1], reach[:, 1], features.measurement[:, 1])
+        for axis in (0, 2, 1):  # the column leaves the fewest pairs to the others
+            offset = np.abs(features.measurement[j, axis] - expected.measurement[i, axis])
+            near = offset <= reach[i, axis]
+            i, j = i[near], j[near]
+        same = alike(
+            (expected.scale[i], features.scale[j]),
+            (expected.orientation[i], features.orientation[j]),
+            _SCALE_RATIO,
+            np.deg2rad(_ORIENTATION_DEG),
+        )
+        descriptors = (expected.descriptors, features.descriptors)
+        pairs = resembling(i[same], j[same], descriptors, self._appearance)
+        had_candidates = np.zeros(len(features), np.bool_)
+        had_candidates[pairs[1]] = True
+        if features.complete is None:
+            return MapMatches(*pick(pairs, self._appearance), had_candidates)
+        return MapMatches(*self._pick_complete_first(pairs, features.complete), had_candidates)
+
+    def _pick_complete_first(self, pairs: Pairs, complete: BoolArray) -> tuple[IntArray, IntArray]:
+        """Matches as without incomplete features, then with them what nothing else resembles."""
+        i, j, cost = pairs
+        whole = complete[j]
+        rest = np.isin(i, i[whole], invert=True)
+        first = pick((i[whole], j[whole], cost[whole]), self._appearance)
+        second = pick((i[rest], j[rest], cost[rest]), self._appearance)
+        order = np.argsort(found := np.concatenate([first[0], second[0]]), kind="stable")
+        return found[order], np.concatenate([first[1], second[1]])[order]
+
+    def match_anywhere(self, expected: ExpectedLandmarks, features: StereoFeatures) -> MapMatches:
+        """Matches within the largest window, regardless of the predicted uncertainty."""
+        reach = np.full((len(expected), 3), self._limit)
+        return self._match_within(expected, features, reach)
+
+    @property
+    def widens(self) -> bool:
+        """True if the gates widen with the predicted uncertainty."""
+        return self._settings.widen_sigmas > 0.0
+
+    @property
+    def refines(self) -> bool:
+        """True if a frame is matched a second time, around the pose found."""
+        return self._settings.refine
+
+    @property
+    def rescues(self) -> bool:
+        """Whether :meth:`match_anywhere` is to be tried where too few match.
+
+        Never without descriptors: in so large a window all would be ambiguous.
+        """
+        return self._settings.rescue and self._appearance.mode == "descriptor"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapMatches:
+    """Matches between expected landmarks and features.
+
+    Attributes:
+        landmarks: (k,) indices into the expected landmarks, ascending.
+        features: (k,) indices into the features.
+        had_candidates: (n,) features that resemble a landmark near by, matched or ambiguous: they
+            start no landmark, which would make the ambiguity worse.
+    """
+
+    landmarks: IntArray
+    features: IntArray
+    had_candidates: BoolArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,21 +174,13 @@ class ExpectedLandmarks:
         return len(self.ids)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class InView(Rows):
-    """Points that may be in view.
+# ------------------------------------------------------------------------------------------
+# Which landmarks are expected in view of a pose
 
-    Attributes:
-        rows: (v,) which of the points, ascending.
-        points: (v, 3) in the camera's frame, metres.
-        measurement: (v, 3) predicted (column, row, disparity).
-        certain: (v,) well inside the view.
-    """
-
-    rows: IntArray
-    points: FloatArray
-    measurement: FloatArray
-    certain: BoolArray
+BORDER_PX = 8.0  # nearer to an image's edge a landmark is not missed
+CONE_DEG = 30.0  # half angle of the cone in which the paper expects landmarks (4.4)
+_NEAREST_M = 0.1
+_SLACK_PX = 1e-6  # of the rough test before the exact one; far above rounding
 
 
 class FieldOfView:
@@ -150,6 +255,23 @@ class FieldOfView:
         return np.asarray(inside)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class InView(Rows):
+    """Points that may be in view.
+
+    Attributes:
+        rows: (v,) which of the points, ascending.
+        points: (v, 3) in the camera's frame, metres.
+        measurement: (v, 3) predicted (column, row, disparity).
+        certain: (v,) well inside the view.
+    """
+
+    rows: IntArray
+    points: FloatArray
+    measurement: FloatArray
+    certain: BoolArray
+
+
 def predicted_covariance(
     rig: CameraRig, prediction: Prediction, positions: FloatArray, covariances: FloatArray
 ) -> FloatArray:
@@ -186,123 +308,3 @@ def lean(rig: CameraRig, wTc: FloatArray, points: FloatArray) -> FloatArray:
     down = wTc[1, :3]
     right, below = rig.fx * (down[0] * z - x * down[2]), rig.fy * (down[1] * z - y * down[2])
     return np.asarray(np.arctan2(-right, below))
-
-
-_SCALE_RATIO = 1.5
-"""Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
-
-WINDOW_PX = 5.0  # side of the search window in the image, as in Se et al. 3.1
-REFINE_SHIFT_PX = 0.25 * WINDOW_PX
-"""Landmarks that a first pose shifts by more, in the median, are matched anew around it. Measured:
-on steps that the odometry foretells within it (roads) a second matching changes nothing."""
-_DISPARITY_PX = 2.0  # largest difference from the predicted disparity, likewise before widening
-MAX_WINDOW_PX = 80.0
-"""Side that widening may not exceed, also of the disparity gate: a quarter of 320 px, beyond
-which most candidates are of other landmarks."""
-_ORIENTATION_DEG = 20.0  # largest difference to the predicted orientation, as between images
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapMatches:
-    """Matches between expected landmarks and features.
-
-    Attributes:
-        landmarks: (k,) indices into the expected landmarks, ascending.
-        features: (k,) indices into the features.
-        had_candidates: (n,) features that resemble a landmark near by, matched or ambiguous: they
-            start no landmark, which would make the ambiguity worse.
-    """
-
-    landmarks: IntArray
-    features: IntArray
-    had_candidates: BoolArray
-
-
-class MapMatcher:
-    """Search window, disparity, scale and orientation gates, then the appearance."""
-
-    def __init__(self, settings: MapMatchingSettings, appearance: AppearanceSettings) -> None:
-        """Takes the gates and the use of descriptors."""
-        self._settings = settings
-        self._appearance = appearance
-        self._limit = 0.5 * MAX_WINDOW_PX
-
-    @property
-    def widens(self) -> bool:
-        """True if the gates widen with the predicted uncertainty."""
-        return self._settings.widen_sigmas > 0.0
-
-    @property
-    def refines(self) -> bool:
-        """True if a frame is matched a second time, around the pose found."""
-        return self._settings.refine
-
-    def match_anywhere(self, expected: ExpectedLandmarks, features: StereoFeatures) -> MapMatches:
-        """Matches within the largest window, regardless of the predicted uncertainty."""
-        reach = np.full((len(expected), 3), self._limit)
-        return self._match_within(expected, features, reach)
-
-    @property
-    def rescues(self) -> bool:
-        """Whether :meth:`match_anywhere` is to be tried where too few match.
-
-        Never without descriptors: in so large a window all would be ambiguous.
-        """
-        return self._settings.rescue and self._appearance.mode == "descriptor"
-
-    def match(
-        self,
-        expected: ExpectedLandmarks,
-        features: StereoFeatures,
-        uncertainty: FloatArray | None = None,
-    ) -> MapMatches:
-        """Matches one frame.
-
-        Args:
-            expected: landmarks in view with predicted characteristics.
-            features: the frame's stereo features.
-            uncertainty: (v, 3) standard deviations of the predicted (column, row, disparity) by
-                which the gates are widened; None keeps the fixed window.
-        """
-        return self._match_within(expected, features, self._reach(len(expected), uncertainty))
-
-    def _match_within(
-        self, expected: ExpectedLandmarks, features: StereoFeatures, reach: FloatArray
-    ) -> MapMatches:
-        i, j = pairs_within(expected.measurement[:, 1], reach[:, 1], features.measurement[:, 1])
-        for axis in (0, 2, 1):  # the column leaves the fewest pairs to the others
-            offset = np.abs(features.measurement[j, axis] - expected.measurement[i, axis])
-            near = offset <= reach[i, axis]
-            i, j = i[near], j[near]
-        same = alike(
-            (expected.scale[i], features.scale[j]),
-            (expected.orientation[i], features.orientation[j]),
-            _SCALE_RATIO,
-            np.deg2rad(_ORIENTATION_DEG),
-        )
-        descriptors = (expected.descriptors, features.descriptors)
-        pairs = resembling(i[same], j[same], descriptors, self._appearance)
-        had_candidates = np.zeros(len(features), np.bool_)
-        had_candidates[pairs[1]] = True
-        if features.complete is None:
-            return MapMatches(*pick(pairs, self._appearance), had_candidates)
-        return MapMatches(*self._pick_complete_first(pairs, features.complete), had_candidates)
-
-    def _pick_complete_first(self, pairs: Pairs, complete: BoolArray) -> tuple[IntArray, IntArray]:
-        """Matches as without incomplete features, then with them what nothing else resembles."""
-        i, j, cost = pairs
-        whole = complete[j]
-        rest = np.isin(i, i[whole], invert=True)
-        first = pick((i[whole], j[whole], cost[whole]), self._appearance)
-        second = pick((i[rest], j[rest], cost[rest]), self._appearance)
-        order = np.argsort(found := np.concatenate([first[0], second[0]]), kind="stable")
-        return found[order], np.concatenate([first[1], second[1]])[order]
-
-    def _reach(self, count: int, uncertainty: FloatArray | None) -> FloatArray:
-        """Half widths (v, 3) of the gates in column, row and disparity."""
-        half = 0.5 * WINDOW_PX
-        base = np.array([half, half, _DISPARITY_PX])
-        if uncertainty is None:
-            return np.tile(base, (count, 1))
-        widened = base + self._settings.widen_sigmas * uncertainty
-        return np.asarray(np.minimum(widened, np.maximum(self._limit, base)))
