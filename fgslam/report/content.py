@@ -418,9 +418,11 @@ def read_metrics(path: Path) -> dict[str, Any]:
         raise DatasetError(f"cannot read {path}: {error.strerror}; check the path") from error
     except ValueError as error:
         raise DatasetError(f"{path} is not JSON ({error}); run the experiment again") from error
-    if not isinstance(document, dict) or not document.keys() & {"estimators", "task"}:
-        raise DatasetError(f"{path} holds no metrics; give the metrics.json of a run folder")
-    return document
+    if isinstance(document, dict) and document.keys() & {"estimators", "task"}:
+        estimators = document.get("estimators", {})
+        if isinstance(estimators, dict) and all(isinstance(v, dict) for v in estimators.values()):
+            return document
+    raise DatasetError(f"{path} holds no metrics; give the metrics.json of a run folder")
 
 
 def write_timing(path: Path, times: Sequence[StageTime]) -> None:

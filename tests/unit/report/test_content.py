@@ -206,7 +206,14 @@ def test_further_values_cannot_hide_the_contract() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "why"), [(None, "No such file"), ("{", "not JSON"), ("[]", "holds no metrics")]
+    ("text", "why"),
+    [
+        (None, "No such file"),
+        ("{", "not JSON"),
+        ("[]", "holds no metrics"),
+        ('{"estimators": []}', "holds no metrics"),
+        ('{"estimators": {"ekf": 1}}', "holds no metrics"),
+    ],
 )
 def test_broken_metrics_files(tmp_path: Path, text: str | None, why: str) -> None:
     path = tmp_path / "metrics.json"
