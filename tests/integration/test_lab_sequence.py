@@ -236,10 +236,13 @@ def test_seeds_share_one_render_but_not_their_noise() -> None:
     assert abs(difference.mean()) < 0.25
 
 
-def test_half_written_cache_is_continued_and_damage_repaired() -> None:
+def test_half_written_cache_is_continued_and_damage_repaired(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FGSLAM_CACHE", str(tmp_path))
     sequence = opened(QUICK, (70, 74))
     before = [sequence.frame(i).images[0] for i in range(4)]
-    files = sorted(sequence._cache.folder.glob("frame_00007[0-3].raw"))
+    files = sorted(tmp_path.rglob("frame_00007[0-3].raw"))
     files[0].unlink()
     files[1].write_bytes(files[1].read_bytes()[:100])
     damaged = bytearray(files[2].read_bytes())

@@ -381,23 +381,11 @@ def _call_violation(node: ast.Call) -> str | None:
 # --------------------------------------------------------------------------------------------
 # Tests
 
-PRIVATE_IN_TESTS = frozenset(
-    {
-        "tests/integration/test_lab_sequence.py",
-    }
-)
-"""Tests that still reach private names of the package. Take files out; put none in."""
-
 _SETTERS = frozenset({"setattr", "getattr", "hasattr", "delattr"})
 
 
-def private_name_violations(
-    tests: Path, modules: list[Module], not_yet: frozenset[str] = PRIVATE_IN_TESTS
-) -> list[Violation]:
-    """Private names of the package that tests reach: whoever cleans a module may rename them.
-
-    A file of ``not_yet`` that reaches none any more is a finding, too.
-    """
+def private_name_violations(tests: Path, modules: list[Module]) -> list[Violation]:
+    """Private names of the package that tests reach: a change of a module may rename them."""
     defined = {name for module in modules for name in _defined_names(module.tree)}
     private = {name for name in defined if name.startswith("_") and not name.startswith("__")}
     private -= {"_fields", "_replace", "_asdict"}  # public, of named tuples
@@ -406,12 +394,7 @@ def private_name_violations(
         name = path.relative_to(tests.parent).as_posix()
         tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
         reached = sorted(_reached_names(tree, private - set(_defined_names(tree))))
-        if name not in not_yet:
-            found += [
-                Violation(name, line, f"reaches the private {what}") for line, what in reached
-            ]
-        elif not reached:
-            found.append(Violation(name, 1, "reaches no private name: strike it from the list"))
+        found += [Violation(name, line, f"reaches the private {what}") for line, what in reached]
     return found
 
 
