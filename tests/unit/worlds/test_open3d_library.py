@@ -112,6 +112,7 @@ def test_open3d_without_memory_is_not_called_a_missing_library(
     with pytest.raises(MemoryShortageError, match="memory is limited to 1000000 MB") as caught:
         load_open3d()
     assert "\n" not in str(caught.value)
+    assert "raise the limit (ulimit -v)" in str(caught.value)
 
 
 def test_open3d_is_loaded_where_it_fits_and_needs_no_room_again(
