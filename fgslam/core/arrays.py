@@ -179,10 +179,6 @@ class GrowingColumns:
         out.append(packed)
         return out
 
-    def bytes_per_row(self) -> int:
-        """Memory of a row, without the room kept for growth."""
-        return sum(b.itemsize * int(np.prod(b.shape[1:])) for b in self._buffers.values())
-
     def _reserve(self, rows: int) -> None:
         have = len(next(iter(self._buffers.values())))
         if rows <= have:

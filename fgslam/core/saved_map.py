@@ -101,10 +101,7 @@ def _require_map(saved: SavedMap) -> None:
         require_finite(name, values)
     require_finite("times of poses", drive.timestamps)
     require_covariances("landmark covariances", landmarks.covariances, definite=False)
-    if (
-        patches is not None
-        and not ((patches.distances >= 0.0) & np.isfinite(patches.distances)).all()
-    ):
+    if not ((patches.distances >= 0.0) & np.isfinite(patches.distances)).all():
         raise ValueError("a distance of a patch is negative or not finite")
 
 

@@ -9,7 +9,6 @@ feature lay in the image is not kept: it is NaN after reading.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +21,6 @@ from fgslam.core.bearings import (
     OmniFeatures,
     UprightFeatures,
 )
-
-Array: TypeAlias = np.ndarray[Any, Any]
 
 _ANGLE = 32767.0 / np.pi
 _LEAST, _MOST = 1e-5, 10.0  # of what is kept as a byte, radians

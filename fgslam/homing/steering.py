@@ -173,7 +173,7 @@ class CorridorAvoidance:
         """See :class:`ObstacleAvoider`."""
         if self._escaping > 0:
             self._escaping -= 1
-            return self._escape(wanted, _points(scan))
+            return self._escape(_points(scan))
         driven = self._in_corridor(wanted, heading, scan)
         stands = driven.overridden and driven.speed < _STANDING
         # Turning towards a way takes its time.
@@ -185,7 +185,7 @@ class CorridorAvoidance:
             self._escaping = _ESCAPE_STEPS
         return driven
 
-    def _escape(self, wanted: Drive, points: FloatArray) -> Drive:
+    def _escape(self, points: FloatArray) -> Drive:
         s = self._settings
         ways = clear_ways(self._directions, points, s.body_m)
         # Of ways that are long enough the one that needs the least turning.

@@ -313,7 +313,7 @@ def truth_in_map(saved: SavedMap, sequence: ImageSequence, config: ExperimentCon
             unknown, "the map is of another place, so errors are not known"
         )
     mapped = _drive_config(drives[-1])
-    aligned = None if mapped is None else _of_recorded(saved, mapped, sequence, config)
+    aligned = None if mapped is None else _of_recorded(saved, mapped, config)
     if aligned is None:
         return TruthInMap(unknown, "the map is of another recording, so errors are not known")
     mTw, matched, slack = aligned
@@ -356,7 +356,7 @@ def _of_rendered(
 
 
 def _of_recorded(
-    saved: SavedMap, mapped: ExperimentConfig, sequence: ImageSequence, config: ExperimentConfig
+    saved: SavedMap, mapped: ExperimentConfig, config: ExperimentConfig
 ) -> tuple[FloatArray, int, float] | None:
     """(4, 4) from the truth's world to the map's, how many poses it was found from, its slack."""
     now, then = (getattr(one.dataset, "path", None) for one in (config, mapped))
