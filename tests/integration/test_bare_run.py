@@ -33,12 +33,12 @@ def test_a_recording_alone_gives_a_run_folder_that_compares(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     out = tmp_path / "run"
-    assert main(monkeypatch, "run", recording, "--out", out) == 0
+    assert main(monkeypatch, "run", recording, "--out", out, *QUIET[:2]) == 0
     first = capfd.readouterr().out.splitlines()[0]
     assert first.startswith("boards: image folder, 3 cameras 160x120; 12 frames at 4 Hz; odometry;")
     assert (out / "report.html").is_file()
     assert metrics_of(out)["estimators"][DEFAULT_ESTIMATOR]["ate_rmse_m"] < 0.01
-    assert main(monkeypatch, "compare", out, "--estimators", "odometry,batch") == 0
+    assert main(monkeypatch, "compare", out, "--estimators", "odometry") == 0
     assert (out / "compare" / "comparison.csv").is_file()
 
 

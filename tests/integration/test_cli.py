@@ -36,50 +36,9 @@ from fgslam.core.types import Trajectory
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import Experiment
 from fgslam.runs.engine import RunResult
-from fgslam.runs.named_experiments import experiment_names
 
 # --------------------------------------------------------------------------------------------
 # Help and usage
-
-
-def test_help_of_the_whole(monkeypatch: Patch, capfd: Capture) -> None:
-    for arguments in ((), ("--help",)):
-        assert main(monkeypatch, *arguments) == 0
-        out = capfd.readouterr().out
-        for verb in ("run", "export", "inspect", "view"):
-            assert verb in out
-
-
-@pytest.mark.parametrize(
-    ("verb", "words"),
-    [
-        ("run", ("e.g. lab_loop", "--out", "--set", "--overwrite", "--resume", "--save-rrd")),
-        (
-            "export",
-            (
-                "--map",
-                ".ply",
-                ".pcd",
-                "--trajectory",
-                ".tum",
-                ".kitti",
-                ".mcap",
-                "--images",
-            ),
-        ),
-        ("export", ("--graph", ".g2o", "--estimator")),
-        ("view", ("rerun viewer", "--save", ".rrd")),
-        ("inspect", ("its folder, file or a pattern", "--frames")),
-    ],
-)
-def test_help_of_a_verb(
-    verb: str, words: tuple[str, ...], monkeypatch: Patch, capfd: Capture
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
-    assert main(monkeypatch, verb, "--help") == 0
-    out = capfd.readouterr().out
-    for word in words:
-        assert word in out
 
 
 @pytest.mark.parametrize("program", [[sys.executable, "-m", "fgslam"], command()])
@@ -136,12 +95,6 @@ def test_mistyped_commands(
     arguments: tuple[str, ...], expected: str, monkeypatch: Patch, capfd: Capture
 ) -> None:
     assert expected in mistake(capfd, monkeypatch, *arguments)
-
-
-def test_help_of_run_lists_every_experiment(monkeypatch: Patch, capfd: Capture) -> None:
-    assert main(monkeypatch, "run", "--help") == 0
-    out = " ".join(capfd.readouterr().out.split())
-    assert f"Experiments that come with fgslam: {', '.join(experiment_names())}." in out
 
 
 # --------------------------------------------------------------------------------------------
@@ -225,9 +178,11 @@ def test_a_current_folder_that_has_been_deleted_is_told(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_the_resolved_configuration_repeats_the_run(finished: Finished, tmp_path: Path) -> None:
-    status, _, error = call("run", finished.folder / "config.yaml", "--out", tmp_path / "again")
-    assert status == 0, error
+def test_the_resolved_configuration_repeats_the_run(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    resolved = finished.folder / "config.yaml"
+    assert main(monkeypatch, "run", resolved, "--out", tmp_path / "again") == 0
     for name in (f"{KIND}/final.tum", "measurements.npz"):
         assert (tmp_path / "again" / name).read_bytes() == (finished.folder / name).read_bytes()
 

@@ -122,16 +122,6 @@ def test_metrics_hold_the_names_of_the_contract_and_true_landmarks(measured: Pat
     ]
 
 
-def test_a_finished_run_on_measurements_is_neither_resumed_nor_replaced(
-    measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
-) -> None:
-    config = write_config(tmp_path / "c.yaml", DRIVE)
-    assert main(monkeypatch, "run", config, "--out", measured, "--resume") == 2
-    assert "the run has finished" in capsys.readouterr().err
-    assert main(monkeypatch, "run", config, "--out", measured) == 2
-    assert "holds a run already" in capsys.readouterr().err
-
-
 @pytest.mark.usefixtures("in_this_process")
 def test_the_table_states_by_which_noise_each_estimator_weighed(
     plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image as PictureFile
-from running import main, write_config
+from running import main, mistake, write_config
 
 from fgslam.core.bearings import BearingLog
 from fgslam.core.errors import DatasetError
@@ -38,16 +38,6 @@ def values_of(run: Path) -> dict[str, Any]:
     document = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     assert isinstance(document, dict)
     return document
-
-
-def mistake(capfd: Capture, monkeypatch: Patch, *arguments: object) -> str:
-    """The one line that a command prints which must fail."""
-    assert main(monkeypatch, *arguments) == 2
-    said = capfd.readouterr()
-    assert said.out == ""
-    (line,) = said.err.splitlines()
-    assert line.startswith("fgslam: ")
-    return line
 
 
 @pytest.fixture(scope="module")
@@ -154,16 +144,6 @@ def test_trials_repeat_simulated_homings_with_other_noise(
     assert load_homing(out / RUN_MARKER).seed == 7
 
 
-def test_a_run_is_neither_resumed_nor_overwritten_unasked(
-    trials: Path, tmp_path: Path, monkeypatch: Patch, capfd: Capture
-) -> None:
-    config = trials / RUN_MARKER
-    line = mistake(capfd, monkeypatch, "run", config, "--out", trials, "--resume")
-    assert "the run has finished" in line
-    line = mistake(capfd, monkeypatch, "run", config, "--out", trials)
-    assert "holds a run already; choose another --out, or add --overwrite" in line
-
-
 def test_other_commands_say_that_it_is_homing(
     trials: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
@@ -228,18 +208,7 @@ def test_a_missing_folder_is_reported_before_anything_is_written(
     assert not (tmp_path / "run").exists()
 
 
-def test_an_unreadable_calibration_is_reported(
-    tmp_path: Path, monkeypatch: Patch, capfd: Capture
-) -> None:
-    folder = panoramas(tmp_path / "pictures", ((64, 48),))
-    (folder / "calib_results.txt").write_text("5 -1 2 nonsense\n", encoding="utf-8")
-    camera = {"kind": "ocamcalib"}
-    dataset = {"kind": "omni_path", "path": str(folder), "camera": camera}
-    config = refused(tmp_path, dataset)
-    line = mistake(capfd, monkeypatch, "run", config, "--out", tmp_path / "run")
-    assert "calib_results.txt" in line
-
-
+@pytest.mark.usefixtures("in_this_process")
 def test_an_image_of_another_size_is_reported(
     tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:

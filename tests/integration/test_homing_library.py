@@ -182,12 +182,13 @@ class Robot:
         return float(np.linalg.norm(way))
 
 
-def test_a_robot_that_is_put_down_anywhere_finds_its_place_and_waits_for_obstacles() -> None:
+@pytest.mark.slow
+def test_a_robot_that_is_carried_off_is_lost_finds_its_place_again_and_reaches_the_end() -> None:
     robot = Robot()
     robot.put(leg=8, part=0.4, turned=0.3)
     given = robot.until("drive", 20)
-    assert given[-1].target == 8
     place = given[-1].place
+    assert given[-1].target == 8
     assert place is not None
     assert place.sure
     assert place.nearest in (7, 8)
@@ -200,15 +201,6 @@ def test_a_robot_that_is_put_down_anywhere_finds_its_place_and_waits_for_obstacl
     went = [robot.step() for _ in range(25)]
     assert went[-1].v > 0.1
     assert robot.away(8) < before - 0.3
-
-
-@pytest.mark.slow
-def test_a_robot_that_is_carried_off_is_lost_finds_its_place_again_and_reaches_the_end() -> None:
-    robot = Robot()
-    robot.put(leg=8, part=0.4, turned=0.3)
-    assert robot.until("drive", 20)[-1].target == 8
-    for _ in range(20):
-        robot.step()
     lost = robot.until("wait", 100, dark=True)  # under somebody's coat
     assert "grey" in lost[-1].reason
     assert [robot.step(dark=True).v for _ in range(10)][-1] == 0.0  # after braking

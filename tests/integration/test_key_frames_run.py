@@ -86,28 +86,13 @@ def test_frames_too_far_apart_to_carry_anything_are_left_to_features_in_all_imag
     assert metrics_of(run.folder)["status_counts"] == {"first": 1, "ok": 1}
 
 
-@pytest.mark.parametrize("frames", [1, 5, 9])
 def test_an_interrupted_run_goes_on_to_the_same_bytes(
-    frames: int, recording: Path, hybrid: Finished, tmp_path: Path
-) -> None:
-    values = values_of(recording)
-    run_values(values, tmp_path / "run", stopped=stop_after(frames))
-    run_values(values, tmp_path / "run", "resume")
-    assert bytes_of(tmp_path / "run") == bytes_of(hybrid.folder)
-
-
-def test_frames_pushed_one_by_one_give_the_same_measurements(
     recording: Path, hybrid: Finished, tmp_path: Path
 ) -> None:
     values = values_of(recording)
-    config = tmp_path / "hybrid.yaml"
-    write_config(config, values)
-    slam = fg.Slam.from_config(config)
-    for t, images, odometry in fg.open_recording(config):
-        slam.track(t, images, odometry)
-    slam.close()
-    slam.log.save(tmp_path / "log.npz")
-    assert (tmp_path / "log.npz").read_bytes() == (hybrid.folder / "measurements.npz").read_bytes()
+    run_values(values, tmp_path / "run", stopped=stop_after(5))
+    run_values(values, tmp_path / "run", "resume")
+    assert bytes_of(tmp_path / "run") == bytes_of(hybrid.folder)
 
 
 def test_a_replay_finds_the_poses_of_the_live_run(hybrid: Finished) -> None:

@@ -79,12 +79,6 @@ def unaligned_errors(run: Path, kind: str = KIND) -> FloatArray:
     return np.asarray(np.linalg.norm(apart, axis=1))
 
 
-@pytest.mark.slow
-def test_the_same_run_saves_the_same_bytes(recording: Path, map_file: Path, tmp_path: Path) -> None:
-    run_values(mapped(recording, save=str(tmp_path / "all.fgmap")), tmp_path / "run")
-    assert (tmp_path / "all.fgmap").read_bytes() == map_file.read_bytes()
-
-
 # --------------------------------------------------------------------------------------------
 # Beginning in a map
 
@@ -112,14 +106,6 @@ def test_a_run_starts_where_the_last_one_stopped(
     # The truth's world is the recording's first frame: that of the map, too. Its landmarks are
     # those of one key frame, and SIFT finds them again from half a metre away.
     assert unaligned_errors(run.folder).max() < 0.005
-
-
-@pytest.mark.slow
-def test_a_run_in_the_middle_is_located_there(
-    recording: Path, map_file: Path, tmp_path: Path
-) -> None:
-    run = run_values(mapped(recording, first=5, load=str(map_file)), tmp_path / "run")
-    assert unaligned_errors(run.folder).max() < 0.004
 
 
 def test_frames_before_the_first_that_is_located_are_left_out(

@@ -51,14 +51,6 @@ def test_omni_home(shared_data: Path) -> None:
     assert np.abs(difference).max() < 1.0
 
 
-def test_omni_corridors(shared_data: Path) -> None:
-    folder = present(shared_data, "omni_corridors")
-    recording = open_omni(PanoramasSettings(path=str(folder), stride=20))
-    assert recording.ids.tolist() == [1, 21, 41]
-    assert recording.poses is None
-    assert recording.image(2).shape == (1024, 2048, 3)
-
-
 # --------------------------------------------------------------------------------------------
 # Mirror images
 

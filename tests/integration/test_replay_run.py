@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 from typing import Any
 
@@ -37,16 +36,9 @@ FRONTENDS: dict[str, dict[str, Any]] = {
     "plain": {"matching": {"widen_sigmas": 3.0}},
     "refined": {"matching": {"widen_sigmas": 3.0, "refine": True, "rescue": True}},
 }
-EACH_ONCE = tuple(zip(KINDS, FRONTENDS, strict=True))
 
 
-@pytest.mark.parametrize(
-    ("kind", "frontend"),
-    [
-        pytest.param(*pair, marks=() if pair in EACH_ONCE else pytest.mark.slow)
-        for pair in itertools.product(KINDS, FRONTENDS)
-    ],
-)
+@pytest.mark.parametrize(("kind", "frontend"), tuple(zip(KINDS, FRONTENDS, strict=True)))
 def test_replay_to_the_bit(kind: str, frontend: str, recording: Path, tmp_path: Path) -> None:
     values = experiment(recording, odometry={"kind": kind}, frontend=FRONTENDS[frontend])
     run = run_values(values, tmp_path / "run")

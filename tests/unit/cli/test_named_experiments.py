@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-import fgslam
 from fgslam.core.errors import ConfigError
 from fgslam.runs.config import read_mapping
 from fgslam.runs.named_experiments import experiment_names, find_experiment, suggestion
@@ -48,30 +45,6 @@ def test_a_missing_file_with_a_known_name_suggests_it(
     assert "lab_loop" in suggestion(Path(missing))
     with pytest.raises(ConfigError, match=r"no such file; the experiment lab_loop comes with"):
         read_mapping(Path(missing))
-
-
-def test_an_installed_package_finds_its_own_copies(tmp_path: Path) -> None:
-    """The layout of the wheel: no checkout beside the package, the experiments inside it."""
-    site = tmp_path / "site"
-    shutil.copytree(
-        Path(fgslam.__file__).parent, site / "fgslam", ignore=shutil.ignore_patterns("__pycache__")
-    )
-    (site / "fgslam" / "experiments").mkdir()
-    shutil.copy(ROOT / "experiments" / "lab_loop.yaml", site / "fgslam" / "experiments")
-    code = (
-        "from pathlib import Path\n"
-        "from fgslam.runs.named_experiments import experiment_names, find_experiment\n"
-        "print(experiment_names(), find_experiment(Path('lab_loop')))"
-    )
-    said = subprocess.run(  # noqa: S603
-        [sys.executable, "-c", code],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(site)},
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout
-    assert said.strip() == f"('lab_loop',) {site / 'fgslam' / 'experiments' / 'lab_loop.yaml'}"
 
 
 def test_the_build_step_copies_every_experiment_into_the_wheel(tmp_path: Path) -> None:

@@ -32,7 +32,6 @@ with signals.stop_flag():
     os.kill(os.getpid(), int(sys.argv[1]))
     time.sleep(600.0)
 """
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def ended(code: str, *arguments: object) -> tuple[int, str]:
@@ -41,8 +40,10 @@ def ended(code: str, *arguments: object) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
-@pytest.mark.parametrize("number", _SIGNALS)
-@pytest.mark.parametrize("module", ["typer", "pydantic", "yaml"])
+@pytest.mark.parametrize(
+    ("number", "module"),
+    [(signal.SIGINT, "typer"), (signal.SIGTERM, "pydantic"), (signal.SIGINT, "yaml")],
+)
 def test_while_a_command_imports_a_signal_ends_it_with_one_line(
     number: signal.Signals, module: str
 ) -> None:
@@ -89,13 +90,10 @@ os._exit(signal.getsignal(ignored) is not signal.SIG_IGN)
 """
 
 
-@pytest.mark.parametrize("number", _SIGNALS)
-def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored(
-    number: signal.Signals,
-) -> None:
-    (other,) = {*_SIGNALS} - {number}
-    assert ended(_ONE_IGNORED, int(number), int(number)) == (0, "False\n")
-    assert ended(_ONE_IGNORED, int(number), int(other)) == (0, "True\n")
+def test_a_signal_that_the_process_was_started_to_ignore_stays_ignored() -> None:
+    ignored, other = map(int, (signal.SIGTERM, signal.SIGINT))
+    assert ended(_ONE_IGNORED, ignored, ignored) == (0, "False\n")
+    assert ended(_ONE_IGNORED, ignored, other) == (0, "True\n")
 
 
 _WHILE_IT_STARTS_TO_WATCH = """
@@ -117,10 +115,9 @@ def test_a_signal_in_the_moment_in_which_it_starts_to_be_answered_is_one_line() 
     assert (status, said) == (143, "fgslam: interrupted\n")
 
 
-@pytest.mark.parametrize("number", _SIGNALS)
-def test_a_command_that_does_not_end_by_itself_is_ended(number: signal.Signals) -> None:
-    status, said = ended(_STUCK, int(number))
-    assert status == 128 + number
+def test_a_command_that_does_not_end_by_itself_is_ended() -> None:
+    status, said = ended(_STUCK, int(signal.SIGTERM))
+    assert status == 128 + signal.SIGTERM
     assert said == "fgslam: interrupted; what was saved until then is in valid files\n"
     assert WITHIN_S < 2.0
 

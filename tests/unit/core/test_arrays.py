@@ -20,18 +20,12 @@ from fgslam.core.arrays import (
     student_quantile,
 )
 from fgslam.core.store import pack, unpack
-from fgslam.core.types import LandmarkMap, Trajectory
+from fgslam.core.types import Trajectory
 
 
 def test_arrays_are_shown_by_their_shapes() -> None:
     trajectory = Trajectory(np.arange(51.0), np.tile(np.eye(4), (51, 1, 1)))
     assert repr(trajectory) == "Trajectory(timestamps=array(51), poses=array(51, 4, 4))"
-
-
-def test_rows_are_shown_by_their_shapes() -> None:
-    landmarks = LandmarkMap(np.arange(9), np.zeros((9, 3)), np.zeros((9, 3, 3)))
-    text = repr(landmarks)
-    assert text == "LandmarkMap(ids=array(9), positions=array(9, 3), covariances=array(9, 3, 3))"
 
 
 # --------------------------------------------------------------------------------------------
@@ -74,10 +68,6 @@ def test_shared_fields_hold_for_all_rows_and_unknown_ones_stay_unknown() -> None
     assert some.time == 3.5
     assert some.colour is None
     assert points(2).join(points(1, colour=False)).colour is None
-
-
-def test_select_keeps_the_given_order() -> None:
-    assert points(3).select(np.array([2, 0, 2])).ids.tolist() == [2, 0, 2]
 
 
 def test_join_appends_rows_and_leaves_its_parts_alone() -> None:

@@ -6,25 +6,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import pose, quaternion_from_rotation, se3_exp, so3_exp
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
     Nees,
-    align,
     associate,
-    chi_square_band,
     end_pose,
     evaluate_trajectory,
     judge,
     landmark_nees,
-    moved,
     nees,
-    path_length,
     pose_errors,
     pose_nees,
-    relative_errors,
     rotation_angles,
     to_estimate_world,
     umeyama,
@@ -98,19 +92,6 @@ def test_ate_and_rpe_agree_with_evo(alignment: Alignment) -> None:
     assert ours.rpe_rot_deg == pytest.approx(expected["rot"], rel=1e-8)
 
 
-def test_rigid_alignment_agrees_with_gtsam() -> None:
-    gtsam = pytest.importorskip("gtsam")
-    truth = wandering(3)
-    estimate = disturbed(truth, 4)
-    source, target = estimate.poses[:, :3, 3], truth.poses[:, :3, 3]
-
-    ours = umeyama(source, target)
-
-    reference = gtsam.Pose3.Align(target.T.copy(), source.T.copy()).matrix()
-    assert ours is not None
-    np.testing.assert_allclose(ours, reference, atol=1e-9)
-
-
 def test_alignment_recovers_an_exact_motion() -> None:
     rng = np.random.default_rng(5)
     source, motion = rng.normal(size=(30, 3)), se3_exp(rng.normal(size=6))
@@ -119,22 +100,6 @@ def test_alignment_recovers_an_exact_motion() -> None:
 
     assert found is not None
     np.testing.assert_allclose(found, motion, rtol=0, atol=1e-12)
-
-
-def test_alignment_is_the_minimum_of_its_cost() -> None:
-    rng = np.random.default_rng(6)
-    source, target = rng.normal(size=(2, 40, 3))
-    target += source
-
-    best = umeyama(source, target)
-
-    def cost(motion: FloatArray) -> float:
-        return float(((source @ motion[:3, :3].T + motion[:3, 3] - target) ** 2).sum())
-
-    assert best is not None
-    for axis in np.eye(6):
-        for step in (1e-3, -1e-3):
-            assert cost(best @ se3_exp(step * axis)) > cost(best)
 
 
 def test_alignment_never_mirrors() -> None:
@@ -152,17 +117,6 @@ def test_straight_path_still_has_an_ate() -> None:
     )
     result = evaluate_trajectory(turned, truth, Alignment.SE3)
     assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-12)
-
-
-def test_perfect_estimate_has_no_error_under_any_rigid_alignment() -> None:
-    truth = wandering(8)
-    moved = Trajectory(truth.timestamps, se3_exp(np.arange(6.0) / 6) @ truth.poses)
-    for alignment in Alignment:
-        result = evaluate_trajectory(moved, truth, alignment)
-        assert result.alignment is alignment
-        assert result.ate_rmse_m == pytest.approx(0.0, abs=1e-12)
-        assert result.rpe_rot_deg == pytest.approx(0.0, abs=1e-6)
-        assert result.end_error_m == pytest.approx(0.0, abs=1e-12)
 
 
 def test_end_error_and_drift_by_hand() -> None:
@@ -220,23 +174,6 @@ def test_association_is_mutual_and_within_tolerance() -> None:
     np.testing.assert_array_equal(true_rows, [5, 30])
 
 
-def test_association_matches_evo_on_jittered_times() -> None:
-    sync = pytest.importorskip("evo.core.sync", reason="evo is not installed")
-    rng = np.random.default_rng(14)
-    truth = np.arange(0.0, 20.0, 0.1)
-    estimate = truth[::3] + rng.uniform(-0.02, 0.02, size=len(truth[::3]))
-    rows, true_rows = associate(estimate, truth, 0.01)
-    expected = sync.matching_time_indices(estimate, truth, 0.01)
-    np.testing.assert_array_equal(rows, expected[0])
-    np.testing.assert_array_equal(true_rows, expected[1])
-
-
-@pytest.mark.parametrize(("n", "m"), [(0, 3), (3, 0), (0, 0)])
-def test_association_of_nothing(n: int, m: int) -> None:
-    rows, true_rows = associate(np.arange(float(n)), np.arange(float(m)), 1.0)
-    assert len(rows) == len(true_rows) == 0
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.3, 3.0, np.pi - 1e-9, np.pi])
 def test_rotation_angles_at_both_ends(angle: float) -> None:
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
@@ -267,21 +204,6 @@ def test_truth_is_brought_into_the_estimates_world() -> None:
     assert to_estimate_world(late, truth) is None
 
 
-def test_relative_errors_do_not_depend_on_the_world() -> None:
-    truth, estimate = wandering(16), disturbed(wandering(16), 17)
-    found = align(estimate.poses, truth.poses, Alignment.SE3)
-    assert found is not None
-    plain = relative_errors(estimate.poses, truth.poses)
-    aligned = relative_errors(moved(found, estimate.poses), truth.poses)
-    np.testing.assert_allclose(plain[0], aligned[0], atol=1e-12)
-    np.testing.assert_allclose(plain[1], aligned[1], atol=1e-12)
-
-
-def test_path_length_of_a_square() -> None:
-    corners = [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1], [0, 0, 0]]
-    assert path_length(np.array([pose(np.eye(3), c) for c in corners])) == pytest.approx(4.0)
-
-
 def random_covariances(rng: np.random.Generator, n: int, d: int) -> np.ndarray:
     root = rng.normal(scale=0.05, size=(n, d, d))
     return root @ np.swapaxes(root, 1, 2) + 1e-6 * np.eye(d)
@@ -291,17 +213,7 @@ def drawn(rng: np.random.Generator, covariances: np.ndarray) -> np.ndarray:
     return np.array([rng.multivariate_normal(np.zeros(len(c)), c) for c in covariances])
 
 
-def test_full_rank_nees_is_the_mahalanobis_distance() -> None:
-    rng = np.random.default_rng(1)
-    covariances = random_covariances(rng, 20, 6)
-    errors = rng.normal(size=(20, 6))
-    expected = [e @ np.linalg.solve(c, e) for e, c in zip(errors, covariances, strict=True)]
-    result = nees(errors, covariances)
-    np.testing.assert_allclose(result.values, expected, rtol=1e-6)
-    assert (result.dof == 6).all()
-
-
-@pytest.mark.parametrize("free", [3, 5])
+@pytest.mark.parametrize("free", [3, 6])
 def test_constrained_poses_count_only_their_free_directions(free: int) -> None:
     rng = np.random.default_rng(2)
     basis, _ = np.linalg.qr(rng.normal(size=(6, 6)))
@@ -361,14 +273,6 @@ def test_wrong_covariances_are_recognised_over_many_runs(inflation: float, verdi
         assert result.items == 600
         assert result.independent == (600 if independent else 10)
         assert result.per_dof == pytest.approx(1.0 / inflation, rel=0.1)
-
-
-def test_band_holds_the_stated_share_of_consistent_runs() -> None:
-    rng = np.random.default_rng(4)
-    lower, upper = chi_square_band(18.0, 0.9)
-    means = rng.chisquare(18, size=20000) / 18
-    assert np.mean((means >= lower) & (means <= upper)) == pytest.approx(0.9, abs=0.01)
-    assert chi2.cdf(18.0 * lower, 18) == pytest.approx(0.05)
 
 
 def test_without_degrees_of_freedom_consistency_is_not_known() -> None:

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.geometry import pose, se3_exp, so3_exp
 from fgslam.evaluation.statistics import EstimatorMetrics, UpdateTime
 from fgslam.report.content import (
     SIGMAS,
     Column,
     StageTime,
     TextTable,
-    bulk_limits,
     exaggeration,
     level_axes,
     outlines,
@@ -25,7 +23,6 @@ from fgslam.report.content import (
     read_metrics,
     read_table,
     thinned,
-    world_position_covariances,
     write_csv,
     write_json,
     write_metrics,
@@ -40,15 +37,6 @@ def test_level_axes_are_a_rotation_with_up_last(up: tuple[float, ...]) -> None:
     assert np.linalg.det(level) == pytest.approx(1.0)
     np.testing.assert_allclose(level @ np.array(up), [0, 0, np.linalg.norm(up)], atol=1e-12)
     np.testing.assert_array_equal(level_axes(np.array([0, -1.0, 0])) @ [1, 2, 3], [1, 3, -2])
-
-
-def test_far_landmarks_do_not_shrink_the_map(rng: np.random.Generator) -> None:
-    near = rng.uniform(-5, 5, (500, 2))
-    path = np.array([[0.0, 0.0], [0.0, 7.5]])
-    (left, right), (bottom, top) = bulk_limits(path, np.vstack([near, [[900.0, 4000.0]]]))
-    assert -6 < left < -4 < 4 < right < 6
-    assert -6 < bottom < -4
-    assert 7.5 < top < 9
 
 
 def test_thinning_keeps_ends_and_peaks() -> None:
@@ -79,17 +67,6 @@ def test_pose_ellipses_are_enlarged_just_enough(sigma: float) -> None:
     assert factor == 1000 or factor * width >= 0.2
     assert factor == 1 or (factor / 2.5) * width < 0.2
     assert exaggeration(np.zeros((3, 2, 2)), span=10.0) == 1
-
-
-def test_position_covariance_is_turned_into_the_world() -> None:
-    rng = np.random.default_rng(6)
-    wTc = pose(so3_exp(np.array([0.2, 1.0, -0.3])), [1.0, 2.0, 3.0])
-    root = 0.01 * rng.normal(size=(6, 6))
-    covariance = root @ root.T
-    samples = rng.multivariate_normal(np.zeros(6), covariance, 20000)
-    expected = np.cov(np.array([(wTc @ se3_exp(xi))[:3, 3] for xi in samples]).T)
-    found = world_position_covariances(wTc[None], covariance[None])[0]
-    np.testing.assert_allclose(found, expected, atol=0.05 * np.trace(expected))
 
 
 # --------------------------------------------------------------------------------------------

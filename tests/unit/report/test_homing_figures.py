@@ -14,7 +14,6 @@ from fgslam.report.homing_figures import (
     MAX_MOMENTS,
     Links,
     catchment_figure,
-    claimed_against_true,
     drive_figure,
     local_map_figure,
     network_figure,
@@ -101,10 +100,6 @@ def test_catchment_shows_both_outcomes() -> None:
 def test_distribution_counts_missing_answers() -> None:
     figure = sorted_errors({"a": np.array([3.0, -1.0, np.nan, 2.0])}, "deg", ("k", "Errors"))
     np.testing.assert_allclose(points(figure.drawing.data[0]), [[1, 25], [2, 50], [3, 75]])
-
-
-def test_no_answer_draws_no_cloud() -> None:
-    assert not claimed_against_true({"a": np.zeros(0)}, {"a": np.zeros(0)}).has_numbers
 
 
 def test_a_chain_unfolds_to_a_line() -> None:

@@ -17,9 +17,8 @@ import pytest
 from PIL import Image
 from reports import HOSTILE, estimator_report, full_report, loop, picture, without_truth
 
-from fgslam.core.errors import OutputError
 from fgslam.report.content import Column, Picture, TextTable
-from fgslam.report.page import BUDGET_BYTES, MAX_WIDTH, embed, headline, slam_page, write_report
+from fgslam.report.page import MAX_WIDTH, embed, headline, slam_page, write_report
 from fgslam.report.page import render as render_page
 from fgslam.report.results import EstimatorReport, ReportData
 
@@ -181,11 +180,6 @@ def test_figures_and_pictures_have_words() -> None:
     assert len(ids) == len(set(ids))
 
 
-def test_a_failed_estimator_has_a_row() -> None:
-    assert "ekf failed: the map" in render(full_report())
-    assert "ekf (failed)" in render(full_report())
-
-
 def test_long_runs_stay_small() -> None:
     rng, truth = np.random.default_rng(5), loop(2500)
     reports = tuple(estimator_report(f"e{i}", truth, rng, landmarks=20_000) for i in range(8))
@@ -194,11 +188,6 @@ def test_long_runs_stay_small() -> None:
     assert len(text.encode()) < 8e6
     left_out = "Left out to keep this page small, see the run folder: noise"
     assert left_out in text  # pictures at their worst
-
-
-def test_an_error_of_the_disk_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"nowhere.*choose another folder"):
-        write_report(tmp_path / "nowhere" / "report.html", full_report())
 
 
 # --------------------------------------------------------------------------------------------
@@ -228,14 +217,17 @@ def test_small_pictures_are_kept_and_large_ones_shrunk(rng: np.random.Generator)
         assert opened.size == (MAX_WIDTH, 495)
 
 
-def test_pictures_that_cannot_be_shown_are_listed(rng: np.random.Generator) -> None:
+def test_pictures_that_cannot_be_shown_are_listed(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
     content = picture(rng)
     shown, left_out = embed([Picture("torn", content[:100]), Picture("text", b"hello")])
     assert shown == []
     assert left_out == ["Picture not readable: torn", "Picture not readable: text"]
-    many = [Picture(f"p{i}", picture(rng, 1200, 900)) for i in range(12)]
+    monkeypatch.setattr("fgslam.report.page.BUDGET_BYTES", 150_000)
+    many = [Picture(f"p{i}", picture(rng, 240, 180)) for i in range(12)]
     shown, left_out = embed(many)
     assert 0 < len(shown) < 12
     assert len(shown) + len(left_out) == 12
-    assert sum(len(p.uri) for p in shown) < BUDGET_BYTES * 1.34
+    assert sum(len(p.uri) for p in shown) < 150_000 * 1.34
     assert left_out[0] == f"Left out to keep this page small, see the run folder: p{len(shown)}"

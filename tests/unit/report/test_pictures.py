@@ -113,14 +113,8 @@ def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
 
 @pytest.mark.usefixtures("coarse")
 @pytest.mark.parametrize("name", list(all_pictures(0, full=False)))
-@pytest.mark.parametrize(
-    ("n", "full"),
-    [(0, False), (1, False), (40, True), pytest.param(0, True, marks=pytest.mark.slow)],
-)
-def test_every_picture_is_drawn_from_much_little_and_nothing(
-    tmp_path: Path, name: str, n: int, full: bool
-) -> None:
-    all_pictures(n, full=full)[name](tmp_path / "a.png")
+def test_every_picture_is_drawn_from_nothing(tmp_path: Path, name: str) -> None:
+    all_pictures(0, full=False)[name](tmp_path / "a.png")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     picture = imread(tmp_path / "a.png")
     assert min(picture.shape[:2]) > 100
@@ -136,6 +130,9 @@ def test_same_input_same_bytes_whatever_the_users_style(tmp_path: Path, name: st
         before = dict(matplotlib.rcParams)
         draw(tmp_path / "b.png")
         assert dict(matplotlib.rcParams) == before
+    picture = imread(tmp_path / "a.png")
+    assert min(picture.shape[:2]) > 100
+    assert picture[..., :3].std() > 0.02
     content = (tmp_path / "a.png").read_bytes()
     assert content == (tmp_path / "b.png").read_bytes()
     assert b"tEXtSoftware" not in content

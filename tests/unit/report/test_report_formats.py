@@ -19,14 +19,12 @@ from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_ex
 from fgslam.core.log import MeasurementLog
 from fgslam.core.types import Trajectory
 from fgslam.report.formats import (
-    EXACT_SIGMA,
     FRAME,
     TOPIC,
     ImageModel,
     MapPoints,
     PoseLandmarkGraph,
     g2o_information,
-    information_of,
     read_ply,
     write_colmap,
     write_g2o,
@@ -94,16 +92,10 @@ def test_ply_header_names_every_property(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
-@pytest.mark.parametrize("n", [0, 1, 50])
-def test_same_map_same_bytes(tmp_path: Path, suffix: str, n: int) -> None:
+def test_same_map_same_bytes(tmp_path: Path, suffix: str) -> None:
     for name in ("a", "b"):
-        write_map(tmp_path / f"{name}{suffix}", a_map(n))
+        write_map(tmp_path / f"{name}{suffix}", a_map(50))
     assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
-
-
-def test_empty_map_there_and_back(tmp_path: Path) -> None:
-    write_ply(tmp_path / "map.ply", a_map(0))
-    assert len(read_ply(tmp_path / "map.ply")) == 0
 
 
 def test_open3d_reads_the_ply(tmp_path: Path, open3d) -> None:
@@ -125,15 +117,6 @@ def test_open3d_reads_the_pcd(tmp_path: Path, open3d) -> None:
     np.testing.assert_allclose(np.asarray(cloud.colors), points.colours / 255.0)
 
 
-def test_selection_keeps_rows_together() -> None:
-    points = a_map()
-    valid = points.select(points.valid)
-    assert len(valid) == points.valid.sum()
-    row = int(np.flatnonzero(points.valid)[3])
-    np.testing.assert_array_equal(valid.positions[3], points.positions[row])
-    assert valid.ids[3] == points.ids[row]
-
-
 def test_unknown_format_and_landmarks_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"use \.ply or \.pcd"):
         write_map(tmp_path / "map.xyz", a_map(1))
@@ -144,11 +127,6 @@ def test_unknown_format_and_landmarks_that_cannot_be_written(tmp_path: Path) -> 
     with pytest.raises(OutputError, match="ids must lie"):
         write_map(tmp_path / "map.pcd", dataclasses.replace(a_map(1), ids=np.array([2**31])))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_columns_of_different_length_are_a_fault_of_ours() -> None:
-    with pytest.raises(ValueError, match="hits has 3 rows, not 4"):
-        dataclasses.replace(a_map(4), hits=np.zeros(3, np.int64))
 
 
 def test_foreign_and_broken_ply_files(tmp_path: Path) -> None:
@@ -248,12 +226,6 @@ def test_information_weighs_a_motion_as_our_covariance_does(rng: np.random.Gener
         theirs = np.concatenate([error[:3, 3], vector])
         ours = xi @ np.linalg.solve(covariance, xi)
         assert theirs @ information @ theirs == pytest.approx(ours, rel=1e-4)
-
-
-def test_an_exact_direction_gets_a_tiny_sigma() -> None:
-    covariance = np.diag([0.0, 4.0, 0.25])[None]
-    expected = np.diag([EXACT_SIGMA**-2, 0.25, 4.0])
-    np.testing.assert_allclose(information_of(covariance)[0], expected, rtol=1e-12)
 
 
 def test_gtsam_reads_poses_and_motions(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -379,13 +351,6 @@ def test_colmap_reads_the_model(model: ImageModel, tmp_path: Path) -> None:
     first = read.point3D(1)
     np.testing.assert_allclose(first.xyz, model.positions[0], rtol=0, atol=1e-12)
     assert first.color.tolist() == model.colours[0].tolist()
-
-
-def test_the_left_camera_is_a_baseline_away_from_the_right_one(model: ImageModel) -> None:
-    right, left = model.poses[:2]
-    np.testing.assert_allclose(
-        np.linalg.inv(right) @ left[:, 3], [-model.rig.baseline, 0, 0, 1], rtol=0, atol=1e-12
-    )
 
 
 def test_normals_are_those_of_the_surface_and_face_the_camera(model: ImageModel) -> None:

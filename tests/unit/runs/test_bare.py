@@ -68,20 +68,6 @@ def test_every_layout_is_named_in_the_line(tmp_path: Path) -> None:
     assert drone in bare_experiment(flight).said
 
 
-def test_the_printed_configuration_repeats_the_run(tmp_path: Path) -> None:
-    root = image_folder(tmp_path / "a walk, again")
-    text = short_config(root)
-    assert text.startswith("# ")
-    assert len(text.splitlines()) <= 10
-    assert make_config(yaml.safe_load(text), "printed") == bare_experiment(root).config
-
-
-def test_overrides_hold_for_a_recording_too(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    config = bare_experiment(root, None, ["dataset.stop=3", "estimator.kind=isam2"]).config
-    assert (config.dataset.stop, config.estimator.kind) == (3, "isam2")
-
-
 def test_the_printed_configuration_keeps_what_was_asked_for(tmp_path: Path) -> None:
     asked = ["dataset.stop=3", "estimator.kind=batch", "frontend.sift.max_features=900"]
     text = short_config(image_folder(tmp_path), None, asked)
@@ -169,11 +155,6 @@ def test_two_layouts_that_fit_equally_are_both_named_and_one_can_be_chosen(tmp_p
     assert "is no layout of a folder of images" in refused(root, "dataset.kind=rendered_lab")
 
 
-def test_a_rate_is_for_what_has_no_times(tmp_path: Path) -> None:
-    line = refused(image_folder(tmp_path), "dataset.fps=5")
-    assert "image folder states its own times; leave --fps out" in line
-
-
 def test_two_layouts_that_are_begun_say_what_each_lacks(tmp_path: Path) -> None:
     (tmp_path / "left").mkdir()
     (tmp_path / "mav0" / "cam0").mkdir(parents=True)
@@ -189,13 +170,6 @@ def test_a_complete_layout_wins_over_parts_of_another(tmp_path: Path) -> None:
 
 def test_an_empty_folder(tmp_path: Path) -> None:
     assert "is empty; give the folder of a recording" in refused(tmp_path)
-
-
-def test_one_camera_only(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    for path in (*(root / "left").iterdir(), root / "left"):
-        path.unlink() if path.is_file() else path.rmdir()
-    assert "has no folder left; a recording of one camera cannot be used" in refused(root)
 
 
 def test_a_missing_calibration(tmp_path: Path) -> None:

@@ -22,7 +22,6 @@ from fgslam.runs.config import (
     make_config,
     make_experiment,
 )
-from fgslam.worlds.settings import RenderedLabSettings
 
 EXPERIMENTS = sorted((Path(__file__).parents[3] / "experiments").glob("*.yaml"))
 MINIMAL: dict[str, Any] = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
@@ -60,20 +59,11 @@ def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
 @pytest.mark.parametrize(
     ("base", "typo", "meant"),
     [
-        (MINIMAL, "seeed", "seed"),
         (MINIMAL, "front_end", "frontend"),
-        (MINIMAL, "dataset.pth", "path"),
         (MINIMAL, "dataset.use_tops", "use_top"),
-        (MINIMAL, "frontend.shift", "sift"),
         (MINIMAL, "frontend.sift.max_feature", "max_features"),
-        (MINIMAL, "frontend.ego_motion.min_match", "min_matches"),
         (MINIMAL, "odometry.time_offset", "time_offset_s"),
-        (MINIMAL, "estimator.updates", "update"),
-        (MINIMAL, "output.picture", "pictures"),
         (LAB, "dataset.rig.baseline", "baseline_m"),
-        (LAB, "dataset.drive.lap", "laps"),
-        (LAB, "dataset.effects.noise_gray", "noise_grey"),
-        (LAB, "dataset.effects.blocked_frame", "blocked_frames"),
     ],
 )
 def test_an_unknown_key_brings_the_nearest_one(
@@ -112,40 +102,21 @@ def test_missing_keys_and_bad_kinds(values: dict[str, Any], expected: str, tmp_p
     assert expected in message_of(values, tmp_path)
 
 
-def test_kinds_are_listed(tmp_path: Path) -> None:
-    message = message_of(nested(MINIMAL, "dataset.kind", "tape"), tmp_path)
-    for kind in ("rendered_lab", "image_folder", "bag", "kitti", "euroc", "measurements"):
-        assert kind in message
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
         ("name", "a/b"),
-        ("name", "."),
         ("name", ".."),
-        ("name", "..-"),
         ("name", ""),
-        ("name", 7),
         ("seed", -1),
-        ("seed", 1.5),
-        ("seed", "many"),
         ("dataset", "there"),
         ("dataset.path", ""),
-        ("dataset.start", -1),
         ("dataset.stop", 0),
-        ("dataset.stride", 0),
         ("dataset.lever_arm_m", 1.0),
         ("frontend", None),
-        ("frontend.sift.max_features", -1),
         ("frontend.sift.contrast_threshold", float("nan")),
-        ("frontend.sift.contrast_threshold", float("inf")),
         ("frontend.sift.base_sigma_px", 3.01),
-        ("frontend.appearance.mode", "colour"),
         ("frontend.ego_motion.dof", 4),
-        ("frontend.matching.refine", "perhaps"),
-        ("output.checkpoint_seconds", -0.1),
-        ("output.checkpoint_seconds", float("nan")),
     ],
 )
 def test_a_wrong_value_is_named_with_its_key(key: str, value: object, tmp_path: Path) -> None:
@@ -168,11 +139,8 @@ def test_a_wrong_item_of_a_vector_is_named_by_its_place(tmp_path: Path) -> None:
     ("content", "expected"),
     [
         (b"", "holds no `key: value` pairs"),
-        (b"# only a remark\n", "holds no `key: value` pairs"),
         (b"- 1\n- 2\n", "holds no `key: value` pairs"),
-        (b"just words\n", "holds no `key: value` pairs"),
         (b"name: [1, 2\n", ", line 2: not valid YAML"),
-        (b"name: x\n  seed: 1\n", ", line 2: not valid YAML"),
         (b"name: !!python/object/apply:os.system ['true']\n", ", line 1: not valid YAML"),
         (b"name: a\x00b\n", "not valid YAML"),
         (b"[" * 5000, ", line 1: not valid YAML (nested over 50 deep)"),
@@ -249,13 +217,10 @@ KITTI = {"name": "x", "dataset": {"kind": "kitti", "path": "there", "sequence": 
     [
         ("01", "01"),  # YAML: a whole number
         ('"01"', "01"),
-        ("'01'", "01"),
-        (" 01 ", "01"),
         ("[1, 2]", "[1, 2]"),
         ("a: b", "a: b"),
         ("{x", "{x"),  # no YAML
         ("now # and here", "now # and here"),  # YAML: a comment
-        ("2020-01-01", "2020-01-01"),  # YAML: a date
         ("no", "no"),  # YAML: false
         ("null", "null"),
     ],
@@ -294,16 +259,6 @@ def test_a_name_among_several_is_no_number_or_truth(tmp_path: Path) -> None:
     assert "odometry.kind is 'no'; use one of recorded" in message
 
 
-def test_the_last_override_wins(tmp_path: Path) -> None:
-    assert load(tmp_path, "seed=3", "seed=4").seed == 4
-
-
-def test_overrides_do_not_outlive_their_run(tmp_path: Path) -> None:
-    values = {"name": "x", "dataset": {"kind": "image_folder", "path": "there"}}
-    load(tmp_path, "dataset.path=elsewhere", base=values)
-    assert values["dataset"] == {"kind": "image_folder", "path": "there"}
-
-
 @pytest.mark.parametrize("override", ["seed", "=3", "a..b=1", ".seed=1", "seed.=1", ""])
 def test_malformed_overrides(override: str, tmp_path: Path) -> None:
     assert "not of the form a.b=value" in message_of(MINIMAL, tmp_path, override)
@@ -333,10 +288,6 @@ def test_another_kind_drops_the_keys_of_the_old_one_but_no_misspelling(tmp_path:
 # Round trip
 
 
-def test_there_are_experiments() -> None:
-    assert {"lab_loop.yaml", "kitti06.yaml", "homing_lab.yaml"} <= {p.name for p in EXPERIMENTS}
-
-
 @pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
 def test_every_experiment_is_valid_and_survives_a_round_trip(path: Path, tmp_path: Path) -> None:
     config = load_experiment(path)
@@ -345,20 +296,6 @@ def test_every_experiment_is_valid_and_survives_a_round_trip(path: Path, tmp_pat
     again = load_experiment(written(tmp_path, config.as_values() | {"provenance": provenance}))
     assert again.as_values() == config.as_values()
     assert again.model_copy(update={"provenance": None}) == config
-
-
-def test_defaults_are_filled_in() -> None:
-    values = make_config(LAB, "x").as_values()
-    assert values["seed"] == 0
-    assert values["dataset"]["rig"]["width"] == 320
-    assert values["estimator"]["kind"] == "landmark_kalman"
-    assert isinstance(make_config(values, "x").dataset, RenderedLabSettings)
-
-
-def test_a_configuration_cannot_be_changed() -> None:
-    config = make_config(LAB, "x")
-    with pytest.raises(ValueError, match="frozen"):
-        config.seed = 3  # type: ignore[misc]
 
 
 def silent(schema: dict[str, Any]) -> list[str]:
@@ -419,7 +356,6 @@ def test_every_estimator_has_a_folder_of_its_own(tmp_path: Path) -> None:
     ("key", "value", "words"),
     [
         ("dataset.stride", "two", "give a whole number"),
-        ("dataset.stride", 1.5, "give a whole number"),
         ("output.pictures", "perhaps", "give true or false"),
         ("frontend.ego_motion.outlier_px", "much", "give a number"),
     ],
@@ -457,13 +393,6 @@ def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) ->
         make_config({**MINIMAL, "map": maps}, "test")
 
 
-def test_a_map_that_is_not_extended_allows_loops() -> None:
-    values = {**MINIMAL, "map": {"load": "a", "extend": False}, "frontend": {"loops": True}}
-    config = make_config(values, "test")
-    assert not config.map.extend
-    assert config.frontend.loops
-
-
 # --------------------------------------------------------------------------------------------
 # Tasks: each has a model of its own, as strict as that of SLAM
 
@@ -479,26 +408,18 @@ def test_configuration_class_follows_from_the_task(tmp_path: Path) -> None:
     ("values", "overrides", "words"),
     [
         (TRIALS | {"task": "homing_trial"}, (), "is 'homing_trial'; did you mean homing_trials?"),
-        (TRIALS | {"task": "slam"}, (), "use one of localisation, homing_"),
-        (TRIALS | {"task": None}, (), "task is None"),
         (TRIALS | {"task": ["a"]}, (), "task is ['a']"),
         (LAB, ("task=homing_trals",), "did you mean homing_trials?"),
-        (TRIALS, ("trial=3",), "unknown key trial; did you mean trials?"),
         (TRIALS, ("dataset.feature=3",), "unknown key dataset.feature; did you mean features?"),
-        (TRIALS, ("homing_vector.sample=3",), "unknown key homing_vector.sample; did you"),
         (TRIALS, ("estimator.kind=homing_graf",), "use one of homing_ekf, paper_ekf, homing_graph"),
-        (TRIALS, ("estimator.solvr=batch",), "unknown key estimator.solvr; did you mean solver?"),
         (TRIALS, ("compare=[homing_ekf, isam2]",), "compare[1].kind is 'isam2'; use one of"),
         (TRIALS, ("outliers=[0.1, 1.0]",), "outliers[1] = 1.0 is not usable"),
-        (TRIALS, ("trials=0",), "trials = 0 is not usable"),
         (TRIALS, ("estimator.label=logs",), "cannot be called logs, a folder of the run"),
-        (TRIALS, ("estimator.label=units",), "cannot be called units, a folder of the run"),
         (
             TRIALS,
             ("compare=[{kind: homing_graph, solver: batch}]",),
             "two different estimators are called homing_graph",
         ),
-        ({"task": "homing_trials"}, (), "key name is missing"),
     ],
 )
 def test_mistakes_are_reported(
@@ -512,14 +433,3 @@ def test_slam_s_own_commands_refuse_homing_and_the_other_way_round(tmp_path: Pat
         load_config(written(tmp_path, TRIALS))
     with pytest.raises(ConfigError, match="has no task"):
         load_homing(written(tmp_path, LAB))
-
-
-def test_the_same_estimator_twice_counts_once() -> None:
-    config = make_experiment(TRIALS | {"compare": ["homing_graph", "alv"]}, "x")
-    assert [settings.title for settings in config.estimators] == ["homing_graph", "alv"]
-
-
-def test_every_task_is_its_model_s_own() -> None:
-    for task, model in TASKS.items():
-        found = model.model_json_schema()["properties"].get("task", {"const": None})
-        assert found["const"] == task

@@ -88,14 +88,6 @@ def test_images_without_content(tmp_path: Path, value: int, words: str) -> None:
     assert words in texts(found, Level.PROBLEM)
 
 
-def test_unreadable_images(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    (root / "right" / "000005.png").write_bytes(b"\x89PNG\r\n\x1a\n")
-    found = texts(check_images(opened(root)), Level.PROBLEM)
-    assert "1 of 6 (16.7 %) sampled frames cannot be read" in found
-    assert "right/000005.png is truncated" in found
-
-
 def test_sampling_reads_no_more_than_asked(tmp_path: Path) -> None:
     read: list[int] = []
     recording = opened(image_folder(tmp_path, 40))
@@ -156,13 +148,6 @@ def with_truth(root: Path, frames: int = 40) -> Path:
     return root
 
 
-def test_recording_without_odometry_and_truth(tmp_path: Path) -> None:
-    recording = opened(image_folder(tmp_path))
-    assert "none recorded; set odometry.kind" in texts(check_odometry(recording), Level.INFO)
-    assert "none, so no accuracy" in texts(check_truth(recording), Level.INFO)
-    assert check_odometry_against_truth(recording) == ()
-
-
 def test_gap_in_the_odometry(tmp_path: Path) -> None:
     root = image_folder(tmp_path, 10)
     (root / "odom.csv").write_text("".join(f"{t},1,0\n" for t in (0, 0.1, 0.2, 0.705, 0.8, 0.9)))
@@ -176,15 +161,6 @@ def test_broken_odometry_is_a_problem_not_an_exception(tmp_path: Path) -> None:
     (root / "odom.csv").write_text("0,1,0\n1,nan,0\n")
     findings = check_sequence(opened(root))
     assert "odom.csv, line 2: forward speed is nan" in texts(findings, Level.PROBLEM)
-
-
-def test_truth_that_jumps(tmp_path: Path) -> None:
-    poses = curve(30)
-    poses[12:, :3, 3] += [40.0, 0.0, 0.0]
-    root = image_folder(tmp_path, 30)
-    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(30), poses)
-    found = texts(check_truth(opened(root)))
-    assert "moves suddenly before its poses 12:" in found
 
 
 def flight(standing: int, flying: int, rate: float, seed: int = 3) -> Trajectory:
@@ -212,14 +188,14 @@ class WithTruth:
         return len(self.ground_truth)
 
 
-@pytest.mark.parametrize("rate", [0.7, 3.3, 20.0, 200.0])
+@pytest.mark.parametrize("rate", [0.7, 200.0])
 @pytest.mark.parametrize("flying", [6, 40])
 def test_a_short_flight_after_long_standing_is_no_jump(rate: float, flying: int) -> None:
     truth = flight(300, flying, rate)
     assert "moves suddenly" not in texts(check_truth(cast(ImageSequence, WithTruth(truth))))
 
 
-@pytest.mark.parametrize("rate", [0.7, 3.3, 20.0, 200.0])
+@pytest.mark.parametrize("rate", [0.7, 200.0])
 @pytest.mark.parametrize("at", [100, 320])
 def test_a_jump_is_found_while_standing_and_while_flying(rate: float, at: int) -> None:
     truth = flight(300, 40, rate)

@@ -27,11 +27,6 @@ AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 # Layouts
 
 
-def test_image_folder_is_recognised(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    assert recognise_layout(root) == {"kind": "image_folder", "path": str(root)}
-
-
 def test_euroc_is_recognised_from_both_folders(tmp_path: Path) -> None:
     cameras = (pose(AHEAD, np.zeros(3)), pose(AHEAD, np.array([0.0, -0.1, 0.0])))
     root = euroc(tmp_path, cameras)
@@ -67,12 +62,6 @@ def test_a_kitti_drive_without_its_root_is_a_folder_of_images(tmp_path: Path) ->
     (moved / "image_1").rename(tmp_path / "elsewhere")
     with pytest.raises(DatasetError, match="move it to ROOT/sequences/00"):
         recognise_layout(moved)
-
-
-def test_half_an_image_folder_gets_its_readers_message(tmp_path: Path) -> None:
-    save(tmp_path / "left" / "000000.png", picture(1))
-    with pytest.raises(DatasetError, match="has no folder right; a recording of one camera"):
-        inspect_recording(tmp_path)
 
 
 @pytest.mark.parametrize("inside", [".", "images", "cam0/data"])
@@ -120,15 +109,6 @@ def descriptors(rng: np.random.Generator, count: int) -> np.ndarray:
     return rng.integers(0, 120, (count, 128), dtype=np.uint8)
 
 
-def test_noisy_copies_find_each_other(rng: np.random.Generator) -> None:
-    a = descriptors(rng, 60)
-    order = rng.permutation(60)
-    b = np.clip(a[order].astype(int) + rng.integers(-9, 10, a.shape), 0, 255).astype(np.uint8)
-    i, j = mutual_nearest(a, b)
-    np.testing.assert_array_equal(i, np.arange(60))
-    np.testing.assert_array_equal(order[j], np.arange(60))
-
-
 def exhaustive(a: np.ndarray, b: np.ndarray, ratio: float) -> list[tuple[int, int]]:
     """In whole numbers; the first of several that are equally near."""
     squared = ((a[:, None].astype(np.int64) - b[None].astype(np.int64)) ** 2).sum(axis=2)
@@ -155,15 +135,6 @@ def test_matches_equal_those_of_exhaustive_search(rng: np.random.Generator, larg
         assert list(zip(*found, strict=True)) == expected
         total += len(expected)
     assert total >= 10
-
-
-def test_ambiguous_and_absent_descriptors_do_not_match(rng: np.random.Generator) -> None:
-    a = descriptors(rng, 3)
-    i, _ = mutual_nearest(a, np.concatenate([a, a[:1]]))
-    np.testing.assert_array_equal(i, [1, 2])
-    for first, second in ((a[:0], a), (a, a[:0])):
-        i, j = mutual_nearest(first, second)
-        assert len(i) == len(j) == 0
 
 
 # --------------------------------------------------------------------------------------------

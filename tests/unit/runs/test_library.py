@@ -182,16 +182,6 @@ def test_a_trajectory_survives_its_file(driven: tuple[fg.Slam, fg.Result], tmp_p
         path.save(tmp_path / "path.txt")
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
-def test_a_map_is_written_as_a_point_cloud(
-    driven: tuple[fg.Slam, fg.Result], tmp_path: Path, suffix: str
-) -> None:
-    place = driven[1].map
-    place.save(tmp_path / f"map{suffix}")
-    head = (tmp_path / f"map{suffix}").read_bytes()[:2000]
-    assert str(len(place)).encode() in head
-
-
 def test_a_saved_map_locates_a_frame_and_refuses_another_rig(
     driven: tuple[fg.Slam, fg.Result], folder: Path, tmp_path: Path
 ) -> None:

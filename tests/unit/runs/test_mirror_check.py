@@ -81,8 +81,7 @@ def test_of_a_camera_by_ocamcalib_is_told_that_it_is_taken_to_look_down(tmp_path
     assert camera_notes(recording, stated=False) == ()  # a route's own camera
 
 
-@pytest.mark.parametrize("holder", [False, True])
-@pytest.mark.parametrize("off", [(3.0, 4.0), (-24.0, 18.0)])
+@pytest.mark.parametrize(("off", "holder"), [((3.0, 4.0), False), ((-24.0, 18.0), True)])
 def test_a_mirror_off_its_place_is_reported_with_the_offset(
     tmp_path: Path, off: tuple[float, float], holder: bool
 ) -> None:

@@ -18,18 +18,12 @@ from fgslam.core import files as whole_files
 from fgslam.core.errors import OutputError
 from fgslam.core.files import make_subfolder, remove_files, replacing, write_bytes, write_text
 from fgslam.runs.engine import is_finished
-from fgslam.runs.folder import create_folder, is_run_folder
+from fgslam.runs.folder import create_folder
 from fgslam.runs.units import UnitStore
 
 
 def leftovers(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if "partial" in path.name]
-
-
-def test_file_appears_whole(tmp_path: Path) -> None:
-    write_text(tmp_path / "a.txt", "one\ntwo\n")
-    assert (tmp_path / "a.txt").read_bytes() == b"one\ntwo\n"
-    assert not leftovers(tmp_path)
 
 
 def test_failure_keeps_the_previous_version(tmp_path: Path) -> None:
@@ -44,16 +38,6 @@ def test_failure_keeps_the_previous_version(tmp_path: Path) -> None:
         interrupted(beside)
     assert target.read_text() == "old"
     assert not leftovers(tmp_path)
-
-
-def test_previous_version_stands_until_the_new_one_is_complete(tmp_path: Path) -> None:
-    target = tmp_path / "a.txt"
-    write_text(target, "old")
-    with replacing(target) as partial:
-        partial.write_text("new")
-        assert target.read_text() == "old"
-        assert partial.parent == target.parent
-    assert target.read_text() == "new"
 
 
 def test_a_folder_that_cannot_be_removed_is_told(
@@ -126,17 +110,6 @@ def a_run(folder: Path) -> Path:
     return folder
 
 
-def test_new_folder_with_its_parents(tmp_path: Path) -> None:
-    folder = create_folder(tmp_path / "a" / "b")
-    assert folder.is_dir()
-    assert not any(folder.iterdir())
-    assert not is_run_folder(folder)
-
-
-def test_empty_folder_is_as_good_as_none(tmp_path: Path) -> None:
-    assert create_folder(tmp_path) == tmp_path
-
-
 def test_folder_with_a_run_is_refused_and_untouched(tmp_path: Path) -> None:
     folder = a_run(tmp_path / "run")
     before = sorted(folder.rglob("*"))
@@ -190,30 +163,6 @@ def test_resume_keeps_everything(tmp_path: Path) -> None:
     before = sorted(folder.rglob("*"))
     create_folder(folder, "resume")
     assert sorted(folder.rglob("*")) == before
-
-
-def test_resume_needs_a_run(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="holds no run"):
-        create_folder(tmp_path / "absent", "resume")
-    assert not (tmp_path / "absent").exists()
-
-
-def test_name_of_a_file_is_refused(tmp_path: Path) -> None:
-    write_text(tmp_path / "file", "x")
-    with pytest.raises(OutputError, match="not a folder"):
-        create_folder(tmp_path / "file")
-    with pytest.raises(OutputError, match="part of the path is a file"):
-        create_folder(tmp_path / "file" / "run")
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_read_only_parent(tmp_path: Path) -> None:
-    tmp_path.chmod(0o500)
-    try:
-        with pytest.raises(OutputError, match="permission denied"):
-            create_folder(tmp_path / "run")
-    finally:
-        tmp_path.chmod(0o700)
 
 
 def test_unwritable_folder_is_found_out_before_the_run(
