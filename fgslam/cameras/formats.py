@@ -894,11 +894,7 @@ def _is_ocamcalib(text: str) -> bool:
 
 def _read_ocamcalib(path: Path, *_: object) -> Calibration:
     """One camera, forward along its axis."""
-    found = read_ocamcalib(path)
-    (c, d, e), (row, column) = found.affine, found.centre
-    matrix = np.array([[1.0, e, column], [d, c, row], [0.0, 0.0, 1.0]])
-    size, depth = (found.width, found.height), np.array(found.direct)
-    camera = checked_camera(RawCamera(*size, matrix, depth, np.eye(4), path.name, "ocam"))
+    camera = replace(read_ocamcalib(path)[0], name=path.name)
     return Calibration(str(path), "OCamCalib", (camera,))
 
 

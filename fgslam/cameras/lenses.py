@@ -318,7 +318,7 @@ LENSES = {
     "ds": Lens((2,), _ds_project, _ds_unproject),
     "eucm": Lens((2,), _eucm_project, _eucm_unproject),
     "omni": Lens((5,), _omni_project, _omni_unproject),
-    "ocam": Lens(tuple(range(2, 33)), _ocam_project, _ocam_unproject),
+    "ocam": Lens(tuple(range(2, 65)), _ocam_project, _ocam_unproject),
 }
 """Every model by the name that files and messages use."""
 

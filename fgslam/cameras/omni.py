@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Protocol, TypeAlias
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -285,8 +285,6 @@ class MirrorFrame:
             turned on its axis is corrected.
         clockwise: whether bearings grow clockwise in the picture. True for the raw picture of an
             upward-looking camera; False where it was mirrored, or the camera points down.
-        affine: (c, d, e) of OCamCalib, for sensors that are skew or have oblong pixels: a point at
-            (x, y) rows and columns from the centre is seen at (c x + d y, e x + y).
     """
 
     width: int
@@ -294,7 +292,6 @@ class MirrorFrame:
     centre: tuple[float, float]
     ahead: float = AHEAD_IS_UP
     clockwise: bool = True
-    affine: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         require_size("mirror image", self.width, self.height)
@@ -304,30 +301,20 @@ class MirrorFrame:
                 f"mirror image: the mirror's centre ({column:g}, {row:g}) lies outside the "
                 f"{self.width}x{self.height} picture; correct the centre or the size"
             )
-        c, d, e = self.affine
-        if not (np.isfinite([self.ahead, c, d, e]).all() and c - d * e > 0.0):
-            raise CalibrationError(
-                f"mirror image: ahead {self.ahead:g} and affine ({c:g}, {d:g}, {e:g}) must be "
-                "finite, with c - d e > 0"
-            )
+        if not math.isfinite(self.ahead):
+            raise CalibrationError(f"mirror image: ahead is {self.ahead:g}, it must be finite")
 
     def polar(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Radius in pixels (n,) and bearing in radians (n,) of pixels (n, 2)."""
         across, down = pixels[:, 0] - self.centre[0], pixels[:, 1] - self.centre[1]
-        c, d, e = self.affine
-        determinant = c - d * e
-        x, y = (down - d * across) / determinant, (c * across - e * down) / determinant
-        angle = np.arctan2(x, y) - self.ahead
-        return np.hypot(x, y), angle if self.clockwise else -angle
+        angle = np.arctan2(down, across) - self.ahead
+        return np.hypot(down, across), angle if self.clockwise else -angle
 
     def pixels(self, radius: FloatArray, bearing: FloatArray) -> FloatArray:
         """(n, 2) pixels of polar coordinates (n,) each, also where they leave the picture."""
         angle = (bearing if self.clockwise else -bearing) + self.ahead
-        x, y = radius * np.sin(angle), radius * np.cos(angle)
-        c, d, e = self.affine
-        return np.column_stack(
-            [self.centre[0] + e * x + y, self.centre[1] + c * x + d * y],
-        )
+        down, across = radius * np.sin(angle), radius * np.cos(angle)
+        return np.column_stack([self.centre[0] + across, self.centre[1] + down])
 
 
 @dataclass(frozen=True)
@@ -429,38 +416,6 @@ class MonotoneInverse:
         return np.where(seen, x, np.nan)
 
 
-@dataclass(frozen=True)
-class InvertedCamera(RadialCamera):
-    """A camera whose elevation is a smooth function of the radius, inverted numerically.
-
-    Raises:
-        CalibrationError: the elevation is not monotone over the ring.
-    """
-
-    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
-    _turns_back: ClassVar[str]
-    """What to do about an elevation that turns back."""
-
-    def __post_init__(self) -> None:
-        RadialCamera.__post_init__(self)
-        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
-        if not inverse.monotone:
-            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
-            raise CalibrationError(
-                f"mirror image: elevation turns back near radius {turn:.1f} px of the ring "
-                f"{self.inner_radius:.1f} to {self.outer_radius:.1f} px; {self._turns_back}"
-            )
-        object.__setattr__(self, "_inverse", inverse)
-
-    def radius(self, elevation: FloatArray) -> FloatArray:
-        """(n,) radii, exact to rounding; see :class:`RadialCamera`."""
-        return self._inverse(elevation)
-
-    @abstractmethod
-    def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n,) elevations of radii (n,), and their derivatives."""
-
-
 # --------------------------------------------------------------------------------------------
 # The hyperbolic mirror as a unified sphere, above and below the horizon
 
@@ -541,7 +496,7 @@ PAPER_DEGREE = 5
 
 
 @dataclass(frozen=True)
-class RadialPolynomial(InvertedCamera):
+class RadialPolynomial(RadialCamera):
     """Elevation = sum of ``coefficients[k] x^k``, x = radius scaled to [-1, 1]; rising or falling.
 
     The paper names the degree, five, and a calibration image, not the argument. Here it is the
@@ -550,19 +505,35 @@ class RadialPolynomial(InvertedCamera):
 
     It falls with the radius where the picture's middle points up: a mirror that is seen from
     above, or one with a second, flat mirror.
+
+    Raises:
+        CalibrationError: the elevation is not monotone over the ring.
     """
 
     coefficients: tuple[float, ...]
-    _turns_back = "fit a lower degree, correct the samples, or take more near the rims"
+    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.coefficients or not np.isfinite(self.coefficients).all():
             raise CalibrationError("radial polynomial: its coefficients must be finite, at least 1")
-        InvertedCamera.__post_init__(self)
+        RadialCamera.__post_init__(self)
+        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
+        if not inverse.monotone:
+            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
+            raise CalibrationError(
+                f"mirror image: elevation turns back near radius {turn:.1f} px of the ring "
+                f"{self.inner_radius:.1f} to {self.outer_radius:.1f} px; fit a lower degree, "
+                "correct the samples, or take more near the rims"
+            )
+        object.__setattr__(self, "_inverse", inverse)
 
     def elevation(self, radius: FloatArray) -> FloatArray:
         """(n,) elevations; see :class:`RadialCamera`."""
         return np.asarray(polynomial.polyval(self._scaled(radius), np.array(self.coefficients)))
+
+    def radius(self, elevation: FloatArray) -> FloatArray:
+        """(n,) radii, exact to rounding; see :class:`RadialCamera`."""
+        return self._inverse(elevation)
 
     def _scaled(self, radius: FloatArray) -> FloatArray:
         return _scaled(radius, self.inner_radius, self.outer_radius)
@@ -723,7 +694,7 @@ class LensCamera:
 
 
 # --------------------------------------------------------------------------------------------
-# OCamCalib's polynomial camera (Scaramuzza, Martinelli and Siegwart 2006) and its result file
+# OCamCalib's result file (Scaramuzza, Martinelli and Siegwart 2006)
 #
 # A pixel at radius rho from the centre points along (rho cos, rho sin, f(rho)), f a polynomial.
 # The file's inverse polynomial is a fit of its own, good to a fraction of a pixel; pixels are found
@@ -735,94 +706,12 @@ _MAX_TERMS = 64
 _MAX_DISAGREEMENT_PX = 3.0
 
 
-@dataclass(frozen=True)
-class OCamCamera(InvertedCamera):
-    """A camera with the direct polynomial ``f(rho) = sum direct[k] rho^k``, rho in pixels.
+def read_ocamcalib(
+    path: Path,
+) -> tuple[RawCamera, tuple[float, float] | None, tuple[int, int]]:
+    """Of a ``calib_results.txt`` the camera, its ring, and the columns cropped left and right.
 
-    With the mirror above an upward-looking camera f is negative where the camera sees downward, in
-    the middle, and elevation is ``atan2(f, rho)``; it must rise over the ring.
-    """
-
-    direct: tuple[float, ...]
-    _turns_back = "narrow the ring to what the mirror shows"
-
-    def elevation(self, radius: FloatArray) -> FloatArray:
-        """(n,) elevations; see :class:`RadialCamera`."""
-        radius = np.asarray(radius, dtype=np.float64)
-        return np.asarray(np.arctan2(polynomial.polyval(radius, np.array(self.direct)), radius))
-
-    def _value_and_slope(self, radius: FloatArray) -> tuple[FloatArray, FloatArray]:
-        f = polynomial.polyval(radius, np.array(self.direct))
-        slope = polynomial.polyval(radius, polynomial.polyder(np.array(self.direct)))
-        return np.arctan2(f, radius), (slope * radius - f) / (f * f + radius * radius)
-
-
-@dataclass(frozen=True, slots=True)
-class OCamCalibration:
-    """The contents of a ``calib_results.txt``.
-
-    Attributes:
-        source: the file, for messages.
-        direct: coefficients of f, from the constant upward, pixels.
-        inverse: coefficients of radius over the angle atan(f / rho), from the constant upward.
-        centre: row and column, from 0.
-        affine: c, d, e.
-        width, height: of the calibrated picture.
-        ring: inner and outer radius that the mirror shows, pixels, or None where not stated.
-        cropped: columns that were cut off at the left and right before calibrating.
-    """
-
-    source: str
-    direct: tuple[float, ...]
-    inverse: tuple[float, ...]
-    centre: tuple[float, float]
-    affine: tuple[float, float, float]
-    width: int
-    height: int
-    ring: tuple[float, float] | None = None
-    cropped: tuple[int, int] = (0, 0)
-
-    def camera(
-        self,
-        size: tuple[int, int] | None = None,
-        ring: tuple[float, float] | None = None,
-        ahead: float = AHEAD_IS_UP,
-        clockwise: bool = True,
-    ) -> OCamCamera:
-        """The camera for pictures of a size (width, height): cropped as calibrated, or not yet.
-
-        ``ring`` replaces the file's; where neither is known the largest circle within the picture
-        is taken. Raises CalibrationError for a picture of any other size.
-        """
-        left, right = self.cropped
-        wide = (self.width + left + right, self.height)
-        size = size or (self.width, self.height)
-        if size not in ((self.width, self.height), wide):
-            uncropped = f" (or {wide[0]}x{wide[1]} uncropped)" if left + right else ""
-            raise CalibrationError(
-                f"{self.source} calibrates pictures of {self.width}x{self.height}{uncropped}, but "
-                f"the picture has {size[0]}x{size[1]} pixels; scale or crop it back, or calibrate "
-                "again"
-            )
-        shift = left if size == wide else 0
-        centre = (self.centre[1] + shift, self.centre[0])
-        frame = MirrorFrame(*size, centre, ahead, clockwise, self.affine)
-        inner, outer = ring or self.ring or (0.0, _largest_circle(frame))
-        return OCamCamera(frame, inner, outer, direct=self.direct)
-
-
-def _largest_circle(frame: MirrorFrame) -> float:
-    column, row = frame.centre
-    return min(column, row, frame.width - 1 - column, frame.height - 1 - row)
-
-
-# --------------------------------------------------------------------------------------------
-# The file
-
-
-def read_ocamcalib(path: Path) -> OCamCalibration:
-    """Reads a ``calib_results.txt``.
-
+    The ring is the inner and outer radius that the mirror shows, pixels; None where not stated.
     Besides OCamCalib's own five entries two more are understood where their comments name them:
     the ring that the mirror shows ("ROI max min radius") and columns that were cut off before
     calibrating ("left right cropped pixel").
@@ -851,10 +740,12 @@ def read_ocamcalib(path: Path) -> OCamCalibration:
     (at_centre, _, centre), (at_affine, _, affine), (at_size, _, size), *extras = entries[2:]
     row, column = _numbers(f"{at_centre}: centre (row, column)", centre, 2)
     c, d, e = _numbers(f"{at_affine}: affine parameters (c, d, e)", affine, 3)
+    if not c - d * e > 0.0:
+        raise CalibrationError(f"{at_affine}: affine parameters: c - d e > 0 is needed")
     height, width = _wholes(f"{at_size}: size (height, width)", size)
-    calibration = OCamCalibration(
-        str(path), direct, inverse, (row, column), (c, d, e), width, height
-    )
+    require_size(f"{at_size}: size", width, height)
+    ring: tuple[float, float] | None = None
+    cropped = (0, 0)
     for where, comment, words in extras:
         if "roi" in comment.lower() and "radius" in comment.lower():
             outer, inner = _numbers(f"{where}: ring (largest, smallest radius)", words, 2)
@@ -863,19 +754,18 @@ def read_ocamcalib(path: Path) -> OCamCalibration:
                     f"{where}: ring: largest radius {outer:g} and smallest {inner:g}; the first "
                     "must be larger"
                 )
-            calibration = replace(calibration, ring=(inner, outer))
+            ring = inner, outer
         elif "crop" in comment.lower():
             cropped = _wholes(f"{where}: cropped columns (left, right)", words)
-            calibration = replace(calibration, cropped=cropped)
         else:
             raise CalibrationError(
                 f"{where}: an entry that is not known ({comment or 'without a comment'}); remove it"
             )
-    try:
-        camera = calibration.camera()
-    except CalibrationError as cause:
-        raise CalibrationError(f"{path}: {cause}") from cause
-    radius = np.linspace(camera.inner_radius, camera.outer_radius, 200)
+    # Rows and columns from the centre, (x, y), are seen at (c x + d y, e x + y).
+    matrix = np.array([[1.0, e, column], [d, c, row], [0.0, 0.0, 1.0]])
+    raw = RawCamera(width, height, matrix, np.array(direct), np.eye(4), str(path), "ocam")
+    camera = LensCamera.of(checked_camera(raw), ring, up=False)
+    radius = np.linspace(*camera.ring, 200)
     angle = np.arctan2(polynomial.polyval(radius, np.array(direct)), radius)
     apart = float(np.abs(polynomial.polyval(angle, np.array(inverse)) - radius).max())
     if not apart <= _MAX_DISAGREEMENT_PX:
@@ -883,7 +773,7 @@ def read_ocamcalib(path: Path) -> OCamCalibration:
             f"{path}: the inverse polynomial is {apart:.3g} px off the direct one, at most "
             f"{_MAX_DISAGREEMENT_PX:g} px are credible: one of the two is damaged; export it again"
         )
-    return calibration
+    return raw, ring, cropped
 
 
 def _numbers(where: str, words: list[str], count: int | None = None) -> tuple[float, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,7 +18,6 @@ from fgslam.cameras.omni import (
     HyperbolicMirror,
     LensCamera,
     MirrorFrame,
-    OCamCamera,
     OmniCamera,
     RadialPolynomial,
     fit_radial_polynomial,
@@ -133,9 +132,9 @@ def make_camera(
         case HyperbolicMirrorSettings():
             return _hyperbolic(settings, _stated_size("mirror", settings.size, image_size))
         case OCamCalibSettings():
-            ahead, ring = math.radians(settings.ahead_deg), settings.ring_px
-            found = read_ocamcalib(_find(settings.file, folder))
-            return found.camera(image_size, ring, ahead, settings.clockwise)
+            raw, ring = _ocamcalib(_find(settings.file, folder), image_size)
+            ring, ahead = settings.ring_px or ring, math.radians(settings.ahead_deg)
+            return LensCamera.of(raw, ring, False, ahead, settings.clockwise)
         case LensSettings():
             ahead, up = math.radians(settings.ahead_deg), settings.middle == "up"
             raw = _only_camera(_find(settings.file, folder), image_size)
@@ -231,6 +230,22 @@ def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMir
     inner = settings.inner_radius_px
     inner = focal * scales[lowest] if inner is None else inner
     return HyperbolicMirror(frame, inner, outer, xi=settings.xi, focal_px=focal)
+
+
+def _ocamcalib(path: Path, size: Size | None) -> tuple[RawCamera, tuple[float, float] | None]:
+    """The camera for pictures cropped as calibrated, or not yet, and the ring of its mirror."""
+    raw, ring, (left, right) = read_ocamcalib(path)
+    wide = (raw.width + left + right, raw.height)
+    if size not in (None, raw.size, wide):
+        uncropped = f" (or {wide[0]}x{wide[1]} uncropped)" if left + right else ""
+        raise CalibrationError(
+            f"{path} calibrates pictures of {raw.width}x{raw.height}{uncropped}, but the picture "
+            f"has {size[0]}x{size[1]} pixels; scale or crop it back, or calibrate again"
+        )
+    if size == wide:
+        shift = np.array([[0.0, 0.0, left], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        raw = replace(raw, width=wide[0], matrix=raw.matrix + shift)
+    return raw, ring
 
 
 def _only_camera(path: Path, size: Size | None) -> RawCamera:
@@ -342,8 +357,8 @@ def _bloggie_values(path: Path) -> dict[str, float]:
 
 _MODELS: dict[str, Any] = {
     model.__name__: model
-    for model in (Equirectangular, Cylinder, HyperbolicMirror, RadialPolynomial, OCamCamera)
-} | {"LensCamera": LensCamera}
+    for model in (Equirectangular, Cylinder, HyperbolicMirror, RadialPolynomial, LensCamera)
+}
 
 
 def camera_values(camera: OmniCamera) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -90,16 +90,16 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     where = Path(settings.path)
     bag = Bag(paths_of(where))
     chosen = choose_topics(bag.topics, settings, bag.first_frame)
-    found = bag.index(chosen)
-    placed = rig_of_bag(settings, found, chosen)
+    bag.index(chosen)
+    placed = rig_of_bag(settings, bag, chosen)
     rig, chosen = placed.rig, placed.chosen
     views = (chosen.right, chosen.left, *chosen.views[2:])
     others = [
-        (side, view, found.stamps[view])
+        (side, view, bag.stamps[view])
         for side, view in zip(("left", "top"), views[1:], strict=False)
     ]
-    rows, unpaired = pair_stamps(found.stamps[chosen.right], others, chosen.right)
-    places = np.column_stack([found.places[v][rows[:, k]] for k, v in enumerate(views)])
+    rows, unpaired = pair_stamps(bag.stamps[chosen.right], others, chosen.right)
+    places = np.column_stack([bag.places[v][rows[:, k]] for k, v in enumerate(views)])
     right, size, sigma = places[:, 0].tolist(), rig.image_size, None
     bits, held = bits_held(len(right), lambda k: bag.read(right[k], messages.stored_of))
     bag.bits = bits
@@ -126,12 +126,12 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         settings,
         where.resolve().stem,
         replace(rig, remarks=()),
-        NANOSECONDS * found.stamps[chosen.right][rows[:, 0]].astype(np.float64),
+        NANOSECONDS * bag.stamps[chosen.right][rows[:, 0]].astype(np.float64),
         load,
         recording_identity([], [file for path in bag.paths for file in _bag_files(path)]),
-        (*bag.notes, *chosen.notes, *found.notes, *unpaired, *held, *placed.notes),
+        (*bag.notes, *chosen.notes, *bag.stamp_notes, *unpaired, *held, *placed.notes),
     )
-    source = _odometry_source(chosen.motion, *found.motions, odometry)
+    source = _odometry_source(chosen.motion, *bag.motions, odometry)
     return replace(recording, odometry_source=source, disparity_sigma_px=sigma)
 
 
@@ -174,31 +174,6 @@ def _bag_files(path: Path) -> list[Path]:
     return [file for file in shown_in(path) if is_bag(file) and file.is_file()]
 
 
-@dataclass(frozen=True, eq=False)
-class Contents:
-    """What was found on the way through a bag, by topic.
-
-    Attributes:
-        places: (k,) of each image topic's messages among all, by increasing stamp.
-        stamps: (k,) their stamps, nanoseconds, increasing.
-        size: width and height of the right images.
-        infos: the first camera_info of each camera, as in a file.
-        frames: the frame of the topic's first message.
-        tree: of tf_static.
-        motions: stamps (n,) in seconds and values of the odometry.
-        notes: which stamps could not be used.
-    """
-
-    places: Mapping[str, IntArray]
-    stamps: Mapping[str, IntArray]
-    size: tuple[int, int]
-    infos: Mapping[str, Info]
-    frames: Mapping[str, str]
-    tree: FrameTree
-    motions: tuple[FloatArray, FloatArray]
-    notes: tuple[str, ...]
-
-
 class Bag:
     """The files of one recording as one; a damaged one is read up to the damage.
 
@@ -209,12 +184,29 @@ class Bag:
         topics: in the order of their names.
         notes: whether a part cannot be read.
         bits: that pixels of 16 bits hold.
+        places, stamps: (k,) of each image topic's messages among all, and their increasing stamps
+            in nanoseconds; they and what follows once the bag is indexed.
+        size: width and height of the right images.
+        infos: the first camera_info of each camera, as in a file.
+        frames: the frame of each topic's first message.
+        tree: of tf_static.
+        motions: stamps (n,) in seconds and values of the odometry.
+        stamp_notes: which stamps could not be used.
     """
+
+    size: tuple[int, int]
+    motions: tuple[FloatArray, FloatArray]
 
     def __init__(self, paths: list[Path]) -> None:
         """Opens the files. Raises DatasetError where one of them is no bag, or has no index."""
         self.paths, self.bits = paths, 16
         self.notes: tuple[str, ...] = ()
+        self.stamp_notes: list[str] = []
+        self.places: dict[str, IntArray] = {}
+        self.stamps: dict[str, IntArray] = {}
+        self.infos: dict[str, Info] = {}
+        self.frames: dict[str, str] = {}
+        self.tree = FrameTree()
         try:
             self._reader = AnyReader(paths, default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
@@ -275,21 +267,19 @@ class Bag:
         except (StopIteration, FrameError, DatasetError):
             return ""
 
-    def index(self, chosen: Chosen) -> Contents:
+    def index(self, chosen: Chosen) -> None:
         """Once through the whole bag, for all but the images. Raises DatasetError as it opens."""
         motion = chosen.motion.name if chosen.motion else ""
         names = (*chosen.views, *chosen.infos, motion, *chosen.transforms)
         topics = frozenset(name for name in names if name)
-        infos: dict[str, Info] = {}
-        frames: dict[str, str] = {}
-        tree, moved = FrameTree(), []
+        moved = []
         rows: list[tuple[str, int, int]] = []  # topic, the bag's time, stamp
         try:
             for connection, time, raw in self._messages(topics):
                 topic, stamp = connection.topic, time
                 if topic in chosen.transforms:
                     transforms = messages.transforms_of(self._decoded(connection, raw))
-                    tree.add(transforms, static=topic.endswith("tf_static"))
+                    self.tree.add(transforms, static=topic.endswith("tf_static"))
                 else:
                     # The header is a message's first field. ROS 1: sequence number, seconds,
                     # nanoseconds; ROS 2: encapsulation, seconds, nanoseconds.
@@ -298,16 +288,16 @@ class Bag:
                         int.from_bytes(raw[k : k + 4], "big" if big else "little") for k in (4, 8)
                     )
                     stamp = 1_000_000_000 * seconds + rest
-                if topic == motion or topic not in (*frames, *chosen.transforms):
+                if topic == motion or topic not in (*self.frames, *chosen.transforms):
                     try:
                         content = self._decoded(connection, raw)
                     except FrameError:
                         if topic not in chosen.views:  # else one lost frame
                             raise
                     else:
-                        frames.setdefault(topic, messages.frame_of(content))
+                        self.frames.setdefault(topic, messages.frame_of(content))
                         if topic in chosen.infos:
-                            infos[topic] = messages.calibration_of(content)
+                            self.infos[topic] = messages.calibration_of(content)
                         if topic == motion:
                             moved.append((stamp, messages.motion_of(content)))
                 rows.append((topic, time, stamp))
@@ -319,9 +309,6 @@ class Bag:
         self._times, stamps = (np.array([row[k] for row in rows], np.int64) for k in (1, 2))
         self._next = len(rows)
         of_topic = np.array([row[0] for row in rows])
-        places: dict[str, IntArray] = {}
-        by_stamp: dict[str, IntArray] = {}
-        notes: list[str] = []
         for topic in sorted(set(chosen.views)):
             at = np.flatnonzero(of_topic == topic)
             if len(at) == 0:
@@ -329,24 +316,25 @@ class Bag:
             own = stamps[at]
             if len(at) > 1 and (own == own[0]).all():
                 own = self._times[at]
-                notes.append(
+                self.stamp_notes.append(
                     f"{topic}: its headers have no time stamps, the bag's own times are used"
                 )
-            by_stamp[topic], first = np.unique(own, return_index=True)
-            places[topic] = at[first]
+            self.stamps[topic], first = np.unique(own, return_index=True)
+            self.places[topic] = at[first]
             if repeated := len(at) - len(first):
-                notes.append(f"{topic}: {repeated} images repeat a stamp and are left out")
-        motions = (
+                self.stamp_notes.append(
+                    f"{topic}: {repeated} images repeat a stamp and are left out"
+                )
+        self.motions = (
             NANOSECONDS * np.array([stamp for stamp, _ in moved], np.float64),
             np.array([value for _, value in moved]),
         )
-        size = self._first_size(chosen.right, places[chosen.right])
-        frames = dict.fromkeys(topics, "") | frames
-        return Contents(places, by_stamp, size, infos, frames, tree, motions, tuple(notes))
+        self.frames = dict.fromkeys(topics, "") | self.frames
+        self.size = self._first_size(chosen.right)
 
-    def _first_size(self, topic: str, places: IntArray) -> tuple[int, int]:
+    def _first_size(self, topic: str) -> tuple[int, int]:
         fault: FrameError | None = None
-        for place in places.tolist():
+        for place in self.places[topic].tolist():
             try:
                 height, width = self.image(place).shape
             except FrameError as error:
@@ -451,29 +439,29 @@ class Placed:
     on_body: bool = False
 
 
-def rig_of_bag(settings: BagSettings, found: Contents, chosen: Chosen) -> Placed:
+def rig_of_bag(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     """The rig of the topics that are chosen, or of one of them and its depth, on the robot.
 
     Raises:
         CalibrationError: nothing states where the cameras are, or what does is malformed.
     """
     if chosen.depth:
-        placed = _rig_of_depth(settings, found, chosen)
+        placed = _rig_of_depth(settings, bag, chosen)
     elif settings.camera_file is not None:
-        placed = _rig_of_file(settings, Path(settings.camera_file), found, chosen)
+        placed = _rig_of_file(settings, Path(settings.camera_file), bag, chosen)
     else:
-        placed = _rig_of_topics(settings, found, chosen)
+        placed = _rig_of_topics(settings, bag, chosen)
     if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
         rig, notes = mounted(placed.rig, settings), placed.rig.remarks
     else:
-        rig, reported = _on_robot(placed, found)
+        rig, reported = _on_robot(placed, bag)
         notes = (*placed.rig.remarks, *reported)
     return replace(placed, rig=rig, notes=(*placed.notes, *notes))
 
 
-def _rig_of_file(settings: BagSettings, file: Path, found: Contents, chosen: Chosen) -> Placed:
+def _rig_of_file(settings: BagSettings, file: Path, bag: Bag, chosen: Chosen) -> Placed:
     numbers = chosen.numbers
-    cameras = in_metres(read_calibration_file(file, size=found.size), settings.unit_m).cameras
+    cameras = in_metres(read_calibration_file(file, size=bag.size), settings.unit_m).cameras
     on_body = not any(np.array_equal(camera.bTc, np.eye(4)) for camera in cameras)
     if not numbers and len(cameras) > 3:
         raise CalibrationError(
@@ -481,7 +469,7 @@ def _rig_of_file(settings: BagSettings, file: Path, found: Contents, chosen: Cho
             f"and {chosen.right} are; write those two: fgslam camera convert {file.name} "
             "two.yaml --cameras 0,1"
         )
-    rig = loaded_rig(settings, file, size=found.size, cameras=numbers or None, pair=not numbers)
+    rig = loaded_rig(settings, file, size=bag.size, cameras=numbers or None, pair=not numbers)
     order: tuple[int, ...] = (0, 1)
     if numbers:  # the topics on the sides where the calibration sees their cameras
         right, left, *top = (chosen.views[k] for k in rig.sources[: rig.cameras])
@@ -497,10 +485,10 @@ def _rig_of_file(settings: BagSettings, file: Path, found: Contents, chosen: Cho
     return Placed(rig, (left_camera, right_camera), chosen, on_body=on_body)
 
 
-def _rig_of_depth(settings: BagSettings, found: Contents, chosen: Chosen) -> Placed:
+def _rig_of_depth(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     """The camera whose depth is recorded, by the file or its camera_info, and one made up."""
     require_one_camera(settings)
-    colour, depth = (found.frames[topic] for topic in (chosen.right, chosen.left))
+    colour, depth = (bag.frames[topic] for topic in (chosen.right, chosen.left))
     sensors = {match[1] for name in chosen.views if (match := SENSOR.match(name))}
     text = ""
     if len(sensors) == 2:  # RealSense's viewer may have recorded two, whose views differ
@@ -514,7 +502,7 @@ def _rig_of_depth(settings: BagSettings, found: Contents, chosen: Chosen) -> Pla
         )
     taken = f"{text}: it is taken as registered to colour, as it was chosen by --topics"
     if settings.camera_file is not None:
-        camera = camera_of_file(Path(settings.camera_file), found.size, settings.resized)
+        camera = camera_of_file(Path(settings.camera_file), bag.size, settings.resized)
     else:
         # Registered depth has the colour camera's calibration.
         topic = chosen.infos[1] or chosen.infos[0]
@@ -523,18 +511,18 @@ def _rig_of_depth(settings: BagSettings, found: Contents, chosen: Chosen) -> Pla
                 f"{settings.path}: no camera_info belongs to {chosen.right}; give its calibration "
                 "by --camera FILE"
             )
-        values = _info_of(settings, found, topic, _is_rectified(chosen.right))
+        values = _info_of(settings, bag, topic, _is_rectified(chosen.right))
         read = read_camera_info(Path(f"{settings.path}:{topic}"), values)
-        camera = at_size(read, found.size, settings.resized).cameras[0]
+        camera = at_size(read, bag.size, settings.resized).cameras[0]
     return Placed(depth_rig(camera), (camera, camera), chosen, (taken,) if text else ())
 
 
-def _rig_of_topics(settings: BagSettings, found: Contents, chosen: Chosen) -> Placed:
+def _rig_of_topics(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     """By camera_info, and by tf_static where that has no baseline."""
     lacking = [
         view
         for view, topic in zip(chosen.views, chosen.infos, strict=False)
-        if topic not in found.infos
+        if topic not in bag.infos
     ]
     if lacking:
         raise CalibrationError(
@@ -543,12 +531,12 @@ def _rig_of_topics(settings: BagSettings, found: Contents, chosen: Chosen) -> Pl
         )
     topics = [str(topic) for topic in chosen.infos]
     rectified = _is_rectified(chosen.left) and _is_rectified(chosen.right)
-    left, right = (_info_of(settings, found, topic, rectified) for topic in topics)
+    left, right = (_info_of(settings, bag, topic, rectified) for topic in topics)
     named = (Path(f"{settings.path}:{topics[0]}"), Path(f"{settings.path}:{topics[1]}"))
     # -fx times the baseline, of the right camera; 0 where none is stated.
     shift_left, shift_right = (info["projection_matrix"]["data"][3] for info in (left, right))
     if not shift_left and not shift_right:
-        return _rig_by_tree(settings, named, (left, right), found, chosen)
+        return _rig_by_tree(settings, named, (left, right), bag, chosen)
     notes: tuple[str, ...] = ()
     if shift_left < 0.0 <= shift_right:
         notes = (f"by their camera_info {chosen.left} is the right camera, and is taken so",)
@@ -556,24 +544,24 @@ def _rig_of_topics(settings: BagSettings, found: Contents, chosen: Chosen) -> Pl
         chosen = replace(chosen, views=(chosen.right, chosen.left))
     pair = read_camera_info_pair(named, (left, right))
     cameras = in_metres(pair, settings.unit_m).cameras
-    return Placed(read_rig(settings, pair, found.size), cameras, chosen, notes)
+    return Placed(read_rig(settings, pair, bag.size), cameras, chosen, notes)
 
 
 def _rig_by_tree(
     settings: BagSettings,
     named: tuple[Path, Path],
     infos: tuple[Info, Info],
-    found: Contents,
+    bag: Bag,
     chosen: Chosen,
 ) -> Placed:
     """Each camera by its own camera_info, their places by the transforms of their frames."""
-    left, right = (found.frames[topic] for topic in (chosen.left, chosen.right))
+    left, right = (bag.frames[topic] for topic in (chosen.left, chosen.right))
     source = f"{named[0]} and {named[1].name}"
     try:
         if left == right:
             raise CalibrationError(f"both cameras have the frame {left or 'without a name'}")
-        fTc, reported = view_axes(found.tree, left, right, "")
-        apart = inverse(fTc) @ found.tree.pose(left, right) @ fTc
+        fTc, reported = view_axes(bag.tree, left, right, "")
+        apart = inverse(fTc) @ bag.tree.pose(left, right) @ fTc
     except CalibrationError as fault:
         raise CalibrationError(
             f"{source}: projection_matrix states no baseline, and {fault}; "
@@ -587,7 +575,7 @@ def _rig_by_tree(
     )
     pair = Calibration(source, "camera_info with tf_static", cameras, sided=True)
     # A unit is that of camera_info; transforms are in metres (REP 103).
-    rig = read_rig(replace(settings, unit_m=1.0), pair, found.size)
+    rig = read_rig(replace(settings, unit_m=1.0), pair, bag.size)
     note = f"camera_info has no baseline: by tf_static {right} is {rig.baseline:.4g} m from {left}"
     if unlikely := implausible(source, rig.plain()):  # --unit, which that names, is another's
         note += ", which no rig has: tf_static is in metres; give the calibration by --camera FILE"
@@ -595,7 +583,7 @@ def _rig_by_tree(
     return Placed(rig, cameras, chosen, (note, *filter(None, [reported])))
 
 
-def _info_of(settings: BagSettings, found: Contents, topic: str, rectified: bool) -> Info:
+def _info_of(settings: BagSettings, bag: Bag, topic: str, rectified: bool) -> Info:
     """The camera_info of images as they were sent: cropped and binned as it states.
 
     Of ``rectified`` images it is that of the view which image_proc has made by it.
@@ -603,7 +591,7 @@ def _info_of(settings: BagSettings, found: Contents, topic: str, rectified: bool
     Raises:
         CalibrationError: its numbers are 0.
     """
-    info = found.infos[topic]
+    info = bag.infos[topic]
     if not info["camera_matrix"]["data"][0]:
         raise CalibrationError(
             f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are 0); "
@@ -612,7 +600,7 @@ def _info_of(settings: BagSettings, found: Contents, topic: str, rectified: bool
     (across, down), (x, y, width, height) = info["binning"], info["roi"]
     whole = (info["image_width"], info["image_height"])
     sent = ((width or whole[0]) // across, (height or whole[1]) // down)
-    if found.size == sent != whole:
+    if bag.size == sent != whole:
         part = np.array(
             [
                 [1.0 / across, 0.0, (0.5 - x) / across - 0.5],
@@ -645,17 +633,17 @@ _BODIES = ("base_link", "base_footprint")
 """The robot itself, where odometry does not name its frame (REP 105)."""
 
 
-def _on_robot(placed: Placed, found: Contents) -> tuple[StereoRig, tuple[str, ...]]:
+def _on_robot(placed: Placed, bag: Bag) -> tuple[StereoRig, tuple[str, ...]]:
     """The rig in the frame whose motion the odometry is, and how that was known.
 
     Where no transform leads to the camera: as calibrated, else by its frame's axes.
     """
-    rig, chosen, tree = placed.rig, placed.chosen, found.tree
+    rig, chosen, tree = placed.rig, placed.chosen, bag.tree
     if chosen.motion is None:
         return rig, ()
-    left, right = (found.frames[topic] for topic in (chosen.left, chosen.right))
+    left, right = (bag.frames[topic] for topic in (chosen.left, chosen.right))
     robot = next((body for body in _BODIES if body in tree.frames), "")
-    body = found.frames[chosen.motion.name] or robot
+    body = bag.frames[chosen.motion.name] or robot
     # Where both have one frame it is the left camera's (CameraInfo.msg, P).
     camera, frame = (0, left) if left == right else (1, right)
     try:

@@ -8,10 +8,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -91,27 +91,9 @@ def open_measurement_files(
 # What all share: landmark identities and the motion model of logs
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredFrame:
-    """One frame of a recording whose landmarks are known by number.
-
-    Attributes:
-        index: the recording's frame number.
-        timestamp: seconds.
-        odometry: motion of the camera or sensor since the last frame of the selection, or None.
-        ids: (k,) landmark numbers, unique.
-        measurement: (k, 3).
-        covariance: (k, 3, 3).
-        pixels: (k, 3, 2) raw pixels, NaN where there are none.
-    """
-
-    index: int
-    timestamp: float
-    odometry: Odometry | None
-    ids: IntArray
-    measurement: FloatArray
-    covariance: FloatArray
-    pixels: FloatArray
+MeasuredFrame: TypeAlias = tuple[int, float, Odometry | None, IntArray, tuple[FloatArray, ...]]
+"""Number, time in seconds, motion since the last frame of the selection, numbers (k,) of the
+landmarks, and what :class:`Observations` holds of them: measurement, covariance, raw pixels."""
 
 
 def make_increments(frames: Iterable[MeasuredFrame]) -> list[Increment]:
@@ -121,24 +103,13 @@ def make_increments(frames: Iterable[MeasuredFrame]) -> list[Increment]:
     """
     known: set[int] = set()
     out = []
-    for frame in frames:
-        is_new = np.array([i not in known for i in frame.ids.tolist()], np.bool_)
-        order = np.lexsort((frame.ids, is_new))
-        everything = Observations(
-            frame.ids, frame.measurement, frame.covariance, frame.pixels, is_new
-        )
-        known.update(frame.ids.tolist())
-        out.append(
-            Increment(
-                index=frame.index,
-                timestamp=frame.timestamp,
-                odometry=frame.odometry,
-                observations=everything.select(order),
-                rejected=np.zeros(len(order), np.bool_),
-                missed_ids=_NONE,
-                pruned_ids=_NONE,
-            )
-        )
+    for index, timestamp, odometry, ids, (measurement, covariance, pixels) in frames:
+        is_new = np.array([i not in known for i in ids.tolist()], np.bool_)
+        order = np.lexsort((ids, is_new))
+        seen = Observations(ids, measurement, covariance, pixels, is_new).select(order)
+        known.update(ids.tolist())
+        accepted = np.zeros(len(order), np.bool_)
+        out.append(Increment(index, timestamp, odometry, seen, accepted, _NONE, _NONE))
     return out
 
 
@@ -315,15 +286,9 @@ def _frames(
         pixels = np.full((b - a, 3, 2), np.nan)
         pixels[:, 0] = np.column_stack([right, row])
         pixels[:, 1] = np.column_stack([left, row])
-        yield MeasuredFrame(
-            index=number,
-            timestamp=number * FRAME_PERIOD_S,
-            odometry=None,
-            ids=values[a:b, 1].astype(np.int64),
-            measurement=np.column_stack([right, row, left - right]),
-            covariance=np.tile(covariance, (b - a, 1, 1)),
-            pixels=pixels,
-        )
+        measurement = np.column_stack([right, row, left - right])
+        seen = measurement, np.tile(covariance, (b - a, 1, 1)), pixels
+        yield number, number * FRAME_PERIOD_S, None, values[a:b, 1].astype(np.int64), seen
 
 
 # --------------------------------------------------------------------------------------------

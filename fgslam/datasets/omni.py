@@ -20,7 +20,6 @@ import numpy as np
 from fgslam.cameras.omni import (
     Equirectangular,
     LensCamera,
-    OCamCamera,
     OmniCamera,
     RadialCamera,
 )
@@ -150,15 +149,15 @@ def open_omni_video(settings: OmniVideoSettings) -> OmniRecording:
         raise DatasetError(f"{path} states no frame rate; convert it to a file that does")
     chosen = select_frames(frames.count, settings, settings.path)
     first = frames.load(int(chosen[0]))
-    moments = moments_of([frames], frames.rate, stated=False)
+    numbers, times, timed = moments_of([frames], frames.rate, stated=False)
     recording = OmniRecording(
         name=path.stem,
         identity=recording_identity([path], []),
         camera=make_camera(settings.camera, (first.shape[1], first.shape[0]), path.parent),
-        ids=moments.numbers[:, 0],
+        ids=numbers[:, 0],
         names=tuple(f"frame {k}" for k in range(frames.count)),
-        timestamps=moments.times,
-        notes=(*frames.notes, *moments.notes),
+        timestamps=times,
+        notes=(*frames.notes, *timed),
         load_image=frames.load,
     )
     return recording.select(chosen)
@@ -217,17 +216,6 @@ _NUMBERS = ("x_m", "y_m", "heading_deg")
 _COLUMNS = ("id", "file", *_NUMBERS)
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """A row of poses.csv."""
-
-    line: int
-    id: int
-    file: str
-    pose: tuple[float, float, float]
-    room: str
-
-
 def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
     """Open a folder of panoramas: those in ``poses.csv`` in its order, else all by their numbers.
 
@@ -239,11 +227,8 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
     root = Path(settings.path)
     require_folder(root, "the folder of panoramas")
     table, pictures = root / POSES_FILE, root / _PICTURES
-    places = _read_places(table) if table.is_file() else []
-    if places:
-        paths = [_listed_picture(root, place) for place in places]
-    else:
-        paths = pictures_in(pictures if pictures.is_dir() else root)
+    listed = _read_places(table) if table.is_file() else None
+    paths = listed[0] if listed else pictures_in(pictures if pictures.is_dir() else root)
     chosen = select_frames(len(paths), settings, settings.path)
     first = read_colour_image(paths[int(chosen[0])])
     size = reduced = (first.shape[1], first.shape[0])
@@ -267,31 +252,35 @@ def open_panoramas(settings: PanoramasSettings) -> OmniRecording:
 
     recording = OmniRecording(
         name=root.resolve().name,
-        identity=recording_identity([table] if places else [], paths),
+        identity=recording_identity([table] if listed else [], paths),
         camera=make_camera(settings.camera, reduced, root),
         ids=ids_of([path.stem for path in paths]),
         names=tuple(path.name for path in paths),
         timestamps=_times(paths, root),
         load_image=load,
     )
-    if places:
+    if listed is not None:
         # Plans lie next to poses.csv, too; pictures that no row names are looked for in panos/.
         inside = pictures.iterdir() if pictures.is_dir() else ()
         extra = [p for p in inside if p.suffix.lower() in IMAGE_SUFFIXES and p not in paths]
         note = f"{len(extra)} pictures of {_PICTURES}/ are not in {POSES_FILE}"
+        _, ids, poses, rooms = listed
         recording = replace(
             recording,
-            ids=np.array([place.id for place in places], dtype=np.int64),
-            poses=np.array([place.pose for place in places], dtype=np.float64),
-            rooms=tuple(p.room for p in places) if any(p.room for p in places) else None,
+            ids=np.array(ids, np.int64),
+            poses=np.array(poses, np.float64),
+            rooms=tuple(rooms) if any(rooms) else None,
             notes=(note,) if extra else (),
         )
     return recording.select(chosen)
 
 
-def _read_places(path: Path) -> list[_Place]:
+def _read_places(
+    path: Path,
+) -> tuple[list[Path], list[int], list[tuple[float, float, float]], list[str]]:
+    """Picture, id, pose and room of each row of poses.csv."""
     reader = csv.DictReader(read_text(path).splitlines(), strict=True)
-    places: list[_Place] = []
+    files, ids, poses, rooms = [], [], [], []
     seen: dict[int | str, int] = {}
     try:
         if absent := [name for name in _COLUMNS if name not in (reader.fieldnames or ())]:
@@ -309,7 +298,18 @@ def _read_places(path: Path) -> list[_Place]:
                 raise DatasetError(f"{where}: id is {words['id']!r}, not a whole number from 0")
             angle = float(wrap(np.array(math.radians(heading))))
             number, file = int(words["id"]), words["file"]
-            places.append(_Place(line, number, file, (x, y, angle), words["room"]))
+            # In the folder itself or in panos/.
+            known = (path.parent / file, path.parent / _PICTURES / file)
+            listed = [p for p in known if p.is_file() and p.suffix.lower() in IMAGE_SUFFIXES]
+            if not listed:
+                raise DatasetError(
+                    f"{where}: there is no picture {file} in {path.parent} or its {_PICTURES}/; "
+                    "restore it, or remove the row"
+                )
+            files.append(listed[0])
+            ids.append(number)
+            poses.append((x, y, angle))
+            rooms.append(words["room"])
             for key, what in ((number, "id"), (file, "file")):
                 if seen.setdefault(key, line) != line:
                     raise DatasetError(
@@ -319,20 +319,9 @@ def _read_places(path: Path) -> list[_Place]:
     except csv.Error as cause:
         where = f"{path}, line {reader.reader.line_num}"
         raise DatasetError(f"{where}: {cause}; correct the line") from cause
-    if not places:
+    if not ids:
         raise DatasetError(f"{path} lists no panorama; add rows, or remove the file")
-    return places
-
-
-def _listed_picture(root: Path, place: _Place) -> Path:
-    """The file of a row, in the folder itself or in panos/."""
-    for path in (root / place.file, root / _PICTURES / place.file):
-        if path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES:
-            return path
-    raise DatasetError(
-        f"{root / POSES_FILE}, line {place.line}: there is no picture {place.file} in "
-        f"{root} or its {_PICTURES}/; restore it, or remove the row"
-    )
+    return files, ids, poses, rooms
 
 
 class PanoramaReduction:
@@ -411,19 +400,16 @@ def camera_notes(recording: OmniRecording, stated: bool = True) -> tuple[str, ..
         turn = "clockwise" if camera.clockwise else "counter-clockwise"
         assumed = (
             f"the picture's middle is taken to look {middle}, bearings to grow {turn} in it; "
-            f"dataset.camera.middle={other} and dataset.camera.clockwise say otherwise",
+            f"dataset.camera.kind=lens, dataset.camera.middle={other} and dataset.camera.clockwise "
+            "say otherwise",
         )
         hole, rim = camera.ring
         # A mirror reflects its camera in the middle; a lens has no rim that must be in the picture.
-        mirror = _mirror_notes(recording, camera.centre, rim, stated) if hole > 0.0 else ()
+        shows_rim = hole > 0.0 or camera.lens == "ocam"
+        mirror = _mirror_notes(recording, camera.centre, rim, stated) if shows_rim else ()
         return (*(assumed if stated else ()), *mirror)
     if isinstance(camera, RadialCamera):
-        assumed = (
-            "the picture's middle is taken to look down, as of a mirror above the camera; of a "
-            "fisheye that points up dataset.camera.kind=lens and dataset.camera.middle=up say so",
-        )
-        mirror = _mirror_notes(recording, camera.frame.centre, camera.outer_radius, stated)
-        return (*(assumed if stated and isinstance(camera, OCamCamera) else ()), *mirror)
+        return _mirror_notes(recording, camera.frame.centre, camera.outer_radius, stated)
     return ()
 
 

@@ -6,7 +6,7 @@ docs/datasets/published.md.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,11 +84,23 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
     for folder in folders:
         require_folder(folder, "a stereo pair needs two cameras, but the folder")
     cameras = [read_camera_frames(folder) for folder in folders]
-    rig = _euroc_rig(settings, root, first_size(cameras[0].paths))
-    right, left = (cameras[k] for k in rig.sources[:2])
-    others = [("left", str(left.paths[0].parent), left.stamps)]
-    rows, paired = pair_stamps(right.stamps, others, str(right.paths[0].parent))
-    paths = [(right.paths[i], left.paths[j]) for i, j in rows.tolist()]
+    # By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain next to mav0.
+    files: tuple[Path, ...] = tuple(folder / "sensor.yaml" for folder in folders)
+    chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
+    if settings.camera_file is not None:
+        files = (Path(settings.camera_file),)
+    elif not any(path.is_file() for path in files):
+        files = next(((chain,) for chain in chains if chain.is_file()), ())
+    if not files:
+        raise CalibrationError(
+            f"{root}: neither {_CAMERAS[0]}/sensor.yaml nor, as in TUM-VI, {chains[0]} is "
+            "there; restore one, or give a calibration by --camera FILE"
+        )
+    rig = mounted(loaded_rig(settings, *files, size=first_size(cameras[0][1])), settings)
+    (at_right, right), (at_left, left) = (cameras[k] for k in rig.sources[:2])
+    others = [("left", str(left[0].parent), at_left)]
+    rows, paired = pair_stamps(at_right, others, str(right[0].parent))
+    paths = [(right[i], left[j]) for i, j in rows.tolist()]
     images, noticed = open_frames(paths, rig, root)
     sensors = [*folders, root / "imu0"]
     defining = [folder / name for folder in sensors for name in ("sensor.yaml", "data.csv")]
@@ -100,7 +112,7 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         settings,
         root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig,
-        right.stamps[rows[:, 0]].astype(np.float64) * NANOSECONDS,
+        at_right[rows[:, 0]].astype(np.float64) * NANOSECONDS,
         images,
         identity,
         (*noticed, *paired),
@@ -115,22 +127,6 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
     return replace(recording, odometry_source=source)
 
 
-def _euroc_rig(settings: EurocSettings, root: Path, size: tuple[int, int] | None) -> StereoRig:
-    """By the file that is given, both sensor.yaml, or, as in TUM-VI, the camchain next to mav0."""
-    given: tuple[Path, ...] = tuple(root / name / "sensor.yaml" for name in _CAMERAS)
-    chains = (root.parent / "dso" / "camchain.yaml", root.parent / "camchain.yaml")
-    if settings.camera_file is not None:
-        given = (Path(settings.camera_file),)
-    elif not any(path.is_file() for path in given):
-        given = next(((chain,) for chain in chains if chain.is_file()), ())
-    if not given:
-        raise CalibrationError(
-            f"{root}: neither {_CAMERAS[0]}/sensor.yaml nor, as in TUM-VI, {chains[0]} is "
-            "there; restore one, or give a calibration by --camera FILE"
-        )
-    return mounted(loaded_rig(settings, *given, size=size), settings)
-
-
 def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
     """True poses of the rectified right camera, interpolated at the frames' stamps (n,)."""
     body = read_body_truth(root / "state_groundtruth_estimate0")
@@ -142,16 +138,8 @@ def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory |
     return Trajectory(at_frames.timestamps, at_frames.poses @ rig.bTc)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CameraFrames:
-    """Images listed in a camera's data.csv: stamps (n,) in nanoseconds, increasing, and files."""
-
-    stamps: IntArray
-    paths: tuple[Path, ...]
-
-
-def read_camera_frames(folder: Path) -> CameraFrames:
-    """Images that a camera's data.csv lists (``stamp in ns, file name``), under data/.
+def read_camera_frames(folder: Path) -> tuple[IntArray, list[Path]]:
+    """Increasing stamps (n,) in nanoseconds and files, under data/, that a camera's data.csv lists.
 
     Raises:
         DatasetError: the file is missing, empty or malformed, or stamps do not increase.
@@ -186,7 +174,7 @@ def read_camera_frames(folder: Path) -> CameraFrames:
             f"{path}: as nanoseconds its stamps are {step:.0f} ns apart (median); are they micro- "
             "or milliseconds? multiply them, and those of all data.csv, by 1e3 or 1e6"
         )
-    return CameraFrames(found, tuple(paths))
+    return found, paths
 
 
 def read_body_truth(folder: Path) -> Trajectory | None:
@@ -319,23 +307,24 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
         [path for path, _ in pairs], (drive / names[1],), None, right
     )
     rig, iTc = _raw_rig(settings, drive, names, first_size(right))
-    oxts = read_oxts(drive)
+    of_unit = read_oxts(drive)
     untrue = (
         "oxts is used as odometry of a camera that points ahead, and not as truth: next to "
         f"{CALIBRATION} there are no calib_imu_to_velo.txt and calib_velo_to_cam.txt"
     )
     images, noticed = open_frames(pairs, rig, drive)
-    notes = (*noticed, *unpaired, *assumed, *([untrue] if oxts and iTc is None else []))
+    notes = (*noticed, *unpaired, *assumed, *([untrue] if of_unit and iTc is None else []))
     identity = recording_identity(lists, (path for pair in pairs for path in pair))
     name = drive.resolve().name
     recording = image_recording(settings, name, rig, stamps, images, identity, notes)
-    if oxts is None:
+    if of_unit is None:
         return recording
-    source = recorded_motions(str(oxts.speeds.path), lambda: motions_of(oxts.speeds, odometry))
+    truth, speeds = of_unit
+    source = recorded_motions(str(speeds.path), lambda: motions_of(speeds, odometry))
     recording = replace(recording, odometry_source=source)
     if iTc is None:
         return recording
-    unit = trajectory_at_frames(oxts.poses, recording.timestamps, _MAX_TRUTH_GAP_S)
+    unit = trajectory_at_frames(truth, recording.timestamps, _MAX_TRUTH_GAP_S)
     return replace(recording, ground_truth=Trajectory(unit.timestamps, unit.poses @ iTc))
 
 
@@ -378,16 +367,10 @@ _COLUMNS = 23  # of those that are used; a file has 30
 _EARTH_RADIUS_M = 6_378_137.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Oxts:
-    """Poses of the unit (x ahead, y left, z up; world with x east), and a table of its speeds."""
+def read_oxts(drive: Path) -> tuple[Trajectory, Table] | None:
+    """Poses of a drive's inertial unit, and a table of its speeds; None where it has none.
 
-    poses: Trajectory
-    speeds: Table
-
-
-def read_oxts(drive: Path) -> Oxts | None:
-    """The inertial data of a drive; None where it has none.
+    The unit's axes are x ahead, y left, z up; the world's x points east.
 
     Raises:
         DatasetError: a file or the list of times is malformed.
@@ -400,7 +383,16 @@ def read_oxts(drive: Path) -> Oxts | None:
     found = written_stamps(files, (folder,)) if (folder / "timestamps.txt").is_file() else None
     if found is None:
         raise DatasetError(f"{folder} has no timestamps.txt; restore it, or remove the folder")
-    rows = np.array([_oxts_row(path) for path in files])
+    values = []
+    for path in files:
+        try:
+            row = [float(word) for word in read_text(path, DatasetError).split()[:_COLUMNS]]
+        except ValueError:
+            row = []
+        if len(row) < _COLUMNS or not np.isfinite(row).all():
+            raise DatasetError(f"{path}: expected 30 numbers; restore the file")
+        values.append(row)
+    rows = np.array(values)
     from scipy.spatial.transform import Rotation
 
     latitude, longitude = np.radians(rows[:, [_LATITUDE, _LONGITUDE]]).T
@@ -412,14 +404,4 @@ def read_oxts(drive: Path) -> Oxts | None:
     poses[:, :3, :3] = Rotation.from_euler("ZYX", rows[:, [_YAW, _PITCH, _ROLL]]).as_matrix()
     speeds = np.column_stack([found[0], rows[:, [_FORWARD_SPEED, _YAW_RATE]]])
     table = Table(folder, speeds, np.arange(1, len(rows) + 1), SPEED_COLUMNS)
-    return Oxts(Trajectory(found[0], poses), table)
-
-
-def _oxts_row(path: Path) -> list[float]:
-    try:
-        values = [float(word) for word in read_text(path, DatasetError).split()[:_COLUMNS]]
-    except ValueError:
-        values = []
-    if len(values) < _COLUMNS or not np.isfinite(values).all():
-        raise DatasetError(f"{path}: expected 30 numbers; restore the file")
-    return values
+    return Trajectory(found[0], poses), table

@@ -11,7 +11,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice, product
 from pathlib import Path
 from typing import TypeAlias
@@ -67,11 +67,11 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
     if not 0.0 < rate < np.inf:
         raise DatasetError(f"{paths[0]} states no frame rate; say it: --fps RATE")
     views, rig, assumed = _views(settings, films, paths[0].parent)
-    moments = moments_of(films, rate, settings.fps is not None)
+    shown, times, timed = moments_of(films, rate, settings.fps is not None)
     size = rig.image_size
 
     def load(index: int, colour: bool) -> tuple[Image, ...]:
-        images = views(*moments.numbers[index].tolist())
+        images = views(*shown[index].tolist())
         if not colour:
             images = tuple(
                 np.asarray(cv2.cvtColor(np.ascontiguousarray(i), cv2.COLOR_RGB2GRAY), np.uint8)
@@ -80,10 +80,10 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
         whole = [_with_last(image, size) for image in images]
         return rig.rectified(tuple(require_size(i, f"frame {index}", *size) for i in whole))
 
-    notes = (*(note for film in films for note in film.notes), *assumed, *moments.notes)
+    notes = (*(note for film in films for note in film.notes), *assumed, *timed)
     name = given.stem if len(films) == 1 else given.resolve().name.replace("*", "")
     identity = recording_identity([], paths)
-    return image_recording(settings, name, rig, moments.times, load, identity, notes)
+    return image_recording(settings, name, rig, times, load, identity, notes)
 
 
 def _with_last(image: Image, size: tuple[int, int]) -> Image:
@@ -203,19 +203,9 @@ _UNEVEN = 0.1  # of the time of a frame: less is the rounding of files that coun
 _LASTING = 15  # frames over which films part, not only jitter: at most half of the film
 
 
-@dataclass(frozen=True, slots=True)
-class Moments:
-    """What is shown when.
-
-    Attributes:
-        numbers: (n, films) of the frames of each film.
-        times: (n,) seconds, from the first film's beginning on.
-        notes: how that was found, and what was left out.
-    """
-
-    numbers: IntArray
-    times: FloatArray
-    notes: tuple[str, ...]
+Moments: TypeAlias = tuple[IntArray, FloatArray, tuple[str, ...]]
+"""Numbers (n, films) of the frames of each film that are shown at one time, these times (n,) in
+seconds from the first film's beginning on, and notes on how they were found."""
 
 
 def moments_of(films: list[VideoFrames], rate: float, stated: bool) -> Moments:
@@ -235,21 +225,27 @@ def moments_of(films: list[VideoFrames], rate: float, stated: bool) -> Moments:
     either = (film.even() if its is None else its for film, its in zip(films, own, strict=True))
     known = [times for times in either if times is not None]
     if stated or len(known) < len(films) or not any(_part(known[0], its) for its in known[1:]):
-        how, moments = "number", _by_number(films, own, rate)
-    else:
-        how, moments = "time", _by_time(films, known)
+        how, (numbers, times, reported) = "number", _by_number(films, own, rate)
+    else:  # of the frames that are each other's nearest
+        how = "time"
+        left, right, *third = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
+        sides = zip(("left", "third"), (films[0], *films[2:]), (left, *third), strict=False)
+        others = [(side, film.name, stamps) for side, film, stamps in sides]
+        rows, reported = pair_stamps(right, others, films[1].name)
+        numbers = rows[:, [1, 0, *range(2, len(films))]]
+        times = known[0][numbers[:, 0]]
     count, all_ = ("two", "both") if len(films) == 2 else ("three", "all")
     notes = [
         f"frames of the {count} films are paired by their {how}: {all_} must begin at one time"
     ]
-    left = films[0]
+    first = films[0]
     for film, side in zip(films[1:], ("right", "third"), strict=False):
-        if left.count != film.count:
-            notes.append(f"the left film has {left.count} frames, the {side} one {film.count}")
-        if abs(left.rate - film.rate) > 1e-3 * left.rate:
-            text = f"the left film has {left.rate:g} frames a second, the {side} {film.rate:g}"
+        if first.count != film.count:
+            notes.append(f"the left film has {first.count} frames, the {side} one {film.count}")
+        if abs(first.rate - film.rate) > 1e-3 * first.rate:
+            text = f"the left film has {first.rate:g} frames a second, the {side} {film.rate:g}"
             notes.append(text)
-    return replace(moments, notes=(*notes, *moments.notes))
+    return numbers, times, (*notes, *reported)
 
 
 def _part(left: FloatArray, right: FloatArray) -> bool:
@@ -265,16 +261,6 @@ def _part(left: FloatArray, right: FloatArray) -> bool:
     return bool(np.abs(np.median(apart, axis=1)).max() > 0.5 * step)
 
 
-def _by_time(films: list[VideoFrames], known: list[FloatArray]) -> Moments:
-    """Frames of the films that are each other's nearest."""
-    left, right, *third = (np.rint(each / NANOSECONDS).astype(np.int64) for each in known)
-    sides = zip(("left", "third"), (films[0], *films[2:]), (left, *third), strict=False)
-    others = [(side, film.name, stamps) for side, film, stamps in sides]
-    rows, notes = pair_stamps(right, others, films[1].name)
-    numbers = rows[:, [1, 0, *range(2, len(films))]]
-    return Moments(numbers, known[0][numbers[:, 0]], notes)
-
-
 def _by_number(films: list[VideoFrames], own: list[FloatArray | None], rate: float) -> Moments:
     """Frames at the rate, or each at its time in the first film where these are uneven."""
     count = min(film.count for film in films)
@@ -282,16 +268,16 @@ def _by_number(films: list[VideoFrames], own: list[FloatArray | None], rate: flo
     numbers = np.repeat(np.arange(count, dtype=np.int64)[:, None], len(films), axis=1)
     shown = [times[:count] for times in own if times is not None]
     if count < 2 or len(shown) < len(films):
-        return Moments(numbers, even, ())
+        return numbers, even, ()
     notes: tuple[str, ...] = ()
     apart = max((float(np.abs(shown[0] - its).max()) for its in shown[1:]), default=0.0)
     if apart > _UNEVEN / rate:
         notes = (f"frames of one number differ in time by up to {1e3 * apart:.0f} ms in the films",)
     if np.abs(shown[0] - even).max() <= _UNEVEN / rate:
-        return Moments(numbers, even, notes)
+        return numbers, even, notes
     steps = 1e3 * np.diff(shown[0])
     note = f"frames are {steps.min():.0f} to {steps.max():.0f} ms apart: each has its own time"
-    return Moments(numbers, shown[0], (note, *notes))
+    return numbers, shown[0], (note, *notes)
 
 
 # --------------------------------------------------------------------------------------------
@@ -323,7 +309,15 @@ class VideoFrames:
         self._capture = self._open()
         stated = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
         self.rate = float(self._capture.get(cv2.CAP_PROP_FPS))
-        self.count = stated if stated > 0 and self._reaches(stated) else self._counted()
+        capture = self._open()
+        capture.set(cv2.CAP_PROP_POS_FRAMES, stated - 1)
+        self.count = stated if stated > 0 and capture.grab() else 0
+        capture.release()
+        if not self.count:  # the last frame that the file states is not there: how many are
+            capture = self._open()
+            while capture.grab():
+                self.count += 1
+            capture.release()
         if self.count < 1:
             raise DatasetError(f"{path} holds no frame; give a video file")
         notes = []
@@ -388,23 +382,6 @@ class VideoFrames:
                     f"video {self._path}: frame {index} cannot be decoded; leave it out with "
                     "dataset.start, stop or stride"
                 )
-
-    def _reaches(self, stated: int) -> bool:
-        """Whether the last frame that the file states is there."""
-        capture = self._open()
-        try:
-            capture.set(cv2.CAP_PROP_POS_FRAMES, stated - 1)
-            return bool(capture.grab())
-        finally:
-            capture.release()
-
-    def _counted(self) -> int:
-        """How many frames can be read, by reading them."""
-        capture, count = self._open(), 0
-        while capture.grab():
-            count += 1
-        capture.release()
-        return count
 
     def _open(self) -> cv2.VideoCapture:
         if not self._path.is_file():

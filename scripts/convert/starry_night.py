@@ -138,15 +138,8 @@ def _stereo_frames(recorded: StarryNight, covariance: FloatArray) -> Iterator[Me
         y = recorded.pixels[index, ids]
         pixels = np.full((len(ids), 3, 2), np.nan)
         pixels[:, 0], pixels[:, 1] = y[:, 2:], y[:, :2]
-        yield MeasuredFrame(
-            index=index,
-            timestamp=float(recorded.stamps[index]),
-            odometry=odometry,
-            ids=ids,
-            measurement=y @ _MEASURE.T,
-            covariance=np.tile(covariance, (len(ids), 1, 1)),
-            pixels=pixels,
-        )
+        seen = y @ _MEASURE.T, np.tile(covariance, (len(ids), 1, 1)), pixels
+        yield index, float(recorded.stamps[index]), odometry, ids, seen
 
 
 def _camera_step(recorded: StarryNight, k: int) -> Odometry:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from edge_straightness import upright_edges
 
-from fgslam.cameras.omni import Cylinder, Equirectangular, OCamCamera, RadialCamera, unwrap_maps
+from fgslam.cameras.omni import Cylinder, Equirectangular, LensCamera, RadialCamera, unwrap_maps
 from fgslam.cameras.rings import find_mirror_circle, mirror_offset
 from fgslam.cameras.settings import OCamCalibSettings
 from fgslam.core.arrays import FloatArray, Image
@@ -90,9 +90,9 @@ VIEW = Cylinder(2400, 530, float(np.tan(np.radians(-40.4))), float(np.tan(np.rad
 def test_the_ocamcalib_picture_unwraps_straight(shared_data: Path) -> None:
     """Bows of long upright edges, and their lean once the camera's own tilt is taken off."""
     recording = ocamcalib(shared_data)
-    assert isinstance(recording.camera, OCamCamera)
+    assert isinstance(recording.camera, LensCamera)
     # Calibrated without the 300 columns at the left, pictured with them.
-    assert recording.camera.frame.centre == pytest.approx((974.318875, 545.872616))
+    assert recording.camera.centre == pytest.approx((974.318875, 545.872616))
     edges = upright_edges(unwrapped(recording, VIEW), 100)
     assert len(edges) >= 25
     assert np.median(edges.bow) < 0.7  # pixels of 2400, on edges of 100 to 300 rows

@@ -12,7 +12,7 @@ import pytest
 from fgslam.cameras.omni import (
     Equirectangular,
     HyperbolicMirror,
-    OCamCamera,
+    LensCamera,
     RadialPolynomial,
     angles_of,
 )
@@ -325,13 +325,14 @@ def test_a_calibration_file_is_looked_for_beside_the_pictures(tmp_path: Path) ->
         encoding="utf-8",
     )
     camera = make_camera(OCamCalibSettings(file="my.txt"), (400, 300), tmp_path)
-    assert isinstance(camera, OCamCamera)
-    np.testing.assert_allclose(np.degrees(camera.elevation(np.array([100.0]))), -45.0, atol=1e-6)
+    assert isinstance(camera, LensCamera)
+    _, elevation = angles_of(camera.rays(np.array([[299.0, 149.0]])))
+    np.testing.assert_allclose(np.degrees(elevation), -45.0, atol=1e-6)
     narrow = make_camera(
         OCamCalibSettings(file="my.txt", ring_px=(70.0, 99.0)), (400, 300), tmp_path
     )
-    assert isinstance(narrow, OCamCamera)
-    assert narrow.outer_radius == 99.0
+    assert isinstance(narrow, LensCamera)
+    assert narrow.ring == (70.0, 99.0)
     with pytest.raises(CalibrationError, match=r"no calibration other\.txt, nor "):
         make_camera(OCamCalibSettings(file="other.txt"), (400, 300), tmp_path)
     with pytest.raises(CalibrationError, match="400x300, but the picture has 640x480"):

@@ -17,8 +17,8 @@ from fgslam.cameras.omni import (
     Cylinder,
     Equirectangular,
     HyperbolicMirror,
+    LensCamera,
     MirrorFrame,
-    OCamCamera,
     OmniCamera,
     RadialPolynomial,
 )
@@ -358,11 +358,10 @@ CAMERAS = (
     Cylinder(640, 200, -0.8, 0.9),
     HyperbolicMirror(MirrorFrame(320, 240, (159.1, 118.7)), 20.0, 110.0, xi=0.92, focal_px=90.0),
     RadialPolynomial(MirrorFrame(320, 240, (160.0, 120.0), 0.3, False), 20.0, 110.0, (-0.9, 0.01)),
-    OCamCamera(
-        MirrorFrame(320, 240, (160.0, 120.0), affine=(1.01, 0.001, -0.002)),
-        20.0,
-        110.0,
-        direct=(-60.0, 0.0, 0.006),
+    LensCamera(
+        *(320, 240, "ocam", (1.0, -0.002, 160.0, 0.001, 1.01, 120.0, 0.0, 0.0, 1.0)),
+        distortion=(-60.0, 0.0, 0.006),
+        ring=(20.0, 110.0),
     ),
 )
 
