@@ -6,7 +6,6 @@ still identifies them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -183,7 +182,9 @@ def _turned_tags(board: Board, tags: IntArray, pixels: FloatArray) -> Corners:
     ids = _CORNERS_OF_TAG * tags[:, None] + np.arange(_CORNERS_OF_TAG)
     flat = board.points[ids.ravel(), :2]
     best, least = pixels, np.inf
-    for order in _orders():
+    around = np.arange(_CORNERS_OF_TAG)
+    turns = (np.roll(turn, k) for turn in (around, around[::-1]) for k in range(_CORNERS_OF_TAG))
+    for order in turns:
         turned = pixels[:, order].reshape(-1, 2)
         homography = cv2.findHomography(flat, turned)[0]
         if homography is not None:
@@ -192,11 +193,6 @@ def _turned_tags(board: Board, tags: IntArray, pixels: FloatArray) -> Corners:
             if error < least:
                 best, least = pixels[:, order], error
     return Corners(ids.ravel(), best.reshape(-1, 2))
-
-
-def _orders() -> Sequence[IntArray]:
-    around = np.arange(_CORNERS_OF_TAG)
-    return [np.roll(turn, k) for turn in (around, around[::-1]) for k in range(_CORNERS_OF_TAG)]
 
 
 def sizes_that_fit(board: Board, image: Image) -> list[str]:

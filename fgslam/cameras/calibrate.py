@@ -7,7 +7,7 @@ poses of the cameras to each other and their intrinsics come with one covariance
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
@@ -100,9 +100,8 @@ def calibrate(
     _require_views(seen, used)
     values, posed = _start(seen, size, model, len(views))
     used = posed[seen.image]
-    if model != "radtan":
-        lens_from = len(INTRINSICS) + (1 if model == "omni" else 0)
-        values = _Fit(seen.select(used), values, size, model).least(_FIRST_STEPS, lens_from)
+    lens_from = len(INTRINSICS) + (1 if model == "omni" else 0)
+    values = _Fit(seen.select(used), values, size, model).least(_FIRST_STEPS, lens_from)
     for trimming in range(_TRIMMINGS):
         _require_views(seen, used)
         fit = _Fit(seen.select(used), values, size, model)
@@ -126,7 +125,10 @@ def calibrate(
             errors[v, c] = _rms(away[own])
             kept[v][c] = Corners(seen.ids[own], seen.pixels[own])
     cameras = tuple(
-        replace(camera_of(model, size, numbers, f"cam{c}"), bTc=inverse(_matrix_of(turn)))
+        replace(
+            camera_of(model, size, numbers, f"cam{c}"),
+            bTc=inverse(pose(so3_exp(turn[:3]), turn[3:])),
+        )
         for c, (numbers, turn) in enumerate(zip(values.intrinsics, values.turns, strict=True))
     )
     return BoardCalibration(
@@ -216,11 +218,6 @@ def _fitting(seen: _Sightings, away: FloatArray) -> BoolArray:
 
 def _rms(distances: FloatArray) -> float:
     return float(np.sqrt(np.mean(distances**2))) if len(distances) else float("nan")
-
-
-def _matrix_of(turn: FloatArray) -> FloatArray:
-    """(4, 4) from rotation vector and translation."""
-    return pose(so3_exp(turn[:3]), turn[3:])
 
 
 def _turn_of(matrix: FloatArray) -> FloatArray:
@@ -367,7 +364,7 @@ class _Fit:
 # Where a fit starts
 
 
-_HALF_VIEWS = np.radians([20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 90.0, 105.0, 120.0])
+_HALF_VIEWS = np.radians([5.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0, 75.0, 90.0, 105.0, 120.0])
 """Angles from the axis that the nearest border of the image may show."""
 _XIS = (0.7, 1.0, 1.5)  # of lenses, parabolic mirrors, and spheres seen from farther away
 _AHEAD = 0.1  # least depth over distance, seen along the board's middle, to take a pose from
@@ -420,46 +417,29 @@ def first_guess(
 ) -> FloatArray:
     """Intrinsics (p,) of one camera: fx, fy, cx, cy and the model's parameters.
 
-    Of a perspective camera by OpenCV from its own images; of others, of several angles of view
-    without distortion, those with which the boards lie nearest to what was seen.
+    Of several angles of view without distortion, those with which the boards lie nearest to what
+    was seen.
 
     Args:
         model: one of :data:`PARAMETERS`.
         points: of each image (n, 3), in the board's axes.
         pixels: of each image (n, 2), where they were found.
         size: width and height of the images.
-
-    Raises:
-        CalibrationError: the images do not determine a camera.
     """
-    if model != "radtan":
-        candidates = list(_undistorted(model, size))
-        off = [_misfit(camera_of(model, size, guess), points, pixels) for guess in candidates]
-        return candidates[int(np.argmin(off))]
-    flat, seen = ([one.astype(np.float32)[:, None] for one in each] for each in (points, pixels))
-    try:
-        _, matrix, distortion, *_ = cv2.calibrateCamera(flat, seen, size, np.eye(3), np.zeros(5))
-    except cv2.error as error:
-        raise CalibrationError(
-            f"the board's images do not determine a camera ({error.err}); take more of them, "
-            "tilted and filling the image"
-        ) from error
-    numbers = matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]
-    return np.array([*numbers, *np.ravel(distortion)[: len(PARAMETERS[model])]])
-
-
-def _undistorted(model: str, size: tuple[int, int]) -> Iterator[FloatArray]:
     centre = (size[0] - 1) / 2.0, (size[1] - 1) / 2.0
+    candidates = []
     for angle in _HALF_VIEWS:
-        if model == "equidistant":
-            focal = 0.5 * min(size) / angle
-            yield np.array([focal, focal, *centre, 0.0, 0.0, 0.0, 0.0])
-            continue
-        for xi in _XIS:
-            below = np.cos(angle) + xi
-            if below > _AHEAD:
-                focal = 0.5 * min(size) * below / np.sin(angle)
-                yield np.array([focal, focal, *centre, xi, 0.0, 0.0, 0.0, 0.0])
+        for xi in _XIS if model == "omni" else (0.0,):
+            # Radius of a ray at that angle, for a focal length of 1.
+            ahead = np.cos(angle) + xi
+            radius = angle if model == "equidistant" else np.sin(angle) / max(ahead, _AHEAD)
+            focal = 0.5 * min(size) / radius
+            lens = np.zeros(len(PARAMETERS[model]))
+            lens[0] = xi
+            if model == "equidistant" or ahead > _AHEAD:
+                candidates.append(np.array([focal, focal, *centre, *lens]))
+    off = [_misfit(camera_of(model, size, guess), points, pixels) for guess in candidates]
+    return candidates[int(np.argmin(off))]
 
 
 def _misfit(camera: RawCamera, points: Sequence[FloatArray], pixels: Sequence[FloatArray]) -> float:

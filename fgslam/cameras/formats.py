@@ -680,11 +680,6 @@ _BASALT = Row(
 )
 
 
-def _is_basalt(tree: Tree) -> bool:
-    inner = tree.get("value0")
-    return isinstance(inner, dict) and "T_imu_cam" in inner
-
-
 def _read_basalt(path: Path, tree: Tree, _: Size | None) -> Calibration:
     """The cameras; the body is the IMU."""
     part = Values(path, tree["value0"], "value0.")
@@ -918,7 +913,7 @@ def _one(form: str, camera: Callable[[Path, Tree], RawCamera]) -> Reader:
 _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (is_realsense, _one("RealSense intrinsics", _realsense)),
     (is_own, read_own),
-    (_is_basalt, _read_basalt),
+    (lambda tree: "T_imu_cam" in Values(Path(), tree).inside("value0"), _read_basalt),
     (lambda tree: {"cameraData", "boardName"} <= tree.keys(), _read_oak),
     (is_camchain, _read_camchain),
     (is_asl, _one("ASL sensor.yaml", read_asl_camera)),

@@ -79,9 +79,11 @@ def _distorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
     """Points of the plane (n, 2) as the lens shows them; NaN beyond where it turns back."""
     if not len(plane) or not parameters.any():
         return plane
-    within = np.hypot(*plane.T) <= _turning_radius(parameters)
-    if len(parameters) == 14 and parameters[12:].any():
-        return _seen(_tilted(parameters, np.where(within[:, None], plane, 0.0)), within)
+    within = np.hypot(*plane.T) <= _RADII[_rising(_radial(parameters)) - 1]
+    if len(parameters) == 14 and parameters[12:].any():  # a tilted sensor (Scheimpflug), by OpenCV
+        points = np.column_stack([np.where(within[:, None], plane, 0.0), np.ones(len(plane))])
+        seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), parameters)[0]
+        return _seen(np.asarray(seen, np.float64).reshape(-1, 2), within)
     k = np.concatenate([parameters, np.zeros(12)])[:12] if len(parameters) < 12 else parameters
     x, y = np.where(within, plane[:, 0], 0.0), np.where(within, plane[:, 1], 0.0)
     r2, xy = x * x + y * y, x * y
@@ -90,13 +92,6 @@ def _distorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
     u = x * radial + 2.0 * k[2] * xy + k[3] * (r2 + 2.0 * x * x) + r2 * (k[8] + r2 * k[9])
     v = y * radial + k[2] * (r2 + 2.0 * y * y) + 2.0 * k[3] * xy + r2 * (k[10] + r2 * k[11])
     return _seen(np.column_stack([u, v]), within)
-
-
-def _tilted(parameters: FloatArray, plane: FloatArray) -> FloatArray:
-    """With a sensor that is tilted against the lens (Scheimpflug), by OpenCV."""
-    points = np.column_stack([plane, np.ones(len(plane))])
-    seen = cv2.projectPoints(points, np.zeros(3), np.zeros(3), np.eye(3), parameters)[0]
-    return np.asarray(seen, np.float64).reshape(-1, 2)
 
 
 def _radial(parameters: FloatArray) -> FloatArray:
@@ -113,10 +108,6 @@ def _rising(values: FloatArray) -> int:
     """How many of the values (n,) rise before the first that does not."""
     stops = np.flatnonzero(~(np.diff(values) > 0.0))
     return int(stops[0]) + 1 if len(stops) else len(values)
-
-
-def _turning_radius(parameters: FloatArray) -> float:
-    return float(_RADII[_rising(_radial(parameters)) - 1])
 
 
 def _undistorted(parameters: FloatArray, plane: FloatArray) -> FloatArray:

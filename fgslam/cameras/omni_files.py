@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, get_args
 
 import numpy as np
 
@@ -32,6 +32,7 @@ from fgslam.cameras.settings import (
     LensSettings,
     MirrorMountSettings,
     OCamCalibSettings,
+    OmniCameraKind,
     RadialPolynomialSettings,
 )
 from fgslam.cameras.trees import flat_numbers, read_tree
@@ -41,17 +42,6 @@ from fgslam.core.settings import make_settings
 from fgslam.core.yaml_text import read_yaml
 
 Size = tuple[int, int]
-
-
-OmniCameraKind: TypeAlias = (
-    EquirectangularSettings
-    | CylinderSettings
-    | HyperbolicMirrorSettings
-    | OCamCalibSettings
-    | LensSettings
-    | RadialPolynomialSettings
-    | BloggieSettings
-)
 
 
 def load_camera(
@@ -75,7 +65,11 @@ def load_camera(
             images of another size; no size is given and the calibration has none.
         ConfigError: a key or its value is wrong.
     """
-    _require_size(size)
+    pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
+    if size is not None and not (pair and all(isinstance(n, int | np.integer) for n in pair)):
+        raise CalibrationError(
+            f"camera: size is {size!r}; give (width, height) of the images in pixels"
+        )
     if isinstance(source, str | Path):
         source, folder = _read(source)
         return make_camera(source, size, folder)
@@ -94,14 +88,6 @@ def camera_keys(source: str | Path) -> dict[str, Any]:
     if folder is not None and "file" in keys:
         keys["file"] = str(folder / keys["file"])
     return keys
-
-
-def _require_size(size: object) -> None:
-    pair = size if isinstance(size, list | tuple) and len(size) == 2 else ()
-    if size is not None and not (pair and all(isinstance(one, int | np.integer) for one in pair)):
-        raise CalibrationError(
-            f"camera: size is {size!r}; give (width, height) of the images in pixels"
-        )
 
 
 def make_camera(
@@ -192,15 +178,7 @@ def _settings_of(source: object, where: str = "camera") -> OmniCameraKind:
     return make_settings(kind, {str(key): value for key, value in source.items()}, "camera")
 
 
-_KINDS: dict[str, type[OmniCameraKind]] = {
-    "equirectangular": EquirectangularSettings,
-    "cylinder": CylinderSettings,
-    "mirror": HyperbolicMirrorSettings,
-    "ocamcalib": OCamCalibSettings,
-    "lens": LensSettings,
-    "radial_polynomial": RadialPolynomialSettings,
-    "bloggie": BloggieSettings,
-}
+_KINDS: dict[str, type[OmniCameraKind]] = {kind.kind: kind for kind in get_args(OmniCameraKind)}
 
 
 def _frame(

@@ -18,7 +18,7 @@ from fgslam.cameras.omni import (
     RadialFit,
     fit_radial_polynomial,
 )
-from fgslam.core.arrays import FloatArray, Image, IntArray
+from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.errors import CalibrationError
 
 Float32 = npt.NDArray[np.float32]
@@ -161,20 +161,14 @@ def _falling_edges(
     """
     radii, angles, profiles = _radial_profiles(grey, centre, limits)
     ray, place, height = _peaks(-_slopes(profiles), _LEAST_CONTRAST)
-    chosen = _strongest_of(ray, height)
+    order = np.lexsort((-height, ray))
+    chosen = order[np.unique(ray[order], return_index=True)[1]]
     if outermost:
         last = np.flatnonzero(np.append(np.diff(ray) > 0, True)[: len(ray)])
         chosen = np.union1d(chosen, last)
     radius = radii[0] + place[chosen] * _STEP_PX
     angle = angles[ray[chosen].astype(np.int64)]
     return np.column_stack([centre[0] + radius * np.cos(angle), centre[1] + radius * np.sin(angle)])
-
-
-def _strongest_of(ray: FloatArray, height: FloatArray) -> IntArray:
-    """(k,) index of the highest peak of each ray."""
-    order = np.lexsort((-height, ray))
-    _, first = np.unique(ray[order], return_index=True)
-    return np.asarray(order[first], np.int64)
 
 
 def _search_circle(

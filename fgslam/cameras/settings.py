@@ -166,13 +166,13 @@ class BloggieSettings:
     )
 
 
-OmniCameraSettings: TypeAlias = Annotated[
+OmniCameraKind: TypeAlias = (
     EquirectangularSettings
     | CylinderSettings
     | HyperbolicMirrorSettings
     | OCamCalibSettings
     | LensSettings
     | RadialPolynomialSettings
-    | BloggieSettings,
-    Field(discriminator="kind"),
-]
+    | BloggieSettings
+)
+OmniCameraSettings: TypeAlias = Annotated[OmniCameraKind, Field(discriminator="kind")]

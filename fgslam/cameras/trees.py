@@ -103,7 +103,13 @@ def read_tree(path: Path) -> Tree | None:
     """
     text = read_text(path, CalibrationError).lstrip("\ufeff \t\r\n")
     if text.startswith("<"):
-        values = _of_xml(path)
+        try:
+            storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+            values = _of_node(storage.root(), 0)
+            storage.release()
+        except (cv2.error, SystemError) as error:  # its constructor wraps the one in the other
+            cause = " ".join(str(error.__cause__ or error).split())
+            raise CalibrationError(f"{path} is malformed: {cause}; write the file again") from None
     else:
         values = read_json(path, text) if text.startswith("{") else _of_yaml(path, text)
     if not isinstance(values, dict):
@@ -141,17 +147,6 @@ def _of_yaml(path: Path, text: str) -> Any:
 def is_camera_text(text: str) -> bool:
     """Whether a text may be a ROS camera_info, as ``rostopic echo`` writes it too."""
     return _CAMERA_INFO.search(text) is not None
-
-
-def _of_xml(path: Path) -> Any:
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        values = _of_node(storage.root(), 0)
-        storage.release()
-    except (cv2.error, SystemError) as error:  # its constructor wraps the one in the other
-        cause = " ".join(str(error.__cause__ or error).split())
-        raise CalibrationError(f"{path} is malformed: {cause}; write the file again") from None
-    return values
 
 
 def _of_node(node: cv2.FileNode, depth: int) -> Any:

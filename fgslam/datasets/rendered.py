@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,9 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.log import Frame
 from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
+from fgslam.datasets.recording import select_frames
 from fgslam.worlds.driving import Drive, simulate_wheels
 from fgslam.worlds.lab import (
     PlaceChoice,
@@ -71,8 +72,8 @@ class RenderedLabSequence:
             progress: called with (frames rendered so far, frames to render).
 
         Raises:
-            ConfigError: the path cannot be driven, leads through furniture, or no frame is left.
-            DatasetError: the cache's folder cannot be written.
+            ConfigError: the path cannot be driven, or leads through furniture.
+            DatasetError: no frame is left, or the cache's folder cannot be written.
             MissingDependencyError: frames must be rendered and Open3D cannot be loaded.
         """
         self._settings = settings
@@ -80,7 +81,8 @@ class RenderedLabSequence:
         self._rig = make_rig(settings.rig)
         self._place = PlaceChoice.of(settings)
         self._drive = plan_in_place(self._place, settings.drive, self._rig)
-        self._indices = _selection(len(self._drive.timestamps), start, stop, stride)
+        chosen = FrameSelection(start=start, stop=stop, stride=stride)
+        self._indices = select_frames(len(self._drive.timestamps), chosen, "the drive")
         self._body = self._drive.body_poses(self._drive.timestamps)
         self._world_body = self._body[0]
         if settings.drive.path == "random_poses":
@@ -91,7 +93,13 @@ class RenderedLabSequence:
         self._walk = make_walk(settings, self._drive, self._rig)
         self._world: World | None = None
         self._world_lock = threading.Lock()
-        description = _render_description(settings)
+        # Exactly what shapes the clean images: neither noise, gain, cover, odometry nor seed.
+        everything = identity_values(settings)
+        description = {key: everything[key] for key in _SHAPING_KEYS if key in everything} | {
+            "render_version": RENDER_VERSION,
+            "motion_blur": everything["effects"]["motion_blur"],
+            "person": everything["effects"]["person"],
+        }
         shape = (self._rig.cameras, self._rig.height, self._rig.width)
         self._cache = RenderCache(content_hash(description), description, shape)
         self._render_missing(progress)
@@ -263,33 +271,6 @@ def first_camera_pose(settings: RenderedLabSettings) -> FloatArray:
     drive = plan_in_place(PlaceChoice.of(settings), settings.drive, rig)
     first = drive.timestamps[settings.start : settings.start + 1]
     return np.asarray(drive.body_poses(first)[0] @ rig.bTc)
-
-
-def _selection(count: int, start: int, stop: int | None, stride: int) -> IntArray:
-    if start < 0 or stride < 1 or (stop is not None and stop < 0):
-        raise ConfigError(
-            f"start {start}, stop {stop}, stride {stride}: start and stop must not be negative "
-            "and stride must be 1 or more"
-        )
-    indices = np.arange(count, dtype=np.int64)[start:stop:stride]
-    if len(indices) == 0:
-        raise ConfigError(
-            f"start {start}, stop {stop} leave none of the drive's {count} frames; "
-            "lower dataset.start or raise dataset.stop"
-        )
-    return indices
-
-
-def _render_description(settings: LabSettings) -> dict[str, Any]:
-    """Exactly what shapes the clean images: neither noise, gain, cover, odometry nor seed."""
-    everything = identity_values(settings)
-    shaping = {key: everything[key] for key in _SHAPING_KEYS if key in everything}
-    effects = everything["effects"]
-    return shaping | {
-        "render_version": RENDER_VERSION,
-        "motion_blur": effects["motion_blur"],
-        "person": effects["person"],
-    }
 
 
 def _check_clearance(drive: Drive, world: World, rig: CameraRig) -> None:

@@ -401,7 +401,15 @@ def _listed(path: Path, images: Sequence[Path], every: Sequence[Path]) -> list[s
     """
     lines = read_lines(path)
     if lines and _DATE.match(lines[0][1]):
-        rows = [[_seconds_of_date(path, number, text)] for number, text in lines]
+        rows = []
+        for number, text in lines:  # 2011-09-26 13:02:25.964389445: all digits are kept
+            whole, _, part = text.strip().partition(".")
+            try:
+                moment = datetime.fromisoformat(whole.strip()).replace(tzinfo=UTC)
+            except ValueError:
+                text = f"{path}, line {number}: {text!r} is no time; correct it"
+                raise DatasetError(text) from None
+            rows.append([f"{int(moment.timestamp())}.{part or 0}"])
     else:
         rows = [[w for w in re.split(r"[,;\s]+", text) if w] for _, text in lines]
         if rows and not any(map(_NUMBER.fullmatch, rows[0])):
@@ -442,16 +450,6 @@ def _stem(word: str) -> str:
     """A file's name without folder and ending; of a number its value."""
     name = re.sub(r"\.(png|jpe?g|p[gnp]m|bmp|tiff?|webp)$", "", word.rpartition("/")[2], flags=re.I)
     return str(int(name)) if name.isdecimal() else name
-
-
-def _seconds_of_date(path: Path, line: int, text: str) -> str:
-    """``2011-09-26 13:02:25.964389445`` in seconds since 1970, as text with all its digits."""
-    whole, _, part = text.strip().partition(".")
-    try:
-        moment = datetime.fromisoformat(whole.strip()).replace(tzinfo=UTC)
-    except ValueError:
-        raise DatasetError(f"{path}, line {line}: {text!r} is no time; correct it") from None
-    return f"{int(moment.timestamp())}.{part or 0}"
 
 
 # Names of files that are dates
