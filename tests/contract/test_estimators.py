@@ -16,10 +16,8 @@ from simulated import RIG
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
-    BatchSettings,
     EstimatorSettings,
     Isam2Settings,
-    LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
     family_of,
 )
@@ -41,12 +39,9 @@ DEFAULTS: dict[str, EstimatorSettings] = {
     settings.kind: settings() for settings in get_args(get_args(EstimatorSettings)[0])
 }
 SETTINGS: dict[str, EstimatorSettings] = DEFAULTS | {
-    "landmark_kalman_graph, world update": LandmarkKalmanGraphSettings(update="world"),
     "isam2, keyframes": Isam2Settings(keyframe_every=4),
-    "batch, gnc": BatchSettings(method="gnc"),
     "landmark_kalman, world update": LandmarkKalmanSettings(update="world"),
     "landmark_kalman, running mean": LandmarkKalmanSettings(update="running_mean"),
-    "landmark_kalman, half": LandmarkKalmanSettings(update="half"),
 }
 CORRECTING = [name for name, settings in SETTINGS.items() if family_of(settings.kind) != "other"]
 """Filters and smoothers learn from landmarks seen again; dead reckoning is neither."""

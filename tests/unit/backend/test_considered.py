@@ -277,10 +277,9 @@ def test_a_frame_that_nothing_places_is_as_uncertain_as_its_odometry() -> None:
         assert (ratio < 2.0).all()
 
 
-@pytest.mark.parametrize("update", ["pixel", "half"])
-def test_estimates_do_not_depend_on_what_is_reported(update: str) -> None:
+def test_estimates_do_not_depend_on_what_is_reported() -> None:
     increments = drawn(4).increments
-    sampled, own = played(increments, update=update), played(increments, None, update=update)
+    sampled, own = played(increments), played(increments, None)
     poses = [one.estimate().trajectory.poses for one in (sampled, own)]
     np.testing.assert_array_equal(*poses)
     np.testing.assert_array_equal(sampled.landmarks().positions, own.landmarks().positions)
@@ -311,7 +310,7 @@ def test_landmarks_of_a_saved_map_may_be_known_exactly_in_a_direction(
     assert errors.values.sum() < 2.0 * errors.dof.sum()
 
 
-@pytest.mark.parametrize(("matches", "drives"), [(1000, 4), (3, 2)])
+@pytest.mark.parametrize(("matches", "drives"), [(1000, 2), (3, 2)])
 def test_a_loop_leaves_the_covariances_those_of_the_errors(matches: int, drives: int) -> None:
     """At the frame that closes it, at the end, and of the landmarks.
 
@@ -406,9 +405,7 @@ def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() ->
     np.testing.assert_allclose(found.covariance, covariance[-k:, -k:], rtol=1e-5, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "term", ["left.yaw", "row", "focal", "all.radial", "radial", "baseline", "mode 0", "mode 25"]
-)
+@pytest.mark.parametrize("term", ["left.yaw", "focal", "all.radial", "baseline", "mode 25"])
 def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     """By some tenths of a pixel; to first order."""
     by = (0.3 if "mode" in term else 0.1 / RIG.fx) * (np.array(ALL) == term)
@@ -591,24 +588,7 @@ def test_filters_report_landmarks_as_uncertain_as_their_rig_leaves_them(kind: st
     assert np.linalg.eigvalsh(joint).min() > 0.0
 
 
-def test_a_correction_is_weighed_once_for_as_long_as_it_stays(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    weighed: list[FloatArray] = []
-
-    def counted(correction: RigCorrection) -> FloatArray:
-        weighed.append(correction.values)
-        return shared_covariance(correction)
-
-    monkeypatch.setattr(considered, "shared_covariance", counted)
-    online = ConsiderCovariance(CALIBRATED.rig, NO_FLOOR)
-    for frame, increment in enumerate(increments_of(12)):
-        applied = UNCORRECTED if frame < 8 else UNCORRECTED + 1e-3
-        online.observe(dataclasses.replace(increment, rig_correction=applied), np.eye(4))
-    assert len(weighed) == 2
-
-
-@pytest.mark.parametrize("kind", ["landmark_kalman", "landmark_kalman_graph", "ekf"])
+@pytest.mark.parametrize("kind", ["landmark_kalman", "ekf"])
 def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: str) -> None:
     increments = increments_of(12, field_px=0.3)
     through, first, second = (make_estimator(CALIBRATED.rig, ONLINE[kind], FREE) for _ in range(3))

@@ -23,7 +23,6 @@ from simulated import (
 )
 from smoothing import FREE, PIXELS, build
 
-from fgslam.backend import loops
 from fgslam.backend.considered import shares
 from fgslam.backend.loops import (
     CLOSURE_FACTOR,
@@ -44,12 +43,10 @@ from fgslam.backend.loops import (
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
     BatchSettings,
-    DeadReckoningSettings,
     EkfSettings,
     EstimatorSettings,
     FixedLagSettings,
     Isam2Settings,
-    LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
@@ -109,13 +106,6 @@ def test_without_constraints_nothing_moves(rng: np.random.Generator) -> None:
     assert cost < 1e-12
 
 
-def test_a_true_chain_meets_its_loop_at_no_cost() -> None:
-    poses = chained([STEP] * (COUNT - 1))
-    found, cost = corrected(poses, uncertain(), [home()])
-    assert apart(found, poses) < 1e-9
-    assert cost < 1e-9
-
-
 def test_the_loop_is_met_and_the_first_pose_stays(rng: np.random.Generator) -> None:
     poses, motion = drifted(rng), g.se3_exp(np.array([0.01, 0.2, 0.0, 0.1, 0.0, -0.2]))
     before = poses.copy()
@@ -141,17 +131,6 @@ def test_submaps_give_the_solution_of_single_frames(every: int, rng: np.random.G
     np.testing.assert_allclose(cost, least, rtol=1e-3)
 
 
-def test_correcting_a_drift_brings_the_drive_nearer_to_the_truth(rng: np.random.Generator) -> None:
-    truth = chained([STEP] * (COUNT - 1))
-    before, after = [], []
-    for _ in range(20):
-        poses = drifted(rng)
-        found, _ = corrected(poses, uncertain(), [home()], every=5)
-        before.append(np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1))
-        after.append(np.linalg.norm(found[:, :3, 3] - truth[:, :3, 3], axis=1))
-    assert np.mean(after) < 0.6 * np.mean(before)
-
-
 def test_the_cost_of_true_loops_is_chi_square(rng: np.random.Generator) -> None:
     """With six degrees of freedom: the drift's covariance is the steps' sum."""
     costs = [corrected(drifted(rng, 0.2), 0.04 * uncertain(), [home()])[1] for _ in range(60)]
@@ -175,17 +154,6 @@ def test_frames_take_the_share_of_a_closure_that_the_whole_solution_gives(
     taken = shares(chain, closed)
     np.testing.assert_allclose(taken @ whole, moved, rtol=0.0, atol=1e-2 * np.abs(moved).max())
     assert np.abs(moved[:8]).max() < 1e-9 < np.abs(moved[8:]).max()
-
-
-def test_corrected_drive_has_no_jumps(rng: np.random.Generator) -> None:
-    """No step changes by much more than its share of the whole."""
-    poses = drifted(rng, 3.0)
-    found, _ = corrected(poses, uncertain(), [home()])
-    whole = np.abs(g.se3_log(poses[-1])).max()
-    for k in range(COUNT - 1):
-        step = g.inverse(poses[k]) @ poses[k + 1]
-        change = g.se3_log(g.inverse(step) @ g.inverse(found[k]) @ found[k + 1])
-        assert np.abs(change).max() < 0.15 * whole
 
 
 def test_unknown_step_takes_the_whole_correction(rng: np.random.Generator) -> None:
@@ -400,7 +368,6 @@ def test_the_step_from_a_frame_without_a_pose_of_its_own_was_measured(matched: i
 
 CLOSING: dict[str, EstimatorSettings] = {
     "landmark_kalman": LandmarkKalmanSettings(),
-    "landmark_kalman_graph": LandmarkKalmanGraphSettings(),
     "ekf": EkfSettings(),
     "fixed_lag": FixedLagSettings(),
     "sliding_window": SlidingWindowSettings(),
@@ -440,14 +407,10 @@ def test_the_camera_is_back_in_the_old_map(name: str) -> None:
     assert without[CLOSED:].mean() > 0.08
     # Where it drove the first time it is right to a few centimetres.
     assert after[CLOSED:].mean() < 0.6 * without[CLOSED:].mean()
-
-
-@pytest.mark.parametrize("name", REVISING)
-def test_the_drive_is_corrected_backwards(name: str) -> None:
-    without, after = (errors(at_end(name, lies)[1], returned()) for lies in (True, False))
-    late = slice(2 * ROUND // 3, CLOSED)
-    assert after[late].mean() < 0.75 * without[late].mean()
-    assert after.max() < without.max()
+    if name in REVISING:
+        late = slice(2 * ROUND // 3, CLOSED)
+        assert after[late].mean() < 0.75 * without[late].mean()
+        assert after.max() < without.max()
 
 
 def test_a_loop_within_the_sliding_window_is_a_factor_more() -> None:
@@ -502,33 +465,17 @@ def test_a_wrong_loop_is_refused_and_changes_nothing(name: str) -> None:
     reported = [words for words in found.remarks if "loop closure to frame" in words]
     assert len(reported) == 1
     assert "refused" in reported[0]
-    if name not in ("landmark_kalman", "isam2"):
+    if name not in ("landmark_kalman", "isam2", "batch"):
         return
     straight = build(CLOSING[name])
     play(straight, [dataclasses.replace(x, loops=()) for x in drive.increments], FREE)
     offset = found.trajectory.poses[:, :3, 3] - straight.estimate().trajectory.poses[:, :3, 3]
     # Frames that wait for an update of iSAM2 are hurried by a loop, refused or not; the lie is of
     # a metre at the end.
-    assert np.abs(offset).max() < (1e-12 if name == "landmark_kalman" else 0.01)
+    assert np.abs(offset).max() < (0.01 if name == "isam2" else 1e-12)
 
 
-@pytest.mark.parametrize("name", ["landmark_kalman", "isam2", "ekf"])
-def test_without_the_gate_the_wrong_loop_is_taken(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """So it is the gate that refuses it."""
-    monkeypatch.setattr(loops, "GATE_SIGMAS", np.inf)
-    drive = returned(lies=True)
-    increments = drive.increments[: CLOSED + 1]
-    estimator = build(CLOSING[name])
-    stats = play(estimator, increments, FREE)
-    loop = increments[CLOSED].loops[0]
-    claimed = drive.poses[loop.frame] @ loop.oTc
-    turned = g.rotation_angle(claimed[:3, :3].T @ stats[-1].wTc[:3, :3])
-    assert turned < 0.35  # the lie is of 0.5, and the filter believes it in part
-
-
-@pytest.mark.parametrize("name", ["landmark_kalman", "ekf", "isam2, keyframes", "sliding_window"])
+@pytest.mark.parametrize("name", ["ekf", "isam2, keyframes", "sliding_window"])
 def test_state_and_replay_keep_every_bit_over_a_loop(name: str) -> None:
     increments = returned().increments
     straight = at_end(name, False)[0]
@@ -552,45 +499,17 @@ def test_a_loop_that_leads_nowhere_is_an_error(name: str) -> None:
         play(estimator, [dataclasses.replace(increments[5], loops=(loop,))], FREE)
 
 
-@pytest.mark.parametrize("name", ["isam2, keyframes", "landmark_kalman"])
-def test_a_loop_on_an_exact_drive_changes_nothing(name: str) -> None:
-    """Without noise the closure agrees with what is there."""
-    drive = Drive(frames=CLOSED + 3, points=80, twist=Rounds().drive.twist, noise=0.0)
-    exact = drive_rounds(Rounds(drive=drive), np.random.default_rng(SEED))
-    estimator = build(CLOSING[name])
-    play(estimator, exact.increments, FREE)
-    estimate = estimator.estimate()
-    assert errors(estimate, exact).max() < 1e-5
-    assert sum("loop" in words for words in estimate.remarks) == 1
-
-
-@pytest.mark.parametrize("name", ["isam2", "batch"])
-def test_a_second_closure_that_agrees_moves_nothing(name: str) -> None:
+def test_a_second_closure_that_agrees_moves_nothing() -> None:
     increments = list(returned().increments)
     k, loop = CLOSED + 3, increments[CLOSED].loops[0]
     oTc = g.inverse(returned().poses[loop.frame]) @ returned().poses[k]
     again = dataclasses.replace(loop, oTc=oTc, covariance=25.0 * loop.covariance)
     increments[k] = dataclasses.replace(increments[k], loops=(again,))
-    estimator = build(CLOSING[name])
+    estimator = build(BatchSettings())
     play(estimator, increments, FREE)
     reported = [words for words in estimator.estimate().remarks if "loop closure" in words]
     assert len(reported) == 2
     assert "nothing moved" in reported[1]
-
-
-def test_refused_loop_leaves_the_answer_of_its_frame_alone() -> None:
-    increments = list(returned(lies=True).increments[: CLOSED + 1])
-    answers = []
-    for closures in (increments[-1].loops, ()):
-        estimator = build(BatchSettings())
-        play(
-            estimator, [*increments[:-1], dataclasses.replace(increments[-1], loops=closures)], FREE
-        )
-        answers.append(estimator.estimate())
-    assert "refused" in answers[0].remarks[0]
-    assert_same_bits(answers[0].trajectory, answers[1].trajectory)
-    assert_same_bits(answers[0].covariances, answers[1].covariances)
-    assert_same_bits(answers[0].landmarks, answers[1].landmarks)
 
 
 def found_again_where_expected(estimator: Any, count: int) -> None:
@@ -697,21 +616,3 @@ def test_relocalised_robot_is_where_its_landmarks_are(name: str) -> None:
     assert np.linalg.norm(online[20:], axis=1).max() < 0.05
     final = estimator.estimate().trajectory.poses[:, :3, 3] - poses[:, :3, 3]
     assert np.linalg.norm(final, axis=1).max() < 0.05
-
-
-@pytest.mark.parametrize("name", ["isam2", "ekf"])
-def test_odometry_of_a_carried_robot_would_mislead(name: str) -> None:
-    """Unless the frame says that it was found without a prior."""
-    poses, increments = carried_off(relocalised=False)
-    estimator = build(CLOSING[name])
-    stats = play(estimator, increments, FREE)
-    online = np.array([s.wTc[:3, 3] for s in stats]) - poses[:, :3, 3]
-    assert np.linalg.norm(online[20:], axis=1).max() > 0.2
-
-
-def test_dead_reckoning_ignores_both() -> None:
-    increments = returned().increments
-    with_loops, without = (build(DeadReckoningSettings()) for _ in range(2))
-    play(with_loops, increments, FREE)
-    play(without, [dataclasses.replace(x, loops=()) for x in increments], FREE)
-    assert_same_bits(with_loops.estimate(), without.estimate())

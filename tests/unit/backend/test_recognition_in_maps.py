@@ -24,10 +24,8 @@ from simulated import RIG, assert_same_bits
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
-    BatchSettings,
     EstimatorSettings,
     Isam2Settings,
-    LandmarkKalmanGraphSettings,
     LandmarkKalmanSettings,
 )
 from fgslam.core import geometry as g
@@ -176,8 +174,7 @@ def test_a_map_that_is_left_as_it_is_stays_so_to_the_bit() -> None:
     )
 
 
-@pytest.mark.parametrize("extends", [True, False])
-@pytest.mark.parametrize("after_closing", [-12, 1])
+@pytest.mark.parametrize(("extends", "after_closing"), [(True, 1), (False, -12)])
 def test_continued_from_its_state_it_goes_on_to_the_bit(extends: bool, after_closing: int) -> None:
     _, reports, states = returned_with_states(extends)
     stop = closings(reports)[0] + after_closing
@@ -199,9 +196,7 @@ def test_continued_from_its_state_it_goes_on_to_the_bit(extends: bool, after_clo
 ESTIMATORS: list[tuple[EstimatorSettings, bool]] = [
     (LandmarkKalmanSettings(), True),
     (LandmarkKalmanSettings(), False),
-    (LandmarkKalmanGraphSettings(), False),
     (Isam2Settings(), True),
-    (BatchSettings(), True),
 ]
 
 

@@ -121,7 +121,7 @@ def found_late(drive: Simulation, knocked_px: float) -> list[Increment]:
 
 
 @pytest.mark.parametrize("knocked_px", [1.0, 2.0], ids=["unmoved", "a knock"])
-@pytest.mark.parametrize("kind", ["isam2", "isam2, keyframes", "sliding_window", "batch"])
+@pytest.mark.parametrize("kind", ["isam2, keyframes", "sliding_window"])
 def test_whole_graphs_correct_all_frames_by_what_became_known_of_the_rig_as_it_was(
     kind: str, knocked_px: float, drive: Simulation
 ) -> None:
