@@ -98,9 +98,9 @@ def nees_of(estimate: Estimate, simulation: Simulation) -> tuple[Nees, Nees]:
     return pose_nees(*poses), landmark_nees(*landmarks)
 
 
-def assert_consistent(settings: EstimatorSettings) -> None:
-    """Errors of poses and landmarks over 20 drives are those that the covariances state."""
-    drives = [drawn(100 + seed) for seed in range(20)]
+def assert_consistent(settings: EstimatorSettings, count: int = 20) -> None:
+    """Errors of poses and landmarks over many drives are those that the covariances state."""
+    drives = [drawn(100 + seed) for seed in range(count)]
     found = [nees_of(answer(settings, drive.increments), drive) for drive in drives]
     for runs in zip(*found, strict=True):
         verdict = judge(runs)

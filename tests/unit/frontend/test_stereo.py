@@ -89,7 +89,7 @@ INSIDE_AND_OUTSIDE = {
     "scale, smaller": (((110.0, 80.0), 1.34, 30.0), ((110.0, 80.0), 1.33, 30.0)),
     "orientation, clockwise": (((110.0, 80.0), 2.0, 49.9), ((110.0, 80.0), 2.0, 50.1)),
     "orientation, through 0": (((110.0, 80.0), 2.0, 10.1), ((110.0, 80.0), 2.0, 9.9)),
-    "orientation, opposite": (((110.0, 80.0), 2.0, 390.0), ((110.0, 80.0), 2.0, 210.0)),
+    "orientation, around the circle": (((110.0, 80.0), 2.0, 390.0), ((110.0, 80.0), 2.0, 210.0)),
 }
 
 
@@ -100,12 +100,6 @@ def test_each_gate_of_the_left_image(gate: str, appearance: AppearanceSettings) 
     for left, count in zip(INSIDE_AND_OUTSIDE[gate], (1, 0), strict=True):
         found = match(right, features(*left), rig=TWO_CAMERAS, appearance=appearance)
         assert len(found) == count
-
-
-def test_orientations_are_compared_around_the_circle() -> None:
-    left = features((110.0, 80.0), orientation_deg=355.0)
-    assert len(match(features(RIGHT, orientation_deg=5.0), left, rig=TWO_CAMERAS)) == 1
-    assert len(match(features(RIGHT, orientation_deg=16.0), left, rig=TWO_CAMERAS)) == 0
 
 
 TOP = {
@@ -260,19 +254,6 @@ def crowd(rng: np.random.Generator, count: int = 150, noise: float = 0.5):
     return features(xy), features(left), features(top)
 
 
-def test_wider_gates_need_not_give_more_matches() -> None:
-    """The count has its maximum inside the range of widths."""
-    widths = [0.05, 0.2, 0.5, 1.0, 2.0, 5.0, 15.0]
-    counts = np.zeros(len(widths))
-    for seed in range(10):
-        images = crowd(np.random.default_rng(seed))[:2]
-        counts += [len(match(*images, rig=TWO_CAMERAS, epipolar_px=w)) for w in widths]
-    best = int(np.argmax(counts))
-    assert 0 < best < len(widths) - 1
-    assert counts[0] < 0.7 * counts[best]
-    assert counts[-1] < 0.3 * counts[best]
-
-
 def test_the_top_image_removes_wrong_matches() -> None:
     """Features whose left partner was not found meet another one in the left image."""
     rng = np.random.default_rng(4)
@@ -354,23 +335,13 @@ def test_fusing_all_coordinates_halves_the_variances() -> None:
 
 
 @pytest.mark.parametrize("kind", ["paper", "fused"])
-@pytest.mark.parametrize("ratio", [1.0, 0.5, 2.5])
-@pytest.mark.parametrize("cameras", [2, 3])
+@pytest.mark.parametrize(("ratio", "cameras"), [(1.0, 2), (0.5, 3), (2.5, 3)])
 def test_exact_pixels_give_the_exact_measurement(kind: str, ratio: float, cameras: int) -> None:
     m = measurement_map(kind, cameras, ratio)
     column, row, disparity = 123.4, 56.7, 8.9
     pixels = [column, row, column + disparity, row, column, row + disparity / ratio]
     found = m @ np.array(pixels[: 2 * cameras])
     np.testing.assert_allclose(found, [column, row, disparity], atol=1e-12)
-
-
-@pytest.mark.parametrize("ratio", [1.0, 0.5, 2.5])
-def test_fused_is_never_worse_and_more_cameras_never_hurt(ratio: float) -> None:
-    paper, fused = (measurement_map(kind, 3, ratio) for kind in ("paper", "fused"))
-    two = measurement_map("fused", 2, ratio)
-    better = paper @ paper.T - fused @ fused.T
-    assert np.linalg.eigvalsh(better).min() > -1e-12
-    assert np.linalg.eigvalsh(two @ two.T - fused @ fused.T).min() > -1e-12
 
 
 @pytest.mark.parametrize("kind", ["paper", "fused"])
@@ -483,7 +454,7 @@ def in_view(found: Features, disparity: float) -> int:
     return int(((found.xy > 8.0) & (found.xy + disparity < size)).all(axis=1).sum())
 
 
-@pytest.mark.parametrize("depth", [0.6, 1.2, WALL_M])
+@pytest.mark.parametrize("depth", [0.6, WALL_M])
 def test_features_are_measured_wherever_all_images_show_them(depth: float) -> None:
     """To a tenth of a pixel; at the borders, too, and near by (43 px of disparity)."""
     truth = WALL_RIG.fx * WALL_RIG.baseline / depth
@@ -504,15 +475,6 @@ def test_light_does_not_matter() -> None:
     )
     found, seen = measured(dim)
     assert len(seen) >= 0.8 * in_view(found, WALL_RIG.fx * WALL_RIG.baseline / WALL_M)
-
-
-def test_few_grey_values_are_no_less_exact() -> None:
-    """Whole pixels of disparity: rounded between pixels, the deviation was 0.13 px."""
-    images = tuple(np.asarray(np.rint(image / 24.0), np.uint8) for image in pictures(HERE))
-    found, seen = measured(images)
-    truth = WALL_RIG.fx * WALL_RIG.baseline / WALL_M
-    assert len(seen) >= 0.8 * in_view(found, truth)
-    assert 1.4826 * np.median(np.abs(seen.measurement[:, 2] - truth)) < 0.01
 
 
 def test_what_another_image_does_not_show_is_left_out() -> None:
@@ -593,14 +555,6 @@ def test_an_image_may_have_more_features_than_opencv_samples_at_once() -> None:
     assert 0.9 * n < len(seen) < n
 
 
-def test_images_smaller_than_a_block_are_no_match() -> None:
-    rig = replace(WALL_RIG, width=16, height=16, vertical_baseline=None)
-    found = Features(np.full((1, 2), 8.0), np.ones(1), np.zeros(1), np.zeros((1, 1), np.uint8))
-    matcher = StereoMatcher(rig, StereoSettings(), AppearanceSettings())
-    images = (np.zeros((16, 16), np.uint8),) * 2
-    assert not len(PatchStereo(rig, matcher, np.inf).match(Frame(0, 0.0, images), found))
-
-
 def test_rows_that_may_be_far_apart_are_matched_by_sift() -> None:
     assert StereoSettings(epipolar_px=2.0).by_patches(2)
     assert not StereoSettings(epipolar_px=3.0).by_patches(2)
@@ -611,11 +565,3 @@ def test_a_rig_of_a_log_by_patches_may_measure_by_sift() -> None:
     rig = replace(WALL_RIG, vertical_baseline=None, places="reference")
     settings = FrontendSettings(stereo=StereoSettings(others="sift"))
     assert as_measured(rig, settings).places == "all"
-
-
-def test_no_features_are_no_match() -> None:
-    found = SiftExtractor(SiftSettings(), "descriptor").extract(np.zeros((240, 320), np.uint8))
-    matcher = StereoMatcher(WALL_RIG, StereoSettings(), AppearanceSettings())
-    assert not len(
-        PatchStereo(WALL_RIG, matcher, np.inf).match(Frame(0, 0.0, pictures(HERE)), found)
-    )

@@ -231,19 +231,11 @@ def test_a_lasting_change_is_taken_as_usual_after_two_alarms(
     assert sum(said) == sum(said[len(before) : len(before) + 5]) == 2
 
 
-def test_being_carried_off_is_noticed_at_the_new_level_too() -> None:
-    assert alarms([*[900] * 25, *[200, 190, 210] * 4, 3])[-1]
-
-
 def test_carried_off_again_and_again_is_noticed_each_time() -> None:
     """Every seventh image, as by somebody who plays with the robot."""
     legs = [200, 190, 210, 205, 195, 200]
     said = alarms([*legs * 2, *[4, *legs] * 5])
     assert [k for k, one in enumerate(said) if one] == [12, 19, 26, 33, 40]
-
-
-def test_the_first_step_says_nothing() -> None:
-    assert after([], 3) == CHANCE
 
 
 @pytest.mark.parametrize(
@@ -340,12 +332,6 @@ def told(path: PathMemory, turn: Callable[[Image], Image], count: int) -> list[s
     found = [sides.look(turn(seen_at(0.3 + 0.5 * k))) for k in range(count)]
     assert not sides.settled
     return found
-
-
-def test_a_picture_that_fits_settles_it(path: PathMemory) -> None:
-    sides = PictureSides(CAMERA, path, DRIVING)
-    assert sides.look(seen_at(0.7)) is None
-    assert sides.settled
 
 
 def test_three_pictures_tell_how_they_are_turned(path: PathMemory) -> None:

@@ -383,17 +383,3 @@ def test_no_pixels_are_kept(tmp_path: Path) -> None:
     stored, whole = ({f.name for f in fields(kind)} for kind in (CoarseSift, UprightFeatures))
     assert whole - stored == {"pixels", "covariance"}
     assert stored - whole == {"spread", "correlation"}
-
-
-def test_saving_returns_kilobytes_an_image(tmp_path: Path) -> None:
-    """The file's size over its images; a fraction of an image of 320 x 240 in colour."""
-    memory = PathMemory.of([some_features(k) for k in range(3)])
-    kilobytes = memory.save(tmp_path / "path.npz")
-    assert kilobytes == pytest.approx((tmp_path / "path.npz").stat().st_size / 3000.0)
-    assert kilobytes < 0.4 * 230.4
-
-
-def test_names_must_fit() -> None:
-    """One an image."""
-    with pytest.raises(StoredMapError, match="2 names for 1 images"):
-        PathMemory.of([EMPTY], ["a", "b"])

@@ -90,17 +90,6 @@ def random_poses(seed: int, count: int) -> FloatArray:
 # Links
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_there_and_back_agree_for_true_answers(seed: int) -> None:
-    """Any two poses; the way back of the way back is the link itself."""
-    link = true_link(random_poses(seed, 2), 0, 1)
-    again = link.reversed().reversed()
-    assert (again.direction, again.rotation, again.back) == (
-        link.direction, link.rotation, link.back,
-    )  # fmt: skip
-    assert link.reversed().direction == link.back
-
-
 def test_answers_that_disagree_are_no_link() -> None:
     """Rotation not opposite; direction not where one came from; a refusal; few inliers."""
     a, b = random_poses(1, 2)
@@ -143,7 +132,7 @@ def test_one_place_is_linked_by_its_turn() -> None:
     assert "disagree" in str(link_pair((0, 1), here, here))
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_true_triangles_hold(seed: int) -> None:
     """The long side lies between the steps; rotations add up to zero."""
     poses = random_poses(seed, 3)
@@ -168,7 +157,7 @@ def all_links(poses: FloatArray, reach: float = 5.0) -> list[Link]:
     ]
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_false_links_are_found_and_true_ones_kept(seed: int) -> None:
     """A tenth of the links is turned or points elsewhere: all of them go, and nothing else."""
     rng = np.random.default_rng(seed)
@@ -402,17 +391,6 @@ def test_localisation_converges_from_unknown(built: tuple[FloatArray, Topologica
     assert near > 0.8
 
 
-def test_carried_off_robot_finds_itself_again(built: tuple[FloatArray, TopologicalMap]) -> None:
-    """A leap to the other side of the hall, against a belief that is sure of itself."""
-    here = localiser(built[1], LocalisationSettings(candidates=6))
-    for view in views_at([3.0, 3.1, 2.9]):
-        here.update(view)
-    assert hops(here.best()[0], 3) <= 1
-    for view in views_at([11.0, 11.1, 10.9]):
-        here.update(view)
-    assert hops(here.best()[0], 11) <= 1
-
-
 def test_image_that_matches_nothing_leaves_belief_near_where_it_was(
     built: tuple[FloatArray, TopologicalMap],
 ) -> None:
@@ -487,7 +465,7 @@ def test_features_of_a_place_come_back_in_its_neighbours() -> None:
     assert rejected == {}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_similar_place_matches_things_of_a_kind_at_random(seed: int) -> None:
     """As many inliers and links as before, but not the same things."""
     views = checked(NEIGHBOURS, seed)
@@ -651,15 +629,6 @@ def test_a_gap_in_a_route_is_a_way_of_last_resort(routes: dict[str, fg.PathMemor
     assert np.isnan(link.direction)
     assert joined.way("through/a", "through").names[-1] == "through/f"
     assert joined.topology.costs.max() > 20.0
-
-
-def test_a_map_survives_its_file(joined: RouteMap, tmp_path: Path) -> None:
-    joined.save(tmp_path / "house.fgmap")
-    again = RouteMap.load(tmp_path / "house.fgmap")
-    assert again.names == joined.names
-    assert again.crossroads == joined.crossroads
-    assert again.way("east/0", "north").names == joined.way("east/0", "north").names
-    assert again.topology.camera == CAMERA
 
 
 def test_wrong_routes_and_places_are_refused(

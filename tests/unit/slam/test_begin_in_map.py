@@ -111,16 +111,6 @@ def tracked(increment: Increment) -> EgoMotion:
 
 
 @pytest.mark.parametrize("settings", USERS, ids=lambda s: s.kind)
-def test_estimators_hold_the_map_before_the_first_frame(
-    settings: EstimatorSettings, saved: SavedMap
-) -> None:
-    found = begun(settings, saved).landmarks()
-    np.testing.assert_array_equal(found.ids, saved.landmarks.ids)
-    np.testing.assert_array_equal(found.positions, saved.landmarks.positions)
-    np.testing.assert_allclose(found.covariances, saved.landmarks.covariances, rtol=1e-14)
-
-
-@pytest.mark.parametrize("settings", USERS, ids=lambda s: s.kind)
 def test_observed_landmarks_become_more_certain_and_others_stay(
     settings: EstimatorSettings, saved: SavedMap
 ) -> None:

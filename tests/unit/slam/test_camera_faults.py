@@ -65,11 +65,6 @@ def test_frames_of_a_late_camera_are_not_used_and_the_covariance_says_so(
     )
 
 
-def test_the_watch_can_be_switched_off(recording: fg.Recording) -> None:
-    status = driven(recording, {"watch_cameras": False}).result().column("status")
-    assert not (status == "camera_fault").any()
-
-
 def test_the_world_does_not_begin_with_images_that_are_not_used(recording: fg.Recording) -> None:
     times, images, _ = zip(*(recording[k] for k in range(3)), strict=True)
     dark = np.zeros_like(images[1][0])

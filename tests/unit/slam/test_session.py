@@ -38,7 +38,7 @@ from fgslam.slam.replay import replay
 from fgslam.slam.results import SessionResult
 from fgslam.slam.session import Session, checked_images
 
-FRAMES = 7
+FRAMES = 5
 RIGHT, LEFT, TOP = range(3)
 
 
@@ -164,22 +164,13 @@ def test_a_step_says_what_was_matched(views: Views) -> None:
     assert np.isin(second.matches.ids, first.new.ids).all()
 
 
-@pytest.mark.parametrize("estimator", ["landmark_kalman", "ekf", "isam2", "batch", "fixed_lag"])
+@pytest.mark.parametrize("estimator", ["landmark_kalman", "isam2", "fixed_lag"])
 def test_results_asked_for_between_frames_change_nothing(views: Views, estimator: str) -> None:
     asked = session(views, estimator)
     for k in range(FRAMES):
         push(asked, views, range(k, k + 1))
         assert len(asked.result().trajectory) == k + 1
     assert_same_result(asked, straight(views, estimator))
-
-
-def test_sessions_side_by_side_do_not_disturb_each_other(views: Views) -> None:
-    together = [session(views, kind) for kind in ("isam2", "ekf", "isam2")]
-    for k in range(FRAMES):
-        for slam in together:
-            push(slam, views, range(k, k + 1))
-    for slam, kind in zip(together, ("isam2", "ekf", "isam2"), strict=True):
-        assert_same_result(slam, straight(views, kind))
 
 
 def test_sessions_in_threads_do_not_disturb_each_other(views: Views) -> None:

@@ -28,24 +28,11 @@ def drawn(seed: int) -> Simulation:
     return simulate(DRIVE, np.random.default_rng(seed))
 
 
-def test_the_pose_is_the_product_of_the_motions() -> None:
-    simulation = drawn(1)
-    estimator = at(NO_PRIOR)
-    play(estimator, simulation.increments)
-    expected = np.eye(4)
-    for increment, wTc in zip(
-        simulation.increments, estimator.estimate().trajectory.poses, strict=True
-    ):
-        if increment.odometry is not None:
-            expected = expected @ increment.odometry.motion
-        np.testing.assert_allclose(wTc, expected, rtol=0, atol=1e-12)
-
-
 def test_the_covariance_is_that_of_many_drawn_drives() -> None:
-    """300 drives: NEES of the last pose, which all of them share the truth of."""
+    """200 drives: NEES of the last pose, which all of them share the truth of."""
     errors = []
     estimator = at(NO_PRIOR)
-    for seed in range(300):
+    for seed in range(200):
         simulation = simulate(
             dataclasses.replace(DRIVE, points=1, frames=8), np.random.default_rng(seed)
         )
@@ -140,15 +127,6 @@ def test_landmarks_stay_where_they_were_first_seen_until_pruned() -> None:
         assert not np.isin(increment.pruned_ids, landmarks.ids).any()
         gone += len(increment.pruned_ids)
     assert gone > 5
-
-
-def test_tracked_pose_is_ignored() -> None:
-    simulation = drawn(4)
-    a, b = at(NO_PRIOR), at(NO_PRIOR)
-    play(a, simulation.increments)
-    far = [dataclasses.replace(i, rejected=~i.rejected) for i in simulation.increments]
-    play_directly(b, far)
-    np.testing.assert_array_equal(a.estimate().trajectory.poses, b.estimate().trajectory.poses)
 
 
 def test_a_point_at_infinity_is_no_landmark() -> None:

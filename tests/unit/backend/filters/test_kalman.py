@@ -63,25 +63,6 @@ def test_rows_hold_the_landmarks_added_and_not_removed(rng: np.random.Generator)
     assert (rows.counts == 1).all()
 
 
-def test_an_unknown_landmark_is_a_key_error(rng: np.random.Generator) -> None:
-    rows = LandmarkRows()
-    fill(rows, np.array([3, 8, 11]), rng, 0)
-    with pytest.raises(KeyError):
-        rows.remove(np.array([8, 9]))
-    with pytest.raises(KeyError):
-        rows.rows(np.array([12]))
-    assert rows.ids.tolist() == [3, 8, 11]
-
-
-def test_written_rows_are_the_landmarks(rng: np.random.Generator) -> None:
-    rows = LandmarkRows()
-    fill(rows, np.array([3, 8, 11]), rng, 0)
-    rows.positions[rows.rows(np.array([8]))] = 7.0
-    rows.counts[1] += 4
-    np.testing.assert_array_equal(rows.map().positions[1], [7.0, 7.0, 7.0])
-    assert rows.counts.tolist() == [1, 5, 1]
-
-
 def test_loading_copies(rng: np.random.Generator) -> None:
     given = LandmarkMap(
         np.array([2, 5]), rng.standard_normal((2, 3)), rng.standard_normal((2, 3, 3))
@@ -444,22 +425,6 @@ def simulation() -> Simulation:
     return simulate(Drive(frames=14, miss_rate=0.3, prune_after=2), np.random.default_rng(3))
 
 
-def test_first_frame_lies_in_the_map_frame(rng: np.random.Generator) -> None:
-    prior = g.se3_exp(np.array([0.3, -0.5, 0.2, 4.0, -1.0, 2.0]))
-    points = points_in_view(RIG, 10, (1.5, 6.0), rng)
-    estimator = make(prior)
-    estimator.update(frame(0, np.arange(10), g.project(RIG, points), True), at(prior, 0))
-    world = points @ prior[:3, :3].T + prior[:3, 3]
-    np.testing.assert_allclose(estimator.landmarks().positions, world, rtol=0, atol=1e-12)
-
-
-def test_the_prior_stays_as_it_was(simulation: Simulation) -> None:
-    prior = Prediction(np.eye(4), EXACT.copy())
-    kept = copy.deepcopy(prior)
-    play(LandmarkKalman(RIG, LandmarkKalmanSettings(), prior), simulation.increments)
-    assert_same_bits(prior, kept)
-
-
 def test_estimate_is_the_history_of_updates(simulation: Simulation) -> None:
     estimator = make()
     results = play(estimator, simulation.increments[:-1])
@@ -473,49 +438,6 @@ def test_estimate_is_the_history_of_updates(simulation: Simulation) -> None:
     kept = copy.deepcopy(arrays_of(estimate))
     play(estimator, simulation.increments[-1:])
     assert_same_bits(arrays_of(estimate), kept)
-
-
-def end_error(estimator: LandmarkKalman, truth: FloatArray) -> float:
-    end = estimator.estimate().trajectory.poses[-1]
-    return float(np.linalg.norm(end[:3, 3] - truth[:3, 3]))
-
-
-def frame_to_frame(simulation: Simulation) -> float:
-    """End error when each frame is tracked against the one before only."""
-    wTc = np.eye(4)
-    for before, after in zip(simulation.increments[:-1], simulation.increments[1:], strict=True):
-        pair = make(wTc)
-        seen = before.observations
-        first = dataclasses.replace(
-            before,
-            observations=dataclasses.replace(seen, is_new=np.ones(len(seen), np.bool_)),
-            odometry=None,
-            missed_ids=NO_IDS,
-            pruned_ids=NO_IDS,
-        )
-        common = np.isin(after.observations.ids, seen.ids)
-        second = dataclasses.replace(
-            after,
-            observations=after.observations.select(common),
-            missed_ids=NO_IDS,
-            pruned_ids=NO_IDS,
-        )
-        play(pair, [dataclasses.replace(first, index=0), second])
-        wTc = pair.estimate().trajectory.poses[-1]
-    return float(np.linalg.norm(wTc[:3, 3] - simulation.poses[-1][:3, 3]))
-
-
-def test_the_map_drifts_less_than_frame_to_frame() -> None:
-    """Features are matched to the map, not to the last frame."""
-    drive = Drive(frames=40, points=300, sigma_px=(0.5, 0.5, 0.4), odometry_sigma=(0.02,) * 6)
-    by_map, by_frame = [], []
-    for seed in range(5):
-        simulation = simulate(drive, np.random.default_rng(seed))
-        estimator = make()
-        play(estimator, simulation.increments)
-        by_map.append(end_error(estimator, simulation.poses[-1]))
-        by_frame.append(frame_to_frame(simulation))
-    assert np.mean(by_map) < 0.7 * np.mean(by_frame)
 
 
 # --------------------------------------------------------------------------------------------

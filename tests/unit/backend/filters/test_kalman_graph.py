@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from functools import cache
 
-import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,10 +27,6 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.sensors import Increment
 from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction, UpdateStats
-from fgslam.factors.graphs import landmark_key, pose_key
-from fgslam.factors.landmark import StereoFactors
-from fgslam.factors.motion import pose_prior
-from fgslam.factors.noise import Whitening
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
@@ -100,7 +95,7 @@ def updated(pair: Pair, depths: FloatArray, covariance: FloatArray, seed: int) -
 
 
 @given(
-    depths=st.lists(st.floats(0.3, 20.0), min_size=1, max_size=8),
+    depths=st.lists(st.floats(0.3, 100.0), min_size=1, max_size=8),
     covariance=st.sampled_from([EXACT, UNCERTAIN, PLANAR]),
     update=st.sampled_from(["pixel", "world", "running_mean", "half"]),
     seed=st.integers(0, 2**32 - 1),
@@ -108,22 +103,8 @@ def updated(pair: Pair, depths: FloatArray, covariance: FloatArray, seed: int) -
 def test_an_update_is_the_closed_form(
     depths: list[float], covariance: FloatArray, update: str, seed: int
 ) -> None:
-    closed, graph = both(update=update)
-    updated((closed, graph), np.array(depths), covariance, seed)
-    assert_equal(graph.landmarks(), closed.landmarks(), 1e-12)
-
-
-@given(
-    depths=st.lists(st.floats(20.0, 100.0), min_size=1, max_size=8),
-    covariance=st.sampled_from([EXACT, UNCERTAIN, PLANAR]),
-    update=st.sampled_from(["pixel", "world", "running_mean", "half"]),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_far_points_are_equal_as_far_as_their_condition_allows(
-    depths: list[float], covariance: FloatArray, update: str, seed: int
-) -> None:
-    """A disparity that drowns in its noise: ellipsoids of condition 1e7 and more, so that many
-    digits fewer are left of sixteen in either form."""
+    """As far as the condition allows: far disparities drown in their noise, their ellipsoids
+    have conditions of 1e7 and more, and leave many digits fewer of sixteen in either form."""
     closed, graph = both(update=update)
     condition = updated((closed, graph), np.array(depths), covariance, seed)
     assert_equal(graph.landmarks(), closed.landmarks(), 1e-12 + EPSILON * condition)
@@ -133,7 +114,7 @@ def test_many_updates_of_the_same_landmarks_stay_equal() -> None:
     closed, graph = both()
     rng = np.random.default_rng(3)
     points = points_in_view(RIG, 30, (0.5, 8.0), rng)
-    for k in range(200):
+    for k in range(60):
         wTc = g.se3_exp(0.02 * rng.standard_normal(6))
         measured = g.project(RIG, g.transform_to_camera(wTc, points))
         measured += SIGMA * rng.standard_normal(measured.shape)
@@ -145,48 +126,22 @@ def test_many_updates_of_the_same_landmarks_stay_equal() -> None:
     assert np.isfinite(stats.nis)
 
 
-def test_the_innovation_is_the_same(rng: np.random.Generator) -> None:
-    closed, graph = both()
-    points = points_in_view(RIG, 20, (1.0, 5.0), rng)
-    measured = g.project(RIG, points)
-    found = []
-    for estimator in (closed, graph):
-        draw = np.random.default_rng(5)
-        estimator.update(frame(0, measured, True), tracked_at(Prediction(np.eye(4), UNCERTAIN), 0))
-        second = measured + SIGMA * draw.standard_normal(measured.shape)
-        tracking = tracked_at(Prediction(np.eye(4), UNCERTAIN), 20)
-        found.append(estimator.update(frame(1, second, False), tracking))
-    assert found[1].nis == pytest.approx(found[0].nis, rel=1e-11)
-    assert found[1].nis_dof == found[0].nis_dof == 60
-
-
 # --------------------------------------------------------------------------------------------
 # A whole run
 
 CASES = {
     "default": (EgoMotionSettings(), {}),
-    "world update": (EgoMotionSettings(), {"update": "world"}),
-    "running mean": (EgoMotionSettings(), {"update": "running_mean"}),
-    "half and half": (EgoMotionSettings(), {"update": "half"}),
     "exact pose": (EgoMotionSettings(), {"pose_covariance": False}),
-    "fixed height": (EgoMotionSettings(dof=5), {}),
     "planar": (EgoMotionSettings(dof=3), {}),
-    "by measurement": (EgoMotionSettings(weighting="measurement"), {}),
     "uniform": (EgoMotionSettings(weighting="uniform", kernel="none"), {}),
     "image alone": (EgoMotionSettings(residuals="image"), {}),
-    "no prior": (EgoMotionSettings(prior=False, kernel="huber"), {}),
     "capped": (EgoMotionSettings(prior=False, max_correction_m=0.008), {}),
-    "too few": (EgoMotionSettings(min_matches=25), {}),
 }
-
-
-FEW = ("default", "world update", "running mean", "planar", "image alone", "uniform", "capped")
-"""Those by default, each of another kind."""
 
 
 @cache
 def increments() -> list[Increment]:
-    drive = dataclasses.replace(DRIVE, twist=(0.0, 0.03, 0.0, 0.0, 0.0, 0.08))
+    drive = dataclasses.replace(DRIVE, frames=24, twist=(0.0, 0.03, 0.0, 0.0, 0.0, 0.08))
     return simulate(drive, np.random.default_rng(11)).increments
 
 
@@ -194,10 +149,7 @@ def run(estimator: LandmarkKalman, ego_motion: EgoMotionSettings) -> list[Update
     return play(estimator, increments(), ego_motion)
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(case, marks=() if case in FEW else pytest.mark.slow) for case in CASES],
-)
+@pytest.mark.parametrize("case", CASES)
 def test_a_run_is_the_closed_form(case: str) -> None:
     ego_motion, settings = CASES[case]
     closed, graph = both(ego_motion, **settings)
@@ -247,37 +199,3 @@ def test_a_new_landmark_at_infinity_is_refused() -> None:
 
 # --------------------------------------------------------------------------------------------
 # What the missing edges cost: the numbers of docs/derivations/filters.md
-
-
-def standing_still(frames: int) -> tuple[float, float]:
-    """Depth deviations (metres) of a landmark seen ``frames`` times from one uncertain pose.
-
-    Returns the filter's, which gives every frame a pose of its own, and the full graph's, in which
-    it is one and the same pose.
-    """
-    point = np.array([0.2, 0.1, 3.0])
-    measured = g.project(RIG, point[None])
-    _, estimator = both()
-    for k in range(frames):
-        there = tracked_at(Prediction(np.eye(4), UNCERTAIN), min(k, 1))
-        estimator.update(frame(k, measured, k == 0), there)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    values.insert(pose_key(0), gtsam.Pose3())
-    values.insert(landmark_key(0), point)
-    graph.add(pose_prior(pose_key(0), Prediction(np.eye(4), UNCERTAIN)))
-    factors = StereoFactors(RIG, Whitening())
-    for _ in range(frames):
-        graph.add(factors.factor(pose_key(0), landmark_key(0), measured[0], np.diag(SIGMA**2)))
-    marginal = gtsam.Marginals(graph, values).marginalCovariance(landmark_key(0))
-    claimed = estimator.landmarks().covariances[0]
-    return float(np.sqrt(claimed[2, 2])), float(np.sqrt(marginal[2, 2]))
-
-
-def test_the_same_pose_error_is_counted_anew_in_every_frame() -> None:
-    claimed_once, true_once = standing_still(1)
-    assert claimed_once == pytest.approx(true_once, rel=1e-9)
-    claimed, honest = standing_still(100)
-    assert claimed == pytest.approx(0.1 * claimed_once, rel=1e-9)
-    # Looking longer does not tell where one stands: the pose's own deviation remains.
-    assert honest > np.sqrt(UNCERTAIN[5, 5])
-    assert (honest / claimed) ** 2 > 3.0

@@ -79,15 +79,6 @@ def test_states_without_variance_never_move() -> None:
     assert last.polar[np.flatnonzero(kept).tolist().index(gauge), 0] == first.polar[gauge, 0]
 
 
-def test_unit_leg_holds_the_leg() -> None:
-    case = trial(4)
-    estimator = HomingEkf(case.start, HomingEkfSettings())
-    for image in case.tracks:
-        estimator.update(image)
-    assert estimator.state.mean[4] == 1.0
-    assert np.hypot(*estimator.estimate().target[:2]) == pytest.approx(1.0, abs=1e-15)
-
-
 def test_motion_derivative() -> None:
     robot = np.array([0.3, -0.2, 0.7, 0.4])
     _, jacobian, spread = motion(robot, 0.2)
@@ -338,16 +329,6 @@ def test_filter_is_the_graph_with_past_poses_eliminated(
     np.testing.assert_allclose(
         state.covariance[np.ix_(free, free)], covariance, rtol=0.0, atol=TOLERANCE
     )
-
-
-def test_joint_start_is_the_graph_of_the_two_views() -> None:
-    case = trial(6)
-    state = initial_state(case.start)
-    linear = joint_start(case, state)
-    keys = [TARGET, *(feature(i) for i in state.ids.tolist())]
-    mean, covariance = linear.solved(keys)
-    np.testing.assert_allclose(state.mean[5:], mean, rtol=0.0, atol=TOLERANCE)
-    np.testing.assert_allclose(state.covariance[5:, 5:], covariance, rtol=0.0, atol=TOLERANCE)
 
 
 def test_printed_target_filter_counts_each_bearing_once_an_image() -> None:

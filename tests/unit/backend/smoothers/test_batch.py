@@ -33,17 +33,21 @@ METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["batch", *(pytest.param(n, marks=pytest.mark.slow) for n in ("gnc", "isam2", "fixed_lag"))],
+    ("name", "count"),
+    [
+        ("batch", 10),
+        *(pytest.param(n, 20, marks=pytest.mark.slow) for n in ("gnc", "isam2", "fixed_lag")),
+        *(pytest.param(n, 20, marks=pytest.mark.slow) for n in ("sliding_window", "batch")),
+    ],
 )
-def test_pose_and_landmarks_are_consistent_over_20_drives(name: str) -> None:
-    assert_consistent(SMOOTHERS[name])
+def test_pose_and_landmarks_are_consistent_over_many_drives(name: str, count: int) -> None:
+    assert_consistent(SMOOTHERS[name], count)
 
 
 def test_covariances_stay_consistent_among_wrong_matches() -> None:
     """The last solution is plain least squares over what fits: its covariances hold."""
     found = []
-    for seed in range(20):
+    for seed in range(10):
         simulation = drawn(100 + seed)
         spoilt = wrong_matches(simulation.increments, 0.2, np.random.default_rng(seed))
         found.append(nees_of(answer(BatchSettings(), spoilt), simulation)[0])

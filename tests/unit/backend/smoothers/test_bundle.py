@@ -93,15 +93,14 @@ def test_cost_and_gradient_are_those_of_the_factors(name: str) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
-@KERNELS
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
-def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str, seed: int) -> None:
-    graph, values, builder = problem(name, seed)
+@pytest.mark.parametrize("name", ["none", "cauchy", "geman_mcclure"])
+def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str) -> None:
+    graph, values, builder = problem(name)
     expected = by_gtsam(graph, values)
     whole, state = builder.whole_graph(values)
     found = whole.minimum(state, MINIMUM.iterations, MINIMUM.tolerance)
     assert whole.cost(found) <= graph.error(expected) * (1.0 + 1e-6)
-    if name in ("huber", "cauchy"):  # the others have minima beside each other
+    if name == "cauchy":  # the others have minima beside each other
         np.testing.assert_allclose(found.poses, State.of(expected).poses, rtol=0, atol=1e-4)
 
 

@@ -411,16 +411,6 @@ def test_poses_that_close_loops(rng: np.random.Generator, ends: list[tuple[int, 
             assert_same(found.joint(pose, np.array([2, 0])), reference_joint(reference, keys))
 
 
-def test_values_and_graph_are_left_alone(rng: np.random.Generator) -> None:
-    problem = Problem(rng)
-    values, size = gtsam.Values(problem.values), problem.graph.size()
-    for kind in BOTH:
-        found = whole(kind, problem.graph, problem.values)
-        found.poses(), found.landmarks(), found.joint(0, np.array([1]))
-    assert problem.values.equals(values, 0.0)
-    assert problem.graph.size() == size
-
-
 def test_nothing_is_inverted_without_a_word_on_the_terminal(
     capfd: pytest.CaptureFixture[str],
 ) -> None:

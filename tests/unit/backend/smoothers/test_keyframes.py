@@ -81,18 +81,6 @@ def test_without_noise_poses_between_are_the_truth() -> None:
         assert np.isfinite(found.pose_covariances).all()
 
 
-def test_the_graph_s_own_poses_stay_and_nothing_between_is_nothing_done() -> None:
-    simulation = drawn(1)
-    found = filled(simulation)
-    before = solved(simulation, 11)
-    for k in KNOWN:
-        np.testing.assert_array_equal(found.poses[k], simulation.poses[k])
-        np.testing.assert_array_equal(found.pose_covariances[k], LITTLE)
-    assert np.isnan(before.poses[1]).all()
-    alone = fill_between(RIG, SIX_DOF, before, [], [None] * 11, {})
-    assert alone is before
-
-
 @pytest.mark.parametrize("sees", [True, False])
 def test_covariances_of_frames_between_are_consistent(sees: bool) -> None:
     """The graph's poses are exact here, and claim nearly that."""
@@ -104,12 +92,6 @@ def test_covariances_of_frames_between_are_consistent(sees: bool) -> None:
         for k in (1, 2, 3, 5, 6, 7, 9, 10):
             values.append(error[k] @ np.linalg.solve(found.pose_covariances[k], error[k]) / 6)
     assert 0.75 < np.mean(values) < 1.25
-
-
-def test_visual_pose_replaces_wheel_odometry() -> None:
-    seen, blind = filled(drawn(2)), filled(drawn(2), sees=False)
-    for k in (1, 2, 3, 9, 10):
-        assert np.trace(seen.pose_covariances[k]) < 0.2 * np.trace(blind.pose_covariances[k])
 
 
 def test_blind_frames_are_most_uncertain_in_the_middle_and_beyond_the_end() -> None:
@@ -371,12 +353,12 @@ def test_keyframes_cost_little_accuracy() -> None:
         settings = Isam2Settings(keyframe_every=every)
         errors[every] = [
             ate(answer(settings, simulation.increments), simulation)
-            for simulation in (drawn(20 + seed, frames=21) for seed in range(6))
+            for simulation in (drawn(20 + seed, frames=21) for seed in range(3))
         ]
     assert np.mean(errors[5]) < 1.15 * np.mean(errors[1])
 
 
-@pytest.mark.parametrize("frames", [1, 2, 4, 6, 9, 10, 13])
+@pytest.mark.parametrize("frames", [1, 4, 9, 13])
 def test_every_frame_has_a_pose_wherever_the_run_ends(frames: int) -> None:
     simulation = drawn(9, frames=13)
     estimator = build(KEYFRAMES)
@@ -389,7 +371,7 @@ def test_every_frame_has_a_pose_wherever_the_run_ends(frames: int) -> None:
     assert (np.linalg.norm(offset, axis=1)[1:] < 4 * sigma[1:]).all()
 
 
-@pytest.mark.parametrize("since", [6, 7, 8, 9, 10])
+@pytest.mark.parametrize("since", [6, 8])
 def test_a_landmark_that_moves_within_a_block(since: int) -> None:
     drive = drawn(8, frames=24)
     place = drive.points_by_id[28] + [0.3, 0.1, 0.3]
@@ -399,16 +381,6 @@ def test_a_landmark_that_moves_within_a_block(since: int) -> None:
     assert offset @ np.linalg.solve(found.landmarks.covariances[row], offset) < 16.3
     assert sum("moved, started anew" in remark for remark in found.remarks) == 1
     assert ate(found, drive) < 0.01
-
-
-@pytest.mark.parametrize("k", [6, 7, 8, 9])
-def test_pruned_in_the_open_block(k: int) -> None:
-    cut = drawn(8, frames=24).increments[: k + 1]
-    gone = cut[k].observations.ids[:3]
-    cut[k] = dataclasses.replace(cut[k], pruned_ids=np.union1d(cut[k].pruned_ids, gone))
-    found = answer(KEYFRAMES, cut)
-    assert_finite(found)
-    assert not np.isin(gone, found.landmarks.ids).any()
 
 
 def test_a_blackout_leaves_every_frame_as_uncertain_as_it_is() -> None:

@@ -12,7 +12,6 @@ from simulated import RIG, Simulation, play
 from smoothing import (
     FREE,
     answer,
-    assert_consistent,
     assert_finite,
     ate,
     blackout,
@@ -229,15 +228,6 @@ def test_a_window_rebuilt_from_the_first_frame_on_has_one_prior() -> None:
     assert (a > 0.999 * b).all()
 
 
-def test_rebuilt_poses_leave_when_their_lag_is_over() -> None:
-    simulation, estimator = drawn(8, frames=24), smoother()
-    play(estimator, simulation.increments[:12], FREE)
-    variable = estimator.builder.admission.tracks[28].variable
-    spoil(estimator, undetermined(variable))
-    play(estimator, simulation.increments[12:15], FREE)
-    assert estimator.solver.window.frames == list(range(9, 15))
-
-
 @pytest.mark.parametrize(
     "error", [UndeterminedError(4, "a pose"), np.linalg.LinAlgError("odd\nwords")]
 )
@@ -379,11 +369,6 @@ def test_answer_is_that_of_batch() -> None:
         np.sqrt(np.diagonal(x.covariances[1:], axis1=1, axis2=2)) for x in (found, best)
     )
     np.testing.assert_allclose(sigma, expected, rtol=0.02)
-
-
-@pytest.mark.slow
-def test_answer_is_consistent_over_20_drives() -> None:
-    assert_consistent(SHORT)
 
 
 def test_what_is_known_too_unevenly_is_begun_anew_with_a_remark(

@@ -10,7 +10,7 @@ import pytest
 
 from fgslam.cameras.omni import Cylinder, Equirectangular, HyperbolicMirror, unwrap_maps
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.core.bearings import ColumnSegments, FeatureKind, OmniFeatures, UprightFeatures
+from fgslam.core.bearings import FeatureKind, OmniFeatures, UprightFeatures
 from fgslam.core.errors import FrameError
 from fgslam.core.geometry import wrap
 from fgslam.frontend.features import omni as colour_sift
@@ -24,7 +24,6 @@ from fgslam.frontend.features.omni import (
     PatchColours,
     View,
     colour_from_means,
-    dct_rows,
     up_in_image,
     whitened,
     wrapping_period,
@@ -71,15 +70,6 @@ def test_gains_cancel_and_an_offset_does_not() -> None:
     raised = (image + np.uint8(20)).astype(np.uint8)
     np.testing.assert_allclose(whole(dimmed), whole(image), rtol=1e-9)
     assert np.abs(whole(raised) - whole(image)).min() > 1e-3
-
-
-def test_the_printed_form_divides_by_zero() -> None:
-    # Centralised bands integrate to nothing, whatever the patch.
-    bands = patch().reshape(-1, 3).astype(np.float64)
-    bands -= bands.mean(axis=0)
-    sums = np.round(bands.sum(axis=0), 6)
-    with np.errstate(divide="raise", invalid="raise"), pytest.raises(FloatingPointError):
-        np.mean(bands[:, 0] * bands[:, 2]) / (sums[0] * sums[2])
 
 
 def test_dark_patches_are_grey() -> None:
@@ -131,12 +121,6 @@ def posts(distance: float = 1.0, seed: int = 4, shift: int = 0) -> tuple[Image, 
     image[:, :400] = np.roll(image[:, :400], shift, axis=1)
     image[:, 400] = image[:, 0]
     return np.clip(np.round(image), 0, 255).astype(np.uint8), ends
-
-
-def test_dct_is_orthonormal_and_blind_to_the_mean() -> None:
-    rows = dct_rows(32, 7)
-    np.testing.assert_allclose(rows @ rows.T, np.eye(7), atol=1e-12)
-    np.testing.assert_allclose(rows @ np.ones(32), 0.0, atol=1e-12)
 
 
 def test_every_post_is_found_once_at_its_place() -> None:
@@ -255,15 +239,6 @@ def test_the_ratio_of_both_ends_is_better_than_that_of_one() -> None:
     assert both < 0.85 * single
     # The stated deviation is that of the tangents' difference.
     assert np.std(one - two) == pytest.approx(np.sqrt(2) * 0.01 * factor.mean(), rel=0.05)
-
-
-def test_few_segments_match_nothing() -> None:
-    image, _ = posts()
-    some = finder().extract(image)
-    none = finder().extract(np.zeros_like(image))
-    assert isinstance(none, ColumnSegments)
-    assert len(match_columns(some, none, OmniMatchingSettings())) == 0
-    assert len(match_columns(none, some, OmniMatchingSettings())) == 0
 
 
 def test_two_equal_segments_compete_for_a_third_equal_one() -> None:

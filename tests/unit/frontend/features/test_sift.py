@@ -101,7 +101,7 @@ def test_scale_is_the_blobs_own(sigma: float) -> None:
     assert np.median(found.scale[which]) == pytest.approx(expected, rel=0.08)
 
 
-@pytest.mark.parametrize("levels", [1, 2, 3, 5, 6])
+@pytest.mark.parametrize("levels", [1, 3, 6])
 def test_the_finest_levels_are_kept(levels: int) -> None:
     image, layers = as_image(texture()), OCTAVE_LAYERS
     full, kept = extract(image, levels=64), extract(image, levels=levels)
@@ -130,29 +130,6 @@ def test_the_finest_levels_are_kept(levels: int) -> None:
     assert full.scale.max() > largest
 
 
-def test_all_levels_are_all_features() -> None:
-    image = as_image(texture())
-    detector = cv2.SIFT_create(
-        nOctaveLayers=2, contrastThreshold=0.03, sigma=1.6, enable_precise_upscale=True
-    )
-    assert len(extract(image, levels=64)) == len(detector.detect(image, None))
-
-
-def test_features_have_the_documented_shapes_and_types() -> None:
-    found = extract(as_image(texture()))
-    count = len(found)
-    assert count > 50
-    assert found.xy.shape == (count, 2)
-    assert found.scale.shape == found.orientation.shape == (count,)
-    assert found.descriptors.shape == (count, 128)
-    assert found.descriptors.dtype == np.uint8
-    assert found.xy.dtype == found.scale.dtype == found.orientation.dtype == np.float64
-    assert ((found.orientation >= 0) & (found.orientation < 2 * np.pi)).all()
-    assert (found.scale > 0).all()
-    norms = np.linalg.norm(found.descriptors.astype(float), axis=1)
-    assert np.median(norms) == pytest.approx(512, rel=0.03)
-
-
 def test_paper_mode_finds_the_same_without_descriptors() -> None:
     image = as_image(texture())
     described = SiftExtractor(SETTINGS, "descriptor").extract(image)
@@ -163,23 +140,13 @@ def test_paper_mode_finds_the_same_without_descriptors() -> None:
     assert not bare.descriptors.any()
 
 
-def test_the_same_image_gives_the_same_bits() -> None:
-    image = as_image(texture())
-    kept = image.copy()
-    extractor = SiftExtractor(SETTINGS, "descriptor")
-    first, again = extractor.extract(image), extractor.extract(image)
-    assert_same_bits(first, again)
-    assert_same_bits(first, SiftExtractor(SETTINGS, "descriptor").extract(image.copy()))
-    np.testing.assert_array_equal(image, kept)
-
-
 def test_parallel_extraction_gives_the_same_features() -> None:
-    images = [as_image(texture(seed=seed)) for seed in range(4)]
+    images = [as_image(texture()), lit(1 / 8, seed=1)]
     extractor = SiftExtractor(SETTINGS, "descriptor")
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(2) as pool:
         together = extractor.extract_all(images * 2, pool)
     for k, found in enumerate(together):
-        assert_same_bits(found, extractor.extract(images[k % 4]))
+        assert_same_bits(found, extractor.extract(images[k % 2]))
 
 
 @pytest.mark.parametrize("grey", [0, 128, 255])
@@ -210,7 +177,7 @@ def lit(gain: float, sigma: float = 0.3, seed: int = 0) -> Image:
     return as_image(np.clip(grey + sigma * rng.standard_normal(grey.shape), 0, 255))
 
 
-@pytest.mark.parametrize("gain", [1 / 4, 1 / 8, 1 / 20])
+@pytest.mark.parametrize("gain", [1 / 4, 1 / 20])
 def test_a_dark_image_has_the_features_of_the_bright_one(gain: float) -> None:
     bright, dark = extract(lit(1.0)), extract(lit(gain))
     assert 0.75 * len(bright) < len(dark) < 1.5 * len(bright)
@@ -231,17 +198,7 @@ def test_a_well_exposed_image_is_taken_as_it_is() -> None:
     assert_same_bits(extract(image), extract(image, contrast="absolute"))
 
 
-def test_dark_images_give_the_same_bits_in_any_thread() -> None:
-    images = [lit(1 / 8, seed=seed) for seed in range(3)]
-    extractor = SiftExtractor(SETTINGS, "descriptor")
-    with ThreadPoolExecutor(3) as pool:
-        together = extractor.extract_all(images * 2, pool)
-    for k, found in enumerate(together):
-        assert_same_bits(found, extract(images[k % 3]))
-
-
-@pytest.mark.parametrize("sigma", [0.3, 1.5, 4.0])
-@pytest.mark.parametrize("grey", [0.0, 20.0, 200.0])
+@pytest.mark.parametrize(("grey", "sigma"), [(0.0, 4.0), (20.0, 0.3), (200.0, 1.5)])
 def test_noise_alone_is_hardly_ever_a_feature(grey: float, sigma: float) -> None:
     """Under a lens cap, or before a white wall: 1 in 100 of what the noise alone would give."""
     noise = sigma * np.random.default_rng(3).standard_normal((240, 320))
@@ -280,12 +237,8 @@ def warped(grey: FloatArray, mapping: FloatArray) -> Image:
 @pytest.mark.parametrize(
     ("angle_deg", "scale", "shift"),
     [
-        (0.0, 1.0, (7.0, -4.0)),
         (0.0, 1.0, (0.37, 0.81)),
-        (25.0, 1.0, (0.0, 0.0)),
-        (90.0, 1.0, (0.0, 0.0)),
         (-160.0, 1.0, (2.5, 1.5)),
-        (0.0, 1.4, (0.0, 0.0)),
         (0.0, 0.75, (0.0, 0.0)),
         (15.0, 1.2, (3.3, -2.1)),
     ],

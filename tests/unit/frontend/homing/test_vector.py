@@ -59,53 +59,31 @@ def error(views: TwoViews, vector: TwoViewVector) -> FloatArray:
     return wrap(np.array([vector.direction - views.direction, vector.rotation - views.rotation]))
 
 
-@pytest.mark.parametrize(
-    ("count", "wrong"),
-    [(30, 0.0), (30, 0.3), pytest.param(50, 0.3, marks=pytest.mark.slow)],
-)
-def test_median_error_at_half_a_degree(count: int, wrong: float) -> None:
-    errors, nees = [], []
-    for seed in range(100):
-        views = two_views(seed, count, HALF_DEGREE, wrong)
+@pytest.mark.parametrize("wrong", [0.0, 0.3])
+def test_median_error_at_half_a_degree(wrong: float) -> None:
+    errors, nees, recalls = [], [], []
+    for seed in range(50):
+        views = two_views(seed, 30, HALF_DEGREE, wrong)
         vector = answer(views)
         if isinstance(vector, TwoViewVector):
             off = error(views, vector)
             errors.append(np.abs(off))
             nees.append(off @ np.linalg.solve(vector.covariance, off))
+            recalls.append(np.mean(vector.inliers[views.right]))
     direction, rotation = np.rad2deg(np.median(errors, axis=0))
     assert direction <= 0.8
     assert rotation <= 0.4
-    assert len(errors) >= 95
+    assert len(errors) >= 47
+    assert np.mean(recalls) >= 0.98
     # Some wrong matches agree by chance and none is distinguished: the share inside is not exact.
     assert np.mean(np.array(nees) < chi2.ppf(0.95, 2)) > 0.85
-
-
-def test_most_right_matches_are_inliers() -> None:
-    recalls = []
-    for seed in range(50):
-        views = two_views(seed, 40, HALF_DEGREE, 0.3)
-        vector = answer(views)
-        if isinstance(vector, TwoViewVector):
-            recalls.append(np.mean(vector.inliers[views.right]))
-    assert np.mean(recalls) >= 0.99
-
-
-def test_equal_from_equal_seeds_and_arguments_untouched() -> None:
-    views = two_views(3, 40, HALF_DEGREE, 0.3)
-    before = dataclasses.astuple(views.matches)
-    first, second = answer(views), answer(views)
-    assert isinstance(first, TwoViewVector)
-    assert isinstance(second, TwoViewVector)
-    assert (first.direction, first.rotation) == (second.direction, second.rotation)
-    for old, new in zip(before, dataclasses.astuple(views.matches), strict=True):
-        np.testing.assert_array_equal(old, new)
 
 
 def test_tilted_cameras_are_estimated() -> None:
     tilts = (np.deg2rad([2.0, -1.0]), np.deg2rad([-1.5, 1.0]))
     settings = dataclasses.replace(SETTINGS, tilt_sigma_deg=2.0)
     level, free = [], []
-    for seed in range(40):
+    for seed in range(20):
         views = two_views(seed, 50, np.deg2rad(0.2), tilts=tilts)
         for found, s in (
             (level, dataclasses.replace(SETTINGS, tilt_sigma_deg=0.0)),
@@ -153,14 +131,14 @@ def test_a_lead_in_one_sector_leaves_doubt_and_the_same_lead_all_around_does_not
 
 def test_random_matches_are_refused() -> None:
     refused = 0
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         angles = np.column_stack([rng.uniform(-np.pi, np.pi, 60), rng.uniform(-0.5, 0.6, 60)] * 2)
         angles[:, 2] = rng.uniform(-np.pi, np.pi, 60)
         angles[:, 3] = rng.uniform(-0.5, 0.6, 60)
         found = estimate_homing_vector(make_matches(angles, HALF_DEGREE), SETTINGS, rng)
         refused += isinstance(found, Refusal)
-    assert refused == 60
+    assert refused == 30
 
 
 def test_few_matches_are_refused_with_their_number() -> None:
@@ -178,15 +156,14 @@ def test_both_views_from_one_place() -> None:
     assert refusal.rotation == pytest.approx(views.rotation, abs=np.deg2rad(0.2))
 
 
-@pytest.mark.parametrize("half_width_deg", [2.0, 8.0])
-def test_one_thing_of_the_same_kind_elsewhere_is_no_arrival(half_width_deg: float) -> None:
+def test_one_thing_of_the_same_kind_elsewhere_is_no_arrival() -> None:
     """A poster that hangs in another room, too, among wrong matches: that looks like a turn."""
     reasons = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
         angles = rng.uniform(-np.pi, np.pi, (80, 4))
         angles[:, 1::2] = rng.uniform(0.05, 0.6, (80, 2)) * rng.choice([-1.0, 1.0], (80, 1))
-        size = np.deg2rad(half_width_deg)
+        size = np.deg2rad(2.0 if seed % 2 else 8.0)
         angles[:20, :2] = np.array([0.5, 0.2]) + rng.uniform(-size, size, (20, 2))
         angles[:20, 2:] = angles[:20, :2] + [1.0, 0.0] + rng.normal(0.0, 0.004, (20, 2))
         quality = np.where(np.arange(80) < 20, 0.7, rng.uniform(0.2, 0.5, 80))
@@ -228,7 +205,7 @@ def _hypothesis(direction: FloatArray, rotation: FloatArray) -> FloatArray:
 
 def test_refinement_covariance_is_that_of_monte_carlo() -> None:
     found = []
-    for seed in range(300):
+    for seed in range(150):
         views = two_views(11, 60)
         rng = np.random.default_rng(seed)
         m = views.matches
@@ -336,13 +313,12 @@ def corridor(seed: int, leg_m: float, sigma: float) -> TwoViews:
     return TwoViews(make_matches(angles, sigma), direction, rotation, leg_m, points, right)
 
 
-@pytest.mark.parametrize("leg_m", [1.2, 2.0])
-def test_links_along_a_corridor_are_as_uncertain_as_they_say(leg_m: float) -> None:
+def test_links_along_a_corridor_are_as_uncertain_as_they_say() -> None:
     """Error over sigma, rms; on short legs much of the derivatives is noise, too."""
     settings = HomingVectorSettings(tilt_sigma_deg=0.0, height_sigma=0.0)
     scaled = []
     for seed in range(60):
-        truth = corridor(seed, leg_m, np.deg2rad(0.5))
+        truth = corridor(seed, 1.2, np.deg2rad(0.5))
         found = answer(truth, settings)
         assert isinstance(found, TwoViewVector)
         scaled.append(error(truth, found) / np.sqrt(np.diag(found.covariance)))
@@ -446,13 +422,6 @@ def test_solutions_with_nearly_as_much_evidence_are_part_of_the_uncertainty() ->
     np.testing.assert_allclose(less[0, 0], 0.01**2 + 0.1**2 / 4, rtol=0, atol=1e-12)
     far = spread_over(near, np.array([500.0, 50.0]), 6.0)
     np.testing.assert_allclose(far, 0.01**2 * np.eye(2), rtol=0, atol=1e-12)
-
-
-def test_views_that_share_nothing_are_refused() -> None:
-    for seed in range(6):
-        a, _ = crowded_views(seed, 45, 28.0)
-        _, b = crowded_views(seed + 50, 45, 28.0)
-        assert not pair_answer((a, b))
 
 
 def test_a_clear_answer_is_that_of_the_matches() -> None:

@@ -254,11 +254,6 @@ def test_patches_are_the_first_map_s_where_it_has_some(world: World) -> None:
     assert (own.distances[150:] == 0.0).all()
 
 
-def test_overlapping_drives_keep_the_first_trajectory(world: World) -> None:
-    a, b = world.seen(np.arange(200), np.eye(4)), world.seen(np.arange(100, 300), BTA)
-    assert len(merge_maps(a, b, align(a, b)).trajectory) == 5
-
-
 def test_merged_files(world: World, tmp_path: Path) -> None:
     a, b, out = tmp_path / "a", tmp_path / "b", tmp_path / "ab"
     save_map(world.seen(np.arange(250), np.eye(4)), a)

@@ -39,8 +39,6 @@ from fgslam.core.types import (
     StereoFeatures,
 )
 from fgslam.datasets.settings import ConstantVelocitySettings
-from fgslam.frontend.features.matching import AppearanceIndex
-from fgslam.frontend.places import known_map
 from fgslam.frontend.places.known_map import Tentative
 from fgslam.frontend.places.recognition import (
     Confirmation,
@@ -61,7 +59,6 @@ from fgslam.frontend.places.relocalisation import (
 )
 from fgslam.frontend.settings import AppearanceSettings, EgoMotionSettings, RelocalisationSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection
-from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.slam.build import make_estimator
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
@@ -146,6 +143,11 @@ def test_return_is_recognised_and_the_drift_corrected() -> None:
     assert error_m(reports[first - 1], RING[first - 1]) > 0.5
     assert error_m(reports[first], RING[first]) < 0.15
     assert max(error_m(reports[k], RING[k]) for k in range(first, len(RING))) < 0.15
+    for k in closed:
+        for loop in reports[k].increment.loops:
+            metres, degrees = difference(g.inverse(RING[loop.frame]) @ RING[k], loop.oTc)
+            assert metres < 0.1
+            assert degrees < 1.0
 
 
 @pytest.mark.slow
@@ -169,15 +171,6 @@ def test_frame_with_two_hypotheses_is_placed_by_recent_landmarks(
     apart, closed = driven()
     assert len(apart) > 5
     assert not closed  # nor do such frames agree on where the place lies
-
-
-def test_no_closure_is_false() -> None:
-    _, reports = ring()
-    for k in closings(reports):
-        for loop in reports[k].increment.loops:
-            metres, degrees = difference(g.inverse(RING[loop.frame]) @ RING[k], loop.oTc)
-            assert metres < 0.1
-            assert degrees < 1.0
 
 
 def test_landmarks_found_twice_become_one() -> None:
@@ -278,13 +271,8 @@ def test_each_estimator_of_a_comparison_accepts_or_refuses_a_closure_itself() ->
     assert np.median(np.linalg.norm(new - old, axis=1)) < 0.1
 
 
-@pytest.mark.parametrize("refusing", [False, True])
-def test_a_replay_closes_the_same_loops_to_the_bit(
-    refusing: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pipeline, reports = ring(refusing)
-    if refusing:
-        refuse_closures(monkeypatch)
+def test_a_replay_closes_the_same_loops_to_the_bit() -> None:
+    pipeline, reports = ring()
     estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
     solver = EgoMotionSolver(RIG, SETTINGS.ego_motion)
     motion = RingMotion(RING, 0.9)
@@ -298,9 +286,7 @@ def test_a_replay_closes_the_same_loops_to_the_bit(
     )
 
 
-@pytest.mark.parametrize(
-    ("refusing", "after_closing"), [(False, -20), (False, 1), (False, 2), (True, 1), (True, 4)]
-)
+@pytest.mark.parametrize(("refusing", "after_closing"), [(False, 1), (True, 4)])
 def test_continued_from_its_state_it_goes_on_to_the_bit(
     refusing: bool, after_closing: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -340,32 +326,6 @@ def test_kidnapped_robot_is_relocalised_in_its_own_map() -> None:
     assert error_m(reports[-1], poses[-1]) < 0.1
     lost = reports[41 : found[0]]
     assert sum(int(r.increment.observations.is_new.sum()) for r in lost) == 0, "not while lost"
-
-
-def test_who_is_lost_indexes_the_same_looks_once_with_the_same_answers(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Frames in unmapped surroundings: each looks at the whole map, and none changes its looks."""
-    poses = [on_ring(k) for k in range(12)] + [on_ring(k) for k in range(36, 46)]
-    lost = LostRules(after=1, give_up_after=20)
-    made = []
-    monkeypatch.setattr(
-        known_map, "AppearanceIndex", lambda *held: (made.append(1), AppearanceIndex(*held))[1]
-    )
-    once = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
-    first = len(made)
-    monkeypatch.setattr(LandmarkDatabase, "changes", property(lambda self: len(made)))
-    every = drive(pipeline_of(poses, 0.1, loops=None, lost=lost), seen(poses))
-    assert first < len(made) - first == len(poses) - 12 + 1
-    for one, other in zip(once, every, strict=True):
-        assert_same_increments(one.increment, other.increment)
-        assert_same_bits(one.tracking, other.tracking)
-
-
-def test_kidnapped_robot_stays_lost_without_relocalisation() -> None:
-    poses = carried()
-    reports = drive(pipeline_of(poses, 0.1, loops=None, lost=None), seen(poses))
-    assert error_m(reports[-1], poses[-1]) > 1.0
 
 
 def test_a_relocalised_frame_is_replayed_to_the_bit() -> None:
@@ -616,26 +576,6 @@ def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
     assert again.way_since(30) == memory.way_since(30)
 
 
-@pytest.mark.parametrize("given", [-1, 8])
-def test_memory_restored_from_log_goes_on_the_same(given: int) -> None:
-    frames = [[0, 1, 2], [1, 2, 3], [3, 4]]
-    memory = remembered(frames, given)
-    log = MeasurementLog(RIG, {})
-    for k in range(3):
-        log.append(frame(k, memory.view(k, NOBODY, _map(np.arange(9), np.zeros((9, 3))))))
-    again = SightingMemory()
-    restore(again, state_of(memory))
-    again.frames[:] = log
-    assert_same_bits(state_of(again), state_of(memory))
-    asked = np.arange(9)
-    for frames_ago in range(3):
-        np.testing.assert_array_equal(
-            again.unseen_for(frames_ago, asked), memory.unseen_for(frames_ago, asked)
-        )
-    assert again.way_since(0) == memory.way_since(0)
-    np.testing.assert_array_equal(again.made_after(1, asked), memory.made_after(1, asked))
-
-
 def _map(ids: IntArray, positions: FloatArray) -> LandmarkMap:
     return LandmarkMap(ids, positions, np.tile(1e-4 * np.eye(3), (len(ids), 1, 1)))
 
@@ -874,13 +814,7 @@ def test_few_inliers_with_a_large_residual_are_refused() -> None:
     assert _status(20, replace(badly, misfit=MAX_MISFIT)) is RelocalisationStatus.FOUND
 
 
-def test_another_place_that_explains_the_frame_as_well_makes_it_ambiguous() -> None:
-    """Half of the features by either; each has some of its own."""
-    best, other = _pose(np.arange(20)), _pose(np.arange(4, 22), place=1)
-    assert _status(24, best, other) is RelocalisationStatus.AMBIGUOUS
-
-
-@pytest.mark.parametrize("missing", [0, 1, 5, 10])
+@pytest.mark.parametrize("missing", [0, 10])
 def test_an_aliased_place_with_missing_landmarks_still_makes_it_ambiguous(missing: int) -> None:
     """Which of two alike places the map knows better does not say where the robot is."""
     best, other = _pose(np.arange(20)), _pose(np.arange(missing, 20), place=1)

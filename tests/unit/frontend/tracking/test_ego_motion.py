@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import gtsam
@@ -12,7 +11,7 @@ from scipy import optimize, stats
 from simulated import RIG, assert_same_bits, points_in_view
 
 from fgslam.backend.persistence import Persistence, learn_from
-from fgslam.backend.settings import BatchSettings, LandmarkKalmanSettings
+from fgslam.backend.settings import BatchSettings
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.log import MeasurementLog
@@ -24,7 +23,7 @@ from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, MatchNoise, PoseProblem, unmeasured
 from fgslam.slam.build import make_estimator
-from fgslam.slam.replay import replay, replay_frame, replay_motion
+from fgslam.slam.replay import replay_frame, replay_motion
 from fgslam.worlds.settings import (
     DetectionSettings,
     MeasurementDriveSettings,
@@ -105,32 +104,35 @@ def perturbed(wTc: FloatArray, rng: np.random.Generator, size: float = 1.0) -> F
 
 
 def full_residual(
-    wTc: FloatArray, problem: PoseProblem, predicted: FloatArray, prior: FloatArray
+    wTc: FloatArray,
+    problem: PoseProblem,
+    predicted: FloatArray,
+    prior: FloatArray,
+    sigma: FloatArray = SIGMA,
 ) -> FloatArray:
     """Whitened image residuals and, below them, the whitened deviation from the odometry."""
     local = (np.linalg.inv(wTc) @ np.column_stack([problem.points, np.ones(len(problem))]).T).T
     u = RIG.fx * local[:, 0] / local[:, 2] + RIG.cx - problem.measurement[:, 0]
     v = RIG.fy * local[:, 1] / local[:, 2] + RIG.cy - problem.measurement[:, 1]
     d = RIG.fx * RIG.baseline / local[:, 2] - problem.measurement[:, 2]
-    images = np.column_stack([u, v, d]) / SIGMA
+    images = np.column_stack([u, v, d]) / sigma
     deviation = gtsam.Pose3.Logmap(gtsam.Pose3(predicted).between(gtsam.Pose3(wTc)))
     return np.concatenate([images.ravel(), np.linalg.solve(np.linalg.cholesky(prior), deviation)])
 
 
-def numerical_jacobian(problem, wTc, predicted, prior) -> FloatArray:
+def numerical_jacobian(problem, wTc, predicted, prior, sigma=SIGMA) -> FloatArray:
     """The paper's: each parameter moved a little, through the whole of the projection."""
     eps = 1e-6
     columns = [
-        full_residual(wTc @ g.se3_exp(eps * e), problem, predicted, prior)
-        - full_residual(wTc @ g.se3_exp(-eps * e), problem, predicted, prior)
+        full_residual(wTc @ g.se3_exp(eps * e), problem, predicted, prior, sigma)
+        - full_residual(wTc @ g.se3_exp(-eps * e), problem, predicted, prior, sigma)
         for e in np.eye(6)
     ]
     return np.column_stack(columns) / (2 * eps)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_analytic_jacobian_is_the_numerical_one(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_analytic_jacobian_is_the_numerical_one() -> None:
+    rng = np.random.default_rng(0)
     problem = scene(FORWARD, rng)
     wTc, predicted = perturbed(FORWARD, rng), perturbed(FORWARD, rng)
     points = g.transform_to_camera(wTc, problem.points)
@@ -144,13 +146,15 @@ def test_analytic_jacobian_is_the_numerical_one(seed: int) -> None:
     assert (np.abs(analytic - numeric).max(axis=0) < 1e-5 * scale).all()
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_solution_is_that_of_scipy_with_a_numerical_jacobian(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+@pytest.mark.parametrize(("weighting", "sigma"), [("measurement", SIGMA), ("uniform", np.ones(3))])
+def test_solution_is_that_of_scipy_with_a_numerical_jacobian(
+    weighting: str, sigma: FloatArray
+) -> None:
+    rng = np.random.default_rng(0)
     problem, predicted = scene(FORWARD, rng), perturbed(FORWARD, rng)
-    found = solve(problem, predicted)
+    found = solve(problem, predicted, change(weighting=weighting))
     best = optimize.least_squares(
-        lambda xi: full_residual(predicted @ g.se3_exp(xi), problem, predicted, PRIOR),
+        lambda xi: full_residual(predicted @ g.se3_exp(xi), problem, predicted, PRIOR, sigma),
         np.zeros(6),
         xtol=1e-14,
         ftol=1e-14,
@@ -158,47 +162,12 @@ def test_solution_is_that_of_scipy_with_a_numerical_jacobian(seed: int) -> None:
     )
     expected = predicted @ g.se3_exp(best.x)
     np.testing.assert_allclose(g.se3_log(g.inverse(expected) @ found.wTc), 0.0, atol=1e-7)
-    j = numerical_jacobian(problem, found.wTc, predicted, PRIOR)
+    # The odometry was not the answer all along.
+    assert np.abs(g.se3_log(g.inverse(predicted) @ found.wTc)).max() > 1e-3
+    j = numerical_jacobian(problem, found.wTc, predicted, PRIOR, sigma)
     expected_covariance = np.linalg.inv(j.T @ j)
     scale = np.sqrt(np.outer(*2 * [np.diag(expected_covariance)]))
     np.testing.assert_allclose(found.covariance / scale, expected_covariance / scale, atol=1e-5)
-
-
-def gtsam_batch(problem: PoseProblem, predicted: FloatArray, weighting: str) -> gtsam.Pose3:
-    """Left-camera stereo factors on fixed points, bridged to the right camera, and the prior."""
-    right_from_left = gtsam.Pose3(gtsam.Rot3(), np.array([-RIG.baseline, 0.0, 0.0]))
-    k = gtsam.Cal3_S2Stereo(RIG.fx, RIG.fy, 0.0, RIG.cx, RIG.cy, RIG.baseline)
-    to_lrv = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for i, point in enumerate(problem.points):
-        covariance = np.eye(3) if weighting == "uniform" else problem.measurement_covariance[i]
-        noise = gtsam.noiseModel.Gaussian.Covariance(to_lrv @ covariance @ to_lrv.T)
-        z = gtsam.StereoPoint2(*(to_lrv @ problem.measurement[i]))
-        graph.add(gtsam.GenericStereoFactor3D(z, noise, 0, i + 1, k, right_from_left))
-        graph.add(gtsam.PriorFactorPoint3(i + 1, point, gtsam.noiseModel.Constrained.All(3)))
-        values.insert(i + 1, point)
-    prior = gtsam.noiseModel.Gaussian.Covariance(PRIOR)
-    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(predicted), prior))
-    values.insert(0, gtsam.Pose3(predicted))
-    parameters = gtsam.GaussNewtonParams()
-    parameters.setRelativeErrorTol(0.0)
-    parameters.setAbsoluteErrorTol(0.0)
-    parameters.setMaxIterations(15)
-    result = gtsam.GaussNewtonOptimizer(graph, values, parameters).optimize()
-    return result.atPose3(0)
-
-
-@pytest.mark.parametrize("weighting", ["measurement", "uniform"])
-@pytest.mark.parametrize("seed", range(3))
-def test_solution_is_that_of_a_gtsam_batch(seed: int, weighting: str) -> None:
-    rng = np.random.default_rng(seed)
-    problem, predicted = scene(FORWARD, rng), perturbed(FORWARD, rng)
-    found = solve(problem, predicted, change(weighting=weighting))
-    expected = gtsam_batch(problem, predicted, weighting)
-    difference = expected.between(gtsam.Pose3(found.wTc))
-    np.testing.assert_allclose(gtsam.Pose3.Logmap(difference), 0.0, atol=1e-6)
-    # The odometry was not the answer all along.
-    assert np.abs(g.se3_log(g.inverse(predicted) @ found.wTc)).max() > 1e-3
 
 
 def test_landmark_weighting_adds_the_landmark_as_seen_in_the_image(
@@ -246,15 +215,12 @@ def height(rig: CameraRig, wTc: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("residuals", ["image_disparity", "image"])
-@pytest.mark.parametrize("pitch", [0.0, 25.0])
 @pytest.mark.parametrize("dof", [6, 5, 3])
 @pytest.mark.parametrize("prior", [False, True])
-def test_ego_motion_is_exact_without_noise(
-    dof: int, pitch: float, residuals: str, prior: bool
-) -> None:
+def test_ego_motion_is_exact_without_noise(dof: int, residuals: str, prior: bool) -> None:
     rng = np.random.default_rng(8)
-    rig = tilted_rig(pitch)
-    for _ in range(5):
+    rig = tilted_rig(25.0)
+    for _ in range(2):
         truth = body_motion(dof, rig, rng)
         problem = scene(truth, rng, noise=0.0)
         predicted = perturbed(truth, rng, 2.0)
@@ -267,18 +233,10 @@ def test_ego_motion_is_exact_without_noise(
         assert found.inliers.all()
 
 
-def test_each_stage_recovers_with_default_settings() -> None:
-    rng = np.random.default_rng(9)
-    problem = scene(FORWARD, rng, noise=0.0)
-    found = solve(problem, perturbed(FORWARD, rng), EgoMotionSettings(), covariance=1e4 * PRIOR)
-    np.testing.assert_allclose(found.wTc, FORWARD, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("pitch", [0.0, 25.0])
 @pytest.mark.parametrize("dof", [5, 3])
-def test_height_stays_exactly_and_planar_motion_planar(dof: int, pitch: float) -> None:
+def test_height_stays_exactly_and_planar_motion_planar(dof: int) -> None:
     rng = np.random.default_rng(11)
-    rig = tilted_rig(pitch)
+    rig = tilted_rig(25.0)
     up = rig.bTc[2, :3]
     for _ in range(10):
         truth = body_motion(dof, rig, rng)
@@ -298,11 +256,10 @@ def test_height_stays_exactly_and_planar_motion_planar(dof: int, pitch: float) -
         assert np.linalg.matrix_rank(found.covariance, tol=1e-12) == dof
 
 
-@pytest.mark.parametrize("pitch", [0.0, 25.0])
 @pytest.mark.parametrize("dof", [6, 5, 3])
-def test_constraining_is_a_projection(dof: int, pitch: float) -> None:
+def test_constraining_is_a_projection(dof: int) -> None:
     rng = np.random.default_rng(12)
-    rig = tilted_rig(pitch)
+    rig = tilted_rig(25.0)
     solver = EgoMotionSolver(rig, change(dof=dof))
     for _ in range(10):
         wTc = g.se3_exp(0.3 * rng.standard_normal(6))
@@ -365,28 +322,15 @@ def test_fixing_the_height_steadies_the_pitch() -> None:
     assert pitch[1] == pytest.approx(0.036, abs=0.004)
 
 
-def test_yaw_and_sideways_motion_are_nearly_the_same() -> None:
-    """Correlation -0.94 in this field of view; height and pitch likewise."""
-    runs = [paper_like(np.random.default_rng(seed))[0].covariance for seed in range(60)]
-    c = np.mean(runs, axis=0)
-    assert c[1, 3] / np.sqrt(c[1, 1] * c[3, 3]) == pytest.approx(-0.94, abs=0.015)
-    assert c[0, 4] / np.sqrt(c[0, 0] * c[4, 4]) > 0.9
-
-
 @pytest.mark.parametrize(
     ("prior", "weighting"),
-    [
-        (True, "landmark"),
-        (False, "measurement"),
-        pytest.param(True, "measurement", marks=pytest.mark.slow),
-        pytest.param(False, "landmark", marks=pytest.mark.slow),
-    ],
+    [(True, "landmark"), (False, "measurement")],
 )
 def test_errors_match_the_covariance(weighting: str, prior: bool) -> None:
-    """NEES over 300 runs, exact landmarks, or noisy ones whose covariance is known."""
+    """NEES over 150 runs, exact landmarks, or noisy ones whose covariance is known."""
     rng = np.random.default_rng(99)
     nees = []
-    for _ in range(300):
+    for _ in range(150):
         problem = scene(FORWARD, rng)
         if weighting == "landmark":
             root = np.linalg.cholesky(np.diag([0.01, 0.02, 0.03]) ** 2)
@@ -399,7 +343,7 @@ def test_errors_match_the_covariance(weighting: str, prior: bool) -> None:
         found = solve(problem, perturbed(FORWARD, rng), settings)
         error = g.se3_log(g.inverse(found.wTc) @ FORWARD)
         nees.append(error @ np.linalg.solve(found.covariance, error))
-    low, high = stats.chi2.ppf([0.001, 0.999], 6 * 300) / 300
+    low, high = stats.chi2.ppf([0.001, 0.999], 6 * 150) / 150
     assert low < np.mean(nees) < high
 
 
@@ -428,7 +372,7 @@ def test_outliers_do_not_change_the_solution(kernel: str, share: float) -> None:
     sigmas = 0.0 if kernel == "none" else 4.0
     settings = EgoMotionSettings(kernel=kernel, outlier_sigmas=sigmas)
     different = 0
-    for _ in range(40):
+    for _ in range(15):
         clean, predicted = scene(FORWARD, rng, count=60), perturbed(FORWARD, rng)
         problem, good = with_outliers(clean, share, rng)
         found = solve(problem, predicted, settings)
@@ -440,23 +384,7 @@ def test_outliers_do_not_change_the_solution(kernel: str, share: float) -> None:
             np.testing.assert_allclose(found.wTc, alone.wTc, rtol=0, atol=1e-7)
         different += not same_set
     # Now and then a good match at the edge of the gate falls on the other side of it.
-    assert different <= 2
-
-
-def test_kernels_hold_where_plain_least_squares_breaks() -> None:
-    rng = np.random.default_rng(18)
-    errors: dict[str, list[float]] = {"none": [], "huber": [], "cauchy": []}
-    for _ in range(30):
-        clean, predicted = scene(FORWARD, rng, count=50), perturbed(FORWARD, rng)
-        problem, _ = with_outliers(clean, 0.4, rng)
-        # All within reach, so that only the kernel tells good from bad.
-        for kernel, found in errors.items():
-            settings = EgoMotionSettings(kernel=kernel, prior=False, outlier_sigmas=0.0)
-            motion = solve(problem, predicted, settings)
-            found.append(float(np.linalg.norm(motion.wTc[:3, 3] - FORWARD[:3, 3])))
-    assert np.median(errors["cauchy"]) < 0.01
-    assert np.max(errors["cauchy"]) < np.max(errors["none"])
-    assert np.mean(errors["huber"]) < np.mean(errors["none"])
+    assert different <= 1
 
 
 def test_wrong_matches_cannot_move_the_pose_beyond_the_cap() -> None:
@@ -631,7 +559,7 @@ def test_measurements_that_are_not_numbers_leave_the_odometry() -> None:
     assert np.isfinite(found.wTc).all()
 
 
-@pytest.mark.parametrize("depth", [-3.0, 0.0, 5e-4])
+@pytest.mark.parametrize("depth", [-3.0, 0.0])
 @pytest.mark.parametrize("weighting", ["uniform", "measurement", "landmark"])
 def test_points_behind_the_camera_are_left_out(depth: float, weighting: str) -> None:
     rng = np.random.default_rng(28)
@@ -702,28 +630,6 @@ def test_uniform_weighting_ignores_the_covariances() -> None:
     assert np.abs(weighted[0].wTc - weighted[1].wTc).max() > 1e-5
 
 
-def test_repeatable_and_pure() -> None:
-    rng = np.random.default_rng(36)
-    problem, _ = with_outliers(scene(FORWARD, rng), 0.2, rng)
-    given = (problem, Prediction(perturbed(FORWARD, rng), PRIOR.copy()))
-    kept = copy.deepcopy(given)
-    solver = EgoMotionSolver(RIG, EgoMotionSettings())
-    first, second = solver.solve(given[1], problem), solver.solve(given[1], problem)
-    assert_same_bits(first, second)
-    assert_same_bits(given, kept)
-
-
-def test_the_world_may_be_moved() -> None:
-    """Moving landmarks and odometry moves the pose rigidly (6 degrees of freedom)."""
-    rng = np.random.default_rng(37)
-    problem, predicted = scene(FORWARD, rng), perturbed(FORWARD, rng)
-    moved_by = g.se3_exp(np.array([0.5, -1.0, 0.3, 5.0, -2.0, 7.0]))
-    moved = dataclasses.replace(problem, points=g.transform_to_world(moved_by, problem.points))
-    a, b = solve(problem, predicted), solve(moved, moved_by @ predicted)
-    np.testing.assert_allclose(b.wTc, moved_by @ a.wTc, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(b.covariance, a.covariance, rtol=1e-5, atol=1e-12)
-
-
 def test_a_problem_takes_the_matched_landmarks() -> None:
     ids = np.array([2, 3, 7, 11])
     landmarks = LandmarkMap(ids, np.arange(12.0).reshape(4, 3), np.tile(np.eye(3), (4, 1, 1)))
@@ -738,17 +644,6 @@ def test_a_problem_takes_the_matched_landmarks() -> None:
     np.testing.assert_array_equal(problem.points, landmarks.positions[[2, 0]])
     with pytest.raises(KeyError, match=r"\[5\]"):
         PoseProblem.of(landmarks, dataclasses.replace(seen, ids=np.array([7, 5])))
-
-
-@pytest.mark.parametrize("status", [EgoMotionStatus.FIRST, EgoMotionStatus.NO_IMAGE])
-def test_without_measurements_the_pose_is_the_prediction(status: EgoMotionStatus) -> None:
-    prediction = Prediction(FORWARD, PRIOR)
-    found = unmeasured(prediction, status)
-    assert found.status is status
-    assert not found.status.measured
-    np.testing.assert_array_equal(found.wTc, FORWARD)
-    np.testing.assert_array_equal(found.covariance, PRIOR)
-    assert len(found.inliers) == len(found.residuals) == 0
 
 
 def test_an_exact_prediction_is_kept() -> None:
@@ -794,13 +689,6 @@ def test_three_frames_contradict_the_stated_noise_and_a_stretch_of_wrong_matches
     assert told(MatchNoise(), *[1.0] * 20, *[50.0] * 14) == 1.0
     assert told(MatchNoise(), *[9.0] * 40, *[50.0] * 14) == 9.0
     assert told(MatchNoise(), np.nan, np.nan, np.nan, np.nan) == 1.0
-
-
-def test_a_drive_four_times_as_noisy_as_stated_is_tracked_by_its_matches() -> None:
-    """By the stated noise a third of the frames find too few, and 7 % of the matches count."""
-    played = replay(noisy_drive(40), LandmarkKalmanSettings(), PLANAR)
-    assert (played.column("status")[1:] == "ok").all()
-    assert played.column("inliers")[10:].sum() > 0.9 * played.column("matched")[10:].sum()
 
 
 def test_a_drive_goes_on_from_a_state_as_it_would_have() -> None:

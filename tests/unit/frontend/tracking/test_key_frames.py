@@ -92,10 +92,6 @@ def found_again(place: FloatArray, off: FloatArray) -> tuple[ReferencePatches, P
     return carrier.find_again(FineImage(now[0]), Begun.again(again, first.patches(here)))
 
 
-def dark(place: FloatArray) -> tuple[Image, ...]:
-    return tuple(np.asarray(np.rint(image / 24.0), np.uint8) for image in pictures(place))
-
-
 def followed(carrier: LandmarkCarrier, place: FloatArray, off: float = 0.0) -> Carried:
     found = carrier.follow(pictures(place), expected(place, off))
     assert found is not None
@@ -119,17 +115,6 @@ def test_points_are_found_in_all_images_to_a_tenth_of_a_pixel(place: FloatArray)
     assert np.abs(np.median(error, axis=0)).max() < 1.0 / 16.0
     assert error.std(axis=0).max() < 0.1
     np.testing.assert_allclose(found.features.pixels[:, 0], truth[:, :2], rtol=0, atol=0.4)
-
-
-def test_few_grey_values_are_no_less_exact() -> None:
-    """A wall of some ten grey values: rounded between its pixels, errors were 0.13 px."""
-    place = np.array([0.03, 0.01, 0.0])
-    found = begun(dark(HERE), HERE).follow(dark(place), expected(place, 0.5))
-    assert found is not None
-    assert len(found) >= 15
-    error = found.features.measurement - measurements(place)[found.ids - 10]
-    assert error.std(axis=0).max() < 0.08
-    assert error[:, 2].std() < 0.01
 
 
 def test_errors_do_not_add_up() -> None:
@@ -302,10 +287,6 @@ def test_enough_landmarks_that_mostly_agree_place_a_frame(
     assert found.suffices is placed
 
 
-def test_a_pose_that_was_not_measured_places_nothing() -> None:
-    assert not frame(100, 0, EgoMotionStatus.DIVERGED).placed
-
-
 def test_few_that_are_left_ask_for_a_key_frame_beside_which_they_are_used() -> None:
     found = replace(frame(100, 0), lasting=False)
     assert found.placed
@@ -404,10 +385,6 @@ def test_a_feature_that_not_all_images_show_holds_no_square() -> None:
 
 def test_places_beyond_the_border_have_squares_of_their_own() -> None:
     assert starting(features_at([(-1.0, 7.0), (119.0, 2.0), (2.0, 7.0)], [1.0] * 3)) == [0, 1, 2]
-
-
-def test_no_feature_begins_nothing() -> None:
-    assert starting(features_at([], [])) == []
 
 
 @pytest.mark.parametrize(("outliers", "lasting"), [(19, True), (21, False)])

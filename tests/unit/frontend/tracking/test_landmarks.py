@@ -194,17 +194,6 @@ def test_perfect_odometry_predicts_perfectly() -> None:
     np.testing.assert_allclose(expected.scale, 3.0)
 
 
-def test_expected_landmarks_carry_their_own_appearance() -> None:
-    points = at_pixels([(80, 60, 8), (-50, 110, 12), (150, 150, 20), (200, 100, 5)])
-    database = database_of(points)
-    features = stereo_features(points)
-    expected = database.expected(landmark_map(points), np.eye(4))
-    assert expected.ids.tolist() == [0, 2, 3]
-    assert expected.rows.tolist() == [0, 2, 3]
-    np.testing.assert_array_equal(expected.descriptors, features.descriptors[[0, 2, 3]])
-    np.testing.assert_array_equal(expected.orientation, features.orientation[[0, 2, 3]])
-
-
 def test_landmark_ids_may_differ_from_row_numbers() -> None:
     points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20), (200, 100, 5)])
     database = database_of(points, DatabaseSettings(prune_after_misses=1))
@@ -371,11 +360,6 @@ def test_an_unconfirmed_landmark_is_forgotten_in_view_or_not() -> None:
     assert database.ids.tolist() == [1]
 
 
-def test_the_paper_prunes_after_20() -> None:
-    assert DatabaseSettings().prune_after_misses == 20
-    assert DatabaseSettings().valid_hits == 3
-
-
 def test_a_hit_resets_consecutive_misses_only() -> None:
     """L resets on a hit, m and n never."""
     points = at_pixels([(80, 60, 8)])
@@ -387,15 +371,6 @@ def test_a_hit_resets_consecutive_misses_only() -> None:
         database.record_hits(only, stereo_features(points), only)
         assert len(database.prune()) == 0
     assert (database.hits[0], database.misses[0], database.missed[0]) == (4, 12, 0)
-
-
-def test_valid_from_the_third_hit_on() -> None:
-    points = at_pixels([(80, 60, 8), (100, 110, 12)])
-    database = database_of(points)
-    features = stereo_features(points)
-    for expected in (False, True, True):
-        database.record_hits(np.array([1]), features, np.array([1]))
-        assert database.valid.tolist() == [False, expected]
 
 
 def test_a_hit_refreshes_the_appearance() -> None:
@@ -412,14 +387,6 @@ def test_a_hit_refreshes_the_appearance() -> None:
     for name in before:
         if name.startswith("columns/"):
             np.testing.assert_array_equal(state_of(database)[name][others], before[name][others])
-
-
-def test_an_empty_database_expects_nothing() -> None:
-    database = LandmarkDatabase(RIG, SETTINGS, 40.0)
-    assert len(database) == 0
-    assert len(database.expected(landmark_map(np.empty((0, 3))), np.eye(4))) == 0
-    assert len(database.prune()) == 0
-    assert database.valid.shape == (0,)
 
 
 # ------------------------------------------------------------------------------------------
@@ -565,13 +532,6 @@ def test_what_cannot_be_merged_is_refused_and_nothing_done(pairs, why) -> None:
     assert_same_bits(state_of(database), before)
 
 
-def test_merging_no_pairs_changes_nothing() -> None:
-    database = database_of(PLACES, LASTING)
-    before = copy.deepcopy(state_of(database))
-    database.merge(np.empty((0, 2), np.int64))
-    assert_same_bits(state_of(database), before)
-
-
 # --------------------------------------------------------------------------------------------
 # Views kept, saved, restored
 
@@ -701,14 +661,6 @@ def test_a_map_with_a_landmark_that_has_no_view_is_refused() -> None:
         LandmarkDatabase(RIG, VIEWS, 40.0).load(given)
 
 
-def test_an_empty_map() -> None:
-    given = saved(LandmarkDatabase(RIG, VIEWS, 40.0), np.empty((0, 3)))
-    database = seen_around()
-    database.load(given)
-    assert len(database) == len(database.appearances()) == 0
-    assert database.next_id == 0
-
-
 def test_memory_a_landmark_is_as_documented() -> None:
     """docs/concepts/maps.md tells it."""
     assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0)) == 78 + 164
@@ -794,13 +746,6 @@ def test_a_match_renews_the_nearest_view_and_no_other() -> None:
     assert names(pool, places) == [1, 3]
     # The view vector stays: another match 15 degrees on would else be near to the first's.
     assert degrees_of(pool, places).tolist() == [0, 50]
-
-
-def test_a_match_from_elsewhere_adds_a_view() -> None:
-    pool = ViewPool(8, ANGLE)
-    places = landmark(pool, view(0, 1), view(20.5, 2))
-    assert names(pool, places) == [1, 2]
-    assert degrees_of(pool, places).tolist() == [0, 20]
 
 
 @pytest.mark.parametrize("step", [1.0, 3.0, 7.0])
@@ -918,16 +863,6 @@ def test_loading_keeps_the_last_views_of_a_landmark_that_has_too_many() -> None:
     np.testing.assert_array_equal(kept.descriptors, given.descriptors[[0, 2, 3, 4, 5]])
 
 
-def test_no_landmark_at_all() -> None:
-    pool = ViewPool(4, ANGLE)
-    nothing = several(np.random.default_rng(0), 0)
-    places = pool.start(nothing)
-    assert places.shape == (0, 4)
-    column, inside = pool.nearest(places, np.empty((0, 3), np.float32))
-    assert len(column) == len(inside) == 0
-    pool.refresh(places, nothing)
-
-
 # ------------------------------------------------------------------------------------------
 # Landmarks and frames hang together by measurements, or lie beside each other by a guess
 
@@ -966,12 +901,6 @@ def booked(*frames: Increment) -> MapParts:
 
 BEFORE = (frame(new=range(20), odometry=None), frame(range(10), range(20, 30)))
 GAP = frame(new=range(30, 50))
-
-
-def test_what_is_tracked_is_one_part() -> None:
-    parts = booked(*BEFORE)
-    assert not parts.several
-    assert parts.connected.all()
 
 
 @pytest.mark.parametrize("odometry", [GUESS, None], ids=["live", "in a log"])
@@ -1068,11 +997,6 @@ def test_a_view_in_which_nearly_nothing_is_matched_is_blocked(below, hits, blind
     hit[:hits] = True
     hit[20:40] = True  # what is at the border says nothing about the view
     assert is_blind(expected, hit, PermanenceSettings(blind_below=below)) is blind
-
-
-def test_a_view_in_which_nothing_is_expected_is_not_blocked() -> None:
-    nothing = np.zeros(0, np.bool_)
-    assert not is_blind(expected_landmarks([]), nothing, PermanenceSettings())
 
 
 PLACE = (100.0, 80.0, 10.0)

@@ -32,7 +32,6 @@ from fgslam.frontend.tracking.map_matching import (
     FieldOfView,
     MapMatcher,
     MapMatches,
-    directions_to,
     lean,
 )
 
@@ -123,17 +122,6 @@ def test_what_is_too_small_to_be_found_is_not_expected() -> None:
         found = database.expected(landmark_map(points), wTc)
         assert found.ids.tolist() == np.flatnonzero(scale >= 1.0).tolist()
         np.testing.assert_allclose(found.scale, scale[found.ids])
-
-
-def test_directions_are_unit_vectors_in_the_world() -> None:
-    rng = np.random.default_rng(6)
-    wTc = g.se3_exp(rng.standard_normal(6))
-    positions = rng.standard_normal((20, 3))
-    found = directions_to(wTc, g.transform_to_camera(wTc, positions))
-    from_camera = positions - wTc[:3, 3]
-    np.testing.assert_allclose(
-        found * np.linalg.norm(from_camera, axis=1)[:, None], from_camera, atol=1e-12
-    )
 
 
 # ------------------------------------------------------------------------------------------
@@ -299,17 +287,6 @@ def test_anywhere_searches_the_largest_window() -> None:
         assert len(matcher.match_anywhere(landmarks(), features(row)).features) == count
 
 
-def test_recall_falls_beyond_the_window() -> None:
-    """All within 2 px of odometry error, none beyond 3, no wrong ones for lack of others."""
-    rng = np.random.default_rng(5)
-    grid = np.stack(np.meshgrid(np.arange(20, 300, 20), np.arange(20, 220, 20)), -1).reshape(-1, 2)
-    rows = np.column_stack([grid, rng.uniform(3, 20, len(grid))])
-    for shift, low, high in ((0.0, 1.0, 1.0), (2.0, 1.0, 1.0), (3.0, 0.0, 0.0), (8.0, 0.0, 0.0)):
-        found = match(landmarks(rows), features(rows + np.array([shift, 0.0, 0.0])))
-        assert low <= len(found.features) / len(rows) <= high
-        np.testing.assert_array_equal(found.features, found.landmarks)
-
-
 def test_matching_without_landmarks_or_features_finds_nothing() -> None:
     none, one = np.empty((0, 3)), [AT]
     for rows, seen in ((none, none), (none, one), (one, none)):
@@ -318,18 +295,6 @@ def test_matching_without_landmarks_or_features_finds_nothing() -> None:
             assert len(found.landmarks) == len(found.features) == 0
             assert found.had_candidates.shape == (len(seen),)
             assert not found.had_candidates.any()
-
-
-def test_matching_settings_switch_widening_refinement_and_rescue() -> None:
-    plain = MapMatcher(FIXED, PAPER)
-    assert [plain.widens, plain.refines, plain.rescues] == [False, False, False]
-    everything = dataclasses.replace(FIXED, widen_sigmas=1.0, refine=True, rescue=True)
-    full = MapMatcher(everything, DESCRIPTOR)
-    assert full.widens
-    assert full.refines
-    assert full.rescues
-    # Without descriptors a large window is all ambiguity.
-    assert not MapMatcher(everything, PAPER).rescues
 
 
 def test_a_feature_that_resembles_no_landmark_is_new() -> None:
@@ -395,12 +360,6 @@ def pixels(points: FloatArray) -> FloatArray:
     return np.asarray(points[:, :2] / points[:, 2:] * RIG.fx)
 
 
-def test_level_cameras_see_no_lean() -> None:
-    points = np.random.default_rng(0).uniform([-2, -2, 1], [2, 2, 5], (20, 3))
-    for yaw in (-170.0, 0.0, 40.0):
-        assert np.array_equal(lean(RIG, turned((yaw, 0.0, 0.0)), points), np.zeros(20))
-
-
 @pytest.mark.parametrize("angles", [(0, 0, 25), (30, 0, 25), (20, -15, -40), (-60, 30, 10)])
 def test_lean_is_how_a_short_upright_line_is_turned(angles: tuple[float, float, float]) -> None:
     wTc = turned(angles)
@@ -412,7 +371,7 @@ def test_lean_is_how_a_short_upright_line_is_turned(angles: tuple[float, float, 
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("roll_deg", [-45.0, -25.0, 25.0, 45.0])
+@pytest.mark.parametrize("roll_deg", [-25.0, 45.0])
 def test_a_rolled_view_keeps_its_features_within_the_gate(
     shared_data: Path, roll_deg: float
 ) -> None:

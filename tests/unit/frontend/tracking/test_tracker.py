@@ -208,16 +208,6 @@ def test_a_camera_at_rest_starts_each_track_once() -> None:
     assert len(scene.map) == count
 
 
-def test_a_hit_in_between_saves_a_landmark() -> None:
-    scene = Scene()
-    scene.step(np.eye(4))
-    for k in range(8):
-        scene.step(np.eye(4), np.array([3, 7, 20]) if k % 3 else None)
-        assert len(scene.map) == len(scene.tracker.database)
-    rows = scene.tracker.database.rows(scene.ids_at(np.array([3, 7, 20])))
-    assert (scene.tracker.database.missed[rows] <= 2).all()
-
-
 def test_landmarks_out_of_view_are_left_alone() -> None:
     """Type I: bit-identical, however long nobody looks."""
     scene = Scene()
@@ -266,14 +256,6 @@ def test_a_poor_prediction_is_corrected() -> None:
 
 
 FAR_OFF = g.se3_exp(np.array([0.0, 0.03, 0.0, 0.0, 0.0, 0.0]))  # about 8 px, beyond the window
-
-
-def test_beyond_the_window_all_is_lost() -> None:
-    scene = Scene()
-    scene.step(np.eye(4))
-    tracked, _ = scene.step(np.eye(4), predicted=FAR_OFF)
-    assert tracked.ego_motion.status is EgoMotionStatus.TOO_FEW_MATCHES
-    np.testing.assert_allclose(tracked.ego_motion.wTc, FAR_OFF, atol=1e-12)
 
 
 @pytest.mark.parametrize("how", ["rescue", "widen"])
@@ -344,12 +326,6 @@ def test_nothing_seen_is_a_miss_for_all_in_view() -> None:
     expected = tracked.expected
     np.testing.assert_array_equal(association.missed_ids, expected.ids[expected.certain])
     assert len(association.missed_ids) > 40
-
-
-def test_no_image_is_no_miss() -> None:
-    nothing = Association.nothing()
-    assert len(nothing.observations) == len(nothing.rejected) == 0
-    assert len(nothing.missed_ids) == len(nothing.pruned_ids) == 0
 
 
 # ------------------------------------------------------------------------------------------
@@ -460,16 +436,6 @@ def test_the_four_branches(branch: str) -> None:
     np.testing.assert_allclose(after.direction[0], before.direction[0], atol=1e-6)
 
 
-def test_without_viewpoints_a_failure_from_elsewhere_is_a_miss() -> None:
-    things = Things(cloud(), settings())
-    things.step(from_angle(HERE))
-    landmark = things.id_of(7)
-    things.step(from_angle(24.0), np.array([7]))
-    assert things.entry(landmark) == {
-        "hits": 1, "misses": 1, "missed": 1, "contradicted": 0, "permanent": 0, "views": 1,
-    }  # fmt: skip
-
-
 class Pillar:
     """Points on a pillar, each seen from before it only: within 60 degrees of its normal."""
 
@@ -529,14 +495,6 @@ def settled(permanence: PermanenceSettings | None) -> Things:
     return things
 
 
-def test_a_blocked_camera_empties_the_map_of_what_it_should_see() -> None:
-    things = settled(None)
-    assert len(things.map) > 30
-    for _ in range(30):
-        things.step(from_angle(HERE), NOTHING)
-    assert len(things.map) < 3  # at most what lies at the images' edge
-
-
 @pytest.mark.parametrize("blind_below", [0.0, 0.05])
 def test_a_blocked_camera_takes_nothing_from_a_lasting_map(blind_below: float) -> None:
     """By the flag alone, and by knowing a blocked view."""
@@ -553,16 +511,6 @@ def test_a_blocked_camera_takes_nothing_from_a_lasting_map(blind_below: float) -
     association = things.step(from_angle(HERE))
     assert not association.observations.is_new.any()
     np.testing.assert_array_equal(association.observations.ids, ids)
-
-
-def test_landmarks_not_yet_permanent_survive_a_blocked_view() -> None:
-    things = Things(cloud(), settings(permanence=dataclasses.replace(LASTING, blind_below=0.05)))
-    things.step(from_angle(HERE))
-    ids = things.map.ids.copy()
-    for _ in range(30):
-        things.step(from_angle(HERE), NOTHING)
-    assert not things.database.permanent.any()
-    np.testing.assert_array_equal(things.map.ids, ids)
 
 
 def beside_a_wall(permanence: PermanenceSettings) -> Things:
@@ -661,15 +609,6 @@ def test_a_frame_is_found_whatever_was_predicted(scene: Scene, predicted: FloatA
     assert found.status is EgoMotionStatus.RELOCALISED
     assert found.inliers.sum() > 30
     np.testing.assert_allclose(g.se3_log(g.inverse(TURNED) @ found.wTc), 0.0, atol=4e-3)
-
-
-def test_the_same_frame_gives_the_same_bits(scene: Scene) -> None:
-    stereo = scene.stereo.match(scene.world.features(TURNED, sigma_px=0.1))
-    wrong = Prediction(ABSURD, CERTAIN)
-    first, again = (scene.tracker.track(wrong, scene.map, stereo).ego_motion for _ in range(2))
-    assert first.status is EgoMotionStatus.RELOCALISED
-    np.testing.assert_array_equal(first.wTc, again.wTc)
-    np.testing.assert_array_equal(first.covariance, again.covariance)
 
 
 def test_nobody_looks_for_a_frame_that_was_foreseen(
