@@ -549,26 +549,13 @@ def _scaled(radius: FloatArray, inner: float, outer: float) -> FloatArray:
     return (2.0 * np.asarray(radius, dtype=np.float64) - (inner + outer)) / (outer - inner)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RadialFit:
-    """A fitted camera and the residuals (n,) of its samples: measured minus fitted, radians."""
-
-    camera: RadialPolynomial
-    residuals: FloatArray
-
-    @property
-    def worst(self) -> float:
-        """Largest residual, radians."""
-        return float(np.abs(self.residuals).max())
-
-
 def fit_radial_polynomial(
     frame: MirrorFrame,
     radii: tuple[float, float],
     samples: tuple[FloatArray, FloatArray],
     degree: int = PAPER_DEGREE,
-) -> RadialFit:
-    """Least squares of elevation over radius.
+) -> tuple[RadialPolynomial, float]:
+    """Least squares of elevation over radius: the camera, and the largest residual in radians.
 
     Args:
         frame: where the mirror lies in the picture.
@@ -592,7 +579,8 @@ def fit_radial_polynomial(
     x = _scaled(radius, *radii)
     coefficients = polynomial.polyfit(x, elevation, degree)
     camera = RadialPolynomial(frame, *radii, coefficients=tuple(coefficients.tolist()))
-    return RadialFit(camera, elevation - polynomial.polyval(x, coefficients))
+    residuals = elevation - polynomial.polyval(x, coefficients)
+    return camera, float(np.abs(residuals).max())
 
 
 # --------------------------------------------------------------------------------------------

@@ -309,7 +309,7 @@ def _bloggie(path: Path, size: Size | None) -> RadialPolynomial:
     fraction = np.clip(np.polynomial.polynomial.polyval(down, np.array(_LEVIN)), 0.0, 1.0)
     elevation = np.radians(_BLOGGIE_VIEW_DEG) * (_ABOVE_HORIZON - down)
     samples = (inner + fraction * (outer - inner), elevation)
-    return fit_radial_polynomial(frame, (inner, outer), samples).camera
+    return fit_radial_polynomial(frame, (inner, outer), samples)[0]
 
 
 def _bloggie_values(path: Path) -> dict[str, float]:

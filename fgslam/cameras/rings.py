@@ -14,8 +14,7 @@ import numpy.typing as npt
 from fgslam.cameras.omni import (
     PAPER_DEGREE,
     MirrorFrame,
-    RadialCamera,
-    RadialFit,
+    RadialPolynomial,
     fit_radial_polynomial,
 )
 from fgslam.core.arrays import FloatArray, Image
@@ -43,13 +42,11 @@ class MirrorCircle:
         centre: column and row, pixels.
         radius: pixels.
         support: part of the directions around the centre in which its edge was found.
-        spread: root mean square distance of those edges from the circle, pixels.
     """
 
     centre: tuple[float, float]
     radius: float
     support: float
-    spread: float
 
 
 def find_mirror_circle(
@@ -83,24 +80,6 @@ def find_mirror_circle(
             f"on at least {_MIN_SUPPORT:.0%} of its circumference"
         )
     return circle
-
-
-def mirror_offset(
-    camera: RadialCamera, image: Image, rng: np.random.Generator
-) -> tuple[float, MirrorCircle]:
-    """How far the mirror lies from where the camera has it, in pixels, and the circle found.
-
-    Raises:
-        CalibrationError: the picture has another size, or shows no circle near the calibrated one.
-    """
-    if image.shape[:2] != (camera.height, camera.width):
-        raise CalibrationError(
-            f"the picture has {image.shape[1]}x{image.shape[0]} pixels, the camera is calibrated "
-            f"for {camera.width}x{camera.height}; give the calibration at this size"
-        )
-    circle = find_mirror_circle(image, rng, (camera.frame.centre, camera.outer_radius))
-    away = np.subtract(circle.centre, camera.frame.centre)
-    return float(np.hypot(*away)), circle
 
 
 def _grey(image: Image) -> Float32:
@@ -213,7 +192,7 @@ def _circles(triples: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _refined(grey: Float32, circle: tuple[FloatArray, float]) -> MirrorCircle:
     """Edges found again from the circle's own centre, and a least-squares circle through them."""
     centre, radius = circle
-    edges, residuals = np.empty((0, 2)), np.empty(0)
+    found = 0
     for step in range(_REFINEMENTS):
         width = max(2.0 * _CIRCLE_TOLERANCE * radius / (1 + step), 3.0)
         limits = (max(radius - width - 2.0, 1.0), radius + width + 2.0)
@@ -221,14 +200,12 @@ def _refined(grey: Float32, circle: tuple[FloatArray, float]) -> MirrorCircle:
         edges = _falling_edges(grey, around, limits, outermost=False)
         if len(edges) < 3:
             break
-        centre, radius, residuals = _fit_circle(edges)
-    support = len(residuals) / _DIRECTIONS
-    spread = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else np.inf
-    return MirrorCircle((float(centre[0]), float(centre[1])), radius, support, spread)
+        centre, radius, found = _fit_circle(edges)
+    return MirrorCircle((float(centre[0]), float(centre[1])), radius, found / _DIRECTIONS)
 
 
-def _fit_circle(points: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Centre, radius and residuals of those points (n, 2) that agree: least squares, trimmed."""
+def _fit_circle(points: FloatArray) -> tuple[FloatArray, float, int]:
+    """Centre, radius, and how many points (n, 2) agree: least squares, trimmed."""
     kept = points
     for _ in range(_REFINEMENTS):
         # x^2 + y^2 = 2 a x + 2 b y + c, linear in a, b, c.
@@ -240,7 +217,7 @@ def _fit_circle(points: FloatArray) -> tuple[FloatArray, float, FloatArray]:
         kept = points[np.abs(away) <= limit]
         if len(kept) < 3:
             break
-    return np.array([a, b]), radius, away[np.abs(away) <= limit]
+    return np.array([a, b]), radius, len(kept)
 
 
 # --------------------------------------------------------------------------------------------
@@ -252,15 +229,15 @@ class RingCalibration:
     """The camera that a picture of rings at known elevations gives.
 
     Attributes:
-        fit: the polynomial camera; its residuals are one a ring.
+        camera: the polynomial camera.
+        worst: largest residual of a ring, radians.
         radii: (n,) of the rings, pixels, as their elevations were given.
-        spreads: (n,) scatter of the radius over the directions, pixels.
         directions: part of the directions in which all rings were found.
     """
 
-    fit: RadialFit
+    camera: RadialPolynomial
+    worst: float
     radii: FloatArray
-    spreads: FloatArray
     directions: float
 
 
@@ -301,9 +278,10 @@ def calibrate_from_rings(
             "rings; check the number of elevations, the centre and the radii"
         )
     ring_radii = np.median(each, axis=0)
-    spreads = 1.4826 * np.median(np.abs(each - ring_radii), axis=0)
-    fit = fit_radial_polynomial(frame, radii, (ring_radii, np.asarray(elevations)), degree)
-    return RingCalibration(fit, ring_radii, spreads, directions)
+    camera, worst = fit_radial_polynomial(
+        frame, radii, (ring_radii, np.asarray(elevations)), degree
+    )
+    return RingCalibration(camera, worst, ring_radii, directions)
 
 
 def _rings_in_each_direction(

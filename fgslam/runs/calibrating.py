@@ -433,7 +433,7 @@ def calibrate_mirror(
         "size": [frame.width, frame.height],
         "centre": [float(number) for number in frame.centre],
         "ring_px": [float(number) for number in radii],
-        "coefficients_deg": np.degrees(found.fit.camera.coefficients).tolist(),
+        "coefficients_deg": np.degrees(found.camera.coefficients).tolist(),
     }
     write_text(out, yaml.safe_dump(settings, sort_keys=False))
     rings = ", ".join(f"{radius:.1f}" for radius in found.radii)
@@ -441,7 +441,7 @@ def calibrate_mirror(
         f"mirror      centre {circle.centre[0]:.1f} {circle.centre[1]:.1f} px, radius "
         f"{circle.radius:.1f} px, its edge found in {circle.support:.0%} of the directions",
         f"rings       radii {rings} px, found in {found.directions:.0%} of the directions",
-        f"fit         worst ring off by {np.degrees(found.fit.worst):.2f} deg",
+        f"fit         worst ring off by {np.degrees(found.worst):.2f} deg",
         f"calibration {out}",
     ]
 

@@ -10,7 +10,7 @@ import pytest
 from edge_straightness import upright_edges
 
 from fgslam.cameras.omni import Cylinder, Equirectangular, LensCamera, RadialCamera, unwrap_maps
-from fgslam.cameras.rings import find_mirror_circle, mirror_offset
+from fgslam.cameras.rings import find_mirror_circle
 from fgslam.cameras.settings import OCamCalibSettings
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.datasets.images import read_colour_image
@@ -62,13 +62,14 @@ def test_the_mirror_video(shared_data: Path) -> None:
     assert recording.timestamps[390] == pytest.approx(390 / 29.97, abs=1e-3)
     camera = recording.camera
     assert isinstance(camera, RadialCamera)
-    away, circle = mirror_offset(camera, recording.image(0), np.random.default_rng(0))
-    assert away < 1.5
+    near, rng = (camera.frame.centre, camera.outer_radius), np.random.default_rng(0)
+    circle = find_mirror_circle(recording.image(0), rng, near)
+    assert np.hypot(*np.subtract(circle.centre, near[0])) < 1.5
     assert circle.radius == pytest.approx(camera.outer_radius, abs=1.5)
     assert circle.support > 0.7
     # Thirteen seconds later the loose accessory has not moved in the picture.
-    later, _ = mirror_offset(camera, recording.image(390), np.random.default_rng(0))
-    assert later < 1.5
+    later = find_mirror_circle(recording.image(390), rng, near)
+    assert np.hypot(*np.subtract(later.centre, near[0])) < 1.5
 
 
 def ocamcalib(shared_data: Path) -> OmniRecording:
