@@ -30,9 +30,9 @@ from fgslam.cameras.settings import (
     EquirectangularSettings,
     HyperbolicMirrorSettings,
     LensSettings,
-    MirrorMountSettings,
     OCamCalibSettings,
     OmniCameraKind,
+    PlacedMirrorSettings,
     RadialPolynomialSettings,
 )
 from fgslam.cameras.trees import flat_numbers, read_tree
@@ -127,7 +127,7 @@ def make_camera(
             return LensCamera.of(raw, settings.ring_px, up, ahead, settings.clockwise)
         case RadialPolynomialSettings():
             size = _stated_size(settings.kind, settings.size, image_size)
-            frame = _frame(settings, size, settings.centre)
+            frame = _frame(settings, size)
             coefficients = tuple(np.deg2rad(settings.coefficients_deg).tolist())
             return RadialPolynomial(frame, *settings.ring_px, coefficients=coefficients)
         case BloggieSettings():
@@ -181,15 +181,13 @@ def _settings_of(source: object, where: str = "camera") -> OmniCameraKind:
 _KINDS: dict[str, type[OmniCameraKind]] = {kind.kind: kind for kind in get_args(OmniCameraKind)}
 
 
-def _frame(
-    mount: MirrorMountSettings, size: Size, centre: tuple[float, float] | None
-) -> MirrorFrame:
-    middle = ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
-    return MirrorFrame(*size, centre or middle, math.radians(mount.ahead_deg), mount.clockwise)
+def _frame(mirror: PlacedMirrorSettings, size: Size) -> MirrorFrame:
+    centre = mirror.centre or ((size[0] - 1) / 2.0, (size[1] - 1) / 2.0)
+    return MirrorFrame(*size, centre, math.radians(mirror.ahead_deg), mirror.clockwise)
 
 
 def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMirror:
-    frame = _frame(settings, size, settings.centre)
+    frame = _frame(settings, size)
     lowest = math.radians(settings.inner_elevation_deg)
     highest = math.radians(settings.outer_elevation_deg)
     if not lowest < highest or not math.sin(highest) < settings.xi:
@@ -201,13 +199,10 @@ def _hyperbolic(settings: HyperbolicMirrorSettings, size: Size) -> HyperbolicMir
     scales = {a: math.cos(a) / (settings.xi - math.sin(a)) for a in (lowest, highest)}
     column, row = frame.centre
     border = min(column, row, size[0] - 1 - column, size[1] - 1 - row)
-    outer, focal = settings.outer_radius_px, settings.focal_px
-    if outer is None:
-        outer = border if focal is None else focal * scales[highest]
-    focal = focal or outer / scales[highest]
-    inner = settings.inner_radius_px
-    inner = focal * scales[lowest] if inner is None else inner
-    return HyperbolicMirror(frame, inner, outer, xi=settings.xi, focal_px=focal)
+    focal = settings.focal_px or (settings.ring_px or (0.0, border))[1] / scales[highest]
+    outer = border if settings.focal_px is None else focal * scales[highest]
+    ring = settings.ring_px or (focal * scales[lowest], outer)
+    return HyperbolicMirror(frame, *ring, xi=settings.xi, focal_px=focal)
 
 
 def _ocamcalib(path: Path, size: Size | None) -> tuple[RawCamera, tuple[float, float] | None]:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, NonNegative, Positive
+from fgslam.core.settings import STRICT, Positive
 
 Pair: TypeAlias = tuple[float, float]
 Size: TypeAlias = tuple[Annotated[int, Field(ge=2)], Annotated[int, Field(ge=2)]]
@@ -58,19 +58,30 @@ class MirrorMountSettings:
         default=True,
         description="bearings grow clockwise, as in an upward-looking camera's raw picture",
     )
+    ring_px: Pair | None = Field(
+        default=None,
+        description="inner and outer radius of what shows the surroundings; null: as the file "
+        "states, or by the elevations at the rims, else the largest circle in the picture",
+    )
 
 
 @dataclass(frozen=True, config=STRICT)
-class HyperbolicMirrorSettings(MirrorMountSettings):
-    """A hyperbolic mirror as a unified sphere."""
+class PlacedMirrorSettings(MirrorMountSettings):
+    """A mirror whose place in the picture no file states."""
 
-    kind: Literal["mirror"] = "mirror"
     size: Size | None = Field(
         default=None, description="width, height calibrated, pixels; null: any picture's"
     )
     centre: Pair | None = Field(
         default=None, description="column, row of the mirror's axis; null: the middle"
     )
+
+
+@dataclass(frozen=True, config=STRICT)
+class HyperbolicMirrorSettings(PlacedMirrorSettings):
+    """A hyperbolic mirror as a unified sphere."""
+
+    kind: Literal["mirror"] = "mirror"
     xi: float = Field(
         default=0.92, gt=0.0, le=1.0, description="2 e / (1 + e^2), e the mirror's eccentricity"
     )
@@ -78,20 +89,14 @@ class HyperbolicMirrorSettings(MirrorMountSettings):
         default=None,
         description="of the unified model: the horizon's radius times xi; null: by the outer rim",
     )
-    inner_radius_px: NonNegative | None = Field(
-        default=None, description="nothing is seen inside; null: where its elevation is"
-    )
-    outer_radius_px: Positive | None = Field(
-        default=None, description="nothing is seen outside; null: by its elevation"
-    )
     inner_elevation_deg: float = Field(
-        default=-65.0,
-        ge=-90.0,
-        lt=90.0,
-        description="at the inner rim, used where stated above",
+        default=-65.0, ge=-90.0, lt=90.0, description="at the inner rim, where ring_px is null"
     )
     outer_elevation_deg: float = Field(
-        default=25.0, gt=-90.0, lt=90.0, description="at the outer rim, used where stated above"
+        default=25.0,
+        gt=-90.0,
+        lt=90.0,
+        description="at the outer rim, where ring_px or focal_px is null",
     )
 
 
@@ -104,9 +109,6 @@ class OCamCalibSettings(MirrorMountSettings):
         default="calib_results.txt",
         min_length=1,
         description="calib_results.txt, looked for next to the pictures, then from here",
-    )
-    ring_px: Pair | None = Field(
-        default=None, description="inner and outer radius; null: as the file states"
     )
 
 
@@ -125,22 +127,13 @@ class LensSettings(MirrorMountSettings):
         description="where the picture's middle points: down as of a mirror above the camera, "
         "up as of a fisheye that points up",
     )
-    ring_px: Pair | None = Field(
-        default=None, description="inner and outer radius; null: the largest circle in the picture"
-    )
 
 
 @dataclass(frozen=True, config=STRICT)
-class RadialPolynomialSettings(MirrorMountSettings):
+class RadialPolynomialSettings(PlacedMirrorSettings):
     """The paper's polynomial of elevation over radius, or a line between two elevations."""
 
     kind: Literal["radial_polynomial"] = "radial_polynomial"
-    size: Size | None = Field(
-        default=None, description="width, height calibrated, pixels; null: any picture's"
-    )
-    centre: Pair | None = Field(
-        default=None, description="column, row of the mirror's axis; null: the middle"
-    )
     ring_px: Pair = Field(default=(20.0, 119.0), description="inner and outer radius, pixels")
     coefficients_deg: tuple[float, ...] = Field(
         default=(-20.0, 45.0),

@@ -57,7 +57,7 @@ def test_the_wide_baseline_pair_is_matched_with_both_kinds(shared_data: Path) ->
     ]
     centre = np.mean([circle.centre for circle in circles], axis=0)
     settings = HyperbolicMirrorSettings(
-        centre=(float(centre[0]), float(centre[1])), outer_radius_px=690.0
+        centre=(float(centre[0]), float(centre[1])), ring_px=(87.65, 690.0)
     )
     extractor = OmniFeatureExtractor(make_camera(settings, (1400, 1400)), OmniFeatureSettings())
     matches = match_features(*map(extractor.extract, images), OmniMatchingSettings())

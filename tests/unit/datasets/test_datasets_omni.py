@@ -297,9 +297,10 @@ def test_cameras_by_kind(tmp_path: Path) -> None:
     assert isinstance(default, HyperbolicMirror)
     assert default.focal_px == pytest.approx(expected.focal_px)
     assert default.inner_radius == pytest.approx(expected.inner_radius)
+    rim = float(60.0 * np.cos(np.radians(25)) / (0.92 - np.sin(np.radians(25))))
     given = make_camera(
         HyperbolicMirrorSettings(
-            centre=(150.0, 110.0), focal_px=60.0, inner_radius_px=0.0, ahead_deg=0.0
+            centre=(150.0, 110.0), focal_px=60.0, ring_px=(0.0, rim), ahead_deg=0.0
         ),
         (320, 240),
     )

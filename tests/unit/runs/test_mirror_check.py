@@ -48,9 +48,7 @@ def notes(
     folder: Path, image: Image, centre: tuple[float, float], equirectangular: bool = False
 ) -> tuple[str, ...]:
     assert cv2.imwrite(str(folder / "m1.png"), image)
-    mirror = HyperbolicMirrorSettings(
-        centre=centre, focal_px=60.0, inner_radius_px=15.0, outer_radius_px=RADIUS
-    )
+    mirror = HyperbolicMirrorSettings(centre=centre, focal_px=60.0, ring_px=(15.0, RADIUS))
     camera = EquirectangularSettings() if equirectangular else mirror
     return open_checked(OmniPathSettings(path=str(folder), camera=camera)).notes
 
