@@ -66,7 +66,7 @@ def open_image_folder(
     """
     root = Path(settings.path)
     require_folder(root, "the recording")
-    cameras = _numbered_images(root, settings.use_top)
+    cameras = _numbered_images(root)
     calibration = root / "calib.json"
     if settings.camera_file is not None:
         calibration = Path(settings.camera_file)
@@ -89,7 +89,7 @@ def open_image_folder(
     notes = [
         f"{n} images of {k}/ are not in times.txt and unused" for k, n in unlisted.items() if n
     ]
-    without_top = settings.camera_file is None and settings.use_top and len(cameras) == 2
+    without_top = settings.camera_file is None and len(cameras) == 2
     if without_top and "vertical_baseline_m" in read_json_object(calibration):
         notes.append(
             "calib.json states a vertical baseline but there is no top/: read as two cameras"
@@ -116,7 +116,7 @@ def open_image_folder(
     )
 
 
-def _numbered_images(root: Path, use_top: bool) -> dict[Path, dict[int, Path]]:
+def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:
     """Images by number of the cameras' folders, right first. Raises DatasetError without any."""
     folders = [root / "right", root / "left"]
     absent = [folder.name for folder in folders if not folder.is_dir()]
@@ -126,7 +126,7 @@ def _numbered_images(root: Path, use_top: bool) -> dict[Path, dict[int, Path]]:
             "cannot be used, a stereo pair (left/ and right/) is the least; check dataset.path, "
             "and dataset.kind where it has another layout"
         )
-    if use_top and (root / "top").is_dir():
+    if (root / "top").is_dir():
         folders.append(root / "top")
     cameras = {folder: list_numbered_images(folder) for folder in folders}
     for folder, images in cameras.items():
@@ -155,7 +155,7 @@ def _folder_rig(
     if three and rig.vertical_baseline is None and not outer_two:
         raise CalibrationError(
             f"{calibration} knows two cameras, but {root} has a third one, top/; give a "
-            "calibration of all three, or leave it out: --set dataset.use_top=false"
+            "calibration of all three, or move top/ elsewhere"
         )
     return mounted(rig if three else replace(rig, vertical_baseline=None), settings)
 

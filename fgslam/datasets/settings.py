@@ -83,7 +83,6 @@ class ImageFolderSettings(CalibratedSettings):
     """Our own layout, left/ right/ [top/] calib.json times.txt: docs/datasets/images.md."""
 
     kind: Literal["image_folder"] = "image_folder"
-    use_top: bool = Field(default=True, description="use the third camera where the folder has one")
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)

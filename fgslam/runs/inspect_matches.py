@@ -76,9 +76,9 @@ TOP_RIGHT = Pair(
     "top and right",
     "columns",
     "the top camera seems swapped with the right one, or lies below it",
-    "swap their images; a camera below cannot be used, so leave it out with dataset.use_top",
+    "swap their images; a camera below cannot be used, so move its images elsewhere",
     "the top camera seems to lie next to the right one, not above it; give as top a camera above "
-    "the right one, or leave it out with dataset.use_top",
+    "the right one, or move its images elsewhere",
 )
 
 

@@ -146,7 +146,8 @@ def test_number_of_frames_is_respected(tmp_path: Path) -> None:
 
 def test_overrides_select_frames_and_cameras(tmp_path: Path) -> None:
     root = write(tmp_path, TRIPLE)
-    report = inspected(root, "dataset.stop=4", "dataset.use_top=false")
+    (root / "top").rename(root / "third")
+    report = inspected(root, "dataset.stop=4")
     assert "frames 4 over 1.5 s" in report
     assert "cameras 2, 240x180" in report
     assert "three-camera" not in report
@@ -221,7 +222,7 @@ def test_cameras_in_other_places_are_reported(
 ) -> None:
     report = inspected(write(tmp_path, {"right": (0.0, 0.0), **cameras}))
     assert f"PROBLEM epipolar{words}" in report
-    assert "swapped" not in words or "dataset.use_top" in report
+    assert "swapped" not in words or "move its images elsewhere" in report
 
 
 def test_wrong_vertical_baseline_is_reported(tmp_path: Path) -> None:

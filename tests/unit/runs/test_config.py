@@ -60,7 +60,7 @@ def message_of(values: object, tmp_path: Path, *overrides: str) -> str:
     ("base", "typo", "meant"),
     [
         (MINIMAL, "front_end", "frontend"),
-        (MINIMAL, "dataset.use_tops", "use_top"),
+        (MINIMAL, "dataset.resize", "resized"),
         (MINIMAL, "frontend.sift.max_feature", "max_features"),
         (MINIMAL, "odometry.time_offset", "time_offset_s"),
         (LAB, "dataset.rig.baseline", "baseline_m"),
@@ -193,7 +193,7 @@ def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
         "frontend.sift.max_features=4",
         "dataset.lever_arm_m=[1, -2.5, 1e-1]",
         "dataset.stop=null",
-        "dataset.use_top=false",
+        "dataset.resized=true",
         "output.checkpoint_seconds=0",
         "dataset.path=a folder/with=sign",
         "frontend.matching={refine: true}",
@@ -203,7 +203,7 @@ def test_overrides_reach_any_depth_and_are_yaml(tmp_path: Path) -> None:
     assert isinstance(config.dataset, ImageFolderSettings)
     assert config.dataset.lever_arm_m == (1.0, -2.5, 0.1)
     assert config.dataset.stop is None
-    assert config.dataset.use_top is False
+    assert config.dataset.resized is True
     assert config.dataset.path == "a folder/with=sign"
     assert config.output.checkpoint_seconds == 0.0
     assert config.frontend.matching.refine is True
