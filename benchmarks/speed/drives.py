@@ -22,7 +22,8 @@ from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.runs.config import load_config
 from fgslam.slam.build import make_estimator
-from fgslam.slam.replay import replay_frame, replay_motion
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.replay import replay_frame
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Player:
         self._log = drive.log
         self._clocked = Clocked(make_estimator(drive.log.rig, settings, drive.ego_motion))
         self._solver = EgoMotionSolver(drive.log.rig, drive.ego_motion)
-        self._motion = replay_motion(drive.log)
+        self._motion = ConstantVelocityMotion()
         self._online: list[FloatArray] = []
 
     def on_to(self, stop: int) -> None:

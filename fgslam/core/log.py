@@ -35,8 +35,8 @@ class MeasurementLog(Brief):
 
     Attributes:
         rig: the cameras, with the lever arm.
-        motion_model: how odometry came about, and the stand-in's numbers where there was none
-            (plain JSON values): replays need it to predict as the live run did.
+        motion_model: how odometry came about, plain JSON values; where there was none, replays
+            predict by constant velocity as the live run did.
         increments: one a frame, time increasing.
     """
 

@@ -138,12 +138,12 @@ def make_log(
             "odometry.kind synthetic needs a recording of images; measurements bring their own "
             "odometry: choose recorded or constant_velocity"
         )
-    motion = asdict(odometry if isinstance(odometry, ConstantVelocitySettings) else odometry.gap)
+    motion = "constant_velocity"
     if isinstance(odometry, ConstantVelocitySettings):
         increments = [replace(increment, odometry=None) for increment in increments]
     elif any(increment.odometry is not None for increment in increments):
-        motion = {"kind": "recorded", "stand_in": motion}
-    log = MeasurementLog(sensor, motion)
+        motion = "recorded"
+    log = MeasurementLog(sensor, {"kind": motion})
     for increment in increments:
         log.append(increment)
     return log

@@ -23,7 +23,6 @@ from fgslam.worlds.settings import SimulatedBearingsSettings as SimulatedBearing
 from fgslam.worlds.settings import SimulatedMeasurementsSettings as SimulatedMeasurementsSettings
 
 Vector3: TypeAlias = tuple[float, float, float]
-PositiveVector3: TypeAlias = tuple[Positive, Positive, Positive]
 FramesASecond: TypeAlias = Annotated[float, Field(gt=0.0, le=1e4)]
 
 # --------------------------------------------------------------------------------------------
@@ -257,28 +256,10 @@ OmniDatasetSettings: TypeAlias = Annotated[
 class ConstantVelocitySettings:
     """No odometry: the camera is expected to keep its velocity, up to a random acceleration.
 
-    Over a step of ``dt`` seconds the prediction's standard deviation is ``sigma * dt**2``, more
-    while the camera is blind: ``sigma * T * dt``, T since the velocity was last measured. How large
-    the acceleration is, is estimated from the frames so far (docs/derivations/motion.md);
-    the first frames are tracked with the values below. They are those of a flying or hand-held
-    camera, wide for any other (cars of KITTI: 12, 6, 8 degrees/s^2 and 0.35, 0.43, 2.3 m/s^2).
+    How large the acceleration is, is estimated from the frames so far (docs/derivations/motion.md).
     """
 
     kind: Literal["constant_velocity"] = "constant_velocity"
-    rotation_sigma_dps2: PositiveVector3 = Field(
-        default=(100.0, 100.0, 100.0),
-        description="at first, about the camera's axes x, y, z, degrees/s^2",
-    )
-    translation_sigma_mps2: PositiveVector3 = Field(
-        default=(3.0, 3.0, 3.0), description="at first, along the camera's axes x, y, z, m/s^2"
-    )
-    start_speed_sigma_mps: Positive = Field(
-        default=15.0, description="speed per axis before the first motion is known, m/s"
-    )
-    start_rotation_sigma_dps: Positive = Field(
-        default=20.0, description="turn per axis before the first motion is known, deg/s"
-    )
-    adapt: bool = Field(default=True, description="estimate the acceleration from the frames")
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -291,9 +272,6 @@ class RecordedOdometrySettings:
     """
 
     kind: Literal["recorded"] = "recorded"
-    gap: ConstantVelocitySettings = Field(
-        default=ConstantVelocitySettings(), description="what stands in over steps without odometry"
-    )
     time_offset_s: float = Field(
         default=0.0, ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds"
     )

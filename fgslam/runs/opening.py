@@ -54,8 +54,8 @@ def _require_own_noise(odometry: OdometrySettings) -> None:
         )
     if not isinstance(odometry, RecordedOdometrySettings):
         return
-    if odometry != RecordedOdometrySettings(gap=odometry.gap):
+    if odometry != RecordedOdometrySettings():
         raise ConfigError(
-            "keys of `odometry` other than kind and gap mean nothing to the rendered lab; set the "
+            "keys of `odometry` other than kind mean nothing to the rendered lab; set the "
             "noise of its wheels under dataset.odometry"
         )

@@ -243,12 +243,10 @@ def make_stereo_matcher(rig: CameraRig, settings: FrontendSettings) -> StereoMat
 def make_motion(rig: CameraRig, settings: OdometrySettings | MotionModel) -> MotionModel:
     """Motion model by the settings; one that is given is taken as it is."""
     if isinstance(settings, ConstantVelocitySettings):
-        return ConstantVelocityMotion(settings)
+        return ConstantVelocityMotion()
     if not isinstance(settings, RecordedOdometrySettings | SyntheticOdometrySettings):
         return settings
-    gap = settings.gap if isinstance(settings, RecordedOdometrySettings) else None
-    stand_in = ConstantVelocityMotion(gap or ConstantVelocitySettings())
-    return OdometryMotion(rig.bTc, settings.kind, stand_in)
+    return OdometryMotion(rig.bTc, settings.kind, ConstantVelocityMotion())
 
 
 def make_places(

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.backend.settings import EstimatorSettings
 from fgslam.core.arrays import Brief, FloatArray
-from fgslam.core.errors import ConfigError, MeasurementLogError
+from fgslam.core.errors import ConfigError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Increment, MeasurementType, Observations
 from fgslam.core.stopwatch import Stopwatch
@@ -36,7 +36,6 @@ from fgslam.core.types import (
     Trajectory,
     UpdateStats,
 )
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection, unmeasured
 from fgslam.frontend.tracking.landmarks import MapParts
@@ -141,7 +140,7 @@ def replay(
     except ESTIMATOR_FAULTS as error:
         return run.result(None, before_mb, f"could not start: {reason(error)}")
     solver = EgoMotionSolver(log.rig, ego_motion)
-    motion = replay_motion(log)
+    motion = ConstantVelocityMotion()
     for k, increment in enumerate(log):
         try:
             frame = replay_frame(increment, estimator, solver, motion, k)
@@ -211,21 +210,6 @@ def _relocated(
     if found.status.measured:
         return found
     return _solve(estimator, partial(ego_motion.solve, prediction), matched)
-
-
-def replay_motion(log: MeasurementLog) -> ConstantVelocityMotion:
-    """What predicted the motion in the live run where no odometry was measured.
-
-    Raises:
-        MeasurementLogError: the log's header names none.
-    """
-    values = log.motion_model.get("stand_in", log.motion_model)
-    try:
-        return ConstantVelocityMotion(ConstantVelocitySettings(**values))
-    except (TypeError, ValueError):
-        raise MeasurementLogError(
-            f"the log's motion model {log.motion_model} is not known to this fgslam; repeat the run"
-        ) from None
 
 
 def memory_mb(name: str) -> float | None:

@@ -20,7 +20,6 @@ from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 from fgslam.core.sensors import CameraRig, Increment, Observations, Odometry
 from fgslam.core.store import pack
 from fgslam.core.types import EgoMotion, EgoMotionStatus, Prediction, UpdateStats
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 from fgslam.slam.motion import ConstantVelocityMotion
@@ -181,7 +180,7 @@ def play(
 ) -> list[UpdateStats]:
     """Gives increments to an estimator as the replay of a log does."""
     solver = EgoMotionSolver(rig, settings or EgoMotionSettings())
-    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    motion = ConstantVelocityMotion()
     return [
         replay_frame(increment, estimator, solver, motion, increment.index // 2).stats
         for increment in increments

@@ -30,7 +30,6 @@ from fgslam.core.log import Frame
 from fgslam.core.sensors import Odometry
 from fgslam.core.store import state_of
 from fgslam.core.types import Prediction
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver
 from fgslam.slam.build import make_estimator, make_stereo, make_tracker
@@ -121,7 +120,7 @@ def live_run(
     world = FeatureWorld(
         points_in_views(dataclasses.replace(DRIVE, points=POINTS), poses, rng), rng
     )
-    stand_in = ConstantVelocityMotion(ConstantVelocitySettings())
+    stand_in = ConstantVelocityMotion()
     odometry = camera_odometry(rng)
     pipeline = SlamPipeline(
         stereo=make_stereo(RIG, frontend),
@@ -163,7 +162,7 @@ def test_a_replay_repeats_the_live_run(settings: EstimatorSettings, dof: int, re
     assert sum(r.tracking.status.measured for r in reports) >= FRAMES - len(NO_IMAGE) - 1
     replayed = at_origin(settings)
     solver = EgoMotionSolver(RIG, frontend.ego_motion)
-    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    motion = ConstantVelocityMotion()
     stats = [
         replay_frame(report.increment, replayed, solver, motion, k).stats
         for k, report in enumerate(reports)

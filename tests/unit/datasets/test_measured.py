@@ -284,7 +284,7 @@ def test_the_filter_follows_the_reference(rng: np.random.Generator) -> None:
     )
     limits = EgoMotionSettings(max_correction_m=3.0, max_correction_deg=10.0)
     solver = EgoMotionSolver(log.rig, limits)
-    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    motion = ConstantVelocityMotion()
     stats = [replay_frame(step, estimator, solver, motion, k).stats for k, step in enumerate(log)]
     error = evaluate_trajectory(estimator.estimate().trajectory, recording.ground_truth)
     assert error.ate_rmse_m is not None

@@ -161,7 +161,7 @@ def test_settings_of_odometry_refuse_nonsense() -> None:
     for values in (
         {"kind": "recorded", "speed_sigma_mps": 0.0},
         {"kind": "synthetic", "rotation_sigma_deg": -1.0},
-        {"kind": "constant_velocity", "translation_sigma_mps2": [1.0, 0.0, 1.0]},
+        {"kind": "constant_velocity", "start_speed_sigma_mps": 1.0},
         {"kind": "wheels"},
     ):
         with pytest.raises(ValidationError):

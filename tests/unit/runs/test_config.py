@@ -276,12 +276,8 @@ def test_another_kind_drops_the_keys_of_the_old_one_but_no_misspelling(tmp_path:
     base = nested(nested(MINIMAL, "odometry.kind", "recorded"), "odometry.speed_sigma_mps", 0.3)
     config = load(tmp_path, "odometry.kind=constant_velocity", base=base)
     assert isinstance(config.odometry, ConstantVelocitySettings)
-    message = message_of(
-        base, tmp_path, "odometry.kind=constant_velocity", "odometry.start_sped_sigma_mps=1"
-    )
-    assert "unknown key odometry.start_sped_sigma_mps; did you mean start_speed_sigma_mps?" in (
-        message
-    )
+    message = message_of(base, tmp_path, "odometry.kind=synthetic", "odometry.rotation_sigma_dg=1")
+    assert "unknown key odometry.rotation_sigma_dg; did you mean rotation_sigma_deg?" in message
 
 
 # --------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from fgslam.core.log import MeasurementRecording
 from fgslam.core.types import Prediction, Trajectory
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import (
-    ConstantVelocitySettings,
     MeasurementFilesSettings,
 )
 from fgslam.evaluation.statistics import evaluate_trajectory
@@ -242,7 +241,7 @@ def filtered(recording: MeasurementRecording, settings: EgoMotionSettings) -> Tr
         log.rig, LandmarkKalmanSettings(), Prediction(np.eye(4), np.zeros((6, 6)))
     )
     solver = EgoMotionSolver(log.rig, settings)
-    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    motion = ConstantVelocityMotion()
     for k, increment in enumerate(log):
         replay_frame(increment, estimator, solver, motion, k)
     return estimator.estimate().trajectory

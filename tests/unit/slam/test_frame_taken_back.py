@@ -10,7 +10,6 @@ from rings import assert_same_increments, on_ring, pipeline_of, seen
 from simulated import RIG, assert_same_bits
 
 from fgslam.core.log import MeasurementLog
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.runs.tasks.slam import restore, state_of
 from fgslam.slam.build import saved_map
 from fgslam.slam.feature_stream import FeatureFrame
@@ -19,7 +18,7 @@ from fgslam.slam.pipeline import SlamPipeline
 from fgslam.slam.results import RunRecorder
 
 POSES = [on_ring(k) for k in range(6)]
-MOTION = ConstantVelocityMotion(ConstantVelocitySettings()).description()
+MOTION = ConstantVelocityMotion().description()
 
 
 def new() -> tuple[SlamPipeline, RunRecorder]:

@@ -35,7 +35,7 @@ PIXELS = np.repeat([5e-4, 0.004], 3)  # radians and metres that matches leave of
 
 def motion_model(bTc: FloatArray | None = None) -> OdometryMotion:
     bTc = np.eye(4) if bTc is None else bTc
-    return OdometryMotion(bTc, "recorded", ConstantVelocityMotion(SETTINGS))
+    return OdometryMotion(bTc, "recorded", ConstantVelocityMotion())
 
 
 def measured(rotation: FloatArray, noise: FloatArray, bias: FloatArray) -> Odometry:
@@ -190,7 +190,7 @@ def test_a_frame_taken_back_leaves_no_step_to_learn_from() -> None:
 def turning_log(frames: int = 10) -> tuple[MeasurementLog, list[FloatArray]]:
     """A simulated drive of whose steps the turn alone was measured."""
     simulation = simulate(Drive(frames=frames), np.random.default_rng(4))
-    log = MeasurementLog(RIG, ConstantVelocityMotion(SETTINGS).description())
+    log = MeasurementLog(RIG, ConstantVelocityMotion().description())
     for increment in simulation.increments:
         step = increment.odometry
         turn = None if step is None else Odometry.turn(step.motion[:3, :3], 1e-8 * np.eye(3))

@@ -13,7 +13,6 @@ from fgslam.core.geometry import se3_exp
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import Odometry
 from fgslam.core.types import Prediction
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import MatchNoise
 from fgslam.slam.build import make_estimator
@@ -28,7 +27,7 @@ MEASURED = Odometry(np.eye(4), 1e-6 * np.eye(6))
 
 def moving() -> ConstantVelocityMotion:
     """After a step of two frames, whose noise is still that of the start."""
-    motion = ConstantVelocityMotion(ConstantVelocitySettings())
+    motion = ConstantVelocityMotion()
     for k in range(2):
         pose = Prediction(se3_exp(k * np.full(6, 0.01)), 1e-8 * np.eye(6))
         motion.observe(float(k), pose, measured=True)
@@ -36,10 +35,10 @@ def moving() -> ConstantVelocityMotion:
 
 
 def test_a_guessed_step_shows_the_acceleration_in_its_own_units() -> None:
-    motion, settings = moving(), ConstantVelocitySettings()
+    motion = moving()
     found = noise_in_use(motion, motion.between(2.0), MatchNoise(), FILTER)
-    assert found.rotation_sigma_dps2 == pytest.approx(settings.rotation_sigma_dps2[0])
-    assert found.translation_sigma_mps2 == pytest.approx(settings.translation_sigma_mps2[0])
+    assert found.rotation_sigma_dps2 == pytest.approx(100.0)
+    assert found.translation_sigma_mps2 == pytest.approx(3.0)
     assert found.match_factor == 1.0
     assert math.isnan(found.gyroscope_factor)
     assert math.isnan(found.single_factor)
@@ -61,8 +60,7 @@ def test_noise_that_a_frame_did_not_use_is_unknown() -> None:
 def replayed(settings: EstimatorSettings, noise: float) -> Replay:
     """A drive without odometry, whose measurements are ``noise`` times as bad as stated."""
     simulation = simulate(Drive(frames=40, noise=noise), np.random.default_rng(1))
-    motion = ConstantVelocityMotion(ConstantVelocitySettings()).description()
-    log = MeasurementLog(RIG, {"kind": "constant_velocity", "stand_in": motion}, [])
+    log = MeasurementLog(RIG, {"kind": "constant_velocity"}, [])
     for increment in simulation.increments:
         log.append(increment)
     return replay(log, settings, EgoMotionSettings())

@@ -13,25 +13,22 @@ from simulated import RIG, Drive, assert_same_bits, play, simulate
 
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.settings import BatchSettings, DeadReckoningSettings, LandmarkKalmanSettings
-from fgslam.core.errors import EstimatorError, MeasurementLogError
+from fgslam.core.errors import EstimatorError
 from fgslam.core.log import MeasurementLog
 from fgslam.core.types import Estimate, Trajectory, UpdateStats
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.judging import Truth, judge_replay
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.slam import build as factory
 from fgslam.slam import replay as module
-from fgslam.slam.replay import Replay, memory_mb, peak_memory_mb, replay, replay_motion
+from fgslam.slam.replay import Replay, memory_mb, peak_memory_mb, replay
 
 SETTINGS = LandmarkKalmanSettings(label="named")
-CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion(
-    ConstantVelocitySettings()
-).description()
+CONSTANT_VELOCITY: dict[str, Any] = factory.ConstantVelocityMotion().description()
 
 
 def a_log(frames: int = 8) -> MeasurementLog:
     simulation = simulate(Drive(frames=frames), np.random.default_rng(4))
-    motion = {"kind": "recorded", "stand_in": CONSTANT_VELOCITY}
+    motion = {"kind": "recorded"}
     return MeasurementLog(RIG, motion, simulation.increments)
 
 
@@ -78,7 +75,7 @@ def test_a_replay_gives_what_the_loop_gives() -> None:
 def test_each_replay_counts_the_closures_that_it_took(lies: bool) -> None:
     rounds = Rounds(lies=((CLOSED, (0.0, 0.5, 0.0, 1.0, 0.0, 0.5)),) if lies else ())
     drive = drive_rounds(rounds, np.random.default_rng(4))
-    log = MeasurementLog(RIG, {"kind": "recorded", "stand_in": CONSTANT_VELOCITY}, drive.increments)
+    log = MeasurementLog(RIG, {"kind": "recorded"}, drive.increments)
     for settings, taken in ((SETTINGS, not lies), (DeadReckoningSettings(), False)):
         replayed = replay(log, settings, EgoMotionSettings())
         assert replayed.closed == (taken,)
@@ -186,15 +183,6 @@ def test_an_estimator_that_cannot_use_the_log_does_not_start(
     replayed = run(a_log())
     assert replayed.failure == "could not start: it cannot use odometry and stereo measurements"
     assert len(replayed) == 0
-
-
-def test_the_header_tells_the_motion() -> None:
-    direct = MeasurementLog(RIG, CONSTANT_VELOCITY)
-    nested = MeasurementLog(RIG, {"kind": "recorded", "stand_in": CONSTANT_VELOCITY})
-    assert replay_motion(direct).description() == CONSTANT_VELOCITY
-    assert replay_motion(nested).description() == CONSTANT_VELOCITY
-    with pytest.raises(MeasurementLogError, match="not known to this fgslam; repeat the run"):
-        replay_motion(MeasurementLog(RIG, {"kind": "warp"}))
 
 
 def test_a_frame_that_the_estimator_names_itself_is_named_once() -> None:

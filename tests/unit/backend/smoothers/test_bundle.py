@@ -42,7 +42,6 @@ from fgslam.core.geometry import inverse, se3_exp
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import BiasEffect, Increment, LoopClosure, Odometry
 from fgslam.core.store import restore, state_of
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.evaluation.statistics import judge
 from fgslam.evaluation.statistics import nees as normalised
 from fgslam.factors.graphs import poses_of_frame, solver_parameters
@@ -191,7 +190,7 @@ class _Given(OdometryMotion):
 
 def live(increments: list[Increment], measured: list[Odometry | None]) -> MeasurementLog:
     settings, solver = EgoMotionSettings(), EgoMotionSolver(RIG, EgoMotionSettings())
-    motion = _Given(RIG.bTc, "recorded", ConstantVelocityMotion(ConstantVelocitySettings()))
+    motion = _Given(RIG.bTc, "recorded", ConstantVelocityMotion())
     estimator = made_or_given(RIG, LandmarkKalmanSettings(), settings, None)
     log = MeasurementLog(RIG, motion.description())
     for k, (increment, body) in enumerate(zip(increments, measured, strict=True)):

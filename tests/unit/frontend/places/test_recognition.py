@@ -38,7 +38,6 @@ from fgslam.core.types import (
     RelocalisationStatus,
     StereoFeatures,
 )
-from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.places.known_map import Tentative
 from fgslam.frontend.places.recognition import (
     Confirmation,
@@ -360,7 +359,7 @@ def test_a_run_that_begins_in_the_dark_maps_as_soon_as_there_is_light() -> None:
 def test_a_correction_is_no_motion() -> None:
     """Nor is being found elsewhere: without wheels, the next frames are expected where they are."""
     for reports in (found_again(), ring()[1]):
-        steady = ConstantVelocityMotion(ConstantVelocitySettings())
+        steady = ConstantVelocityMotion()
         jumps = []
         for k, report in enumerate(reports):
             expected = steady.between(float(k))

@@ -23,7 +23,8 @@ from fgslam.datasets.settings import ConstantVelocitySettings
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, MatchNoise, PoseProblem, unmeasured
 from fgslam.slam.build import make_estimator
-from fgslam.slam.replay import replay_frame, replay_motion
+from fgslam.slam.motion import ConstantVelocityMotion
+from fgslam.slam.replay import replay_frame
 from fgslam.worlds.settings import (
     DetectionSettings,
     MeasurementDriveSettings,
@@ -693,7 +694,7 @@ def test_three_frames_contradict_the_stated_noise_and_a_stretch_of_wrong_matches
 
 def test_a_drive_goes_on_from_a_state_as_it_would_have() -> None:
     log = noisy_drive(18)
-    whole, motion = make_estimator(log.rig, BatchSettings(), PLANAR), replay_motion(log)
+    whole, motion = make_estimator(log.rig, BatchSettings(), PLANAR), ConstantVelocityMotion()
     again, solver = (
         make_estimator(log.rig, BatchSettings(), PLANAR),
         EgoMotionSolver(log.rig, PLANAR),
@@ -701,7 +702,7 @@ def test_a_drive_goes_on_from_a_state_as_it_would_have() -> None:
     for k, increment in enumerate(log):
         if k == 12:
             restore(again, state_of(whole))
-            other, other_motion = EgoMotionSolver(log.rig, PLANAR), replay_motion(log)
+            other, other_motion = EgoMotionSolver(log.rig, PLANAR), ConstantVelocityMotion()
             restore(other.noise, state_of(solver.noise))
             restore(other_motion, state_of(motion))
         found = replay_frame(increment, whole, solver, motion, k)
