@@ -17,7 +17,9 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.worlds.open3d_library import load_open3d
 
 # A red test must be red again on the next run, and slow machines must not make one red.
-settings.register_profile("fgslam", derandomize=True, deadline=None, print_blob=True)
+settings.register_profile(
+    "fgslam", max_examples=50, derandomize=True, deadline=None, print_blob=True
+)
 settings.load_profile("fgslam")
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -117,16 +116,6 @@ class Browser:
             if message["method"] == "Network.requestWillBeSent"
         ]
         return [url for url in asked if not url.startswith(_LOCAL)]
-
-    def screenshot(self, path: Path, height: int | None = None) -> None:
-        """The whole page, or its first ``height`` pixels."""
-        width = self.js("innerWidth")
-        full = self.js("document.documentElement.scrollHeight")
-        clip = {"x": 0, "y": 0, "width": width, "height": height or full, "scale": 1}
-        found = self.driver.execute_cdp_cmd(
-            "Page.captureScreenshot", {"clip": clip, "captureBeyondViewport": True}
-        )
-        path.write_bytes(base64.b64decode(found["data"]))
 
 
 @contextmanager

@@ -28,7 +28,6 @@ from fgslam.core.geometry import (
 )
 from fgslam.core.sensors import (
     CameraRig,
-    vertical_to_horizontal,
 )
 from fgslam.core.types import Floor
 from fgslam.factors.noise import Whitening
@@ -64,23 +63,6 @@ def stereo_coordinates(
         return _behind(rig, 3)
     column, row, disparity = predicted - measured
     return np.array([column + disparity, column, row])
-
-
-def pair(
-    rig: CameraRig, wTc: FloatArray, point: FloatArray, right: FloatArray, left: FloatArray
-) -> FloatArray:
-    """Residual (3,) of (u_left, u_right, v) of raw pixels (2,), v the mean of both rows, pixels."""
-    row = 0.5 * (right[1] + left[1])
-    return stereo_coordinates(rig, wTc, point, np.array([right[0], row, left[0] - right[0]]))
-
-
-def top(rig: CameraRig, wTc: FloatArray, point: FloatArray, pixel: FloatArray) -> FloatArray:
-    """Residual (2,) of the top camera's (column, row), pixels; ``wTc`` is the right camera's."""
-    predicted = _image(rig, wTc, point)
-    if predicted is None:
-        return _behind(rig, 2)
-    column, row, disparity = predicted
-    return np.array([column, row + disparity / vertical_to_horizontal(rig)]) - pixel
 
 
 def _image(rig: CameraRig, wTc: FloatArray, point: FloatArray) -> FloatArray | None:

@@ -86,19 +86,6 @@ def test_columns_are_their_landmarks_whatever_comes_and_goes() -> None:
     assert np.array_equal(again.kept("columns", asked), found)
 
 
-def test_what_comes_and_goes_moves_no_other_landmark_and_takes_the_room_that_is_free() -> None:
-    """So a frame costs what it sees, not what the map holds."""
-    columns = ErrorColumns(_COUNT)
-    columns.append({"ids": np.arange(100), "columns": np.zeros((100, 3, _COUNT))})
-    kept = np.arange(50, 100)
-    before = columns.rows(kept)[0]
-    columns.forget(np.arange(0, 50, 2))
-    columns.append({"ids": np.arange(100, 125), "columns": np.ones((25, 3, _COUNT))})
-    columns.append({"ids": np.array([0]), "columns": np.ones((1, 3, _COUNT))})
-    assert np.array_equal(columns.rows(kept)[0], before)
-    assert len(state_of(columns)["map/columns"]) == 101
-
-
 # ------------------------------------------------------------------------------------------
 # Covariances that the per-landmark filter reports, against its errors
 

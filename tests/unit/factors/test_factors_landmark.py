@@ -71,21 +71,6 @@ def test_a_stereo_factor_is_as_specified(
         assert factor.error(values_of(wTc, point)) == pytest.approx(cost, rel=1e-10)
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_raw_pixel_factors_are_as_specified(rig: CameraRig, rng: np.random.Generator) -> None:
-    make = RawPixelFactors(rig, 0.4, Whitening())
-    for _ in range(10):
-        wTc = random_pose(rng, 3.0)
-        point = point_before(rng, wTc, rng.uniform(0.5, 9.0))
-        pixels = pixel_model(3, vertical_to_horizontal(rig)) @ image(rig, wTc, point)
-        right, left, top = (pixels + 2.0 * rng.standard_normal(6)).reshape(3, 2)
-        pair = partial(residuals.pair, rig, right=right, left=left)
-        both_rows = 0.16 * np.diag([1.0, 1.0, 0.5])
-        assert_as_specified(make.pair(0, 1, right, left), pair, [wTc, point], both_rows)
-        above = partial(residuals.top, rig, pixel=top)
-        assert_as_specified(make.top(0, 1, top), above, [wTc, point], 0.16 * np.eye(2))
-
-
 def test_the_pose_is_the_right_cameras() -> None:
     """A landmark worked out by hand: 2 m ahead, 0.4 m right and 0.2 m below the right camera."""
     wTc = g.pose(g.so3_exp(np.array([0.0, np.pi / 2, 0.0])), np.array([1.0, 2.0, 3.0]))
@@ -133,19 +118,6 @@ def test_fused_measurement_has_the_information_of_all_raw_pixels(
         two = information([raw.pair(0, 1, right, left), raw.top(0, 1, top)], values)
         for a, b in zip(one, two, strict=True):
             assert_near(a, b, 1e-9 * np.abs(b).max())
-
-
-def test_two_cameras_need_the_pair_alone(rng: np.random.Generator) -> None:
-    fuse = measurement_map("fused", 2, 1.0)
-    wTc = random_pose(rng)
-    point = point_before(rng, wTc, 3.0)
-    pixels = pixel_model(2, 1.0) @ image(RIG, wTc, point) + rng.standard_normal(4)
-    right, left = pixels.reshape(2, 2)
-    values = values_of(wTc, point)
-    one = information([stereo(RIG, fuse @ pixels, fuse @ fuse.T)], values)
-    two = information([RawPixelFactors(RIG, 1.0, Whitening()).pair(0, 1, right, left)], values)
-    for a, b in zip(one, two, strict=True):
-        assert_near(a, b, 1e-9 * np.abs(b).max())
 
 
 # --------------------------------------------------------------------------------------------

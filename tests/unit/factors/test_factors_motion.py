@@ -284,28 +284,6 @@ def test_a_blind_drive_with_a_pitched_camera_stays_solvable(
     assert np.sqrt(np.linalg.eigvalsh(spread)[1]) > 0.1  # it is lost, and knows it
 
 
-@pytest.mark.parametrize("down", [TILTED, np.array([1.0, 0.0, 0.0])])
-def test_a_soft_floors_sigmas_are_the_posteriors(down: FloatArray) -> None:
-    """A pose known only by the floor in height and tilt is known there to just the sigmas."""
-    ground = floor(3, down, False)
-    wTc = g.pose(g.so3_exp(0.7 * down), ground.horizontal @ [1.0, 2.0])
-    vague = 3.0
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(pose_prior(0, Prediction(wTc, vague**2 * np.eye(6))))
-    for factor in floor_factors(0, ground, wTc):
-        graph.add(factor)
-    covariance = gtsam.Marginals(graph, values_of(wTc)).marginalCovariance(0)
-    in_world = g.congruence(np.kron(np.eye(2), wTc[:3, :3]), covariance)
-    rotation, translation = in_world[:3, :3], in_world[3:, 3:]
-    assert down @ translation @ down == pytest.approx(both(ground.height_sigma_m, vague), rel=1e-6)
-    tilts = ground.horizontal.T @ rotation @ ground.horizontal
-    tilt = both(ground.tilt_sigma_rad, vague)
-    assert_near(tilts, tilt * np.eye(2), 1e-6 * tilt)
-    assert down @ rotation @ down == pytest.approx(vague**2, rel=1e-6)
-    across = ground.horizontal.T @ translation @ ground.horizontal
-    assert_near(across, vague**2 * np.eye(2), 1e-6 * vague**2)
-
-
 def both(a: float, b: float) -> float:
     """Variance of what is known twice, with standard deviations a and b."""
     return 1.0 / (a**-2 + b**-2)

@@ -306,11 +306,6 @@ def test_noise_is_the_median_of_the_answers(size: tuple[int, int], levels: int) 
     assert noise_sigma(image.astype(np.uint8)[:, ::-1][:, ::-1]) == pytest.approx(expected)
 
 
-def test_rounding_is_the_least_noise() -> None:
-    assert noise_sigma(np.zeros((240, 320), np.uint8)) == pytest.approx(12**-0.5)
-    assert noise_sigma(np.zeros((2, 2), np.uint8)) == pytest.approx(12**-0.5)
-
-
 # ------------------------------------------------------------------------------------------
 # A camera that is knocked is named, with its turn; a sound rig, and what passes by, never
 

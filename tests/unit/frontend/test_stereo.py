@@ -245,40 +245,6 @@ def test_two_cameras_and_the_paper_have_complete_features_alone(
     assert len(match_all(right, left, top, appearance=appearance)) == (appearance is DESCRIPTOR)
 
 
-def crowd(rng: np.random.Generator, count: int = 150, noise: float = 0.5):
-    """Features that look alike, each with its true partner, all over the image."""
-    xy = np.column_stack([rng.uniform(0, 280, count), rng.uniform(0, 240, count)])
-    disparity = rng.uniform(3, 30, count)
-    left = xy + np.outer(disparity, [1, 0]) + noise * rng.standard_normal(xy.shape)
-    top = xy + np.outer(disparity, [0, 1]) + noise * rng.standard_normal(xy.shape)
-    return features(xy), features(left), features(top)
-
-
-def test_the_top_image_removes_wrong_matches() -> None:
-    """Features whose left partner was not found meet another one in the left image."""
-    rng = np.random.default_rng(4)
-    right, left, top = crowd(rng, 250, noise=0.2)
-    true_left = left.xy.copy()
-    lost = rng.uniform(size=250) < 0.6
-    # In place of the lost ones: features at random places, as many.
-    elsewhere = np.column_stack([rng.uniform(0, 320, lost.sum()), rng.uniform(0, 240, lost.sum())])
-    moved = left.xy.copy()
-    moved[lost] = elsewhere
-    left = dataclasses.replace(left, xy=moved)
-    matcher = StereoMatcher(RIG, GATES, PAPER)
-    i, j = matcher.match_left(right, left)
-    kept, k = matcher.match_top(right, left, top, (i, j))
-
-    def right_ones(i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        return (i == j) & (left.xy[j] == true_left[j]).all(axis=1)
-
-    before, after = right_ones(i, j), right_ones(i[kept], j[kept]) & (i[kept] == k)
-    assert before.mean() < 0.9
-    assert after.mean() > before.mean() + 0.08
-    assert after.mean() >= 0.97
-    assert after.sum() > 0.6 * before.sum()
-
-
 # --------------------------------------------------------------------------------------------
 # The measurement and its covariance
 
@@ -315,23 +281,6 @@ def test_the_papers_measurement() -> None:
     depth = 277.0 * 0.1 / 9.9
     expected = [(100.0 - 159.5) * depth / 277.0, (80.0 - 119.5) * depth / 277.0, depth]
     np.testing.assert_allclose(found.position[0], expected, atol=1e-12)
-
-
-def test_two_cameras_leave_the_top_pixels_unknown() -> None:
-    found = match(features(RIGHT), features((110.0, 80.0)), rig=TWO_CAMERAS)
-    assert np.isnan(found.pixels[0, 2]).all()
-    assert np.isfinite(found.pixels[0, :2]).all()
-
-
-def test_the_papers_measurement_has_correlated_coordinates() -> None:
-    m = measurement_map("paper", 3, 1.0)
-    expected = [[1.0, 0.0, -0.5], [0.0, 1.0, -0.5], [-0.5, -0.5, 1.0]]
-    np.testing.assert_allclose(m @ m.T, expected, atol=1e-15)
-
-
-def test_fusing_all_coordinates_halves_the_variances() -> None:
-    m = measurement_map("fused", 3, 1.0)
-    np.testing.assert_allclose(np.diag(m @ m.T), [5 / 12, 5 / 12, 3 / 4], atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["paper", "fused"])
@@ -398,27 +347,6 @@ def test_empty_images_match_nothing() -> None:
             assert found.measurement.shape == found.position.shape == (0, 3)
             assert found.pixels.shape == (0, 3, 2)
             assert found.descriptors.shape == (0, 128)
-
-
-def test_shuffled_features_match_the_same() -> None:
-    rng = np.random.default_rng(11)
-    images = crowd(rng, 60, noise=0.2)
-    before = match(*images)
-    shuffled = []
-    for image in images:
-        order = rng.permutation(len(image))
-        shuffled.append(
-            Features(
-                *(getattr(image, n)[order] for n in ("xy", "scale", "orientation", "descriptors"))
-            )
-        )
-    after = match(*shuffled)
-    assert len(before) > 20
-
-    def ordered(found: StereoFeatures) -> FloatArray:
-        return found.measurement[np.lexsort(found.measurement.T)]
-
-    np.testing.assert_array_equal(ordered(before), ordered(after))
 
 
 @pytest.mark.parametrize("rig", [RIG, TWO_CAMERAS], ids=["three cameras", "two cameras"])
@@ -524,12 +452,6 @@ def test_two_cameras_need_features_of_one_image(
     assert exact == one
     paper = replace(settings, stereo=replace(settings.stereo, measurement="paper"))
     assert not paper.stereo.by_patches(cameras)
-
-
-def test_swapped_cameras_give_next_to_nothing() -> None:
-    right, left, top = pictures(np.array([0.0, 0.0, 1.0]))
-    found, seen = measured((left, right, top))
-    assert len(seen) <= 0.02 * len(found)
 
 
 def test_a_limit_beyond_half_the_width_is_looked_up_to() -> None:

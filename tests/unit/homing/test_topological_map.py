@@ -410,7 +410,6 @@ def test_image_that_matches_nothing_leaves_belief_near_where_it_was(
 # Third views tell a place seen again from one that looks the same
 
 
-THIRD_SETTINGS = TopologicalMapSettings()
 THIRD_COUNT, THINGS = 12, 60
 WALK = Walks((THIRD_COUNT,))
 FAR = (1, 9)

@@ -8,7 +8,7 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
-from simulated import RIG, Drive, Simulation, assert_same_bits, play, simulate, tracked_at
+from simulated import RIG, Drive, Simulation, assert_same_bits, simulate, tracked_at
 
 from fgslam.backend.filters.ekf import (
     DivergedError,
@@ -30,7 +30,6 @@ from fgslam.factors.graphs import landmark_key, pose_key
 from fgslam.factors.landmark import StereoFactors
 from fgslam.factors.motion import floor_factors, odometry_factor, pose_prior
 from fgslam.factors.noise import Whitening
-from fgslam.frontend.settings import EgoMotionSettings
 
 FREE = Floor.under(RIG, 6)
 PRIOR = np.diag([1e-3, 2e-3, 1e-3, 3e-3, 2e-3, 4e-3]) ** 2
@@ -466,28 +465,3 @@ def test_a_soft_floor_is_what_the_graphs_factors_say(dof: int, rng: np.random.Ge
             weighted @ found.jacobian, information, rtol=0, atol=1e-7 * scale
         )
         np.testing.assert_allclose(weighted @ found.innovation, vector, rtol=0, atol=1e-7 * scale)
-
-
-@pytest.mark.parametrize("dof", [3, 5])
-def test_a_soft_floor_keeps_height_and_tilt_near(dof: int) -> None:
-    drive = dataclasses.replace(
-        SMALL, twist=(0.0, 0.03, 0.0, 0.0, 0.0, 0.08), points=3, frames=40, miss_rate=0.6
-    )
-    simulation = drawn(drive, 9)
-    soft, free = make(floor(dof, hard=False)), make()
-    for increment in simulation.increments:
-        a, b = step(soft, increment), step(free, increment)
-    ground = floor(dof, hard=True)
-    excluded = np.eye(6) - ground.basis(a.wTc) @ ground.basis(a.wTc).T
-    with_floor, without = (np.trace(excluded @ c @ excluded) for c in (a.covariance, b.covariance))
-    assert with_floor < 0.2 * without
-    assert abs(ground.down @ a.wTc[:3, 3]) < 4 * 0.002
-
-
-def test_tracked_pose_is_ignored() -> None:
-    simulation = drawn(SMALL, 10)
-    tracked, alone = make(), make()
-    play(tracked, simulation.increments, EgoMotionSettings(min_matches=3))
-    for increment in simulation.increments:
-        step(alone, increment)
-    assert_same_bits(state_of(tracked), state_of(alone))

@@ -110,22 +110,6 @@ def test_an_update_is_the_closed_form(
     assert_equal(graph.landmarks(), closed.landmarks(), 1e-12 + EPSILON * condition)
 
 
-def test_many_updates_of_the_same_landmarks_stay_equal() -> None:
-    closed, graph = both()
-    rng = np.random.default_rng(3)
-    points = points_in_view(RIG, 30, (0.5, 8.0), rng)
-    for k in range(60):
-        wTc = g.se3_exp(0.02 * rng.standard_normal(6))
-        measured = g.project(RIG, g.transform_to_camera(wTc, points))
-        measured += SIGMA * rng.standard_normal(measured.shape)
-        matches = 30 if k else 0
-        for estimator in (closed, graph):
-            tracking = tracked_at(Prediction(wTc, UNCERTAIN), matches)
-            stats = estimator.update(frame(k, measured, k == 0), tracking)
-    assert_equal(graph.landmarks(), closed.landmarks(), 1e-10)
-    assert np.isfinite(stats.nis)
-
-
 # --------------------------------------------------------------------------------------------
 # A whole run
 

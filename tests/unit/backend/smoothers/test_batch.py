@@ -29,8 +29,6 @@ from fgslam.backend.smoothers.smoother import MapSmoother
 from fgslam.core.errors import EstimatorError
 from fgslam.evaluation.statistics import judge
 
-METHODS = pytest.mark.parametrize("name", ["batch", "gnc"])
-
 
 @pytest.mark.parametrize(
     ("name", "count"),

@@ -287,45 +287,6 @@ def test_the_larger_group_is_eliminated_first(rng: np.random.Generator) -> None:
         assert isinstance(either(problem.graph, problem.values), kind)
 
 
-@pytest.mark.parametrize("dof", [5, 3])
-def test_beside_a_hard_floor_both_agree_with_the_exact_constraint(
-    dof: Any, rng: np.random.Generator
-) -> None:
-    """What the floor allows, from a system of its own coordinates, where nothing is stiff."""
-    floor = Floor(dof, PITCHED, True)
-    problem = Problem(rng, 4, 7, floor=floor)
-    free = floorless(problem, dof)
-    matrices = [problem.values.atPose3(key).matrix() for key in problem.poses]
-    basis = np.zeros((21 + 24, 21 + 4 * dof))
-    basis[:21, :21] = np.eye(21)
-    for k, wTc in enumerate(matrices):
-        basis[21 + 6 * k : 27 + 6 * k, 21 + dof * k : 21 + dof * (k + 1)] = floor.basis(wTc)
-    information, _ = free.linearize(problem.values).hessian()
-    exact = basis @ np.linalg.inv(basis.T @ information @ basis) @ basis.T
-    answers = [whole(kind, problem.graph, problem.values) for kind in BOTH]
-    for k, wTc in enumerate(matrices):
-        rows = slice(21 + 6 * k, 27 + 6 * k)
-        size = np.abs(exact[rows, rows]).max()
-        for found in (a.poses()[k] for a in answers):
-            # The floor's stiffness is seen beside centimetres, squared: 1e-4 here.
-            assert_near(floor.allowed_part(wTc, found), exact[rows, rows], 1e-3 * size)
-    for a, b in zip(answers[0].poses(), answers[1].poses(), strict=True):
-        assert_near(a, b, RELATIVE * np.abs(b).max())
-
-
-def floorless(problem: Problem, dof: int) -> Any:
-    """The graph without the factors of the floor, which have poses alone for keys."""
-    kept, left = gtsam.NonlinearFactorGraph(), 0
-    for row in range(problem.graph.size()):
-        factor = problem.graph.at(row)
-        if isinstance(factor, gtsam.PoseTranslationPrior3D | gtsam.PoseRotationPrior3D):
-            left += 1
-        else:
-            kept.add(factor)
-    assert left == (8 if dof == 3 else 4)
-    return kept
-
-
 # --------------------------------------------------------------------------------------------
 # Refused
 
@@ -340,21 +301,6 @@ def test_a_graph_without_a_prior_is_refused(kind: Whole, rng: np.random.Generato
             loose.add(problem.graph.at(row))
     with pytest.raises(EstimatorError, match="determine"):
         whole(kind, loose, problem.values).poses()
-
-
-@pytest.mark.parametrize("kind", BOTH)
-def test_a_landmark_behind_the_camera_is_refused(kind: Whole, rng: np.random.Generator) -> None:
-    """Its factor has no Jacobian."""
-    problem = Problem(rng)
-    key = landmark_key(99)
-    wTc = problem.values.atPose3(problem.poses[0]).matrix()
-    problem.values.insert(key, g.transform_to_world(wTc, np.array([[0.1, 0.2, -3.0]]))[0])
-    seen = StereoFactors(RIG, Whitening()).factor(
-        problem.poses[0], key, np.array([160.0, 120.0, 8.0]), np.eye(3)
-    )
-    problem.graph.add(seen)
-    with pytest.raises(EstimatorError, match=r"determine|no covariances"):
-        whole(kind, problem.graph, problem.values).poses()
 
 
 @pytest.mark.parametrize("kind", BOTH)

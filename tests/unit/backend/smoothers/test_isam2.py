@@ -14,12 +14,9 @@ from smoothing import (
     answer,
     assert_finite,
     ate,
-    blackout,
     build,
     drawn,
-    position_sigma,
     relinearise_beyond,
-    run,
     unseen,
 )
 
@@ -187,31 +184,6 @@ def test_tracker_answers_between_updates_of_the_graph() -> None:
     assert len(estimator.estimate().trajectory) == 12
 
 
-def test_asking_for_estimates_changes_nothing() -> None:
-    simulation = drawn(9, frames=18)
-    asked, silent = build(Isam2Settings()), build(Isam2Settings())
-    for increment in simulation.increments:
-        assert_same_bits(play(asked, [increment], FREE), play(silent, [increment], FREE))
-        assert_finite(asked.estimate())
-    assert_same_bits(asked.estimate(), silent.estimate())
-
-
-def test_a_blackout_is_bridged_and_the_uncertainty_shows_it() -> None:
-    simulation = drawn(3, frames=26)
-    dark = range(10, 20)
-    estimator, stats = run(EVERY_FRAME, blackout(simulation.increments, dark))
-    online = position_sigma(np.array([s.covariance for s in stats]))
-    assert (np.diff(online[9:20]) > 0).all()
-    assert online[19] > 5 * online[9]
-    assert online[-1] < 0.3 * online[19]
-    found = estimator.estimate()
-    sigma = position_sigma(found.covariances)
-    assert sigma[12:17].min() > 2 * max(sigma[9], sigma[20])
-    error = np.linalg.norm(found.trajectory.poses[:, :3, 3] - simulation.poses[:, :3, 3], axis=1)
-    assert (error[1:] < 4 * sigma[1:]).all()
-    assert error[-1] < 0.03
-
-
 @pytest.mark.parametrize(
     ("at", "every"),
     [(5, 1), (10, 4), (13, 4)]
@@ -248,15 +220,6 @@ def test_with_keyframes_the_joint_covariance_is_of_the_last_frame(frames: int) -
         at = slice(6 + 3 * k, 9 + 3 * k)
         np.testing.assert_allclose(joint[at, at], own[k], rtol=1e-6, atol=1e-12)
     assert np.linalg.eigvalsh(joint)[0] > -1e-12
-
-
-def test_joint_covariance_of_a_landmark_outside_the_graph_is_refused() -> None:
-    _, estimator = played(14, Isam2Settings(keyframe_every=4))
-    outside = set(estimator.landmarks().ids.tolist()) - set(estimator.builder.admission.tracks)
-    for identity in sorted(outside):
-        with pytest.raises(EstimatorError, match=f"landmark {identity} waits outside"):
-            estimator.joint_covariance(np.array([identity]))
-    assert outside
 
 
 def test_landmarks_behind_a_camera_are_put_back_before_it() -> None:

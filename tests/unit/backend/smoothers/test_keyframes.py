@@ -195,13 +195,6 @@ def test_a_block_of_one_frame_is_that_frame() -> None:
     np.testing.assert_allclose(fused.covariance, own.covariance[order], rtol=1e-9, atol=1e-12)
 
 
-def test_without_noise_it_is_what_the_middle_would_have_seen() -> None:
-    frames, landmarks = frames_of(0.0)
-    fused = summarise(RIG, frames, frames[2], landmarks)
-    local = g.transform_to_camera(frames[2].wTc, landmarks.positions[fused.ids])
-    np.testing.assert_allclose(fused.measurement, g.project(RIG, local), rtol=0, atol=1e-6)
-
-
 def by_points(
     frames: list[TrackedFrame], middle: FloatArray, identity: int
 ) -> tuple[FloatArray, FloatArray]:

@@ -71,18 +71,6 @@ def test_words_at_hand_change_nothing(
 
 
 @pytest.mark.parametrize("exact", [0, 10_000])
-def test_queries_are_answered_one_by_one(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
-) -> None:
-    monkeypatch.setattr(descriptor_index, "EXACT", exact)
-    held, asked = looks(rng, 500), looks(rng, 30)
-    together = AppearanceIndex(held).query(asked, 4)
-    monkeypatch.setattr(descriptor_index, "AT_ONCE", 7)
-    apart = AppearanceIndex(held).query(asked, 4)
-    _assert_equal(together, apart)
-
-
-@pytest.mark.parametrize("exact", [0, 10_000])
 def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:

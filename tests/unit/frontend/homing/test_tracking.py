@@ -291,19 +291,6 @@ def test_points_of_planar_patches_are_mapped_within_half_a_degree() -> None:
     assert np.mean(np.abs(off) < 3.0 * sigma) > 0.9
 
 
-def test_the_start_sees_the_point_at_its_pixel() -> None:
-    matches, features = two_views(wall_points(60, 2))
-    rows, pixels, moved = move_to_trackable(view_of(POINT_START), CAMERA, matches, features)
-    rays = CAMERA.rays(pixels)
-    np.testing.assert_allclose(
-        wrap(moved.bearing_a - np.arctan2(rays[:, 1], rays[:, 0])), 0.0, atol=1e-9
-    )
-    np.testing.assert_allclose(moved.elevation_a, np.arcsin(rays[:, 2]), atol=1e-9)
-    np.testing.assert_array_equal(moved.kind, matches.kind[rows])
-    assert (pixels[:, 0] >= 0).all()
-    assert (pixels[:, 0] < CAMERA.width - 1).all()
-
-
 def test_a_window_tells_corners_from_edges() -> None:
     """Eq. 2 of a single pixel has rank 1 everywhere; summed over a window only on edges."""
     grey = np.full((CAMERA.height, CAMERA.width - 1), 60, np.uint8)

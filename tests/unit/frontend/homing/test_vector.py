@@ -27,7 +27,6 @@ from fgslam.frontend.homing.two_view import (
     HomingRefinement,
     Refined,
     make_local_map,
-    match_sift,
     planar_distances,
     spread_over,
     triangulable,
@@ -245,12 +244,6 @@ def test_hypotheses_refined_side_by_side_are_refined_as_if_alone() -> None:
     assert len({round(float(one.parameters[0]), 3) for one in together}) > 1
 
 
-def test_triangulation_is_exact() -> None:
-    views = two_views(2, 100)
-    distance = triangulate(views.matches, views.direction, views.rotation)
-    np.testing.assert_allclose(distance, np.hypot(*views.points.T) / views.leg_m, rtol=1e-6)
-
-
 def test_local_map_covariance_is_that_of_monte_carlo() -> None:
     views = two_views(4, 40)
     sigma = np.deg2rad(0.05)
@@ -424,18 +417,6 @@ def test_solutions_with_nearly_as_much_evidence_are_part_of_the_uncertainty() ->
     np.testing.assert_allclose(far, 0.01**2 * np.eye(2), rtol=0, atol=1e-12)
 
 
-def test_a_clear_answer_is_that_of_the_matches() -> None:
-    views = crowded_views(3, 300, 2.0)
-    alone, matches = vector_between(
-        *views, MATCHING, replace(PAIR_SETTINGS, second_look=False), pair_generator(0, 0, 1)
-    )
-    assert isinstance(alone, TwoViewVector)
-    again = pair_answer(views)
-    assert isinstance(again, TwoViewVector)
-    assert len(again.inliers) == len(matches)
-    assert again.direction == alone.direction
-
-
 def test_inliers_are_features_that_occur_once() -> None:
     views = crowded_views(1, 45, 28.0)
     found, matches = vector_between(*views, MATCHING, PAIR_SETTINGS, pair_generator(0, 0, 1))
@@ -465,20 +446,6 @@ def test_candidates_are_the_five_nearest_of_either_view() -> None:
     assert pairs
     assert pairs <= nearest
     np.testing.assert_array_equal(squared, before)
-
-
-def test_distances_that_are_known_give_the_same_matches_and_stay_as_they_are() -> None:
-    a, b = (views.sift for views in crowded_views(4, 40, 5.0))
-    squared = planar_distances(a, b, MATCHING)
-    squared[7] = np.inf  # nothing may be like it
-    before = squared.copy()
-    known, anew = match_sift(a, b, MATCHING, squared), match_sift(a, b, MATCHING)
-    candidate_matches(a, b, squared)
-    np.testing.assert_array_equal(squared, before)
-    others = anew.index_a != 7
-    assert np.count_nonzero(others) > 20
-    np.testing.assert_array_equal(known.index_a, anew.index_a[others])
-    np.testing.assert_array_equal(known.index_b, anew.index_b[others])
 
 
 def test_gradients_along_one_line_are_an_edge() -> None:

@@ -270,21 +270,6 @@ def test_each_estimator_of_a_comparison_accepts_or_refuses_a_closure_itself() ->
     assert np.median(np.linalg.norm(new - old, axis=1)) < 0.1
 
 
-def test_a_replay_closes_the_same_loops_to_the_bit() -> None:
-    pipeline, reports = ring()
-    estimator = make_estimator(RIG, LandmarkKalmanSettings(), SETTINGS.ego_motion)
-    solver = EgoMotionSolver(RIG, SETTINGS.ego_motion)
-    motion = RingMotion(RING, 0.9)
-    for k, report in enumerate(reports):
-        replay_frame(report.increment, estimator, solver, motion, k)
-    np.testing.assert_array_equal(
-        estimator.estimate().trajectory.poses, pipeline.estimator.estimate().trajectory.poses
-    )
-    np.testing.assert_array_equal(
-        estimator.landmarks().positions, pipeline.estimator.landmarks().positions
-    )
-
-
 @pytest.mark.parametrize(("refusing", "after_closing"), [(False, 1), (True, 4)])
 def test_continued_from_its_state_it_goes_on_to_the_bit(
     refusing: bool, after_closing: int, monkeypatch: pytest.MonkeyPatch
@@ -628,12 +613,6 @@ def test_drift_is_worth_a_correction_and_bounded_by_the_way(
     assert drift_allows(recognised, np.eye(4), way, RETURN_LOOPS) is allowed
 
 
-def test_difference_in_metres_and_degrees() -> None:
-    metres, degrees = difference(turned(10.0, x=1.0), turned(25.0, x=1.0, z=2.0))
-    assert metres == pytest.approx(2.0)
-    assert degrees == pytest.approx(15.0)
-
-
 # -- resection -------------- -----------------------------------------------------------------
 
 
@@ -777,11 +756,6 @@ def _pose(features: IntArray, place: int = 0, covered: float = 1.0, misfit: floa
 
 def _status(matched: int, *poses: Refined) -> RelocalisationStatus:
     return accept(_tentative(matched), list(poses), PLACES, ACCEPTANCE).status
-
-
-def test_few_inliers_are_accepted_where_nearly_all_matches_agree() -> None:
-    """Ten of twelve features that look like landmarks, and all places in view show somecarried."""
-    assert _status(12, _pose(np.arange(10))) is RelocalisationStatus.FOUND
 
 
 def test_few_inliers_among_many_outliers_are_refused() -> None:

@@ -248,19 +248,6 @@ def test_a_restored_carrier_goes_on_to_the_same_bits() -> None:
             np.testing.assert_array_equal(array, state_of(other)[name])
 
 
-@pytest.mark.parametrize("looked", [False, True])
-def test_a_state_that_lacks_an_array_is_refused(looked: bool) -> None:
-    """Before the patches are taken as well as after: the names are the same."""
-    carrier = begun(pictures(HERE), HERE)
-    if looked:
-        followed(carrier, np.array([0.03, 0.01, 0.0]))
-    state = state_of(carrier)
-    assert "patches/first" in state
-    for name in state:
-        with pytest.raises(KeyError, match=name):
-            restore(carrier, {key: array for key, array in state.items() if key != name})
-
-
 # ------------------------------------------------------------------------------------------
 # When carried landmarks place a frame, and when it is left to SIFT
 

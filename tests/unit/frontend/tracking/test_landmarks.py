@@ -112,14 +112,6 @@ def test_the_cone_is_one_of_the_axes_not_of_the_ray() -> None:
     assert expected_ids(np.array([[corner, corner, 3.0]]), CONE) == [0]
 
 
-def test_the_cone_expects_what_the_image_cannot_show() -> None:
-    """320x240 with 60 degrees across sees 23.4 degrees up and down."""
-    point = np.array([[0.0, 3.0 * np.tan(np.deg2rad(27.0)), 3.0]])
-    assert g.project(RIG, point)[0, 1] > RIG.height
-    assert expected_ids(point, CONE) == [0]
-    assert expected_ids(point, SETTINGS) == []
-
-
 @pytest.mark.parametrize("settings", [SETTINGS, CONE])
 def test_nothing_behind_the_camera_is_expected(settings: DatabaseSettings) -> None:
     points = np.array([[0.1, 0.0, -3.0], [0.0, 0.0, 0.0], [0.0, 0.0, -1e-9], [0.1, 0.0, 3.0]])
@@ -180,18 +172,6 @@ def test_the_scale_follows_the_depth(forward: float) -> None:
     wTc = g.pose(np.eye(3), np.array([0.0, 0.0, forward]))
     expected = database.expected(landmark_map(points), wTc)
     np.testing.assert_allclose(expected.scale, 3.0 * points[:, 2] / (points[:, 2] - forward))
-
-
-def test_perfect_odometry_predicts_perfectly() -> None:
-    rng = np.random.default_rng(2)
-    local = at_pixels([(80, 60, 8), (200, 110, 12), (150, 150, 20)])
-    wTc = g.se3_exp(0.3 * rng.standard_normal(6))
-    world = g.transform_to_world(wTc, local)
-    expected = database_of(local).expected(landmark_map(world), wTc)
-    np.testing.assert_allclose(
-        expected.measurement, [(80, 60, 8), (200, 110, 12), (150, 150, 20)], atol=1e-9
-    )
-    np.testing.assert_allclose(expected.scale, 3.0)
 
 
 def test_landmark_ids_may_differ_from_row_numbers() -> None:
@@ -310,40 +290,6 @@ def test_predicted_covariance_matches_monte_carlo() -> None:
 # Life and death
 
 
-def test_new_landmarks_count_one_hit_and_get_ascending_ids() -> None:
-    """Every feature of the first frame becomes a track."""
-    points = at_pixels([(80, 60, 8), (100, 110, 12), (150, 150, 20)])
-    database = LandmarkDatabase(RIG, SETTINGS, 40.0)
-    features = stereo_features(points)
-    assert database.next_id == 0
-    first = database.add(features, np.array([0, 2]), np.array([7, 9], np.uint8))
-    second = database.add(features, np.array([1]), np.array([8], np.uint8))
-    assert first.tolist() == [0, 1]
-    assert second.tolist() == [2]
-    assert database.ids.tolist() == [0, 1, 2]
-    assert database.hits.tolist() == [1, 1, 1]
-    assert database.misses.tolist() == database.missed.tolist() == [0, 0, 0]
-    assert database.colour.tolist() == [7, 9, 8]
-    np.testing.assert_allclose(database.appearances().size, 3.0 * points[[0, 2, 1], 2])
-
-
-@pytest.mark.parametrize("limit", [1, 3, 20])
-def test_pruned_exactly_at_the_last_miss_in_a_row(limit: int) -> None:
-    """N = 20 in the paper."""
-    points = at_pixels([(80, 60, 8), (100, 110, 12)])
-    database = database_of(points, DatabaseSettings(prune_after_misses=limit))
-    for _ in range(limit - 1):
-        database.record_misses(np.array([1]))
-        assert len(database.prune()) == 0
-    database.record_misses(np.array([1]))
-    assert database.prune().tolist() == [1]
-    assert database.ids.tolist() == [0]
-    assert len(database.appearances()) == len(database.hits) == len(database.colour) == 1
-    # Never again: neither the entry nor its name.
-    assert len(database.prune()) == 0
-    assert database.next_id == 2
-
-
 def test_an_unconfirmed_landmark_is_forgotten_in_view_or_not() -> None:
     """Three landmarks: never seen again, confirmed by two more hits, seen again once and late."""
     points = at_pixels([(80, 60, 8), (100, 110, 12), (200, 100, 9)])
@@ -358,19 +304,6 @@ def test_an_unconfirmed_landmark_is_forgotten_in_view_or_not() -> None:
         gone += [(frame, int(i)) for i in database.prune()]
     assert gone == [(4, 0), (7, 2)]
     assert database.ids.tolist() == [1]
-
-
-def test_a_hit_resets_consecutive_misses_only() -> None:
-    """L resets on a hit, m and n never."""
-    points = at_pixels([(80, 60, 8)])
-    database = database_of(points, DatabaseSettings(prune_after_misses=5))
-    only = np.array([0])
-    for _ in range(3):
-        for _ in range(4):
-            database.record_misses(only)
-        database.record_hits(only, stereo_features(points), only)
-        assert len(database.prune()) == 0
-    assert (database.hits[0], database.misses[0], database.missed[0]) == (4, 12, 0)
 
 
 def test_a_hit_refreshes_the_appearance() -> None:
@@ -425,22 +358,6 @@ def towards(*degrees: float) -> FloatArray:
 # Permanence
 
 
-def test_a_permanent_landmark_is_not_pruned() -> None:
-    database = database_of(PLACES, LASTING)
-    for k in range(2):
-        hit(database, 0, 1)
-        assert database.permanent.tolist() == [k == 1, k == 1, False, False]
-        assert len(end_frame(database)) == 0
-    for _ in range(2):
-        assert len(end_frame(database, 0, 2)) == 0
-    assert end_frame(database, 0, 2).tolist() == [2]
-    for _ in range(50):
-        assert len(end_frame(database, 0)) == 0
-    assert database.ids.tolist() == [0, 1, 3]
-    # The flag does not go with the ratio, which is far below the threshold now.
-    assert (database.hits[0], database.misses[0], database.permanent[0]) == (3, 53, True)
-
-
 def test_a_permanent_landmark_is_not_forgotten_when_seldom_seen() -> None:
     settings = DatabaseSettings(
         valid_hits=2,
@@ -466,14 +383,6 @@ def test_a_demoted_landmark_is_pruned_like_any_other_and_a_hit_makes_it_permanen
     hit(database, 1)
     assert database.permanent[1]
     assert end_frame(database, 0).tolist() == [0]
-
-
-def test_without_permanence_there_is_none_to_save() -> None:
-    database = database_of(PLACES)
-    for _ in range(9):
-        hit(database, 0)
-    assert not database.permanent.any()
-    assert not database.lasting.any()
 
 
 # --------------------------------------------------------------------------------------------
@@ -643,41 +552,12 @@ def test_fewer_views_than_the_map_has_are_the_latest() -> None:
     np.testing.assert_allclose(found.direction, towards(80, 40, 0, 0), atol=1e-7)
 
 
-def test_a_view_of_the_map_goes_before_one_of_this_visit() -> None:
-    database = LandmarkDatabase(RIG, VIEWS, 40.0)
-    database.load(saved(seen_around(), PLACES))
-    for angle in (120.0, 160.0):
-        hit(database, 0, directions=towards(angle))
-    np.testing.assert_allclose(
-        database.appearances(np.array([0])).direction, towards(80, 120, 160), atol=1e-7
-    )
-
-
 def test_a_map_with_a_landmark_that_has_no_view_is_refused() -> None:
     given = saved(seen_around(), PLACES)
     object.__setattr__(given, "appearances", given.appearances.of(np.array([0, 1, 3])))
     assert isinstance(given.appearances, LandmarkAppearances)
     with pytest.raises(MapError, match="without a view"):
         LandmarkDatabase(RIG, VIEWS, 40.0).load(given)
-
-
-def test_memory_a_landmark_is_as_documented() -> None:
-    """docs/concepts/maps.md tells it."""
-    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0)) == 78 + 164
-    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)) == 242 + 289
-    assert kept_bytes(LandmarkDatabase(RIG, VIEWS, 40.0)) == 242 + 2 * 4
-
-
-def kept_bytes(database: LandmarkDatabase) -> float:
-    """Bytes of a landmark with one view, but for the view's word (2), which is found again."""
-    count = 200
-    database.add(
-        stereo_features(np.tile(PLACES[:1], (count, 1))),
-        np.arange(count),
-        np.zeros(count, np.uint8),
-    )
-    arrays = state_of(database).values()
-    return sum(array.nbytes for array in arrays if array.shape[:1] == (count,)) / count
 
 
 # ------------------------------------------------------------------------------------------
@@ -746,18 +626,6 @@ def test_a_match_renews_the_nearest_view_and_no_other() -> None:
     assert names(pool, places) == [1, 3]
     # The view vector stays: another match 15 degrees on would else be near to the first's.
     assert degrees_of(pool, places).tolist() == [0, 50]
-
-
-@pytest.mark.parametrize("step", [1.0, 3.0, 7.0])
-@pytest.mark.parametrize("turn", [90.0, 170.0])
-def test_an_orbit_adds_a_view_every_20_degrees(step: float, turn: float) -> None:
-    """The list grows as angle / 20; steps may jump over the threshold by their own size."""
-    pool = ViewPool(32, ANGLE)
-    places = pool.start(view(0, 1))
-    for k in range(1, int(turn / step) + 1):
-        pool.refresh(places, view(k * step, 1))
-    count = int((places >= 0).sum())
-    assert 1 + int(turn / (20.0 + step)) <= count <= 1 + int(turn / 20.0)
 
 
 def test_a_full_landmark_loses_the_view_matched_longest_ago() -> None:
@@ -844,14 +712,6 @@ def test_merging_keeps_the_later_of_two_alike_and_adds_the_others() -> None:
     assert degrees_of(pool, stays).tolist() == [0, 40, 90]
 
 
-@pytest.mark.parametrize(("used", "left"), [(3, [1]), (4, [2]), (5, [2])])
-def test_merging_single_views_keeps_the_later(used: int, left: list[int]) -> None:
-    pool = ViewPool(1, 0.0)
-    stays, ends = pool.start(view(0, 1, 4)), pool.start(view(90, 2, used))
-    pool.merge(stays, ends)
-    assert names(pool, stays) == left
-
-
 def test_loading_keeps_the_last_views_of_a_landmark_that_has_too_many() -> None:
     pool = ViewPool(2, ANGLE)
     rng = np.random.default_rng(1)
@@ -930,11 +790,6 @@ def test_a_frame_that_sees_two_parts_makes_them_one() -> None:
 def test_a_few_agreeing_landmarks_do_not_join_parts() -> None:
     parts = booked(*BEFORE, GAP, frame(range(28, 48)))
     assert parts.connected.tolist() == [True, True, False, False]
-
-
-def test_frames_before_the_first_landmark_are_the_beginning() -> None:
-    dark = frame(odometry=None), frame()
-    assert booked(*dark, frame(new=range(10)), frame(range(10))).connected.all()
 
 
 @pytest.mark.parametrize("taken", [True, False])

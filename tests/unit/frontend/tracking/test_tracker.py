@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import json
 import math
 import time
 from typing import Any
@@ -18,7 +17,7 @@ from textured_room import TEXTURE
 from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, Image, IntArray
 from fgslam.core.sensors import CameraRig
-from fgslam.core.store import TREE, restore, state_of
+from fgslam.core.store import restore, state_of
 from fgslam.core.types import EgoMotionStatus, LandmarkMap, Prediction
 from fgslam.frontend.settings import (
     AppearanceSettings,
@@ -208,21 +207,6 @@ def test_a_camera_at_rest_starts_each_track_once() -> None:
     assert len(scene.map) == count
 
 
-def test_landmarks_out_of_view_are_left_alone() -> None:
-    """Type I: bit-identical, however long nobody looks."""
-    scene = Scene()
-    scene.step(np.eye(4))
-    before = copy.deepcopy(state_of(scene.tracker.database))
-    away = g.se3_exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-    for _ in range(10):
-        _, association = scene.step(away)
-        assert len(association.missed_ids) == len(association.pruned_ids) == 0
-    after = state_of(scene.tracker.database)
-    frames = [json.loads(str(state.pop(TREE)))["part"]["_frame"][0] for state in (before, after)]
-    assert frames[1] == frames[0] + 10  # frames counted, no entry
-    assert_same_bits(after, before)
-
-
 def test_outliers_count_as_misses_and_are_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = Scene()
     scene.step(np.eye(4))
@@ -284,25 +268,6 @@ def test_refining_matches_again_around_the_pose_found() -> None:
         assert tracked.ego_motion.status is EgoMotionStatus.OK
         matches[refine] = len(tracked.matches.landmarks)
     assert matches[True] > matches[False] + 5
-
-
-@pytest.mark.parametrize(("sideways_m", "attempts"), [(0.0, 1), (0.005, 1), (0.03, 2)])
-def test_a_frame_is_matched_anew_only_where_the_prediction_was_off(
-    sideways_m: float, attempts: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    matching = dataclasses.replace(SETTINGS.matching, refine=True)
-    scene = Scene(dataclasses.replace(SETTINGS, matching=matching))
-    scene.step(np.eye(4))
-    made: list[None] = []
-    attempt = scene.tracker.match_and_solve
-
-    def counted(*given: Any, **named: Any) -> Tracked:
-        made.append(None)
-        return attempt(*given, **named)
-
-    monkeypatch.setattr(scene.tracker, "match_and_solve", counted)
-    scene.step(np.eye(4), predicted=g.se3_exp(np.array([0.0, 0.0, 0.0, sideways_m, 0.0, 0.0])))
-    assert len(made) == attempts
 
 
 def test_tracking_alone_changes_nothing() -> None:
