@@ -66,7 +66,6 @@ from fgslam.datasets.recording import (
     mounted,
     numbered,
     read_rig,
-    recording_identity,
 )
 from fgslam.datasets.settings import BagSettings, RecordedOdometrySettings
 from fgslam.datasets.times import NANOSECONDS, Table, pair_stamps
@@ -128,11 +127,11 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         replace(rig, remarks=()),
         NANOSECONDS * bag.stamps[chosen.right][rows[:, 0]].astype(np.float64),
         load,
-        recording_identity([], [file for path in bag.paths for file in _bag_files(path)]),
+        ([], [file for path in bag.paths for file in _bag_files(path)]),
         (*bag.notes, *chosen.notes, *bag.stamp_notes, *unpaired, *held, *placed.notes),
+        _odometry_source(chosen.motion, *bag.motions, odometry),
     )
-    source = _odometry_source(chosen.motion, *bag.motions, odometry)
-    return replace(recording, odometry_source=source, disparity_sigma_px=sigma)
+    return replace(recording, disparity_sigma_px=sigma)
 
 
 # --------------------------------------------------------------------------------------------

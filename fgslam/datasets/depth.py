@@ -39,13 +39,11 @@ from fgslam.datasets.layouts import (
     colour_and_depth_files,
     images_in,
 )
-from fgslam.datasets.odometry import file_odometry, find_odometry
 from fgslam.datasets.recording import (
     Recording,
     image_recording,
     mounted,
     on_wheels,
-    recording_identity,
 )
 from fgslam.datasets.settings import CalibratedSettings, RecordedOdometrySettings, RgbdSettings
 from fgslam.datasets.times import (
@@ -172,14 +170,14 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         CalibrationError: nothing states the colour camera's focal length.
     """
     root = Path(settings.path)
-    pairs, stamps, notes, lists = _pairs(root, settings)
+    pairs, stamps, notes, lists = _pairs(root)
     size = first_size(colour for colour, _ in pairs)
     if size is None:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
     require_one_camera(settings)
     camera, known = _camera(root, settings, size)
-    odometry_file = find_odometry(root)
-    rig, mounting = on_wheels(mounted(depth_rig(camera), settings), settings, odometry_file)
+    rig = mounted(depth_rig(camera), settings)
+    rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
     scale, reported = _scale(root, pairs, settings, size)
 
     def read(index: int) -> tuple[Image, Depth, str]:
@@ -188,21 +186,17 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         depth = read_depth_image(depth_file)
         return colour, depth.astype(np.float32) / np.float32(scale), str(depth_file)
 
-    identity = recording_identity(
-        [*lists, *filter(None, [odometry_file])], (path for pair in pairs for path in pair)
-    )
     images = depth_images(read, rig, camera)
+    files = [*lists, *wheels], (path for pair in pairs for path in pair)
     notes = (*notes, *known, *reported, *mounting)
     name, truth = root.resolve().name, root / "groundtruth.txt"
-    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
-    return replace(
-        recording,
-        ground_truth=trajectory_at_frames(read_tum(truth), recording.timestamps)
-        if truth.is_file()
-        else None,
-        odometry_source=file_odometry(odometry_file, odometry),
-        disparity_sigma_px=depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M),
-    )
+    recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
+    sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
+    recording = replace(recording, disparity_sigma_px=sigma)
+    if not truth.is_file():
+        return recording
+    at_frames = trajectory_at_frames(read_tum(truth), recording.timestamps)
+    return replace(recording, ground_truth=at_frames)
 
 
 def require_one_camera(settings: CalibratedSettings) -> None:
@@ -225,7 +219,7 @@ def colour_and_depth_notes(notes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _pairs(
-    root: Path, settings: RgbdSettings
+    root: Path,
 ) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...], tuple[Path, ...]]:
     """Colour and depth of each frame, their stamps (n,) in seconds, notes and lists."""
     lists = (root / "rgb.txt", root / "depth.txt")

@@ -18,7 +18,6 @@ from fgslam.core.geometry import right_from_left_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import files_of, find_cameras
-from fgslam.datasets.odometry import file_odometry, find_odometry
 from fgslam.datasets.recording import (
     Recording,
     calibrated_rig,
@@ -27,7 +26,6 @@ from fgslam.datasets.recording import (
     mounted,
     numbered,
     on_wheels,
-    recording_identity,
 )
 from fgslam.datasets.settings import (
     ImageFolderSettings,
@@ -82,8 +80,7 @@ def open_image_folder(
         for number in numbers.tolist()
     ]
     images, noticed = open_frames(files, rig, root)
-    odometry_file = find_odometry(root)
-    rig, mounting = on_wheels(rig, settings, odometry_file)
+    rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
     known = set(numbers.tolist())
     unlisted = {folder.name: len(found.keys() - known) for folder, found in cameras.items()}
     notes = [
@@ -95,13 +92,7 @@ def open_image_folder(
             "calib.json states a vertical baseline but there is no top/: read as two cameras"
         )
     present = [path for path in (calibration,) if path.is_file()]
-    defining = [*present, root / "times.txt", *filter(None, [odometry_file])]
-    identity = recording_identity(
-        defining, (path for found in cameras.values() for path in found.values())
-    )
-    notes = [*mounting, *noticed, *notes]
-    name = root.resolve().name
-    recording = image_recording(settings, name, rig, stamps, images, identity, tuple(notes))
+    defining = [*present, root / "times.txt", *wheels]
     truth = None
     for file, of_left in ((TRUTH_RIGHT, False), (TRUTH_LEFT, True)):
         if truth is None and (root / file).is_file():
@@ -109,11 +100,13 @@ def open_image_folder(
             if of_left:
                 poses = right_from_left_camera(truth.poses, rig.baseline)
                 truth = Trajectory(truth.timestamps, poses)
-    return replace(
-        recording,
-        ground_truth=None if truth is None else trajectory_at_frames(truth, recording.timestamps),
-        odometry_source=file_odometry(odometry_file, odometry),
-    )
+    listed = (path for found in cameras.values() for path in found.values())
+    all_notes = (*mounting, *noticed, *notes)
+    name, defined = root.resolve().name, (defining, listed)
+    recording = image_recording(settings, name, rig, stamps, images, defined, all_notes, source)
+    if truth is None:
+        return recording
+    return replace(recording, ground_truth=trajectory_at_frames(truth, recording.timestamps))
 
 
 def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:
@@ -213,13 +206,10 @@ def open_loose_images(
     rig = calibrated_rig(settings, root, first_size(right))
     rig = numbered(rig) if cameras.numbered else rig
     images, noticed = open_frames(pairs, rig, root)
-    odometry_file = find_odometry(root)
-    rig, mounting = on_wheels(rig, settings, odometry_file)
+    rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
     also = ", ".join(" with ".join(pair) for pair in cameras.others)
     others = (f"also there: {also}; leave one pair of folders to take that",) if also else ()
-    defining = [*lists, *filter(None, [odometry_file])]
-    identity = recording_identity(defining, (path for pair in pairs for path in pair))
+    files_of_it = [*lists, *wheels], (path for pair in pairs for path in pair)
     notes = (*mounting, *noticed, *others, *unpaired, *assumed)
     name = root.resolve().name
-    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
-    return replace(recording, odometry_source=file_odometry(odometry_file, odometry))
+    return image_recording(settings, name, rig, stamps, images, files_of_it, notes, source)

@@ -115,10 +115,8 @@ def is_of_gyroscope(path: Path) -> bool:
     return path.is_file() and path.name.lower().startswith(("imu", "gyro"))
 
 
-def file_odometry(path: Path | None, settings: RecordedOdometrySettings) -> OdometrySource | None:
-    """Body motions by a file, which is read when they are first needed; None without a file."""
-    if path is None:
-        return None
+def file_odometry(path: Path, settings: RecordedOdometrySettings) -> OdometrySource:
+    """Body motions by a file, which is read when they are first needed."""
     kind = "rates" if is_of_gyroscope(path) else "speeds" if path.suffix == ".csv" else "poses"
     return recorded_motions(str(path), lambda: motions_of(read_columns(path, kind), settings))
 

@@ -41,7 +41,6 @@ from fgslam.datasets.recording import (
     loaded_rig,
     mounted,
     read_rig,
-    recording_identity,
 )
 from fgslam.datasets.settings import (
     EurocSettings,
@@ -104,27 +103,26 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
     images, noticed = open_frames(paths, rig, root)
     sensors = [*folders, root / "imu0"]
     defining = [folder / name for folder in sensors for name in ("sensor.yaml", "data.csv")]
-    identity = recording_identity(
-        [path for path in defining if path.is_file()],
-        [path for pair in paths for path in pair if path.is_file()],
-    )
+    gyroscope, own = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
+    source = None
+    if gyroscope.is_file():
+        of_noise = (own, root.parent / "dso" / "imu_config.yaml")
+        noise = next((path for path in of_noise if path.is_file()), None)
+        source = gyroscope_odometry(gyroscope, own if own.is_file() else None, noise, odometry)
     recording = image_recording(
         settings,
         root.resolve().parent.name if root.name == "mav0" else root.resolve().name,
         rig,
         at_right[rows[:, 0]].astype(np.float64) * NANOSECONDS,
         images,
-        identity,
+        (
+            [path for path in defining if path.is_file()],
+            [path for pair in paths for path in pair if path.is_file()],
+        ),
         (*noticed, *paired),
+        source,
     )
-    recording = replace(recording, ground_truth=_euroc_truth(root, rig, recording.timestamps))
-    gyroscope, own = root / "imu0" / "data.csv", root / "imu0" / "sensor.yaml"
-    if not gyroscope.is_file():
-        return recording
-    noise = next((p for p in (own, root.parent / "dso" / "imu_config.yaml") if p.is_file()), None)
-    mounting = own if own.is_file() else None
-    source = gyroscope_odometry(gyroscope, mounting, noise, odometry)
-    return replace(recording, odometry_source=source)
+    return replace(recording, ground_truth=_euroc_truth(root, rig, recording.timestamps))
 
 
 def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
@@ -243,9 +241,8 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
     rig = load_rig(calibration, size=size)
     images, noticed = open_frames(paths, rig, folder)
     listed = [path for found in cameras.values() for path in found.values()]
-    identity = recording_identity([calibration, times], listed)
-    name = f"KITTI {settings.sequence}"
-    recording = image_recording(settings, name, rig, stamps, images, identity, noticed)
+    name, files = f"KITTI {settings.sequence}", ([calibration, times], listed)
+    recording = image_recording(settings, name, rig, stamps, images, files, noticed)
     poses = _kitti_poses(Path(settings.path) / "poses" / f"{settings.sequence}.txt", len(stamps))
     if poses is None:
         return recording
@@ -314,15 +311,13 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     )
     images, noticed = open_frames(pairs, rig, drive)
     notes = (*noticed, *unpaired, *assumed, *([untrue] if of_unit and iTc is None else []))
-    identity = recording_identity(lists, (path for pair in pairs for path in pair))
-    name = drive.resolve().name
-    recording = image_recording(settings, name, rig, stamps, images, identity, notes)
-    if of_unit is None:
-        return recording
-    truth, speeds = of_unit
-    source = recorded_motions(str(speeds.path), lambda: motions_of(speeds, odometry))
-    recording = replace(recording, odometry_source=source)
-    if iTc is None:
+    files = lists, (path for pair in pairs for path in pair)
+    name, source = drive.resolve().name, None
+    if of_unit is not None:
+        truth, speeds = of_unit
+        source = recorded_motions(str(speeds.path), lambda: motions_of(speeds, odometry))
+    recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
+    if of_unit is None or iTc is None:
         return recording
     unit = trajectory_at_frames(truth, recording.timestamps, _MAX_TRUTH_GAP_S)
     return replace(recording, ground_truth=Trajectory(unit.timestamps, unit.poses @ iTc))

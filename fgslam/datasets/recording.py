@@ -26,11 +26,14 @@ from fgslam.datasets.images import ImageLoader
 from fgslam.datasets.odometry import (
     STAMP_TOLERANCE_S,
     OdometrySource,
+    file_odometry,
+    find_odometry,
     is_of_gyroscope,
     synthetic_motions,
 )
 from fgslam.datasets.settings import (
     CalibratedSettings,
+    RecordedOdometrySettings,
     RecordingSettings,
     SyntheticOdometrySettings,
 )
@@ -120,8 +123,9 @@ def image_recording(
     rig: CameraRig,
     stamps: FloatArray,
     load_images: ImageLoader,
-    identity: str,
+    files: tuple[Iterable[Path], Iterable[Path]],
     notes: tuple[str, ...],
+    odometry_source: OdometrySource | None = None,
 ) -> Recording:
     """Recording of those frames that the settings select; what all readers of images end in.
 
@@ -131,8 +135,9 @@ def image_recording(
         rig: of the cameras, on the body that odometry moves.
         stamps: (n,) seconds of all frames, increasing.
         load_images: reads the images of a frame by its number among all.
-        identity: as :func:`recording_identity` makes it.
+        files: that identify it: by their content, and by their names (:func:`recording_identity`).
         notes: what was tolerated; the rig's own remarks are put before them.
+        odometry_source: where the body's motions come from.
 
     Raises:
         DatasetError: no frame is selected.
@@ -142,7 +147,15 @@ def image_recording(
     if isinstance(rig, StereoRig):
         plain, rectifier, notes = rig.plain(), rig.rectifier, (*rig.remarks, *notes)
     return Recording(
-        name, plain, stamps[indices], identity, notes, indices, load_images, rectifier=rectifier
+        name,
+        plain,
+        stamps[indices],
+        recording_identity(*files),
+        notes,
+        indices,
+        load_images,
+        odometry_source=odometry_source,
+        rectifier=rectifier,
     )
 
 
@@ -301,20 +314,25 @@ def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:
 
 
 def on_wheels(
-    rig: Rig, settings: CalibratedSettings, odometry_file: Path | None
-) -> tuple[Rig, tuple[str, ...]]:
-    """The rig on the body that a file's odometry moves, and what is assumed of its place there.
+    rig: Rig, root: Path, settings: CalibratedSettings, odometry: RecordedOdometrySettings
+) -> tuple[Rig, tuple[str, ...], list[Path], OdometrySource | None]:
+    """The rig on the body that the odometry in a recording's folder moves, and that odometry.
 
     Where the calibration is of the cameras alone, they look straight ahead from its origin.
+
+    Returns:
+        The rig, what is assumed of its place on the body, the file of odometry, and its motions.
     """
+    file = find_odometry(root)
+    if file is None:
+        return rig, (), [], None
+    source = file_odometry(file, odometry)
     stated = settings.camera_yaw_deg is not None or settings.lever_arm_m is not None
     # A gyroscope is in the camera's own box, wheels turn about another axis.
-    if stated or odometry_file is None or is_of_gyroscope(odometry_file):
-        return rig, ()
-    if not body_is_camera(rig.bTc):
-        return rig, ()
-    text = f"nothing states where the camera sits on the body of {odometry_file}: {LOOKS_AHEAD}"
-    return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (text,)
+    if stated or is_of_gyroscope(file) or not body_is_camera(rig.bTc):
+        return rig, (), [file], source
+    text = f"nothing states where the camera sits on the body of {file}: {LOOKS_AHEAD}"
+    return replace(rig, bTc=BODY_FORWARD_LEFT_UP_FROM_CAMERA), (text,), [file], source
 
 
 LOOKS_AHEAD = (

@@ -33,7 +33,6 @@ from fgslam.datasets.recording import (
     calibrated_rig,
     image_recording,
     numbered,
-    recording_identity,
 )
 from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
 from fgslam.datasets.times import NANOSECONDS, pair_stamps
@@ -82,8 +81,7 @@ def open_video(settings: VideoSettings, _: RecordedOdometrySettings) -> Recordin
 
     notes = (*(note for film in films for note in film.notes), *assumed, *timed)
     name = given.stem if len(films) == 1 else given.resolve().name.replace("*", "")
-    identity = recording_identity([], paths)
-    return image_recording(settings, name, rig, times, load, identity, notes)
+    return image_recording(settings, name, rig, times, load, ([], paths), notes)
 
 
 def _with_last(image: Image, size: tuple[int, int]) -> Image:
