@@ -107,7 +107,15 @@ def calibrate(
         fit = _Fit(seen.select(used), values, size, model)
         values, sigmas = fit.solution()
         away = np.linalg.norm(_predicted(seen, values, size, model) - seen.pixels, axis=1)
-        trimmed = _fitting(seen, away)
+        # Distances beyond five robust deviations of all are left out; what an earlier, worse fit
+        # left out comes back where it fits now.
+        known = away[np.isfinite(away)]
+        if not len(known):
+            raise CalibrationError(_UNDETERMINED)
+        limit = _OUTLIER_SIGMAS * float(np.median(known)) / _MEDIAN_OF_RAYLEIGH
+        near = away <= limit
+        counts = np.bincount(seen.image[near], minlength=len(seen.images))
+        trimmed = near & (counts >= _LEAST_CORNERS)[seen.image]
         if trimming == _TRIMMINGS - 1 or trimmed.sum() == used.sum():
             break
         used = trimmed
@@ -201,19 +209,6 @@ def _require_views(seen: _Sightings, used: BoolArray) -> None:
                 f"the {which} shows the board in {count} images that can be "
                 f"used; {LEAST_VIEWS} are needed at least, twenty are good"
             )
-
-
-def _fitting(seen: _Sightings, away: FloatArray) -> BoolArray:
-    """Which corners (n,) fit: distances beyond five robust deviations of all are left out.
-
-    What an earlier, worse fit left out comes back where it fits now.
-    """
-    known = away[np.isfinite(away)]
-    if not len(known):
-        raise CalibrationError(_UNDETERMINED)
-    kept = away <= _OUTLIER_SIGMAS * float(np.median(known)) / _MEDIAN_OF_RAYLEIGH
-    counts = np.bincount(seen.image[kept], minlength=len(seen.images))
-    return np.asarray(kept & (counts >= _LEAST_CORNERS)[seen.image])
 
 
 def _rms(distances: FloatArray) -> float:

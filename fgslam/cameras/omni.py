@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -379,44 +378,6 @@ class RadialCamera(ABC):
 
 
 # --------------------------------------------------------------------------------------------
-# Exact inverse of a smooth monotone function: started from a table, ended by Newton's method
-
-
-ValueAndSlope: TypeAlias = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
-
-_KNOTS = 513
-# From a table of 513 knots two steps reach rounding; the others guard uneven functions.
-_STEPS = 5
-
-
-class MonotoneInverse:
-    """Solves ``function(x) = y`` for x in an interval over which the function is monotone."""
-
-    def __init__(self, function: ValueAndSlope, lowest: float, highest: float) -> None:
-        """Tabulates ``function``, which gives values and slopes, over [lowest, highest]."""
-        self._function, self._limits = function, (lowest, highest)
-        knots = np.linspace(lowest, highest, _KNOTS)
-        values, slopes = function(knots)
-        self.monotone = bool(np.all(slopes > 0.0) or np.all(slopes < 0.0))
-        self.knots = knots
-        self.slopes = slopes
-        rising = values[-1] > values[0]
-        self._values = values if rising else values[::-1]
-        self._starts = knots if rising else knots[::-1]
-
-    def __call__(self, wanted: FloatArray) -> FloatArray:
-        """Arguments (n,) of values (n,); NaN where the function does not take them."""
-        wanted = np.asarray(wanted, dtype=np.float64)
-        slack = 1e-12 * (1.0 + np.abs(self._values[[0, -1]]).max())
-        seen = (wanted >= self._values[0] - slack) & (wanted <= self._values[-1] + slack)
-        x = np.interp(np.where(seen, wanted, self._values[0]), self._values, self._starts)
-        for _ in range(_STEPS):
-            value, slope = self._function(x)
-            x = np.clip(x - (value - wanted) / slope, *self._limits)
-        return np.where(seen, x, np.nan)
-
-
-# --------------------------------------------------------------------------------------------
 # The hyperbolic mirror as a unified sphere, above and below the horizon
 
 
@@ -493,6 +454,9 @@ class HyperbolicMirror(RadialCamera):
 
 
 PAPER_DEGREE = 5
+_KNOTS = 513
+# From a table of 513 knots two steps reach rounding; the others guard uneven functions.
+_NEWTON_STEPS = 5
 
 
 @dataclass(frozen=True)
@@ -511,29 +475,39 @@ class RadialPolynomial(RadialCamera):
     """
 
     coefficients: tuple[float, ...]
-    _inverse: MonotoneInverse = field(init=False, repr=False, compare=False)
+    _table: tuple[FloatArray, FloatArray] = field(init=False, repr=False, compare=False)
+    """Rising elevations (513,), and the radii that have them."""
 
     def __post_init__(self) -> None:
         if not self.coefficients or not np.isfinite(self.coefficients).all():
             raise CalibrationError("radial polynomial: its coefficients must be finite, at least 1")
         RadialCamera.__post_init__(self)
-        inverse = MonotoneInverse(self._value_and_slope, self.inner_radius, self.outer_radius)
-        if not inverse.monotone:
-            turn = inverse.knots[int(np.argmin(np.abs(inverse.slopes)))]
+        radii = np.linspace(self.inner_radius, self.outer_radius, _KNOTS)
+        values, slopes = self._value_and_slope(radii)
+        if not (np.all(slopes > 0.0) or np.all(slopes < 0.0)):
+            turn = radii[int(np.argmin(np.abs(slopes)))]
             raise CalibrationError(
                 f"mirror image: elevation turns back near radius {turn:.1f} px of the ring "
                 f"{self.inner_radius:.1f} to {self.outer_radius:.1f} px; fit a lower degree, "
                 "correct the samples, or take more near the rims"
             )
-        object.__setattr__(self, "_inverse", inverse)
+        order = slice(None, None, 1 if values[-1] > values[0] else -1)
+        object.__setattr__(self, "_table", (values[order], radii[order]))
 
     def elevation(self, radius: FloatArray) -> FloatArray:
         """(n,) elevations; see :class:`RadialCamera`."""
         return np.asarray(polynomial.polyval(self._scaled(radius), np.array(self.coefficients)))
 
     def radius(self, elevation: FloatArray) -> FloatArray:
-        """(n,) radii, exact to rounding; see :class:`RadialCamera`."""
-        return self._inverse(elevation)
+        """(n,) radii, from the table by Newton's method; see :class:`RadialCamera`."""
+        wanted, (values, radii) = np.asarray(elevation, dtype=np.float64), self._table
+        slack = 1e-12 * (1.0 + np.abs(values[[0, -1]]).max())
+        seen = (wanted >= values[0] - slack) & (wanted <= values[-1] + slack)
+        x = np.interp(np.where(seen, wanted, values[0]), values, radii)
+        for _ in range(_NEWTON_STEPS):
+            value, slope = self._value_and_slope(x)
+            x = np.clip(x - (value - wanted) / slope, self.inner_radius, self.outer_radius)
+        return np.where(seen, x, np.nan)
 
     def _scaled(self, radius: FloatArray) -> FloatArray:
         return _scaled(radius, self.inner_radius, self.outer_radius)

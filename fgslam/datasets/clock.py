@@ -151,7 +151,19 @@ def judged(seen: SeenTurns) -> Judged:
     now, then = seen.errors(0.0), seen.errors(best)
     before, left = _median(now), _median(then)
     if size > _LEAST_TURN_RAD:
-        _require_radians(seen, best)
+        # The odometry may turn 57 times as much as the images.
+        dt = np.diff(seen.stamps)[seen.rows - 1][:, None]
+        rates = (turns / dt for turns in (seen.by_odometry(best), seen.turns))
+        # How far they are from their median, which a bias may be.
+        odometry, images = (np.linalg.norm(r - np.nanmedian(r, axis=0), axis=1) for r in rates)
+        known = np.isfinite(odometry) & (images >= np.median(images))
+        scale = float(np.median(odometry[known] / images[known])) if known.any() else 1.0
+        if _DEGREES / _LIKE_DEGREES < scale < _DEGREES * _LIKE_DEGREES:
+            raise OdometryError(
+                f"the odometry of {seen.name} turns {scale:.0f} times as fast as the images: its "
+                "angular velocity is in degrees/s, radians/s are expected; name the columns so "
+                "(gyro_x_dps), or convert them"
+            )
     if size > _CLEAR_TURN_RAD and left > _AGREES * size and seen.by_gyroscope:
         return Judged(
             fault=True,
@@ -176,22 +188,6 @@ def judged(seen: SeenTurns) -> Judged:
         f"({np.degrees(left):.2g} instead of {np.degrees(before):.2g} degrees a step): "
         f"odometry.time_offset_s is {best:.3f}",
     )
-
-
-def _require_radians(seen: SeenTurns, shift: float) -> None:
-    """Raises OdometryError where the odometry turns 57 times as much as the images."""
-    dt = np.diff(seen.stamps)[seen.rows - 1][:, None]
-    rates = (turns / dt for turns in (seen.by_odometry(shift), seen.turns))
-    # How far they are from their median, which a bias may be.
-    odometry, images = (np.linalg.norm(r - np.nanmedian(r, axis=0), axis=1) for r in rates)
-    known = np.isfinite(odometry) & (images >= np.median(images))
-    scale = float(np.median(odometry[known] / images[known])) if known.any() else 1.0
-    if _DEGREES / _LIKE_DEGREES < scale < _DEGREES * _LIKE_DEGREES:
-        raise OdometryError(
-            f"the odometry of {seen.name} turns {scale:.0f} times as fast as the images: its "
-            "angular velocity is in degrees/s, radians/s are expected; name the columns so "
-            "(gyro_x_dps), or convert them"
-        )
 
 
 # --------------------------------------------------------------------------------------------

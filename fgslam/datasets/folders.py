@@ -156,7 +156,7 @@ def _folder_rig(
 def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
     """Image numbers (n,) and stamps (n,) in seconds."""
     table = read_table(path, ("image number", "time"))
-    stated = table.column(0)
+    stated = table.values[:, 0]
     wrong = np.flatnonzero((stated != np.floor(stated)) | (stated < 0) | (stated > _LAST_NUMBER))
     if len(wrong):
         line = table.lines[wrong[0]]
@@ -173,8 +173,8 @@ def _read_times(path: Path) -> tuple[IntArray, FloatArray]:
             f"{path}, line {table.lines[k]}: image number {numbers[k]} is listed twice; "
             "remove one of the lines"
         )
-    require_increasing(table, table.column(1))
-    return numbers, table.column(1)
+    require_increasing(table, table.values[:, 1])
+    return numbers, table.values[:, 1]
 
 
 # ------------------------------------------------------------------------------------------

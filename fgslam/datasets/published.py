@@ -188,11 +188,11 @@ def read_body_truth(folder: Path) -> Trajectory | None:
     if not path.is_file():
         return None
     table = read_table(path, _TRUTH_COLUMNS, ",")
-    require_increasing(table, table.column(0))
+    require_increasing(table, table.values[:, 0])
     poses = poses_of(table, table.values[:, 1:4], table.values[:, [5, 6, 7, 4]])
     if (folder / "sensor.yaml").is_file():
         poses = poses @ inverse(read_asl_mounting(folder / "sensor.yaml"))
-    return Trajectory(table.column(0) * NANOSECONDS, poses)
+    return Trajectory(table.values[:, 0] * NANOSECONDS, poses)
 
 
 # --------------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ def open_kitti(settings: KittiSettings, _: RecordedOdometrySettings) -> Recordin
         for name in (f"image_{pair[1]}", f"image_{pair[0]}")
     }
     table = read_table(times, ("time",))
-    stamps = table.column(0)
+    stamps = table.values[:, 0]
     require_increasing(table, stamps)
     paths = [
         tuple(found.get(k, folder / name / f"{k:06d}.png") for name, found in cameras.items())

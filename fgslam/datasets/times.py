@@ -53,10 +53,6 @@ class Table:
     def __len__(self) -> int:
         return len(self.lines)
 
-    def column(self, k: int) -> FloatArray:
-        """Column ``k`` (n,)."""
-        return np.asarray(self.values[:, k])
-
 
 def read_table(
     path: Path,
@@ -134,9 +130,9 @@ def read_tum(path: Path) -> Trajectory:
         DatasetError: a line is malformed, times do not increase, or a quaternion is no rotation.
     """
     table = read_table(path, TUM_COLUMNS)
-    require_increasing(table, table.column(0))
+    require_increasing(table, table.values[:, 0])
     poses = poses_of(table, table.values[:, 1:4], table.values[:, 4:8])
-    return Trajectory(table.column(0), poses)
+    return Trajectory(table.values[:, 0], poses)
 
 
 def poses_of(

@@ -460,7 +460,7 @@ def test_times_of_rates_are_in_any_unit(tmp_path: Path, unit: float) -> None:
     rows = np.column_stack([stamps / unit, rates])
     path.write_text("\n".join(",".join(f"{x:.12g}" for x in row) for row in rows))
     table = read_columns(path, "rates")
-    np.testing.assert_allclose(table.column(0), stamps, rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(table.values[:, 0], stamps, rtol=0.0, atol=1e-9)
 
 
 def test_degrees_are_refused_by_their_size(tmp_path: Path) -> None:
