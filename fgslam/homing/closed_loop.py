@@ -15,7 +15,7 @@ from fgslam.core.geometry import wrap
 from fgslam.homing.active import ActiveHoming
 from fgslam.homing.controller import HomingChain, LegOutcome
 from fgslam.homing.settings import ClosedLoopSettings
-from fgslam.homing.steering import Command, Drive, ObstacleAvoider, RangeScan, Steering
+from fgslam.homing.steering import Command, CorridorAvoidance, Drive, RangeScan, Steering
 
 
 class World(Protocol):
@@ -42,28 +42,11 @@ class World(Protocol):
 Watcher = Callable[[Command, ByteArray], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Driver:
-    """Steering and avoidance, which turn commands into motion."""
-
-    steering: Steering
-    avoider: ObstacleAvoider
-
-    def drive(self, command: Command, world: World, dt: float) -> Drive:
-        """Speed and turning rate for the next ``dt`` seconds."""
-        wanted = self.steering.step(command, dt)
-        if command.stop:
-            return wanted
-        driven = self.avoider.override(wanted, command.heading, RangeScan(*world.scan()))
-        if driven.overridden:
-            self.steering.driven(driven)
-        return driven
-
-
 def follow(
     world: World,
     follower: HomingChain,
-    driver: Driver,
+    steering: Steering,
+    avoider: CorridorAvoidance | None,
     settings: ClosedLoopSettings,
     targets: FloatArray | None = None,
     watch: Watcher | None = None,
@@ -73,7 +56,8 @@ def follow(
     Args:
         world: where the robot stands at the path's start.
         follower: fresh.
-        driver: fresh, too.
+        steering: fresh, too.
+        avoider: fresh, too; None for a robot without a range sensor.
         settings: rate and longest time.
         targets: (m, 3) true poses of the targets, for the record alone.
         watch: called with every command and its image, for pictures of the drive.
@@ -83,21 +67,38 @@ def follow(
     """
     dt = 1.0 / settings.images_per_s
     steps = max(1, int(np.ceil(settings.longest_s * settings.images_per_s)))
-    recorder = _Recorder()
+    poses: list[FloatArray] = []
+    commands: list[Command] = []
+    drives: list[Drive] = []
+    rows: list[int] = []
+    states: list[HomingEstimate | None] = []
+    laps: list[list[float]] = []
+    homings: list[tuple[int, ActiveHoming, int]] = []  # target, homing, its first step
     for k in range(steps):
-        clock = _Clock()
-        time, pose = k * dt, np.array(world.true_pose, dtype=np.float64)
+        time = k * dt
+        poses.append(np.array(world.true_pose, dtype=np.float64))
+        clock = [perf_counter()]
         image = world.image(time)
-        clock.lap()
+        clock.append(perf_counter())
         command = follower.step(image, time)
-        clock.lap()
-        drive = driver.drive(command, world, dt)
-        if drive.overridden:
-            follower.held_up(dt)
-        clock.lap()
+        clock.append(perf_counter())
+        drive = steering.step(command, dt)
+        if avoider is not None and not command.stop:
+            drive = avoider.override(drive, command.heading, RangeScan(*world.scan()))
+            if drive.overridden:
+                steering.driven(drive)
+                follower.held_up(dt)
+        clock.append(perf_counter())
         world.drive(drive.speed, drive.turn_rate, dt)
-        clock.lap()
-        recorder.note(pose, command, drive, follower.controller.active, clock.laps)
+        clock.append(perf_counter())
+        laps.append(np.diff(clock).tolist())
+        homing = follower.controller.active
+        if homing is not None and (not homings or homings[-1][1] is not homing):
+            homings.append((command.target, homing, k))
+        rows.append(-1 if homing is None else len(homings) - 1)
+        states.append(None if homing is None else homing.estimate)
+        commands.append(command)
+        drives.append(drive)
         if watch is not None:
             watch(command, image)
         # The record ends with the robot at a stand: brakes need a few steps.
@@ -105,98 +106,43 @@ def follow(
             break
     else:
         follower.interrupt((steps - 1) * dt, f"not finished after {settings.longest_s:g} s")
-    return recorder.record(np.array(world.true_pose), follower, targets)
-
-
-class _Clock:
-    """Wall times between laps, seconds."""
-
-    def __init__(self) -> None:
-        self.laps: list[float] = []
-        self._last = perf_counter()
-
-    def lap(self) -> None:
-        now = perf_counter()
-        self.laps.append(now - self._last)
-        self._last = now
-
-
-class _Recorder:
-    """Rows of a drive, gathered into a record."""
-
-    def __init__(self) -> None:
-        self._poses: list[FloatArray] = []
-        self._commands: list[Command] = []
-        self._drives: list[Drive] = []
-        self._rows: list[int] = []
-        self._estimates: list[HomingEstimate | None] = []
-        self._laps: list[list[float]] = []
-        self._logs: list[tuple[int, ActiveHoming, int]] = []
-
-    def note(
-        self,
-        pose: FloatArray,
-        command: Command,
-        drive: Drive,
-        homing: ActiveHoming | None,
-        laps: list[float],
-    ) -> None:
-        """Adds the row of one step."""
-        self._poses.append(pose)
-        self._drives.append(drive)
-        self._laps.append(laps)
-        self._estimates.append(None if homing is None else homing.estimate)
-        self._rows.append(-1 if homing is None else self._log(command, homing))
-        self._commands.append(command)
-
-    def _log(self, command: Command, homing: ActiveHoming) -> int:
-        if not self._logs or self._logs[-1][1] is not homing:
-            self._logs.append((command.target, homing, len(self._commands)))
-        return len(self._logs) - 1
-
-    def _closed(self, target: int, homing: ActiveHoming, first_step: int) -> HomingLog:
-        times = np.array([c.time for c in self._commands])
-        return HomingLog(
-            target=target,
-            start=homing.start,
-            tracks=tuple(homing.history),
-            estimate=homing.estimate,
-            unit=homing.unit,
-            first_step=first_step,
-            steps=np.searchsorted(times, [t.time for t in homing.history]),
-        )
-
-    def record(
-        self, end: FloatArray, follower: HomingChain, targets: FloatArray | None
-    ) -> DriveRecord:
-        """The record of all steps."""
-        commands, drives, known = self._commands, self._drives, self._estimates
-        unknown, blank = np.full(3, np.nan), np.full((6, 6), np.nan)
-        laps = np.array(self._laps)
-        return DriveRecord(
-            time=np.array([c.time for c in commands]),
-            truth=np.array(self._poses),
-            end=end,
-            targets=np.empty((0, 3)) if targets is None else np.array(targets),
-            target=np.array([c.target for c in commands], dtype=np.int64),
-            state=tuple(c.state.value for c in commands),
-            reason=tuple(c.reason for c in commands),
-            heading=np.array([c.heading for c in commands]),
-            remaining=np.array([c.remaining for c in commands]),
-            rotation=np.array([c.rotation for c in commands]),
-            covariance=np.array([c.covariance for c in commands]),
-            speed=np.array([d.speed for d in drives]),
-            turn_rate=np.array([d.turn_rate for d in drives]),
-            overridden=np.array([d.overridden for d in drives]),
-            homing=np.array(self._rows, dtype=np.int64),
-            robot=np.array([unknown if e is None else e.robot for e in known]),
-            aim=np.array([unknown if e is None else e.target for e in known]),
-            joint=np.array([blank if e is None else e.covariance for e in known]),
-            homings=tuple(self._closed(*log) for log in self._logs),
-            legs=tuple(follower.outcomes),
-            seconds={name: laps[:, i] for i, name in enumerate(STAGES)},
-            finished=follower.finished,
-        )
+    times = np.array([c.time for c in commands])
+    unknown, blank = np.full(3, np.nan), np.full((6, 6), np.nan)
+    return DriveRecord(
+        time=times,
+        truth=np.array(poses),
+        end=np.array(world.true_pose),
+        targets=np.empty((0, 3)) if targets is None else np.array(targets),
+        target=np.array([c.target for c in commands], dtype=np.int64),
+        state=tuple(c.state.value for c in commands),
+        reason=tuple(c.reason for c in commands),
+        heading=np.array([c.heading for c in commands]),
+        remaining=np.array([c.remaining for c in commands]),
+        rotation=np.array([c.rotation for c in commands]),
+        covariance=np.array([c.covariance for c in commands]),
+        speed=np.array([d.speed for d in drives]),
+        turn_rate=np.array([d.turn_rate for d in drives]),
+        overridden=np.array([d.overridden for d in drives]),
+        homing=np.array(rows, dtype=np.int64),
+        robot=np.array([unknown if e is None else e.robot for e in states]),
+        aim=np.array([unknown if e is None else e.target for e in states]),
+        joint=np.array([blank if e is None else e.covariance for e in states]),
+        homings=tuple(
+            HomingLog(
+                target=target,
+                start=homing.start,
+                tracks=tuple(homing.history),
+                estimate=homing.estimate,
+                unit=homing.unit,
+                first_step=first,
+                steps=np.searchsorted(times, [t.time for t in homing.history]),
+            )
+            for target, homing, first in homings
+        ),
+        legs=tuple(follower.outcomes),
+        seconds=dict(zip(STAGES, np.array(laps).T, strict=True)),
+        finished=follower.finished,
+    )
 
 
 # --------------------------------------------------------------------------------------------

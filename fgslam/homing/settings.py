@@ -6,8 +6,6 @@ Where the paper leaves a number open, `docs/concepts/homing.md` says where the d
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
@@ -39,22 +37,6 @@ class SteeringSettings:
 
 
 @dataclass(frozen=True, config=STRICT)
-class AvoidanceSettings:
-    """A range scan overrides the steering (IV)."""
-
-    method: Literal["corridors", "none"] = Field(
-        default="corridors",
-        description="`corridors`: the free direction nearest to home; `none`: no sensor",
-    )
-    half_width_m: Positive = Field(
-        default=0.42, description="half the corridor needed: the robot's radius and a margin"
-    )
-    body_m: Positive = Field(
-        default=0.37, description="half width of the bare robot, for ways out of corners"
-    )
-
-
-@dataclass(frozen=True, config=STRICT)
 class ClosedLoopSettings:
     """The loop of camera, homing, steering and drive."""
 
@@ -68,7 +50,6 @@ class HomingBehaviourSettings:
 
     control: HomingControlSettings = HomingControlSettings()
     steering: SteeringSettings = SteeringSettings()
-    avoidance: AvoidanceSettings = AvoidanceSettings()
     loop: ClosedLoopSettings = ClosedLoopSettings()
 
 

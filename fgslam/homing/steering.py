@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.bearings import Refusal, TwoViewVector
 from fgslam.core.geometry import wrap
-from fgslam.homing.settings import AvoidanceSettings, SteeringSettings
+from fgslam.homing.settings import SteeringSettings
 
 ACCELERATION_MPS2, TURN_ACCELERATION_DEG_S2 = 0.5, 120.0
 """Largest changes of speed and of the turning rate: what a passenger takes without holding on."""
@@ -46,47 +46,38 @@ class Steering:
 
     def step(self, command: Command, dt: float) -> Drive:
         """Speed and turning rate for the next ``dt`` seconds."""
+        speed, rate, heading = 0.0, 0.0, command.heading
         if command.stop:
-            wanted_speed, wanted_rate = 0.0, 0.0
             self._turning = False
         else:
-            wanted_rate = self._turn(command.heading)
-            wanted_speed = self._forward(command)
-        self._speed = _towards(self._speed, wanted_speed, ACCELERATION_MPS2 * dt)
+            around = heading
+            if abs(heading) > _BEHIND and self._turn_rate != 0.0:
+                around = float(np.copysign(heading, self._turn_rate))
+            limit = np.deg2rad(self._settings.max_turn_deg_s)
+            rate = float(np.clip(_STEERING_GAIN_PER_S * around, -limit, limit))
+            # Two thresholds: with one, noise would switch between turning and driving.
+            in_place = np.deg2rad(TURN_IN_PLACE_DEG)
+            self._turning = abs(heading) > (0.5 * in_place if self._turning else in_place)
+            if not self._turning:
+                ahead = max(float(np.cos(heading)), 0.0)
+                speed = self._settings.max_speed_mps * ahead * _speed_share(command)
+        faster = ACCELERATION_MPS2 * dt
+        self._speed += float(np.clip(speed - self._speed, -faster, faster))
         most = np.deg2rad(TURN_ACCELERATION_DEG_S2) * dt
-        self._turn_rate = _towards(self._turn_rate, wanted_rate, most)
+        self._turn_rate += float(np.clip(rate - self._turn_rate, -most, most))
         return Drive(self._speed, self._turn_rate)
 
     def driven(self, drive: Drive) -> None:
         """What was commanded in the end, where avoidance overrode: limits start from there."""
         self._speed, self._turn_rate = drive.speed, drive.turn_rate
 
-    def _turn(self, heading: float) -> float:
-        s = self._settings
-        if abs(heading) > _BEHIND and self._turn_rate != 0.0:
-            heading = float(np.copysign(heading, self._turn_rate))
-        limit = np.deg2rad(s.max_turn_deg_s)
-        return float(np.clip(_STEERING_GAIN_PER_S * heading, -limit, limit))
 
-    def _forward(self, command: Command) -> float:
-        s = self._settings
-        limit = np.deg2rad(TURN_IN_PLACE_DEG)
-        # Two thresholds: with one, noise would switch between turning and driving.
-        self._turning = abs(command.heading) > (0.5 * limit if self._turning else limit)
-        if self._turning:
-            return 0.0
-        ahead = max(float(np.cos(command.heading)), 0.0)
-        return s.max_speed_mps * ahead * self._share(command)
-
-    def _share(self, command: Command) -> float:
-        if command.state in (HomingState.BLIND, HomingState.SEARCH):
-            return BLIND_SHARE
-        least = _LEAST_SHARE if command.final else PASSING_SHARE
-        return float(np.clip(command.remaining / SLOW_FRACTION, least, 1.0))
-
-
-def _towards(now: float, wanted: float, most: float) -> float:
-    return now + float(np.clip(wanted - now, -most, most))
+def _speed_share(command: Command) -> float:
+    """Part of the largest speed that a command's state and its distance to the target allow."""
+    if command.state in (HomingState.BLIND, HomingState.SEARCH):
+        return BLIND_SHARE
+    least = _LEAST_SHARE if command.final else PASSING_SHARE
+    return float(np.clip(command.remaining / SLOW_FRACTION, least, 1.0))
 
 
 # --------------------------------------------------------------------------------------------
@@ -95,6 +86,8 @@ def _towards(now: float, wanted: float, most: float) -> float:
 # the way, and the next image corrects the rest.
 
 
+_HALF_WIDTH_M = 0.42  # half the corridor needed: the robot's radius and a margin
+_BODY_M = 0.37  # half width of the bare robot, for ways out of corners
 _ESCAPE_MPS = 0.25  # speed on the way out
 _ESCAPE_M = 1.2  # ways longer than this are equally good ways out
 _ESCAPE_STEPS = 20  # steps of driving along it; 2 s at 10 a second
@@ -124,28 +117,6 @@ class RangeScan(NamedTuple):
     ranges: FloatArray
 
 
-class ObstacleAvoider(Protocol):
-    """Decides, from the steering's wish and the scan, what is driven."""
-
-    def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
-        """What is driven in the end.
-
-        Args:
-            wanted: by the steering.
-            heading: direction of home, radians.
-            scan: taken just now.
-        """
-        ...
-
-
-class NoAvoidance:
-    """For robots without a range sensor: the steering is obeyed."""
-
-    def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
-        """``wanted`` itself."""
-        return wanted
-
-
 class CorridorAvoidance:
     """Drives along the free corridor that is nearest to home's direction.
 
@@ -159,9 +130,8 @@ class CorridorAvoidance:
     longest way that its bare body fits through, wherever that leads, and looks for corridors again.
     """
 
-    def __init__(self, settings: AvoidanceSettings, max_turn_deg_s: float) -> None:
+    def __init__(self, max_turn_deg_s: float) -> None:
         """``max_turn_deg_s`` is the robot's largest turning rate."""
-        self._settings = settings
         self._limit = np.deg2rad(max_turn_deg_s)
         step = 2.0 * np.pi / _DIRECTIONS
         self._directions: FloatArray = -np.pi + step * np.arange(_DIRECTIONS, dtype=float)
@@ -170,11 +140,20 @@ class CorridorAvoidance:
         self._escaping = 0  # steps that are left of a way out
 
     def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
-        """See :class:`ObstacleAvoider`."""
+        """What is driven in the end.
+
+        Args:
+            wanted: by the steering.
+            heading: direction of home, radians.
+            scan: taken just now.
+        """
+        hit = np.isfinite(scan.ranges)
+        r, a = np.asarray(scan.ranges)[hit], np.asarray(scan.angles)[hit]
+        points = np.column_stack([r * np.cos(a), r * np.sin(a)])
         if self._escaping > 0:
             self._escaping -= 1
-            return self._escape(_points(scan))
-        driven = self._in_corridor(wanted, heading, scan)
+            return self._escape(points)
+        driven = self._in_corridor(wanted, heading, points)
         stands = driven.overridden and driven.speed < _STANDING
         # Turning towards a way takes its time.
         faces = self._chosen is None or abs(self._chosen) <= _AHEAD
@@ -186,8 +165,7 @@ class CorridorAvoidance:
         return driven
 
     def _escape(self, points: FloatArray) -> Drive:
-        s = self._settings
-        ways = clear_ways(self._directions, points, s.body_m)
+        ways = clear_ways(self._directions, points, _BODY_M)
         # Of ways that are long enough the one that needs the least turning.
         worth = np.minimum(ways, _ESCAPE_M) - 0.1 * np.abs(self._directions)
         direction = float(self._directions[int(np.argmax(worth))])
@@ -195,24 +173,26 @@ class CorridorAvoidance:
         if abs(direction) > _AHEAD:
             self._escaping += 1  # turning does not count
             return Drive(0.0, rate, True)
-        way = float(clear_ways(np.zeros(1), points, s.body_m)[0])
-        return Drive(min(_ESCAPE_MPS, _BRAKE * max(way, 0.0)), rate, True)
+        return Drive(min(_ESCAPE_MPS, _most_speed(points, _BODY_M)), rate, True)
 
-    def _in_corridor(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:
+    def _in_corridor(self, wanted: Drive, heading: float, points: FloatArray) -> Drive:
         if wanted.speed <= 0.0 and self._chosen is None:
             return wanted  # turning on the spot is safe
-        s = self._settings
-        points = _points(scan)
         needed = _LOOK_AHEAD_M + _LOOK_AHEAD_S * max(wanted.speed, 0.0)
-        if clear_ways(np.array([heading]), points, s.half_width_m)[0] >= needed:
+        if clear_ways(np.array([heading]), points, _HALF_WIDTH_M)[0] >= needed:
             self._chosen = None
-            return self._slowed(wanted, points)
-        self._chosen = self._choose(heading, points, needed)
-        return self._drive(wanted, self._chosen, points)
+            most = _most_speed(points, _HALF_WIDTH_M)
+            return wanted if wanted.speed <= most else Drive(most, wanted.turn_rate, True)
+        direction = self._chosen = self._choose(heading, points, needed)
+        rate = float(np.clip(_AVOIDING_GAIN_PER_S * direction, -self._limit, self._limit))
+        if abs(direction) > _AHEAD:
+            return Drive(0.0, rate, True)
+        speed = min(wanted.speed, _most_speed(points, _HALF_WIDTH_M))
+        return Drive(speed * float(np.cos(direction)), rate, True)
 
     def _choose(self, heading: float, points: FloatArray, needed: float) -> float:
         """The best free direction; none being free, the one with the longest clear way."""
-        ways = clear_ways(self._directions, points, self._settings.half_width_m)
+        ways = clear_ways(self._directions, points, _HALF_WIDTH_M)
         free = ways >= needed
         if not free.any():
             return float(self._directions[int(np.argmax(ways))])
@@ -222,20 +202,11 @@ class CorridorAvoidance:
             cost = cost + _KEEP_WEIGHT * kept
         return float(self._directions[int(np.argmin(np.where(free, cost, np.inf)))])
 
-    def _drive(self, wanted: Drive, direction: float, points: FloatArray) -> Drive:
-        rate = float(np.clip(_AVOIDING_GAIN_PER_S * direction, -self._limit, self._limit))
-        if abs(direction) > _AHEAD:
-            return Drive(0.0, rate, True)
-        slowed = self._slowed(Drive(wanted.speed, rate, True), points)
-        return Drive(slowed.speed * float(np.cos(direction)), rate, True)
 
-    def _slowed(self, drive: Drive, points: FloatArray) -> Drive:
-        """No faster than the clear way straight ahead allows."""
-        way = clear_ways(np.zeros(1), points, self._settings.half_width_m)[0]
-        most = _BRAKE * max(float(way), 0.0)
-        if drive.speed <= most:
-            return drive
-        return Drive(most, drive.turn_rate, True)
+def _most_speed(points: FloatArray, half_width: float) -> float:
+    """Speed that the clear way straight ahead allows, m/s."""
+    way = clear_ways(np.zeros(1), points, half_width)[0]
+    return _BRAKE * max(float(way), 0.0)
 
 
 def clear_ways(directions: FloatArray, points: FloatArray, half_width: float) -> FloatArray:
@@ -256,20 +227,6 @@ def clear_ways(directions: FloatArray, points: FloatArray, half_width: float) ->
     front = np.sqrt(np.maximum(half_width**2 - across**2, 0.0))
     way = np.where(hit, np.maximum(along - front, 0.0), np.inf)
     return np.asarray(way.min(axis=1, initial=np.inf))
-
-
-def _points(scan: RangeScan) -> FloatArray:
-    """(n, 2) of the beams that hit something."""
-    hit = np.isfinite(scan.ranges)
-    r, a = np.asarray(scan.ranges)[hit], np.asarray(scan.angles)[hit]
-    return np.column_stack([r * np.cos(a), r * np.sin(a)])
-
-
-def make_avoider(settings: AvoidanceSettings, max_turn_deg_s: float) -> ObstacleAvoider:
-    """The avoider that the settings name, for a robot with this largest turning rate."""
-    if settings.method == "none":
-        return NoAvoidance()
-    return CorridorAvoidance(settings, max_turn_deg_s)
 
 
 # --------------------------------------------------------------------------------------------

@@ -28,10 +28,10 @@ from fgslam.core.bearings import (
 from fgslam.core.geometry import bearings, compose, wrap
 from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.homing.active import Sighting
-from fgslam.homing.closed_loop import Driver, DriveRecord, follow
+from fgslam.homing.closed_loop import DriveRecord, follow
 from fgslam.homing.controller import HomingChain
 from fgslam.homing.settings import HomingBehaviourSettings
-from fgslam.homing.steering import NoAvoidance, ObstacleAvoider, Steering
+from fgslam.homing.steering import CorridorAvoidance, Steering
 from fgslam.runs.tasks.homing_replay import start_from_matches
 
 DARK = np.zeros((1, 1, 3), dtype=np.uint8)
@@ -292,10 +292,16 @@ def drive_path(
     setting: Setting,
     settings: HomingBehaviourSettings | None = None,
     estimator: HomingEstimatorSettings | None = None,
-    avoider: ObstacleAvoider | None = None,
+    avoider: CorridorAvoidance | None = None,
 ) -> DriveRecord:
     """The whole path in closed loop."""
     behaviour = HomingBehaviourSettings() if settings is None else settings
-    driver = Driver(Steering(behaviour.steering), avoider or NoAvoidance())
     follower = make_follower(setting, behaviour, estimator)
-    return follow(setting.world, follower, driver, behaviour.loop, setting.targets)
+    return follow(
+        setting.world,
+        follower,
+        Steering(behaviour.steering),
+        avoider,
+        behaviour.loop,
+        setting.targets,
+    )

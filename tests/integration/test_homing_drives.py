@@ -16,7 +16,6 @@ from fgslam.backend.settings import HomingGraphSettings
 from fgslam.core.bearings import TrackedBearings
 from fgslam.evaluation.homing import homing_errors
 from fgslam.homing.closed_loop import (
-    Driver,
     DriveRecord,
     cross_track,
     follow,
@@ -25,7 +24,7 @@ from fgslam.homing.closed_loop import (
 )
 from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import HomingBehaviourSettings
-from fgslam.homing.steering import NoAvoidance, Steering
+from fgslam.homing.steering import Steering
 from fgslam.runs.config import HomingConfig, PathFollowingConfig, make_experiment
 from fgslam.runs.folder import write_config
 from fgslam.runs.tasks.homing_drives import (
@@ -233,8 +232,8 @@ def test_the_camera_s_last_view_of_each_leg_is_drawn(tmp_path: Path) -> None:
     follower = make_follower(setting, behaviour, None)
     assert not isinstance(setting.front_end, Unwrapping)
     watcher = DriveWatcher(cast(Unwrapping, ShowingFrontEnd(setting.front_end)), follower)
-    driver = Driver(Steering(behaviour.steering), NoAvoidance())
-    record = follow(setting.world, follower, driver, behaviour.loop, setting.targets, watch=watcher)
+    steering, loop = Steering(behaviour.steering), behaviour.loop
+    record = follow(setting.world, follower, steering, None, loop, setting.targets, watch=watcher)
     assert record.arrived
     assert [view.target for view in watcher.views(8)] == [0, 1, 2]
     assert [view.target for view in watcher.views(1)] == [2]

@@ -16,11 +16,10 @@ from fgslam.cli.main import app
 from fgslam.datasets.opening import open_house
 from fgslam.homing.settings import (
     DRIVING,
-    AvoidanceSettings,
     HomingBehaviourSettings,
     SteeringSettings,
 )
-from fgslam.homing.steering import Drive, DriveCommand, RangeScan, make_avoider
+from fgslam.homing.steering import CorridorAvoidance, Drive, DriveCommand, RangeScan
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.settings import HouseCameraSettings, HousePathSettings, OmniHouseSettings
 
@@ -82,12 +81,12 @@ def test_between_gives_the_numbers_of_the_task_homing_pairs(tmp_path: Path) -> N
 
 def test_a_follower_commands_what_the_closed_loop_does(tmp_path: Path, world: OmniWorld) -> None:
     values = yaml.safe_load(Path("experiments/homing_lab.yaml").read_text(encoding="utf-8"))
-    values["behaviour"] = {"loop": {"longest_s": STEPS * DT}, "avoidance": {"method": "none"}}
+    values["behaviour"] = {"loop": {"longest_s": STEPS * DT}}
     values["output"] = QUIET
     written = rows(run(tmp_path, values) / "commands.csv")
     assert len(written) == STEPS
     world.put(world.reference_poses[0])
-    behaviour = HomingBehaviourSettings(avoidance=AvoidanceSettings(method="none"))
+    behaviour = HomingBehaviourSettings()
     path = fg.teach(world.targets, world.camera)
     follower = fg.PathFollower(world.camera, path, behaviour=behaviour, seed=SEED)
     for k, row in enumerate(written):
@@ -143,7 +142,7 @@ class Robot:
         self.world = open_house(ten_legs, SEED)
         path = fg.teach(self.world.targets, self.world.camera)
         self.follower = fg.PathFollower(self.world.camera, path, seed=SEED)
-        self._avoider = make_avoider(AvoidanceSettings(), SteeringSettings().max_turn_deg_s)
+        self._avoider = CorridorAvoidance(SteeringSettings().max_turn_deg_s)
         self.commands: list[DriveCommand] = []
 
     def put(self, leg: int, part: float, turned: float) -> None:

@@ -74,7 +74,7 @@ HOUSE: dict[str, Any] = {
     "jobs": 1,
     "trials": 2,
     "dataset": {"path": {"legs": 1, "spacing_m": 2.0}},
-    "behaviour": {"loop": {"longest_s": 0.3}, "avoidance": {"method": "none"}},
+    "behaviour": {"loop": {"longest_s": 0.3}},
     "output": SILENT,
 }
 IN_SMALL_BLOCKS = """

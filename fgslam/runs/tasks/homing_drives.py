@@ -32,7 +32,6 @@ from fgslam.homing.api import teach
 from fgslam.homing.closed_loop import (
     ARRIVED_M,
     STAGES,
-    Driver,
     DriveRecord,
     HomingLog,
     World,
@@ -48,7 +47,7 @@ from fgslam.homing.controller import HomingChain
 from fgslam.homing.front_end import HomingFrontEnd, make_front_end
 from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import FrontEndSettings
-from fgslam.homing.steering import Command, HomingState, Steering, make_avoider
+from fgslam.homing.steering import Command, CorridorAvoidance, HomingState, Steering
 from fgslam.homing.topological_map import RouteMap
 from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import (
@@ -211,14 +210,14 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
         lambda start: make_homing_estimator(start, config.estimator),
         behaviour.control,
     )
-    avoider = make_avoider(behaviour.avoidance, behaviour.steering.max_turn_deg_s)
-    driver = Driver(Steering(behaviour.steering), avoider)
+    steering = Steering(behaviour.steering)
+    avoider = CorridorAvoidance(behaviour.steering.max_turn_deg_s)
     start = np.array(world.true_pose)
     shown = config.output.pictures if task.seed == config.seed else 0
     watcher = (
         DriveWatcher(front_end, follower) if shown and isinstance(front_end, Unwrapping) else None
     )
-    record = follow(world, follower, driver, behaviour.loop, opened.poses, watcher)
+    record = follow(world, follower, steering, avoider, behaviour.loop, opened.poses, watcher)
     leg = float(np.hypot(*(opened.poses[0, :2] - start[:2])))
     views = () if watcher is None else watcher.views(shown)
     return DrivenSeed(task.seed, record, memory, tuple(world.outlines), leg, views)

@@ -60,7 +60,7 @@ from fgslam.homing.settings import (
     HomingBehaviourSettings,
     HomingControlSettings,
 )
-from fgslam.homing.steering import Command, Drive, HomingState, RangeScan
+from fgslam.homing.steering import Command, CorridorAvoidance, Drive, HomingState, RangeScan
 
 SETTINGS = HomingControlSettings()
 POINTS = 3.0 * unit(np.linspace(-3.0, 3.0, 20)) * np.linspace(0.6, 1.4, 20)[:, None]
@@ -842,10 +842,11 @@ def test_refusal_does_not_end_a_drive() -> None:
     assert pass_distances(record).max() < 0.2
 
 
-class Doorkeeper:
+class Doorkeeper(CorridorAvoidance):
     """Stops the robot for so many steps on its way."""
 
     def __init__(self, first: int, last: int) -> None:
+        super().__init__(40.0)
         self._steps, self._closed = 0, range(first, last)
 
     def override(self, wanted: Drive, heading: float, scan: RangeScan) -> Drive:

@@ -10,7 +10,7 @@ from landmark_world import drive_path, ray_ranges, winding_path
 
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import to_robot, wrap
-from fgslam.homing.settings import AvoidanceSettings, HomingBehaviourSettings, SteeringSettings
+from fgslam.homing.settings import HomingBehaviourSettings, SteeringSettings
 from fgslam.homing.steering import (
     ACCELERATION_MPS2,
     BLIND_SHARE,
@@ -22,11 +22,9 @@ from fgslam.homing.steering import (
     CorridorAvoidance,
     Drive,
     HomingState,
-    NoAvoidance,
     RangeScan,
     Steering,
     clear_ways,
-    make_avoider,
 )
 
 SETTINGS = SteeringSettings()
@@ -125,16 +123,15 @@ def test_clear_way_is_where_the_robot_touches() -> None:
 
 def test_open_way_is_not_overridden() -> None:
     """Nor is a robot that turns on the spot."""
-    avoider, wanted = CorridorAvoidance(AvoidanceSettings(), 40.0), Drive(0.4, 0.1)
+    avoider, wanted = CorridorAvoidance(40.0), Drive(0.4, 0.1)
     assert avoider.override(wanted, 0.0, scan_of(np.array([[0.0, 2.0, 0.5]]))) == wanted
     turning = Drive(0.0, 0.5)
     assert avoider.override(turning, 2.0, scan_of(np.array([[0.7, 0.0, 0.2]]))) == turning
-    assert NoAvoidance().override(wanted, 0.0, scan_of(np.array([[0.6, 0.0, 0.3]]))) == wanted
 
 
 def test_obstacle_ahead_is_turned_away_from() -> None:
     """To the nearer free side, and back when it is past."""
-    avoider = CorridorAvoidance(AvoidanceSettings(), 40.0)
+    avoider = CorridorAvoidance(40.0)
     drive = avoider.override(Drive(0.4, 0.0), 0.0, scan_of(np.array([[0.9, -0.15, 0.3]])))
     assert drive.overridden
     assert drive.turn_rate > 0.0
@@ -147,9 +144,7 @@ def test_walled_in_stands_still_rather_than_hits() -> None:
     """Nothing is free within reach: no speed into the wall."""
     around = np.deg2rad(np.arange(0.0, 360.0, 10.0))
     ring = np.column_stack([0.6 * np.cos(around), 0.6 * np.sin(around), np.full(36, 0.1)])
-    drive = CorridorAvoidance(AvoidanceSettings(), 40.0).override(
-        Drive(0.4, 0.0), 0.0, scan_of(ring)
-    )
+    drive = CorridorAvoidance(40.0).override(Drive(0.4, 0.0), 0.0, scan_of(ring))
     assert drive.speed < 0.1
 
 
@@ -158,7 +153,7 @@ def test_failed_beams_are_passed_over() -> None:
     angles = np.deg2rad(np.arange(-180.0, 180.0, 2.0))
     ranges = np.where(np.arange(180) % 2, np.nan, np.inf)
     wanted = Drive(0.4, 0.0)
-    avoider = CorridorAvoidance(AvoidanceSettings(), 40.0)
+    avoider = CorridorAvoidance(40.0)
     assert avoider.override(wanted, 0.0, RangeScan(angles, ranges)) == wanted
 
 
@@ -167,7 +162,7 @@ def test_homing_converges_although_it_is_overridden() -> None:
     setting = winding_path(5, 1, 4.0, offset=0.0)
     middle = 0.5 * setting.targets[0, :2]
     setting.world.discs = np.array([[*middle, 0.25]])
-    avoider = make_avoider(AvoidanceSettings(), 40.0)
+    avoider = CorridorAvoidance(40.0)
     record = drive_path(setting, HomingBehaviourSettings(), avoider=avoider)
     assert record.arrived
     assert np.count_nonzero(record.overridden) > 5
@@ -206,7 +201,7 @@ def scan_from(pose: FloatArray, points: FloatArray) -> RangeScan:
 
 def drive() -> FloatArray:
     """(k, 2) places while homing points east, through the pocket's end, for 40 s."""
-    avoider = CorridorAvoidance(AvoidanceSettings(), 40.0)
+    avoider = CorridorAvoidance(40.0)
     pose, places = np.array([0.4, 0.0, 0.0]), []
     for _ in range(400):
         heading = float(wrap(np.arctan2(-pose[1], 5.0 - pose[0]) - pose[2]))
