@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -67,16 +67,11 @@ def follow(
     """
     dt = 1.0 / settings.images_per_s
     steps = max(1, int(np.ceil(settings.longest_s * settings.images_per_s)))
-    poses: list[FloatArray] = []
-    commands: list[Command] = []
-    drives: list[Drive] = []
-    rows: list[int] = []
-    states: list[HomingEstimate | None] = []
-    laps: list[list[float]] = []
+    rows: list[_Row] = []
     homings: list[tuple[int, ActiveHoming, int]] = []  # target, homing, its first step
     for k in range(steps):
         time = k * dt
-        poses.append(np.array(world.true_pose, dtype=np.float64))
+        pose = np.array(world.true_pose, dtype=np.float64)
         clock = [perf_counter()]
         image = world.image(time)
         clock.append(perf_counter())
@@ -91,14 +86,12 @@ def follow(
         clock.append(perf_counter())
         world.drive(drive.speed, drive.turn_rate, dt)
         clock.append(perf_counter())
-        laps.append(np.diff(clock).tolist())
         homing = follower.controller.active
         if homing is not None and (not homings or homings[-1][1] is not homing):
             homings.append((command.target, homing, k))
-        rows.append(-1 if homing is None else len(homings) - 1)
-        states.append(None if homing is None else homing.estimate)
-        commands.append(command)
-        drives.append(drive)
+        estimate = None if homing is None else homing.estimate
+        number = -1 if homing is None else len(homings) - 1
+        rows.append((pose, command, drive, number, estimate, np.diff(clock)))
         if watch is not None:
             watch(command, image)
         # The record ends with the robot at a stand: brakes need a few steps.
@@ -106,13 +99,29 @@ def follow(
             break
     else:
         follower.interrupt((steps - 1) * dt, f"not finished after {settings.longest_s:g} s")
+    known = np.empty((0, 3)) if targets is None else np.array(targets)
+    return _recorded(rows, homings, np.array(world.true_pose), follower, known)
+
+
+_Row: TypeAlias = tuple[FloatArray, Command, Drive, int, HomingEstimate | None, FloatArray]
+"""Of one step: true pose, command, drive, number of its homing, its estimate, seconds."""
+
+
+def _recorded(
+    rows: list[_Row],
+    started: list[tuple[int, ActiveHoming, int]],
+    end: FloatArray,
+    follower: HomingChain,
+    targets: FloatArray,
+) -> DriveRecord:
+    poses, commands, drives, numbers, states, laps = zip(*rows, strict=True)
     times = np.array([c.time for c in commands])
     unknown, blank = np.full(3, np.nan), np.full((6, 6), np.nan)
     return DriveRecord(
         time=times,
         truth=np.array(poses),
-        end=np.array(world.true_pose),
-        targets=np.empty((0, 3)) if targets is None else np.array(targets),
+        end=end,
+        targets=targets,
         target=np.array([c.target for c in commands], dtype=np.int64),
         state=tuple(c.state.value for c in commands),
         reason=tuple(c.reason for c in commands),
@@ -123,7 +132,7 @@ def follow(
         speed=np.array([d.speed for d in drives]),
         turn_rate=np.array([d.turn_rate for d in drives]),
         overridden=np.array([d.overridden for d in drives]),
-        homing=np.array(rows, dtype=np.int64),
+        homing=np.array(numbers, dtype=np.int64),
         robot=np.array([unknown if e is None else e.robot for e in states]),
         aim=np.array([unknown if e is None else e.target for e in states]),
         joint=np.array([blank if e is None else e.covariance for e in states]),
@@ -137,7 +146,7 @@ def follow(
                 first_step=first,
                 steps=np.searchsorted(times, [t.time for t in homing.history]),
             )
-            for target, homing, first in homings
+            for target, homing, first in started
         ),
         legs=tuple(follower.outcomes),
         seconds=dict(zip(STAGES, np.array(laps).T, strict=True)),
