@@ -301,6 +301,8 @@ def test_a_jump_of_the_tracking_does_not_make_a_true_closure_impossible() -> Non
             _add_frame(record, 0.9 if k == 20 else 0.1, used if k == 20 else 80)
         found = record.close(_closure(0, _forward(3.9)), record.chain.poses[-1], "frame 39")
         assert (found is not None) is taken, record.remarks
+    (closure,) = record.chain.constraints
+    np.testing.assert_allclose(closure.covariance, CLOSURE_FACTOR**2 * _TRACKED)
 
 
 def test_a_few_old_landmarks_among_many_new_ones_tie_a_frame_to_nothing() -> None:

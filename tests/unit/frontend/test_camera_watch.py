@@ -424,7 +424,7 @@ def disturbed(first: int, length: int, turns_deg: FloatArray, axis: int) -> Turn
     return watch
 
 
-@pytest.mark.parametrize("length", range(2, 9))
+@pytest.mark.parametrize("length", [2, 5, 8])
 def test_disturbance_of_few_frames_is_no_knock(length: int) -> None:
     for offset, size in itertools.product(range(WINDOW), (0.3, 2.0)):
         watch = disturbed(4 * WINDOW + offset, length, np.full(length, size), offset % 3)
@@ -437,8 +437,7 @@ def test_opposite_disturbances_in_consecutive_windows_are_no_knock() -> None:
         assert disturbed(3 * WINDOW, count * WINDOW, turns, 0).knocks == []
 
 
-@pytest.mark.parametrize("lag", [0.1, -0.3, 0.5])
-@pytest.mark.parametrize("apparent_deg", [0.2, 0.3])
+@pytest.mark.parametrize(("apparent_deg", "lag"), [(0.3, 0.1), (0.3, -0.3), (0.2, 0.5)])
 def test_pitching_robot_with_cameras_out_of_step_is_no_knock(
     apparent_deg: float, lag: float, rng: np.random.Generator
 ) -> None:
@@ -450,8 +449,9 @@ def test_pitching_robot_with_cameras_out_of_step_is_no_knock(
     assert watch.knocks == []
 
 
-@pytest.mark.parametrize("offset", range(WINDOW))
-@pytest.mark.parametrize("lag", [0.0, 0.3])
+@pytest.mark.parametrize(
+    ("lag", "offset"), [(0.0, 0), *((0.3, offset) for offset in range(1, WINDOW, 2))]
+)
 def test_knock_is_found_wherever_it_lies_in_a_window(
     lag: float, offset: int, rng: np.random.Generator
 ) -> None:
@@ -494,13 +494,6 @@ def test_camera_that_turns_again_and_again_is_loose(rng: np.random.Generator) ->
     assert (remark.code, remark.values["camera"]) == ("camera_loose", "left")
     assert remark.values["degrees"] == pytest.approx(0.6, abs=0.005)
     assert remark.frames == (5 * WINDOW, 10 * WINDOW, 15 * WINDOW)
-
-
-def test_what_passes_within_a_window_is_no_knock(rng: np.random.Generator) -> None:
-    watch = TurnWatch(PAIR, 0.1)
-    for frame in range(10 * WINDOW):
-        show(watch, frame, rng, 1.0 if frame // WINDOW == 4 else 0.0)
-    assert watch.remarks() == ()
 
 
 def test_noise_is_no_knock_in_a_long_drive(rng: np.random.Generator) -> None:

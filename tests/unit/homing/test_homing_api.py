@@ -192,15 +192,6 @@ def test_what_the_robot_drove_must_be_finite(path: fg.PathMemory) -> None:
         fg.PathFollower(CAMERA, path).driven(0.1, 0.0, -0.1)
 
 
-def test_a_path_is_saved_and_loaded(path: fg.PathMemory, tmp_path: Path) -> None:
-    path.save(str(tmp_path / "path.npz"))
-    loaded = fg.PathMemory.load(str(tmp_path / "path.npz"))
-    assert loaded.names == path.names == ("0", "1")
-    command = fg.PathFollower(CAMERA, loaded).step(picture(0), 0.0)
-    assert command.state is HomingState.INITIALISE
-    assert command.target == 1  # the first target is where the robot stands
-
-
 def test_cameras_come_from_files_keys_and_kinds(tmp_path: Path) -> None:
     keys = {"kind": "mirror", "xi": 0.9, "size": [320, 240]}
     (tmp_path / "camera.yaml").write_text("kind: mirror\nxi: 0.9\nsize: [320, 240]\n")

@@ -789,17 +789,6 @@ def test_record_fits_together(record: DriveRecord) -> None:
         assert record.robot[rows[-1], :2] * leg == pytest.approx(moved[:2], abs=0.15)
 
 
-def test_remaining_share_of_the_way_falls_and_matches_the_truth(record: DriveRecord) -> None:
-    """Monotone but for noise, and right to a tenth at mid-leg."""
-    for k in range(4):
-        rows = np.flatnonzero((record.target == k) & (record.homing >= 0))
-        left = record.remaining[rows]
-        assert np.all(np.diff(left) < 0.05)
-        true = np.hypot(*(record.truth[rows, :2] - record.targets[k, :2]).T)
-        middle = int(np.argmin(np.abs(true / true[0] - 0.5)))
-        assert left[middle] == pytest.approx(true[middle] / true[0], abs=0.1)
-
-
 @pytest.fixture
 def _refuses_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fgslam.homing.controller.GIVE_UP_S", 0.5)

@@ -219,9 +219,3 @@ def test_held_up_robot_leaves_the_pocket_and_touches_nothing() -> None:
     assert np.min(places[:, 0]) < -0.3
     nearest = np.hypot(*(places[:, None] - dead_end()).transpose(2, 0, 1)).min(axis=1)
     assert np.min(nearest) > 0.35
-
-
-def test_robot_that_does_not_escape_stays_in_the_pocket(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fgslam.homing.steering.ESCAPE_AFTER", 10_000)
-    places = drive()
-    assert np.min(places[:, 0]) > 0.0

@@ -340,7 +340,7 @@ def test_wrong_matches_are_left_out_with_a_remark() -> None:
     increment = simulation.increments[5]
     old = np.flatnonzero(~increment.observations.is_new)[:3]
     measurement = increment.observations.measurement.copy()
-    measurement[old] += [30.0, -25.0, 4.0]
+    measurement[old] += [8.0, -7.0, 1.0]
     wrong = dataclasses.replace(increment.observations, measurement=measurement)
     others = np.setdiff1d(np.arange(len(wrong)), old)
     kept = dataclasses.replace(increment, observations=increment.observations.select(others))

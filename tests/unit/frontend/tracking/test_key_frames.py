@@ -154,19 +154,6 @@ def test_what_looks_different_by_now_is_not_found_again() -> None:
     assert (~same).sum() <= 2
 
 
-def test_where_all_look_different_by_now_nothing_is_carried() -> None:
-    here, now = pictures(HERE)[0], pictures(np.array([0.02, 0.0, 0.0]))
-    first = Begun.new(FineImage(here), points(measurements(HERE)[:, :2], HERE))
-    other = np.random.default_rng(6).integers(0, 256, first.cut.shape).astype(np.uint8)
-    carrier = begun(now, np.array([0.02, 0.0, 0.0]))
-    patches = LandmarkPatches(other, first.patches(here).distances)
-    carrier.forget(10 + np.arange(len(GRID)))
-    carrier.begin(now[0], Begun.again(first.points, patches))
-    assert carrier.follow(now, expected(np.array([0.02, 0.0, 0.0]))) is None
-    assert not len(carrier.ids)
-    assert carrier.follow(now, expected(np.array([0.02, 0.0, 0.0]))) is None
-
-
 def test_a_landmark_without_a_patch_is_not_carried() -> None:
     image = pictures(HERE)[0]
     first = Begun.new(FineImage(image), points(measurements(HERE)[:, :2], HERE))

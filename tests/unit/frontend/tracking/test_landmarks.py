@@ -393,18 +393,19 @@ def test_merging_adds_counts_and_keeps_the_later_look() -> None:
     database = database_of(PLACES, LASTING)
     end_frame(database, 0)
     hit(database, 0)
+    end_frame(database)
     for _ in range(2):
         hit(database, 2)
     end_frame(database, 3)
     looks = {i: database.appearances(np.array([i])).descriptors[0] for i in (0, 2, 3)}
     seen = state_of(database)["columns/seen"][[0, 2, 3]].copy()
-    assert seen.tolist() == [1, 1, 0]
+    assert seen.tolist() == [1, 2, 0]
     database.merge(np.array([[2, 0], [3, 1]]))
     assert database.ids.tolist() == [0, 1]
     assert database.hits.tolist() == [5, 2]
     assert database.misses.tolist() == [1, 1]
     assert database.missed.tolist() == [0, 0]
-    assert state_of(database)["columns/seen"].tolist() == [1, 0]
+    assert state_of(database)["columns/seen"].tolist() == [2, 0]
     assert database.permanent.tolist() == [True, False]
     np.testing.assert_array_equal(database.appearances(np.array([0])).descriptors[0], looks[2])
     # What ends is never named again.
