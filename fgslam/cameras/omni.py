@@ -695,10 +695,16 @@ def read_ocamcalib(
             "centre, affine parameters, size): it is truncated or another kind of file; export it "
             "again"
         )
-    direct, inverse = (
-        _polynomial(f"{where}: {which} polynomial", words)
-        for which, (where, _, words) in zip(("direct", "inverse"), entries[:2], strict=True)
-    )
+    polynomials = []
+    for which, (where, _, words) in zip(("direct", "inverse"), entries[:2], strict=True):
+        count, *terms = _numbers(f"{where}: {which} polynomial", words)
+        if count != len(terms) or not 2 <= count <= _MAX_TERMS:
+            raise CalibrationError(
+                f"{where}: {which} polynomial: states {count:g} coefficients (2 to {_MAX_TERMS}) "
+                f"and has {len(terms)}; correct the line"
+            )
+        polynomials.append(np.array(terms))
+    direct, inverse = polynomials
     (at_centre, _, centre), (at_affine, _, affine), (at_size, _, size), *extras = entries[2:]
     row, column = _numbers(f"{at_centre}: centre (row, column)", centre, 2)
     c, d, e = _numbers(f"{at_affine}: affine parameters (c, d, e)", affine, 3)
@@ -725,11 +731,11 @@ def read_ocamcalib(
             )
     # Rows and columns from the centre, (x, y), are seen at (c x + d y, e x + y).
     matrix = np.array([[1.0, e, column], [d, c, row], [0.0, 0.0, 1.0]])
-    raw = RawCamera(width, height, matrix, np.array(direct), np.eye(4), str(path), "ocam")
+    raw = RawCamera(width, height, matrix, direct, np.eye(4), str(path), "ocam")
     camera = LensCamera.of(checked_camera(raw), ring, up=False)
     radius = np.linspace(*camera.ring, 200)
-    angle = np.arctan2(polynomial.polyval(radius, np.array(direct)), radius)
-    apart = float(np.abs(polynomial.polyval(angle, np.array(inverse)) - radius).max())
+    angle = np.arctan2(polynomial.polyval(radius, direct), radius)
+    apart = float(np.abs(polynomial.polyval(angle, inverse) - radius).max())
     if not apart <= _MAX_DISAGREEMENT_PX:
         raise CalibrationError(
             f"{path}: the inverse polynomial is {apart:.3g} px off the direct one, at most "
@@ -761,13 +767,3 @@ def _wholes(where: str, words: list[str]) -> tuple[int, int]:
             f"{where}: {first:g} and {second:g}, expected whole numbers of pixels; correct the line"
         )
     return int(first), int(second)
-
-
-def _polynomial(where: str, words: list[str]) -> tuple[float, ...]:
-    count, *coefficients = _numbers(where, words)
-    if count != len(coefficients) or not 2 <= count <= _MAX_TERMS:
-        raise CalibrationError(
-            f"{where}: states {count:g} coefficients (2 to {_MAX_TERMS}) and has "
-            f"{len(coefficients)}; correct the line"
-        )
-    return tuple(coefficients)

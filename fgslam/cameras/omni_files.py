@@ -123,7 +123,18 @@ def make_camera(
             return LensCamera.of(raw, ring, False, ahead, settings.clockwise)
         case LensSettings():
             ahead, up = math.radians(settings.ahead_deg), settings.middle == "up"
-            raw = _only_camera(_find(settings.file, folder), image_size)
+            path = _find(settings.file, folder)
+            raw, *others = read_calibration_file(path).cameras
+            if others:
+                raise CalibrationError(
+                    f"{path}: is of {1 + len(others)} cameras, an omnidirectional camera is one; "
+                    "leave only that one in the file"
+                )
+            if image_size not in (None, raw.size):
+                raise CalibrationError(
+                    f"{path} calibrates pictures of {raw.width}x{raw.height}, but the pictures "
+                    f"have {image_size[0]}x{image_size[1]} pixels; scale them, or calibrate again"
+                )
             return LensCamera.of(raw, settings.ring_px, up, ahead, settings.clockwise)
         case RadialPolynomialSettings():
             size = _stated_size(settings.kind, settings.size, image_size)
@@ -219,21 +230,6 @@ def _ocamcalib(path: Path, size: Size | None) -> tuple[RawCamera, tuple[float, f
         shift = np.array([[0.0, 0.0, left], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
         raw = replace(raw, width=wide[0], matrix=raw.matrix + shift)
     return raw, ring
-
-
-def _only_camera(path: Path, size: Size | None) -> RawCamera:
-    cameras = read_calibration_file(path).cameras
-    if len(cameras) != 1:
-        raise CalibrationError(
-            f"{path}: is of {len(cameras)} cameras, an omnidirectional camera is one; leave only "
-            "that one in the file"
-        )
-    if size not in (None, cameras[0].size):
-        raise CalibrationError(
-            f"{path} calibrates pictures of {cameras[0].width}x{cameras[0].height}, but the "
-            f"pictures have {size[0]}x{size[1]} pixels; scale them, or calibrate again"
-        )
-    return cameras[0]
 
 
 def _stated_size(kind: str, calibrated: Size | None, size: Size | None) -> Size:

@@ -621,7 +621,11 @@ def _three(cameras: Sequence[RawCamera]) -> Placed:
     Of cameras in a line the outer two are used. The corner of an L becomes the right one; the view
     is turned by a multiple of 90 degrees where its neighbours are not to the left and above.
     """
-    cosines = [_cosine(cameras, k) for k in range(3)]
+    cosines = []  # of the angle at each of the three cameras
+    for k in range(3):
+        a, b = (c.bTc[:3, 3] - cameras[k].bTc[:3, 3] for j, c in enumerate(cameras) if j != k)
+        length = float(np.linalg.norm(a) * np.linalg.norm(b))
+        cosines.append(float(a @ b / max(length, 1e-12)))
     if all(abs(cosine) > np.cos(np.radians(15.0)) for cosine in cosines):
         x = [_offset(camera, cameras[0])[0] for camera in cameras]
         right, left = int(np.argmax(x)), int(np.argmin(x))
@@ -645,12 +649,6 @@ def _three(cameras: Sequence[RawCamera]) -> Placed:
         turn = np.eye(3) if left_side else np.diag([-1.0, -1.0, 1.0])
         return (corner, adjacent, above), turn, notes
     return (corner, above, adjacent), _quarter_turn(upper_side), notes
-
-
-def _cosine(cameras: Sequence[RawCamera], corner: int) -> float:
-    """Cosine of the angle at one of three cameras."""
-    a, b = (c.bTc[:3, 3] - cameras[corner].bTc[:3, 3] for k, c in enumerate(cameras) if k != corner)
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
 
 
 def _require_side_by_side(chosen: Sequence[RawCamera], turn: FloatArray) -> None:

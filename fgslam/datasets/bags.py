@@ -62,6 +62,7 @@ from fgslam.datasets.recording import (
     LOOKS_AHEAD,
     Recording,
     image_recording,
+    in_order,
     loaded_rig,
     mounted,
     numbered,
@@ -474,9 +475,7 @@ def _rig_of_file(settings: BagSettings, file: Path, bag: Bag, chosen: Chosen) ->
         right, left, *top = (chosen.views[k] for k in rig.sources[: rig.cameras])
         chosen = replace(chosen, views=(left, right, *top))
         cameras = tuple(cameras[k] for k in numbers)
-        if rig.rectifier is not None:
-            kept = tuple(range(rig.cameras))
-            rig = replace(rig, rectifier=replace(rig.rectifier, order=kept))
+        rig = in_order(rig)
     else:
         rig = numbered(rig) if differ_in_number(chosen.left, chosen.right) else rig
         order = order if rig.rectifier is None else rig.rectifier.order

@@ -303,6 +303,14 @@ def numbered(rig: StereoRig) -> StereoRig:
     return replace(rig, rectifier=replace(kept, order=(1, 0)), remarks=(*rig.remarks, text))
 
 
+def in_order(rig: StereoRig) -> StereoRig:
+    """The rig of images that are given as right, left[, top], whatever the file calls them."""
+    if rig.rectifier is None:
+        return rig
+    order = tuple(range(rig.cameras))
+    return replace(rig, rectifier=replace(rig.rectifier, order=order))
+
+
 def mounted(rig: Rig, settings: CalibratedSettings) -> Rig:
     """The rig where the settings put it; as it is, where they name no place."""
     if settings.camera_yaw_deg is None and settings.lever_arm_m is None:

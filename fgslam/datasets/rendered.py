@@ -20,9 +20,10 @@ from fgslam.core.sensors import CameraRig, Odometry
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.recording import select_frames
-from fgslam.worlds.driving import Drive, simulate_wheels
+from fgslam.worlds.driving import simulate_wheels
 from fgslam.worlds.lab import (
     PlaceChoice,
+    Room,
     World,
     camera_offsets,
     first_pose,
@@ -228,8 +229,21 @@ class RenderedLabSequence:
         with self._world_lock:
             if self._world is None:
                 self._world = World(self._rig, open_room(self._place))
-                _check_clearance(self._drive, self._world, self._rig)
+                self._require_clearance(self._world.room)
             return self._world
+
+    def _require_clearance(self, room: Room) -> None:
+        """Refuses a drive whose cameras come too near to a surface."""
+        cameras = self.room_from_camera(self._drive.timestamps)
+        distance, xy = room.caster.distance(cameras[:, :3, 3]), cameras[:, :2, 3]
+        outside = np.any((xy < room.low) | (xy > room.high), axis=1)
+        bad = np.flatnonzero((distance < _CLEARANCE_M) | outside)
+        if len(bad):
+            x, y = xy[bad[0]]
+            raise ConfigError(
+                f"the drive's frame {bad[0]} puts the camera at ({x:.2f}, {y:.2f}) m, into a wall "
+                "or furniture; move the points of dataset.drive.waypoints_m"
+            )
 
     def _render_missing(self, progress: Progress | None) -> None:
         missing = [int(i) for i in self._indices if not self._cache.present(int(i))]
@@ -271,17 +285,3 @@ def first_camera_pose(settings: RenderedLabSettings) -> FloatArray:
     drive = plan_in_place(PlaceChoice.of(settings), settings.drive, rig)
     first = drive.timestamps[settings.start : settings.start + 1]
     return np.asarray(drive.body_poses(first)[0] @ rig.bTc)
-
-
-def _check_clearance(drive: Drive, world: World, rig: CameraRig) -> None:
-    """Refuses a drive whose cameras come too near to a surface."""
-    cameras = drive.body_poses(drive.timestamps) @ rig.bTc
-    distance, xy = world.room.caster.distance(cameras[:, :3, 3]), cameras[:, :2, 3]
-    outside = np.any((xy < world.room.low) | (xy > world.room.high), axis=1)
-    bad = np.flatnonzero((distance < _CLEARANCE_M) | outside)
-    if len(bad):
-        x, y = cameras[bad[0], :2, 3]
-        raise ConfigError(
-            f"the drive's frame {bad[0]} puts the camera at ({x:.2f}, {y:.2f}) m, into a wall or "
-            "furniture; move the points of dataset.drive.waypoints_m"
-        )

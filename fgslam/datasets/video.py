@@ -11,7 +11,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 from itertools import islice, product
 from pathlib import Path
 from typing import TypeAlias
@@ -32,6 +31,7 @@ from fgslam.datasets.recording import (
     Recording,
     calibrated_rig,
     image_recording,
+    in_order,
     numbered,
 )
 from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
@@ -156,10 +156,7 @@ def _films_of_cameras(
             f"{where} has films of three cameras, but the calibration knows two; give one of all "
             "three, --camera FILE, or move the third film elsewhere"
         )
-    if rig.rectifier is not None:
-        kept = tuple(range(rig.cameras))
-        rig = replace(rig, rectifier=replace(rig.rectifier, order=kept))
-    return rig, rig.sources if by_file else (1, 0, 2)
+    return in_order(rig), rig.sources if by_file else (1, 0, 2)
 
 
 def _rig(
