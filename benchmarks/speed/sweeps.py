@@ -83,8 +83,7 @@ def _sweep(workers: int, cases: int) -> dict[str, float]:
         folder = Path(scratch) / "sweep"
         begun, cpu = time.monotonic(), time.process_time()
         plan = make_plan([_EXPERIMENT], axes, _ESTIMATORS)
-        watch = (clock.tell, lambda: False, lambda table: None)
-        result = run_sweep(plan, folder, Pool(workers), watch=watch)
+        result = run_sweep(plan, folder, Pool(workers), progress=clock.tell)
         wall, driver = time.monotonic() - begun, time.process_time() - cpu
         if result.done != cases:
             raise RuntimeError(f"{cases - result.done} cases failed: {result.failures}")

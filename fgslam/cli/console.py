@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from rich.console import Console, Group
-from rich.live import Live
+from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -32,7 +31,7 @@ _WIDTH_OF_FILES = 120
 
 
 class Display:
-    """A bar for each stage of the work, with the time left, and below them a table.
+    """A bar for each stage of the work, with the time left.
 
     Drawn from the first stage on: before, a mistake shall stand alone.
     """
@@ -46,44 +45,31 @@ class Display:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self.bars = Progress(*columns, console=console)
-        self._live = Live(self.bars, console=console)
+        self._bars = Progress(*columns, console=console)
         self._stages: dict[str, TaskID] = {}
 
     def tell(self, what: str, done: int, total: int) -> None:
         """Shows how much of a stage is done."""
         if not self._stages:
-            self._live.start()
+            self._bars.start()
         if what not in self._stages:
-            self._stages[what] = self.bars.add_task(what, total=total)
-        self.bars.update(self._stages[what], completed=done, total=total)
-
-    def show_table(self, table: TextTable) -> None:
-        """Shows a table in place of the one before, while there is more to come."""
-        self._live.update(Group(self.bars, rich_table(table)))
+            self._stages[what] = self._bars.add_task(what, total=total)
+        self._bars.update(self._stages[what], completed=done, total=total)
 
     def close(self) -> None:
-        """Leaves the bars as they stand, without the table."""
+        """Leaves the bars as they stand."""
         if self._stages:
-            self._live.update(self.bars)
-            self._live.stop()
-
-
-@contextmanager
-def display() -> Iterator[Display]:
-    """A display on standard error."""
-    found = Display(Console(stderr=True))
-    try:
-        yield found
-    finally:
-        found.close()
+            self._bars.stop()
 
 
 @contextmanager
 def progress_bar() -> Iterator[Tell]:
     """A bar on standard error for each stage of the work."""
-    with display() as found:
+    found = Display(Console(stderr=True))
+    try:
         yield found.tell
+    finally:
+        found.close()
 
 
 def show(result: RunResult, resume: str = "") -> None:

@@ -318,16 +318,17 @@ def sweep(  # noqa: PLR0913 - each option is a parameter
         overwrite: replace an earlier one
         resume: do what has no result yet; axes may have become longer
     """
-    from fgslam.cli.console import display
+    from fgslam.cli.console import progress_bar
     from fgslam.runs.sweep import make_plan, run_sweep
     from fgslam.runs.workers import Pool
 
     existing = existing_folder(overwrite, resume)
     plan = make_plan(experiments, axes or (), None if estimators is None else estimators.split(","))
     folder = out or plan.default_folder
-    with stop_flag() as stopped, display() as shown:
-        watch = (stoppable(shown.tell, stopped), stopped, shown.show_table)
-        result = run_sweep(plan, folder, Pool(jobs, scheduler), existing, metric, watch)
+    pool = Pool(jobs, scheduler)
+    with stop_flag() as stopped, progress_bar() as bar:
+        progress = stoppable(bar, stopped)
+        result = run_sweep(plan, folder, pool, existing, metric, progress, stopped)
     show_all([result], same_with_resume())
     exit_as([result])
 

@@ -25,7 +25,7 @@ from fgslam.runs.named_experiments import find_experiment, suggestion
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.session import Overrides, override_texts, slam_config
-from fgslam.runs.sweep import UNWATCHED, SweepResult, make_plan, run_sweep
+from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
 from fgslam.runs.workers import Pool
 from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
@@ -245,9 +245,8 @@ def sweep(  # noqa: PLR0913 - each is an option of the command
         [as_path(one, DatasetError, "experiment") for one in given], settings, estimators
     )
     folder = plan.default_folder if out is None else Path(out)
-    watch = (progress, *UNWATCHED[1:])
     existing = _checked_existing(existing)
-    return run_sweep(plan, folder, Pool(jobs, scheduler), existing, metric, watch)
+    return run_sweep(plan, folder, Pool(jobs, scheduler), existing, metric, progress)
 
 
 def replay(

@@ -14,7 +14,7 @@ import os
 import re
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -106,18 +106,16 @@ class Axis(NamedTuple):
     @property
     def settings(self) -> list[Any]:
         """The values as the table has them: numbers or booleans where all are, else text."""
-        found = [_plain(text) for text in self.values]
+        found = []
+        for text in self.values:
+            try:
+                found.append(plain_values(text))
+            except yaml.YAMLError:
+                found.append(text)
         for kinds in ((bool,), (int,), (int, float)):
             if all(type(value) in kinds for value in found):
                 return [float(value) for value in found] if float in map(type, found) else found
         return list(self.values)
-
-
-def _plain(text: str) -> Any:
-    try:
-        return plain_values(text)
-    except yaml.YAMLError:
-        return text
 
 
 def read_source(path: Path) -> Source:
@@ -304,9 +302,11 @@ def make_plan(
 
 _ABOUT = ("name", "task", "status", "remarks", "estimators")
 _TIMED = {"ms", "mb", "seconds", "second", "growth", "memory"}
-# What else a case may end with, without ending its worker.
-_WRONG_VALUES = (ArithmeticError, AssertionError, LookupError, TypeError, ValueError)
-_FAULTS = (*_WRONG_VALUES, ImportError, MemoryError, OSError, RuntimeError)
+_FAULTS = (
+    *(ArithmeticError, AssertionError, ImportError, LookupError),
+    *(MemoryError, OSError, RuntimeError, TypeError, ValueError),
+)
+"""What else a case may end with, without ending its worker."""
 
 Settled: TypeAlias = tuple[Experiment, tuple[Any, ...]]
 """A configuration, and the settings of its estimators."""
@@ -321,9 +321,9 @@ class Row(NamedTuple):
 
 
 class CaseResult(NamedTuple):
-    """What a case gave, and how many seconds it took."""
+    """What a case gave, and how many seconds it took; None for one without a result."""
 
-    seconds: float
+    seconds: float | None
     rows: tuple[Row, ...]
 
 
@@ -485,48 +485,31 @@ Columns: TypeAlias = dict[str, list[Any]]
 """Cells by name of the column, all of one length; None where a value is not known."""
 
 
-class SweepTable(NamedTuple):
-    """A row for each case and estimator.
+def make_table(
+    plan: Plan, found: Iterable[tuple[int, CaseResult | str]]
+) -> tuple[Columns, Columns]:
+    """Metrics and times, a row for each case and estimator, after the columns of what it is of.
 
-    Attributes:
-        keys: columns that say which case and estimator a row is of.
-        numbers: columns of metrics; the same cases give the same bytes.
-        times: columns of what differs between executions.
+    Args:
+        plan: what is swept.
+        found: cases by their numbers, with the reason in words where one has no result. The same
+            give the same metrics to the byte; times differ between executions.
     """
-
-    keys: Columns
-    numbers: Columns
-    times: Columns
-
-    def write(self, folder: Path, plan: Plan) -> None:
-        """Both tables as Parquet, with the experiments in their metadata. Raises OutputError."""
-        about = {
-            f"fgslam.experiment.{source.name}": yaml.safe_dump(dict(source.values), sort_keys=False)
-            for source in plan.sources
-        }
-        write_parquet(folder / TABLE_FILE, self.keys | self.numbers, about)
-        write_parquet(folder / TIMES_FILE, self.keys | self.times, about)
-
-
-def make_table(plan: Plan, found: Iterable[tuple[int, CaseResult | str]]) -> SweepTable:
-    """The table of cases by their numbers; a text is the reason why a case has no result."""
     names = (CASE, EXPERIMENT, *(axis.key for axis in plan.axes), ESTIMATOR)
     keys: list[tuple[Any, ...]] = []
     numbers: list[Mapping[str, Any]] = []
     times: list[Mapping[str, Any]] = []
     for number, result in found:
         case = plan.cases[number]
-        took: dict[str, Any] = {}
         if isinstance(result, str):
-            rows: Sequence[Row] = [Row("", {FAILURE: result}, {})]
-        else:
-            rows, took = result.rows, {"case_seconds": result.seconds}
-        for row in rows:
+            result = CaseResult(None, (Row("", {FAILURE: result}, {}),))
+        for row in result.rows:
             keys.append((number, case.source.name, *case.settings, row.estimator or None))
             numbers.append(row.numbers)
+            took = {} if result.seconds is None else {"case_seconds": result.seconds}
             times.append({**took, **row.times})
-    columns = {name: [row[k] for row in keys] for k, name in enumerate(names)}
-    return SweepTable(columns, _columns(numbers), _columns(times))
+    first = {name: [row[k] for row in keys] for k, name in enumerate(names)}
+    return first | _columns(numbers), first | _columns(times)
 
 
 def _columns(rows: Sequence[Mapping[str, Any]]) -> Columns:
@@ -552,24 +535,24 @@ ALL_PAIRS_OF = 12
 """Variants of which every two are compared; of more each one with the first."""
 SIGNIFICANT = 0.05
 _VARIANTS_SHOWN = 400
-_VARIANTS_WHILE_RUNNING = 16
 _SERIES_SHOWN = 24
 
 
 class Comparison(NamedTuple):
-    """Variant A against B; ``p_value`` is corrected for all comparisons of the sweep."""
+    """Variant A against B.
+
+    Attributes:
+        a, b: the variants.
+        test: over the repetitions that both have.
+        p_value: of the test, corrected for all comparisons of the sweep.
+        better: which of them is; empty where none is shown to be.
+    """
 
     a: str
     b: str
     test: PairedTest
     p_value: float | None
-
-    @property
-    def better(self) -> str:
-        """Which of them is; empty where none is shown to be."""
-        if self.p_value is None or self.p_value >= SIGNIFICANT:
-            return ""
-        return self.a if self.test.difference.mean < 0.0 else self.b
+    better: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -613,35 +596,38 @@ class Findings:
         )
         first, *others = self.variants
         every = len(self.variants) <= ALL_PAIRS_OF
-        pairs = combinations(self.variants, 2) if every else ((v, first) for v in others)
-        known = []
-        for a, b in pairs:
+        tests = []
+        for a, b in combinations(self.variants, 2) if every else ((v, first) for v in others):
             if a in values and b in values:
                 test = paired_test(_numbers(values[a]), _numbers(values[b]))
                 if test is not None and test.difference.count > 1:
-                    known.append((a, b, test))
-        corrected = iter(holm([t.p_value for _, _, t in known if t.p_value is not None]))
-        return [
-            Comparison(a, b, test, None if test.p_value is None else next(corrected))
-            for a, b, test in known
-        ]
+                    tests.append((a, b, test))
+        corrected = iter(holm([t.p_value for _, _, t in tests if t.p_value is not None]))
+        found = []
+        for a, b, test in tests:
+            p_value = None if test.p_value is None else next(corrected)
+            differ = p_value is not None and p_value < SIGNIFICANT
+            better = (a if test.difference.mean < 0.0 else b) if differ else ""
+            found.append(Comparison(a, b, test, p_value, better))
+        return found
 
 
 def _numbers(column: pandas.Series[Any]) -> FloatArray:
     return column.to_numpy(np.float64)
 
 
-def find(table: SweepTable, plan: Plan, metric: str | None = None) -> Findings | None:
-    """Findings; None where the table has no number.
+def find(table: Columns, plan: Plan, metric: str | None = None) -> Findings | None:
+    """Findings in a table of metrics; None where it has no number.
 
     Raises:
         ConfigError: ``metric`` is no column of numbers.
     """
     import pandas  # half a second, that a worker does not need
 
-    frame = pandas.DataFrame({FAILURE: None} | table.keys | table.numbers)
-    numeric = set(frame.select_dtypes("number"))
-    known = [name for name in table.numbers if name in numeric]
+    frame = pandas.DataFrame({FAILURE: None} | table)
+    numeric = list(map(str, frame.select_dtypes("number")))
+    keys = {CASE, EXPERIMENT, ESTIMATOR, *(axis.key for axis in plan.axes)}
+    known = [name for name in numeric if name not in keys]
     if not known:
         return None
     if metric is not None and metric not in known:
@@ -650,7 +636,6 @@ def find(table: SweepTable, plan: Plan, metric: str | None = None) -> Findings |
     metrics = tuple(dict.fromkeys([*([metric] if metric else []), *preferred]))
     varied = [axis.key for axis in plan.axes if len(axis.values) > 1 and axis.key != SEED]
     axes = tuple(key for key in varied if key in numeric)
-    seeds = [axis.key for axis in plan.axes if axis.key == SEED]
     frame = frame[frame[ESTIMATOR].notna() | frame[FAILURE].isna()]
     titles = frame[ESTIMATOR].fillna("")
     several = titles[titles != ""].nunique() > 1
@@ -670,7 +655,8 @@ def find(table: SweepTable, plan: Plan, metric: str | None = None) -> Findings |
 
     series = marked_label([key for key in varied if key not in axes], titled=True)
     frame = frame.assign(variant=marked_label(varied, several), series=series)
-    return Findings(frame, metrics, axes, (EXPERIMENT, *seeds))
+    repeated = (EXPERIMENT, *(SEED for axis in plan.axes if axis.key == SEED))
+    return Findings(frame, metrics, axes, repeated)
 
 
 def summarise(findings: Findings | None, cases: int, done: int, failed: int) -> tuple[str, ...]:
@@ -690,8 +676,8 @@ def summarise(findings: Findings | None, cases: int, done: int, failed: int) -> 
     )
 
 
-def table_of_means(findings: Findings, most: int = _VARIANTS_SHOWN) -> TextTable:
-    """Means of the variants, of at most so many."""
+def table_of_means(findings: Findings) -> TextTable:
+    """Means of the variants."""
     columns = (
         Column("cases", "repetitions, over seeds and experiments, in which it ended well"),
         *(Column(name, "mean and 95 % interval by Student's t") for name in findings.metrics),
@@ -700,12 +686,13 @@ def table_of_means(findings: Findings, most: int = _VARIANTS_SHOWN) -> TextTable
     means = [findings.means(metric) for metric in findings.metrics]
     failed = findings.frame.groupby("variant")[FAILURE].count()
     rows = []
-    for name in findings.variants[:most]:
+    for name in findings.variants[:_VARIANTS_SHOWN]:
         count = "0" if (tested := means[0][name]) is None else str(tested.count)
         cells = (count, *(_interval_text(one[name]) for one in means), str(failed[name]))
         rows.append((name, cells))
-    more = f"; {len(findings.variants) - most} more" if len(findings.variants) > most else ""
-    return TextTable("means", f"Means{more}", "variant", columns, tuple(rows))
+    more = len(findings.variants) - _VARIANTS_SHOWN
+    heading = f"Means; {more} more" if more > 0 else "Means"
+    return TextTable("means", heading, "variant", columns, tuple(rows))
 
 
 def table_of_pairs(findings: Findings) -> TextTable:
@@ -773,36 +760,24 @@ def _figures(findings: Findings) -> Iterator[Figure]:
     groups = list(findings.well.groupby("series", sort=False))[:_SERIES_SHOWN]
     series = {str(name): own for name, own in groups}
     for metric, axis in product(findings.metrics, findings.axes):
-        curves = {name: _effect_curve(own, findings, axis, metric) for name, own in series.items()}
+        curves = {}
+        for name, rows in series.items():
+            # Intervals over the repetitions, each averaged over the other settings.
+            repetitions = rows.groupby([axis, *findings.repeated])[metric].mean()
+            on_axis = repetitions.index.get_level_values(axis).to_numpy(np.float64)
+            curve = []
+            for value in np.unique(on_axis):
+                if (mean := mean_interval(_numbers(repetitions[on_axis == value]))) is not None:
+                    curve.append((value, mean.mean, mean.lower, mean.upper))
+            curves[name] = np.array(curve, np.float64).reshape(-1, 4)
         yield effect_figure(curves, axis, metric, several=len(findings.axes) > 1)
     metric = findings.metrics[0]
     pooled = {name: _numbers(own[metric].dropna()) for name, own in series.items()}
     yield sorted_errors(pooled, metric, ("spread", f"Spread of {metric} over all cases"))
 
 
-def _effect_curve(rows: pandas.DataFrame, findings: Findings, axis: str, metric: str) -> FloatArray:
-    """(n, 4): value on the axis, mean over the other settings and the seeds, ends of its interval.
-
-    The interval is over the repetitions, each averaged over the other settings.
-    """
-    repetitions = rows.groupby([axis, *findings.repeated])[metric].mean()
-    on_axis = repetitions.index.get_level_values(axis).to_numpy(np.float64)
-    curve = []
-    for value in np.unique(on_axis):
-        mean = mean_interval(_numbers(repetitions[on_axis == value]))
-        if mean is not None:
-            ends = [math.nan if end is None else end for end in (mean.lower, mean.upper)]
-            curve.append((value, mean.mean, *ends))
-    return np.array(curve, np.float64).reshape(-1, 4)
-
-
 # --------------------------------------------------------------------------------------------
 # The sweep
-
-Watch: TypeAlias = tuple[Progress, Stopped, Callable[[TextTable], None]]
-"""Called after each case; asked whether to end, within a moment; called with the means so far."""
-
-UNWATCHED: Watch = (lambda what, done, total: None, lambda: False, lambda table: None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -830,7 +805,8 @@ def run_sweep(
     pool: AbstractContextManager[Executor],
     existing: ExistingFolder = "refuse",
     metric: str | None = None,
-    watch: Watch = UNWATCHED,
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
 ) -> SweepResult:
     """Runs the cases of a sweep that have no result yet, and writes table and page.
 
@@ -841,19 +817,19 @@ def run_sweep(
         existing: what to do where it holds a sweep: `resume` does what is missing, also of axes
             that have become longer.
         metric: column of the table that curves and tests are of; None: the first that is known.
-        watch: receives progress, and may end it; the cases so far are kept and in the table.
+        progress: called after each case.
+        stopped: True ends it within a moment; the cases so far are kept and in the table.
 
     Raises:
         FgslamError: a case is impossible, the recording cannot be opened, or the results cannot be
             written.
     """
-    progress, stopped, shown = watch
     cases = plan.cases
     require_usable(folder, existing, SWEEP)
     if existing == "resume":
         _require_same_experiments(folder, plan)
     with pool as workers, Owner(folder) as owner:
-        keys, config = check_cases(plan, watch)
+        keys, config = check_cases(plan, progress, stopped)
         begin_folder(folder, existing, owner, SWEEP)
         write_text(folder / MARKER, plan.description)
         reasons: dict[str, str] = {}
@@ -880,11 +856,7 @@ def run_sweep(
                 progress("cases", had, len(cases))
                 begun = time.monotonic()
                 if begun > due:
-                    table = write_table()
-                    # The metric's first number may be that of a later case.
-                    with suppress(ConfigError):
-                        if so_far := find(table, plan, metric):
-                            shown(table_of_means(so_far, _VARIANTS_WHILE_RUNNING))
+                    write_table()
                     took = time.monotonic() - begun
                     due = begun + max(_TABLE_EVERY_S, _TABLE_SHARE * took)
             table = write_table()
@@ -920,16 +892,23 @@ def run_sweep(
 
 def _write_table(
     plan: Plan, folder: Path, keys: Sequence[str], journal: Journal, reasons: Mapping[str, str]
-) -> SweepTable:
-    """The table so far, whole or not at all: killed, the sweep leaves one of a moment ago."""
-    found = (
-        (number, journal.result(key) if key in journal else reasons[key])
-        for number, key in enumerate(keys)
-        if key in journal or key in reasons
+) -> Columns:
+    """The metrics so far; each file whole or not at all: killed, it is one of a moment ago."""
+    numbers, times = make_table(
+        plan,
+        (
+            (number, journal.result(key) if key in journal else reasons[key])
+            for number, key in enumerate(keys)
+            if key in journal or key in reasons
+        ),
     )
-    table = make_table(plan, found)
-    table.write(folder, plan)
-    return table
+    about = {
+        f"fgslam.experiment.{source.name}": yaml.safe_dump(dict(source.values), sort_keys=False)
+        for source in plan.sources
+    }
+    write_parquet(folder / TABLE_FILE, numbers, about)
+    write_parquet(folder / TIMES_FILE, times, about)
+    return numbers
 
 
 def _require_same_experiments(folder: Path, plan: Plan) -> None:
@@ -947,12 +926,15 @@ def _require_same_experiments(folder: Path, plan: Plan) -> None:
         )
 
 
-def check_cases(plan: Plan, watch: Watch = UNWATCHED) -> tuple[list[str], Experiment]:
+def check_cases(
+    plan: Plan,
+    progress: Progress = lambda what, done, total: None,
+    stopped: Stopped = lambda: False,
+) -> tuple[list[str], Experiment]:
     """Key of every case, and the first configuration; what cannot be run is refused now.
 
     Recordings are opened, each once; what has to be rendered is rendered before workers would.
     """
-    progress, stopped, _ = watch
     opened: dict[str, str] = {}
     keys: list[str] = []
     for case in plan.cases:
@@ -963,17 +945,12 @@ def check_cases(plan: Plan, watch: Watch = UNWATCHED) -> tuple[list[str], Experi
             parts = {name: values.get(name) for name in ("task", "dataset", "odometry", "map")}
             ground = json.dumps(parts, sort_keys=True)
             if ground not in opened:
-                opened[ground] = _identity(config, progress)
+                task = opener_of(config)(config, Opening(Path("no such run"), False, progress))
+                opened[ground] = str((task.provenance.get("dataset") or {}).get("identity", ""))
+                if (given := getattr(getattr(config, "map", None), "load", None)) is not None:
+                    opened[ground] += f" {digest_of([Path(given)])}"
             identity = opened[ground]
         keys.append(case.key(identity, (config, estimators)))
         if stopped():
             raise KeyboardInterrupt
     return keys, plan.cases[0].settled()[0]
-
-
-def _identity(config: Experiment, progress: Progress) -> str:
-    """Digests of the recording and of the map that is given. Raises FgslamError."""
-    task = opener_of(config)(config, Opening(Path("no such run"), False, progress))
-    recording = str((task.provenance.get("dataset") or {}).get("identity", ""))
-    given = getattr(getattr(config, "map", None), "load", None)
-    return recording if given is None else f"{recording} {digest_of([Path(given)])}"

@@ -20,7 +20,7 @@ from running import HANGS_AFTER_S, main
 
 import fgslam
 from fgslam.core.errors import ConfigError, OutputError
-from fgslam.runs.sweep import UNWATCHED, CaseResult, Row, SweepResult, make_plan, run_sweep
+from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
 from fgslam.runs.workers import Executor
 
 DRIVE: dict[str, Any] = {
@@ -54,9 +54,9 @@ def drive(tmp_path: Path) -> Path:
 def do(
     source: Path, sets: list[str], out: Path, existing: Any = "refuse", stopped: Any = None
 ) -> SweepResult:
-    watch = UNWATCHED if stopped is None else (UNWATCHED[0], stopped, UNWATCHED[2])
     plan = make_plan([source], sets)
-    return run_sweep(plan, out, nullcontext(Executor()), existing, watch=watch)
+    stop = stopped or (lambda: False)
+    return run_sweep(plan, out, nullcontext(Executor()), existing, stopped=stop)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -144,21 +144,6 @@ def test_failed_cases_are_told_and_done_again_on_resuming(
     again = do(drive, ["seed=0:3"], tmp_path / "out", "resume")
     assert not again.failed
     assert again.table().failure.isna().all()
-
-
-class LateMetric(Executor):
-    """Cases of which only the last has the metric."""
-
-    def run(self, function: Any, arguments: Any, *_: Any, **__: Any) -> Iterator[tuple[int, Any]]:
-        for k in range(len(arguments)):
-            numbers = {"ate_final_m": 1.0} | ({"late_m": 2.0} if k == len(arguments) - 1 else {})
-            yield k, CaseResult(0.1, (Row("odometry", numbers, {}),))
-
-
-def test_a_metric_may_have_its_first_number_in_a_late_case(drive: Path, tmp_path: Path) -> None:
-    plan = make_plan([drive], ["seed=0:3"])
-    result = run_sweep(plan, tmp_path / "out", nullcontext(LateMetric()), metric="late_m")
-    assert (result.status, result.done) == ("finished", 3)
 
 
 def test_homings_are_swept_as_well(tmp_path: Path) -> None:

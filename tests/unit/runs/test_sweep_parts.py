@@ -12,6 +12,7 @@ import pytest
 
 from fgslam.core.errors import ConfigError, OutputError
 from fgslam.evaluation.judging import holm
+from fgslam.report.content import write_parquet
 from fgslam.runs import sweep
 from fgslam.runs.engine import Task
 from fgslam.runs.folder import ExistingFolder, Owner, begin_folder
@@ -26,7 +27,6 @@ from fgslam.runs.sweep import (
     Plan,
     Row,
     Source,
-    SweepTable,
     check_cases,
     find,
     make_axes,
@@ -279,15 +279,16 @@ def result(plan: Plan, number: int, **more: Any) -> CaseResult:
     return CaseResult(0.1, tuple(rows))
 
 
-def table_of(plan: Plan, failing: int = -1) -> SweepTable:
+def table_of(plan: Plan, failing: int = -1) -> dict[str, list[Any]]:
     numbers = range(len(plan.cases))
-    return make_table(plan, [(k, "it fell" if k == failing else result(plan, k)) for k in numbers])
+    found = [(k, "it fell" if k == failing else result(plan, k)) for k in numbers]
+    return make_table(plan, found)[0]
 
 
 def test_the_table_opens_in_pandas_with_settings_metrics_and_failures(
     plan: Plan, tmp_path: Path
 ) -> None:
-    table_of(plan, failing=3).write(tmp_path, plan)
+    write_parquet(tmp_path / TABLE_FILE, table_of(plan, failing=3), {})
     found = pandas.read_parquet(tmp_path / TABLE_FILE)
     assert len(found) == 2 * len(plan.cases) - 1
     assert list(found.columns) == [
@@ -298,7 +299,7 @@ def test_the_table_opens_in_pandas_with_settings_metrics_and_failures(
     assert (failed.case.item(), failed.seed.item(), failed.failure.item()) == (3, 1, "it fell")
     assert np.isnan(failed.ate_final_m.item())
     first = (tmp_path / TABLE_FILE).read_bytes()
-    table_of(plan, failing=3).write(tmp_path, plan)
+    write_parquet(tmp_path / TABLE_FILE, table_of(plan, failing=3), {})
     assert (tmp_path / TABLE_FILE).read_bytes() == first
 
 
@@ -327,12 +328,12 @@ def test_a_metric_without_numbers_is_refused(plan: Plan) -> None:
         ConfigError, match="--metric kind: no column of numbers; known: ate_final_m"
     ):
         find(table_of(plan), plan, "kind")
-    assert find(make_table(plan, [(0, "it fell")]), plan) is None
+    assert find(make_table(plan, [(0, "it fell")])[0], plan) is None
 
 
 def test_an_estimator_that_gave_up_is_in_no_mean(plan: Plan) -> None:
     lost = CaseResult(0.1, (Row("a", {"ate_final_m": 0.0, "failure": "lost"}, {}),))
-    found = find(make_table(plan, [(0, lost), (2, result(plan, 2))]), plan)
+    found = find(make_table(plan, [(0, lost), (2, result(plan, 2))])[0], plan)
     assert found is not None
     expected = f"{11.0 + math.sin(1):.4g}"
     assert table_of_means(found).rows[0] == ("gate=2 a", ("1", expected, "1"))
@@ -366,7 +367,7 @@ def test_poses_and_odometry_that_are_not_measured_are_marked_wherever_a_sweep_sh
         a, b = result(plan, k, odometry="synthetic", predicted_frames=0).rows
         a = a._replace(numbers={**a.numbers, "predicted_frames": 2 * (k % 2 == 0)})
         results.append((k, CaseResult(0.1, (a, b))))
-    found = find(make_table(plan, results), plan)
+    found = find(make_table(plan, results)[0], plan)
     assert found is not None
     worst = f"gate=2 a ({2 * SEEDS} poses predicted, synthetic odometry)"
     best = "gate=3 b (synthetic odometry)"
