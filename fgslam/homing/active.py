@@ -25,7 +25,7 @@ from fgslam.homing.settings import HomingControlSettings
 
 MAX_ACROSS = 0.1
 """Deviation of the target's place across the way, in parts of the leg, beyond which the target is
-matched anew."""
+matched again."""
 
 CONTRADICTION_DEG = 30.0
 """A new homing vector that differs by more from a consistent estimate (and by more than four
@@ -35,7 +35,7 @@ _MAX_RESIDUAL_DEG = 5.0
 """Median difference of the bearings from the estimate's prediction beyond which the estimate counts
 as diverged."""
 
-MIN_TRACKS = 10  # with fewer the target is matched anew, while the estimate is still used
+MIN_TRACKS = 10  # with fewer the target is matched again, while the estimate is still used
 _FEWEST_TRACKS = 4
 """With fewer than this the estimate is not used any more (a third view needs three
 bearings)."""

@@ -76,7 +76,7 @@ class HomingVector:
         Bearings are counter-clockwise from the heading of a. The distance is not known: the scale
         of images is not. Both kinds of answer can be asked: ``if answer:`` is true of a vector,
         with ``direction``, ``rotation`` (radians), ``covariance`` (2, 2) of both and ``inliers``,
-        and false of a refusal, with ``reason`` and ``details``. Its reason ``AT_TARGET`` says that
+        and false of a refusal, with ``reason`` and ``details``. Its reason ``AT_TARGET`` means that
         both images are from one place, and ``rotation`` how they are turned.
 
         Args:
@@ -143,7 +143,7 @@ def teach(
 
 
 def _recognisable(image: Image, number: int, extractor: OmniFeatureExtractor) -> OmniFeatures:
-    """Features of a target image. Raises StoredMapError where nobody could find it again."""
+    """Features of a target image. Raises StoredMapError where it cannot be recognised."""
     features = extractor.extract(image)
     refusal = unusable(image, features)
     if refusal is not None:
@@ -179,7 +179,7 @@ def _selected(
 class PathFollower:
     """Drives along a taught path: an image in, speed and turning rate out.
 
-    The robot may be put down anywhere on the path, be carried off, or lose sight of it: while the
+    The robot may be put down anywhere on the path, be carried off, or lose it: while the
     next path image is not matched, its place is sought among all of them.
 
     Followers share nothing: any number of them work side by side. Used as a context manager it is
@@ -208,7 +208,7 @@ class PathFollower:
             front_end: features, matching, tracking.
             seed: of RANSAC's samples; the same images then give the same commands.
             by: ``tracks``: features are matched once a leg and tracked from then on, ten images a
-                second; ``looks``: every image is matched with the path anew, at any rate, whoever
+                second; ``looks``: every image is matched with the path again, at any rate, whatever
                 drives: of a recording, say.
 
         Raises:
@@ -286,7 +286,7 @@ class PathFollower:
 
     @property
     def finished(self) -> bool:
-        """Whether the last target is reached, or the path given up."""
+        """Whether the last target is reached, or the path abandoned."""
         return self._homing.finished
 
     @property
@@ -346,13 +346,13 @@ def _require_kind(settings: object, kind: type, who: str) -> None:
 # Path following by a robot that may be anywhere: homings, and the place on the path
 #
 # With tracks the chain of homings drives, and the place is looked for only while the next path
-# image is not matched: at the start, after the robot was carried off, when a leg is given up.
+# image is not matched: at the start, after the robot was carried off, when a leg is abandoned.
 # Without tracks every image is looked at, and its homing vector is the command.
 
 
 _SEEKING = (HomingState.INITIALISE, HomingState.WAIT, HomingState.SEARCH, HomingState.REFUSED)
 _LOOK_EVERY_S = 0.5  # while the next path image is not matched
-_GIVE_UP_S = 10.0  # of looks after a leg was given up, until the path is
+_GIVE_UP_S = 10.0  # of tries after a leg was abandoned, until the path is
 
 
 class GuidedHoming:
@@ -390,7 +390,7 @@ class GuidedHoming:
 
     @property
     def finished(self) -> bool:
-        """Whether the path's end is reached, or the path given up."""
+        """Whether the path's end is reached, or the path abandoned."""
         return self._ended is not None
 
     def step(self, image: ByteArray, time: float) -> tuple[Command, PathPlace | None]:

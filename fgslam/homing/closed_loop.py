@@ -165,7 +165,7 @@ avoidance; the world's own motion."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomingLog:
-    """One homing from matching to its end; a leg has several where it was matched anew.
+    """One homing from matching to its end; a leg has several where it was matched again.
 
     Attributes:
         target: number of the target image.
@@ -209,7 +209,7 @@ class DriveRecord:
         homings: in order.
         legs: how each leg ended.
         seconds: wall time of each stage of :data:`STAGES`, (k,) each. Not repeatable.
-        finished: the path's end was reached, or given up by the robot itself; else the drive was
+        finished: the path's end was reached, or abandoned by the robot itself; else the drive was
             ended from outside.
     """
 
@@ -263,9 +263,9 @@ def end_distance(record: DriveRecord) -> float:
 
 
 def truly_arrived(record: DriveRecord) -> bool:
-    """Whether the robot says that it reached the last target, and stands within ARRIVED_M of it.
+    """Whether the robot reports that it reached the last target, and stands within ARRIVED_M of it.
 
-    Where the truth is not known, what the robot says has to do.
+    Where the truth is not known, its report has to do.
     """
     return record.arrived and not end_distance(record) > ARRIVED_M
 
@@ -310,7 +310,7 @@ def corners(record: DriveRecord) -> FloatArray:
     """(m,) how sharply each leg turns off the one before: the angle's sine, 1 beyond 90 degrees.
 
     The robot turns off where the switch fraction of the leg before is left, and so begins the next
-    leg that part times this beside its line. The first leg begins on its line: 0. NaN for legs that
+    leg that part times this off its line. The first leg begins on its line: 0. NaN for legs that
     have no direction, two targets in one place, and for those after them.
     """
     ends = np.vstack([record.truth[0, :2], record.targets[:, :2]])

@@ -1,7 +1,7 @@
 """One homing as a state machine: initialise, drive and update, stop (sections II to IV).
 
 The controller knows no metres. Lengths are parts of the leg, the distance to the target where the
-robot set out for it. When the target is matched anew on the way, the new homing's unit is what was
+robot set out for it. When the target is matched again on the way, the new homing's unit is what was
 left then, so that the remaining part goes on from where it was; being a distance to the target, it
 still ends at 0 however wrong that unit is.
 """
@@ -32,10 +32,10 @@ from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.steering import Command, HomingState
 
 BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
-GIVE_UP_S = 3.0  # of refusals, standing: the robot looks from farther on, or ends the homing
+GIVE_UP_S = 3.0  # of refusals, standing: the robot tries from farther on, or ends the homing
 WAIT_S = 60.0  # on one leg, on top of the time without progress, for a blocked way to clear
 FARTHER_TRIES = 3  # drives farther on for one target
-STALL_S = 15.0  # without progress for so long, the target is matched anew
+STALL_S = 15.0  # without progress for so long, the target is matched again
 FARTHER_S = 2.5
 """Drive straight on, at reduced speed, to look for a refused target from elsewhere; 0.4 m with the
 default steering."""
@@ -44,7 +44,7 @@ NEAR_FRACTION = 0.3
 """From this part of the leg on, another look must show the target where the estimate has it before
 it counts as reached."""
 
-MAX_STALLS = 3  # so often without progress, or with an estimate given up, ends the homing
+MAX_STALLS = 3  # so often without progress, or with an estimate rejected, ends the homing
 _BLIND_HEADING_DEG = 20.0  # without tracks the robot drives on only if home was so nearly ahead
 _PASS_FRACTION = 0.25
 """A target nearer than this part of the leg that has fallen behind the robot counts as reached:
@@ -82,7 +82,9 @@ class HomingController:
         self._was_ahead = False
         # Where the leg begins, and where it went on by a vector that two images agree on.
         self._begun: list[HomingStart] = []
-        self._progress, self._patience = _Progress(STALL_S), WAIT_S
+        # A stall: the robot is held up, or drives by a wrong estimate.
+        self._stalls, self._patience = 0, WAIT_S
+        self._nearest, self._nearer_at = np.inf, 0.0
         self._next_try = -np.inf
         self._blind_until = -np.inf
         self._search_until, self._searches = -np.inf, 0
@@ -112,7 +114,7 @@ class HomingController:
 
     def held_up(self, seconds: float) -> None:
         """Excludes seconds in which avoidance decided, not homing, from the search for a stall."""
-        self._progress.excuse(min(seconds, self._patience))
+        self._nearer_at += min(seconds, self._patience)
         self._patience = max(self._patience - seconds, 0.0)
 
     # ----------------------------------------------------------------------------------------
@@ -121,20 +123,29 @@ class HomingController:
     def _go_on(self, homing: ActiveHoming, image: ByteArray, time: float) -> Command:
         fault = homing.update(self._front_end.track(image, time))
         if fault is not None and not fault.usable:
-            return self._lose(image, time, fault.reason)
+            # The target is matched again at once; where that fails, the robot drives blind a while.
+            ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
+            self._blind_until = time + BLIND_S if ahead else -np.inf
+            self.active, self._next_try = None, time
+            return self._seek(image, time, fault.reason)
         home = homing.home
         self.remaining, self._heading = home.distance, home.direction
         arrival = self._arrival(homing.unit)
-        doubt = self._recognise(homing, image, time, arrival)
-        if doubt is not None:
-            return doubt
+        contradiction = self._recognise(homing, image, time, arrival)
+        if contradiction is not None:
+            return contradiction
         if arrival and homing.supported:
             return self._end(time, HomingState.ARRIVED, arrival)
         if arrival and fault is None:
             fault = Fault(f"no track confirms it: {arrival}", True)
-        if self._progress.stalled(self.remaining, time):
+        nearer = self.remaining < self._nearest - _PROGRESS
+        late = not nearer and time - self._nearer_at > STALL_S
+        if nearer or late:
+            self._nearest, self._nearer_at = self.remaining, time
+        if late:
+            self._stalls += 1
             fault = Fault(f"no progress for {STALL_S:g} s", True)
-            if self._progress.stalls >= MAX_STALLS:
+            if self._stalls >= MAX_STALLS:
                 return self._refuse(time, Refusal(RefusalReason.NO_PROGRESS, fault.reason))
         if fault is None:
             return self._drive(homing, time, f"{len(homing.tracked)} tracks")
@@ -168,7 +179,7 @@ class HomingController:
         if isinstance(answer, Sighting):
             if homing.contradicts(answer.vector):
                 return self._seen_elsewhere(homing, answer, time)
-            # The first estimate is near when it says so. Later ones took the place of one that
+            # The first estimate is near when it claims so. Later ones took the place of one that
             # failed, with its distance or where its tracks ended.
             first = self.initialisations == 1
             self._recognised = first or self._surely_left(answer) <= NEAR_FRACTION
@@ -205,7 +216,7 @@ class HomingController:
     def _doubt(
         self, time: float, why: str, vector: TwoViewVector | None = None, left: float = 1.0
     ) -> Command:
-        """Gives the estimate up; homing begins anew where the robot stands.
+        """Rejects the estimate; homing begins again where the robot stands.
 
         Args:
             time: now.
@@ -216,13 +227,14 @@ class HomingController:
         self.active, self._pending, self._next_try = None, vector, time
         self.remaining, self._was_ahead, self._obstacle = left, False, why
         self._recognised = False
-        self._progress.begin_anew(time)
-        if self._progress.stalls >= MAX_STALLS:
+        self._nearest, self._nearer_at = np.inf, time
+        self._stalls += 1
+        if self._stalls >= MAX_STALLS:
             return self._refuse(time, Refusal(RefusalReason.LOST, why))
         return self._hold(time, why)
 
     def _renew(self, homing: ActiveHoming, image: ByteArray, time: float, why: str) -> Command:
-        """Matches the target anew while driving on by an estimate that is usable, but weak."""
+        """Matches the target again while driving on by an estimate that is usable, but weak."""
         if time < self._next_try:
             return self._drive(homing, time, why)
         answer = self._begin(image, time)
@@ -236,15 +248,8 @@ class HomingController:
             return self._doubt(time, "new homing vector contradicts the estimate", vector)
         return self._accept(answer, f"matched anew: {why}")
 
-    def _lose(self, image: ByteArray, time: float, why: str) -> Command:
-        """Matches the target anew at once; where that fails, drives blind for a while."""
-        ahead = abs(self._heading) <= np.deg2rad(_BLIND_HEADING_DEG)
-        self._blind_until = time + BLIND_S if ahead else -np.inf
-        self.active, self._next_try = None, time
-        return self._seek(image, time, why)
-
     # ----------------------------------------------------------------------------------------
-    # Matching the target, for the first time or anew
+    # Matching the target, for the first time or again
 
     def _seek(self, image: ByteArray, time: float, why: str = "") -> Command:
         """Tries to match the target without an estimate; else stands, or drives blind.
@@ -260,7 +265,12 @@ class HomingController:
                 answer = replace(answer, details=f"{why}; {answer.details}")
             return self._refused(time, answer)
         vector = answer.start.vector
-        if self._confirmed(vector):
+        # It is accepted where the view was never ambiguous, or where two images agree.
+        confirmed = not self._ambiguous
+        if self._pending is not None:
+            turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))
+            confirmed = bool(turn <= np.deg2rad(CONTRADICTION_DEG))
+        if confirmed:
             return self._accept(answer, f"matched anew: {why}" if why else "target matched")
         if self._pending is None:
             words, self._next_try = "ambiguous before, needs another image", time
@@ -279,17 +289,10 @@ class HomingController:
         except EstimatorError as error:
             return Refusal(RefusalReason.UNCERTAIN, str(error))
 
-    def _confirmed(self, vector: TwoViewVector) -> bool:
-        """Whether a new vector is accepted: nothing was in doubt, or two images agree."""
-        if self._pending is None:
-            return not self._ambiguous
-        turn = float(np.abs(wrap(np.array(vector.direction - self._pending.direction))))
-        return bool(turn <= np.deg2rad(CONTRADICTION_DEG))
-
     def _accept(self, homing: ActiveHoming, why: str) -> Command:
         time = homing.start.time
         if self._standing_since is not None or self.initialisations == 0:
-            self._progress.pause(time)
+            self._nearer_at = time  # the robot stood until now
         self.active = homing
         if self._pending is not None or not self._begun:
             self._begun.append(homing.start)
@@ -304,7 +307,7 @@ class HomingController:
     def _refused(self, time: float, refusal: Refusal) -> Command:
         """Stands, or drives blind, until there was nothing but refusals for too long.
 
-        Then it looks from farther on: another image says more than the same one again.
+        Then it tries from farther on: another image shows more than the same one again.
         """
         if refusal.reason is RefusalReason.AT_TARGET:
             return self._end(time, HomingState.ARRIVED, refusal.details)
@@ -314,17 +317,14 @@ class HomingController:
         if since is None or time - since < GIVE_UP_S:
             return command
         if self._searches < FARTHER_TRIES:
-            return self._search(time, refusal.details)
+            self._searches += 1
+            self._search_until = time + FARTHER_S
+            self._standing_since = self._pending = None
+            self._nearer_at = time
+            return self._hold(time, refusal.details)
         if self.initialisations:
             refusal = Refusal(RefusalReason.LOST, f"lost, then: {refusal.details}")
         return self._refuse(time, refusal)
-
-    def _search(self, time: float, why: str) -> Command:
-        self._searches += 1
-        self._search_until = time + FARTHER_S
-        self._standing_since = self._pending = None
-        self._progress.pause(time)
-        return self._hold(time, why)
 
     # ----------------------------------------------------------------------------------------
     # Commands
@@ -378,41 +378,6 @@ class HomingController:
             reason=why,
             refusal=refusal,
         )
-
-
-class _Progress:
-    """Detection of a stall: the robot is held up, or drives by a wrong estimate.
-
-    Attributes:
-        stalls: how often it was noticed.
-    """
-
-    def __init__(self, longest_s: float) -> None:
-        self.stalls = 0
-        self._longest = longest_s
-        self._best, self._since = np.inf, 0.0
-
-    def stalled(self, remaining: float, time: float) -> bool:
-        """Whether there was no progress for too long; the clock then starts again."""
-        nearer = remaining < self._best - _PROGRESS
-        late = not nearer and time - self._since > self._longest
-        if nearer or late:
-            self._best, self._since = remaining, time
-        self.stalls += late
-        return late
-
-    def begin_anew(self, time: float) -> None:
-        """Starts again after an estimate that was wrong; counts as one stall."""
-        self._best, self._since = np.inf, time
-        self.stalls += 1
-
-    def excuse(self, seconds: float) -> None:
-        """Leaves so many seconds out."""
-        self._since += seconds
-
-    def pause(self, time: float) -> None:
-        """Leaves out the time until now, in which the robot stood."""
-        self._since = time
 
 
 # --------------------------------------------------------------------------------------------
@@ -476,16 +441,14 @@ class HomingChain:
         self._path = tuple(path)
         self._make_estimator = make_estimator
         self._control = control
-        self._target = 0
-        self._skipped: list[int] = []
-        self._began: float | None = None
+        self._skipped = 0
         self._ended: Command | None = None
         self.outcomes: list[LegOutcome] = []
-        self.controller = self._new_controller()
+        self._aim(0, None)
 
     @property
     def finished(self) -> bool:
-        """Whether the last target is reached, or the path given up."""
+        """Whether the last target is reached, or the path abandoned."""
         return self._ended is not None
 
     def step(self, image: ByteArray, time: float) -> Command:
@@ -494,13 +457,13 @@ class HomingChain:
             return replace(self._ended, time=time)
         if self._began is None:
             self._began = time
-        command = self._numbered(self.controller.step(image, time))
+        command = self._step(image, time)
         # Each turn ends a leg, so that it ends with the path at the latest.
         while command.state in (HomingState.ARRIVED, HomingState.REFUSED):
             if not self._go_on(command):
                 self._ended = command
                 return command
-            command = self._numbered(self.controller.step(image, time))
+            command = self._step(image, time)
         return command
 
     @property
@@ -517,9 +480,8 @@ class HomingChain:
         """Goes on to another target, for the robot was found elsewhere; also after giving up."""
         if self._ended is None:
             self._note("skipped", time, self.controller.remaining, reason)
-        self._ended, self._skipped = None, []
-        self._target, self._began = target, time
-        self.controller = self._new_controller()
+        self._ended, self._skipped = None, 0
+        self._aim(target, time)
 
     def held_up(self, seconds: float) -> None:
         """See :meth:`HomingController.held_up`."""
@@ -533,30 +495,26 @@ class HomingChain:
     def _go_on(self, command: Command) -> bool:
         """Notes how the leg ended and begins the next one; False at the path's end."""
         last = self._target + 1 == len(self._path)
-        if command.state is HomingState.ARRIVED:
-            self._note("arrived", command.time, command.remaining, command.reason)
-            self._skipped = []
-        elif last or len(self._skipped) >= _MAX_SKIPS:
-            self._note("refused", command.time, command.remaining, command.reason)
+        result: LegResult = "arrived"
+        if command.state is not HomingState.ARRIVED:
+            result = "refused" if last or self._skipped >= _MAX_SKIPS else "skipped"
+        self._note(result, command.time, command.remaining, command.reason)
+        if last or result == "refused":
             return False
-        else:
-            self._note("skipped", command.time, command.remaining, command.reason)
-            self._skipped.append(self._target)
-        if last:
-            return False
-        self._target += 1
-        self._began = command.time
-        self.controller = self._new_controller()
+        self._skipped = self._skipped + 1 if result == "skipped" else 0
+        self._aim(self._target + 1, command.time)
         return True
 
-    def _new_controller(self) -> HomingController:
-        return HomingController(
-            self._front_end, self._path[self._target], self._make_estimator, self._control
+    def _aim(self, target: int, time: float | None) -> None:
+        """Begins the leg to a target."""
+        self._target, self._began = target, time
+        self.controller = HomingController(
+            self._front_end, self._path[target], self._make_estimator, self._control
         )
 
-    def _numbered(self, command: Command) -> Command:
-        final = self._target + 1 == len(self._path)
-        return replace(command, target=self._target, final=final)
+    def _step(self, image: ByteArray, time: float) -> Command:
+        command = self.controller.step(image, time)
+        return replace(command, target=self._target, final=self._target + 1 == len(self._path))
 
     def _note(self, result: LegResult, time: float, remaining: float, reason: str) -> None:
         began = time if self._began is None else self._began

@@ -100,7 +100,7 @@ def _one_way(pair: Pair, there: Answer, back: Answer) -> Link | str:
     """Link of a pair that is answered in one direction and undecided in the other.
 
     Which of the two solutions the few decisive features support, or which minimum of a
-    valley, may hang on the draw; that is no contradiction. Any other refusal is, as both answers
+    valley, may depend on the draw; that is no contradiction. Any other refusal is, as both answers
     come from the same views.
     """
     answer, other = (back, there) if isinstance(there, Refusal) else (there, back)

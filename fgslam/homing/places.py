@@ -2,9 +2,9 @@
 
 Each image is matched with the path images that are believed to be near and with those that look
 alike; a Bayes filter along the path (:mod:`.localisation`) joins what they say. So a robot that was
-put down anywhere, or was carried off, finds its place, and a wall that looks like another one does
-not lead astray. The homing vector to the next path image comes from the same matches: no tracking,
-so images may be far apart, or the robot's motion somebody else's.
+put down anywhere, or was carried off, finds its place, and a wall that resembles another one does
+not mislead it. The homing vector to the next path image comes from the same matches: no tracking,
+so images may be far apart, or the robot be driven by others.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ homing vector exceeds it: of many wrong images one always has the most."""
 
 _POWER = 3.0
 """Of the evidence. From single images of eight rendered drives, a film and a school floor the place
-is told best by its fourth to sixth power; neighbouring images say partly the same again. By half or
+is best known by its fourth to sixth power; neighbouring images agree in part. By half or
 twice the power no known place was wrong in 40 drives along these routes."""
 
 _NEAR = 0.25
@@ -283,7 +283,7 @@ class PathPlaces:
     def _reached(self, aim: _Aim, nearest: int) -> bool:
         """Whether the path's end is: two images in a row approach it, or are there.
 
-        What is left is measured along the last leg as it was taught, as the robot may pass beside
+        What is left is measured along the last leg as it was taught, as the robot may pass next to
         the end; and no nearer than to half its last step, as the next image would be farther off.
         """
         last = len(self._path) - 1
@@ -344,7 +344,7 @@ def _forward(count: int) -> FloatArray:
 
 
 def _most_by_chance(counts: Sequence[int]) -> float:
-    """Matches of the one of so many wrong places that has the most, as far as their spread tells.
+    """Matches of the one of so many wrong places that has the most, as far as their spread shows.
 
     A normal distribution's quantile; counts of independent matches spread by their root at least.
     """
@@ -542,7 +542,7 @@ robot that stood and drives on (0.6 of the features left) is none that was carri
 
 _OFF = 0.5  # from this probability on a step does not count as usual
 _AGAIN = 5
-"""Steps within which nobody is carried off twice: what seems so is a drive that has changed, as it
+"""Steps within which none is carried off twice: what seems so is a drive that has changed, as it
 went faster, in dimmer light, or on after a long stand."""
 
 _SPREAD = 1.0  # prior, in one step's weight: of the logarithm, a factor e
@@ -572,7 +572,7 @@ class Continuity:
         Where it went on, the logarithm of the common features is as in the steps before
         (Student's t, the prediction for unknown mean and variance); where it was carried off,
         anything from none to ``most`` is as likely. A second such step soon after the first is
-        reported too, but what is usual is learned anew from the first one on.
+        reported too, but what is usual is learned again from the first one on.
 
         Args:
             common: features of both images that agree on one motion.
@@ -618,7 +618,7 @@ def in_common(answer: Answer, matches: BearingMatches) -> int:
 
 
 LEFT_SIGMA = 0.12
-"""Of the part of a leg that is left, as parallax tells it, legs: at 45 places on legs of 2 m in the
+"""Of the part of a leg that is left, by parallax, legs: at 45 places on legs of 2 m in the
 rendered house it was off by 0.11 (root mean square; 0.34 at most)."""
 
 
@@ -648,16 +648,16 @@ def metric_place(metric: MetricPoses | None, target: int, left: float) -> Metric
 # --------------------------------------------------------------------------------------------
 # Whether pictures fit a route only when they are mirrored or turned over
 #
-# Descriptors of a mirrored picture fit nothing, or what looks alike by chance, and homing vectors
+# Descriptors of a mirrored picture fit nothing, or what is alike by chance, and homing vectors
 # then point anywhere. So the first pictures are compared with the route both as they are and as
-# they would be if a side was mistaken: what they have in common with a path image tells which is
+# they would be if a side was mistaken: what they have in common with a path image shows which is
 # right.
 
 
 Turn: TypeAlias = Callable[[Image], Image]
 
 _SIDE_CANDIDATES = 6  # path images that a picture is compared with: those that look most alike
-_CLEARLY = 2.0  # times the features in common; what looks alike by chance varies by its root
+_CLEARLY = 2.0  # times the features in common; what is alike by chance varies by its root
 _SIDES_AGREEING = 3  # pictures that tell the same
 _SIDE_STREAM = 10  # of the seed's random numbers
 
@@ -667,12 +667,12 @@ class Mistaken:
     """A way in which pictures may be other than stated.
 
     Attributes:
-        said: what is wrong, and the mend.
+        fault: what is wrong, and the mend.
         camera: with which they would be right.
         turn: that makes them right.
     """
 
-    said: str
+    fault: str
     camera: OmniCamera
     turn: Turn
 
@@ -705,7 +705,7 @@ class PictureSides:
             self.settled = bool(common[0] > 0)
         elif common[best] > _CLEARLY * common[0]:
             self._votes[best] += 1
-        return self._ways[best].said if self._votes[best] >= _SIDES_AGREEING else None
+        return self._ways[best].fault if self._votes[best] >= _SIDES_AGREEING else None
 
     def _common(self, way: int, image: Image) -> int:
         """Features in common with the path image that has most of them, on one homing vector."""

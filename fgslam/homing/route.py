@@ -36,12 +36,12 @@ from fgslam.homing.settings import FrontEndSettings
 
 COMMON = 80
 """Features that two neighbouring path images must share. A third of them is left in 20 kB and from
-beside the path; homing needs eight."""
+next to the path; homing needs eight."""
 
 DIRECTION_DEG = 4.0  # deviation of the direction from one path image to the next
 PARALLAX_DEG = 2.0
 """Median of the common features between two path images; below, one of both is superfluous: the
-direction between them would hang on noise."""
+direction between them would depend on noise."""
 
 _BEND = 0.2
 """Of the straight line between two path images, in its length, that the way between them may keep
@@ -323,7 +323,7 @@ def _bends(way: Sequence[TaughtImage], end: TaughtImage) -> bool:
 def with_neighbours_votes(
     images: Sequence[OmniFeatures], settings: FrontEndSettings, seed: int = 0
 ) -> list[OmniFeatures]:
-    """What is kept of path images that were chosen by somebody else: what neighbours show, too."""
+    """What is kept of path images that were chosen by the caller: what neighbours show, too."""
     votes = [Votes.none(one) for one in images]
     for k in range(len(images) - 1):
         rng = pair_generator(seed, k, k + 1)

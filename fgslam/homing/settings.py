@@ -1,6 +1,6 @@
 """Settings of homing: behaviour, front-end, maps, localisation.
 
-Where the paper leaves a number open, `docs/concepts/homing.md` says where the default comes from.
+Where the paper leaves a number open, `docs/concepts/homing.md` states where the default comes from.
 *Legs* are distances from start to target: the scale of images is not known.
 """
 
@@ -15,7 +15,7 @@ from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings
 
 @dataclass(frozen=True, config=STRICT)
 class HomingControlSettings:
-    """When a target is reached, when matching begins anew, and when to stop."""
+    """When a target is reached, when matching begins again, and when to stop."""
 
     switch_fraction: float = Field(
         default=0.07,
@@ -24,7 +24,7 @@ class HomingControlSettings:
         description="part of the leg left when the target counts as reached",
     )
     retry_s: NonNegative = Field(
-        default=0.5, description="between two attempts to match the target anew"
+        default=0.5, description="between two attempts to match the target again"
     )
 
 

@@ -82,8 +82,8 @@ def _speed_share(command: Command) -> float:
 
 # --------------------------------------------------------------------------------------------
 # The lower layer that may override the steering: obstacles in a range scan (IV). It is kept apart
-# from homing, as in the paper: homing says where home is, this says how to get past what stands in
-# the way, and the next image corrects the rest.
+# from homing, as in the paper: homing finds where home is, this how to get past what stands in the
+# way, and the next image corrects the rest.
 
 
 _HALF_WIDTH_M = 0.42  # half the corridor needed: the robot's radius and a margin
@@ -127,7 +127,7 @@ class CorridorAvoidance:
     the speed is bounded by the clear way.
 
     Corridors end in corners. Where the robot has been held up for a while it drives a bit along the
-    longest way that its bare body fits through, wherever that leads, and looks for corridors again.
+    longest way that its bare body fits through, wherever that leads, and searches corridors again.
     """
 
     def __init__(self, max_turn_deg_s: float) -> None:
@@ -245,7 +245,7 @@ class HomingState(str, Enum):
     CONFIRM = "confirm"
     """Standing: a new homing vector contradicts the estimate."""
     BLIND = "blind"
-    """Slowly straight on: there are no tracks, and the target is not matched anew yet."""
+    """Slowly straight on: there are no tracks, and the target is not matched again yet."""
     WAIT = "wait"
     """Standing: the same, after the longest blind drive."""
     SEARCH = "search"

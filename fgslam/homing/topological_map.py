@@ -449,7 +449,7 @@ class RouteMap:
         return sorted(order[:_CANDIDATES].tolist())
 
     def _with_image(self, links: Iterable[Link]) -> TopologicalMap:
-        """The map with one more node, whose features nobody needs."""
+        """The map with one more node, whose features are not needed."""
         old, mine = self.topology, tuple(links)
         usual = _usual_support(old.links)
         costs = [*old.costs.tolist(), *(_undriven_cost(link, usual) for link in mine)]
@@ -533,7 +533,7 @@ def _with_driven_steps(
 
 
 def _undriven_cost(link: Link, usual: float) -> float:
-    """Of a way that nobody drove: the fewer of the usual inliers, the longer it probably is."""
+    """Of a way that was not driven: the fewer of the usual inliers, the longer it probably is."""
     if _at_one_place(link):
         return _NO_WAY
     return link_cost(link) * max(1.0, usual / max(link.support, 1))
