@@ -368,12 +368,27 @@ def wrong_by(rng: np.random.Generator) -> dict[str, float]:
     return {"yaw": turn[0], "pitch": turn[1], "roll": turn[2], "focal": focal}
 
 
-def wrong_by_all(rig: CameraRig, seed: int) -> FloatArray:
-    """The same of each of a rig's other cameras."""
+def wrong_by_all(rig: CameraRig, seed: int, term: str = "all") -> FloatArray:
+    """The same of each of a rig's other cameras; of one term alone, where it is named."""
     rng, out = np.random.default_rng(seed), errors(rig)
     for camera in CAMERA_NAMES[1 : rig.cameras]:
-        out += errors(rig, camera, **wrong_by(rng))
+        values = wrong_by(rng)
+        named = {name: v for name, v in values.items() if term in (name, "all")}
+        out += errors(rig, camera, **named)
     return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("term", ["yaw", "pitch", "roll", "focal", "all"])
+@pytest.mark.parametrize("rig", RIGS.values(), ids=RIGS)
+def test_fifty_rigs_are_recovered(rig: CameraRig, term: str) -> None:
+    left = []
+    for seed in range(50):
+        wrong = wrong_by_all(rig, seed, term)
+        found = calibrated(Road(rig=rig), wrong, seed).found
+        left.append([image_error(one, wrong) for one in (found.applied, found.best)])
+    assert (np.median(left, axis=0) < 0.02).all()
+    assert (np.max(left, axis=0) < 0.06).all()
 
 
 @pytest.mark.slow

@@ -34,6 +34,24 @@ def pose2(pose: FloatArray) -> gtsam.Pose2:
     return gtsam.Pose2(*pose)
 
 
+def test_printed_equation_8_is_wrong_and_the_corrected_right() -> None:
+    """True 14.14 degrees, as printed 92.80, sign corrected alone 2.33, order alone 94.35."""
+    point = np.array([3.0, 2.0])
+    corrected = bearings(POSE, point[None])[0]
+    truth = np.arctan2(2.5, 1.8) - 0.7
+    c, s = np.cos(0.7), np.sin(0.7)
+    positive = np.array([[c, -s], [s, c]])
+    readings = (
+        positive @ point - POSE[:2],
+        positive.T @ point - POSE[:2],
+        positive @ (point - POSE[:2]),
+    )
+    angles = [np.rad2deg(np.arctan2(y, x)) for x, y in readings]
+    assert corrected == pytest.approx(truth, abs=1e-15)
+    np.testing.assert_allclose(np.rad2deg(corrected), 14.14, atol=0.005)
+    np.testing.assert_allclose(angles, [92.80, 2.33, 94.35], atol=0.005)
+
+
 def test_robot_and_target_models_are_one() -> None:
     target = np.array([np.hypot(1.2, -0.5), np.arctan2(-0.5, 1.2), 0.7])
     np.testing.assert_allclose(r.target_pose(target), POSE, atol=1e-15)

@@ -67,6 +67,40 @@ def test_first_distance_and_ratio_are_the_truth() -> None:
     np.testing.assert_allclose(solutions.first_distance[rows, best], expected, rtol=1e-6)
 
 
+def test_agrees_with_poselib() -> None:
+    samples, _, _, tangents = random_cases(500, seed=3)
+    solutions = solve_two_point(samples, least_separation=0.0)
+    for k in range(500):
+        theirs = sorted(_poselib_solutions(samples, tangents, k))
+        ours = sorted(
+            zip(
+                solutions.direction[k][solutions.valid[k]],
+                solutions.rotation[k][solutions.valid[k]],
+                strict=True,
+            )
+        )
+        assert len(ours) == len(theirs)
+        np.testing.assert_allclose(np.array(ours), np.array(theirs), atol=1e-6)
+
+
+def _poselib_solutions(
+    samples: TwoPointSamples, tangents: FloatArray, k: int
+) -> list[tuple[float, float]]:
+    """PoseLib's axes are x right, y down, z forward; its pose takes points of a to b."""
+    poselib = pytest.importorskip("poselib", reason="the test oracle PoseLib is not installed")
+    to_camera = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    rays = []
+    for view, bearing in enumerate((samples.bearing_a[k], samples.bearing_b[k])):
+        level = np.column_stack([unit(bearing), tangents[k, :, view]])
+        rays.append(level / np.linalg.norm(level, axis=1, keepdims=True) @ to_camera.T)
+    out = []
+    for found in poselib.relpose_upright_planar_2pt(*rays):
+        turn = to_camera.T @ found.R @ to_camera
+        leg = -turn.T @ (to_camera.T @ found.t)
+        out.append((float(np.arctan2(leg[1], leg[0])), float(np.arctan2(turn[0, 1], turn[0, 0]))))
+    return out
+
+
 def test_noise_beyond_the_double_root_is_clamped_or_refused() -> None:
     exact = TwoPointSamples(
         np.array([[0.0, 1.0]]), np.array([[0.2, 1.7]]), np.array([[-1.2, 0.6]]) * -1.0,

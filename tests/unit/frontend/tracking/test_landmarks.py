@@ -561,6 +561,25 @@ def test_a_map_with_a_landmark_that_has_no_view_is_refused() -> None:
         LandmarkDatabase(RIG, VIEWS, 40.0).load(given)
 
 
+def test_memory_a_landmark_is_as_documented() -> None:
+    """docs/concepts/maps.md tells it."""
+    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0)) == 78 + 164
+    assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)) == 242 + 289
+    assert kept_bytes(LandmarkDatabase(RIG, VIEWS, 40.0)) == 242 + 2 * 4
+
+
+def kept_bytes(database: LandmarkDatabase) -> float:
+    """Bytes of a landmark with one view, but for the view's word (2), which is found again."""
+    count = 200
+    database.add(
+        stereo_features(np.tile(PLACES[:1], (count, 1))),
+        np.arange(count),
+        np.zeros(count, np.uint8),
+    )
+    arrays = state_of(database).values()
+    return sum(array.nbytes for array in arrays if array.shape[:1] == (count,)) / count
+
+
 # ------------------------------------------------------------------------------------------
 # Several views of a landmark (Se et al. 6.3)
 
