@@ -581,7 +581,8 @@ class LensCamera:
         ahead, clockwise: as of :class:`MirrorFrame`.
 
     Raises:
-        CalibrationError: the lens is none of these, or the radii do not rise from 0 or more.
+        CalibrationError: the lens is none of these, the radii do not rise from 0 or more, or the
+            elevation of OCamCalib's polynomial does not rise over them.
     """
 
     width: int
@@ -610,6 +611,15 @@ class LensCamera:
         size = (self.width, self.height)
         raw = RawCamera(*size, matrix, distortion, np.eye(4), model=self.lens)
         object.__setattr__(self, "_raw", checked_camera(raw))
+        if self.lens == "ocam":  # a polynomial that any file may state
+            radii = np.linspace(*self.ring, _KNOTS)
+            steps = np.diff(np.arctan2(polynomial.polyval(radii, distortion), radii))
+            if not (steps > 0.0).all():
+                raise CalibrationError(
+                    f"camera: elevation turns back near radius {radii[np.argmin(steps > 0.0)]:.1f} "
+                    f"px of the ring {self.ring[0]:.1f} to {self.ring[1]:.1f} px; narrow the ring "
+                    "to what the mirror shows"
+                )
 
     @classmethod
     def of(
@@ -732,7 +742,11 @@ def read_ocamcalib(
     # Rows and columns from the centre, (x, y), are seen at (c x + d y, e x + y).
     matrix = np.array([[1.0, e, column], [d, c, row], [0.0, 0.0, 1.0]])
     raw = RawCamera(width, height, matrix, direct, np.eye(4), str(path), "ocam")
-    camera = LensCamera.of(checked_camera(raw), ring, up=False)
+    checked_camera(raw)
+    try:
+        camera = LensCamera.of(raw, ring, up=False)
+    except CalibrationError as cause:
+        raise CalibrationError(f"{path}: {cause}") from cause
     radius = np.linspace(*camera.ring, 200)
     angle = np.arctan2(polynomial.polyval(radius, direct), radius)
     apart = float(np.abs(polynomial.polyval(angle, inverse) - radius).max())

@@ -480,6 +480,14 @@ def test_an_uncropped_picture_has_its_centre_further_right(tmp_path: Path) -> No
         read(tmp_path, size=(640, 480))
 
 
+def test_a_ring_over_which_the_polynomial_turns_back_is_refused() -> None:
+    numbers = (320, 240, "ocam", (1.0, 0.0, 160.0, 0.0, 1.0, 120.0, 0.0, 0.0, 1.0))
+    direct = (-60.0, 0.0, 0.006, -4e-5)
+    assert LensCamera(*numbers, direct, (20.0, 100.0)).ring == (20.0, 100.0)
+    with pytest.raises(CalibrationError, match=r"turns back near radius 1[0-9.]+ px .* narrow"):
+        LensCamera(*numbers, direct, (20.0, 200.0))
+
+
 def test_without_a_ring_the_largest_circle_is_taken(tmp_path: Path) -> None:
     plain = text(ring="", crop="")
     assert read(tmp_path, plain).ring == pytest.approx((0.0, 1079 - 545.872616))
