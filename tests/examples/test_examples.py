@@ -19,6 +19,7 @@ LONG = (
     "drive_home",
     "filter_or_smoother",
     "homing_vector",
+    "live_robot",  # test_live_robot.py
     "own_features",
 )
 HERE = [

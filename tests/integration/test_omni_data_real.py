@@ -7,13 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from edge_straightness import upright_edges
 
-from fgslam.cameras.omni import Cylinder, Equirectangular, LensCamera, RadialCamera, unwrap_maps
+from fgslam.cameras.omni import Cylinder, Equirectangular, RadialCamera, unwrap_maps
 from fgslam.cameras.rings import find_mirror_circle
 from fgslam.cameras.settings import OCamCalibSettings
 from fgslam.core.arrays import FloatArray, Image
-from fgslam.datasets.images import read_colour_image
 from fgslam.datasets.omni import OmniRecording
 from fgslam.datasets.opening import open_omni
 from fgslam.datasets.settings import OmniPathSettings, OmniVideoSettings, PanoramasSettings
@@ -88,32 +86,6 @@ def unwrapped(recording: OmniRecording, view: Cylinder) -> Image:
 VIEW = Cylinder(2400, 530, float(np.tan(np.radians(-40.4))), float(np.tan(np.radians(27.0))))
 
 
-def test_the_ocamcalib_picture_unwraps_straight(shared_data: Path) -> None:
-    """Bows of long upright edges, and their lean once the camera's own tilt is taken off."""
-    recording = ocamcalib(shared_data)
-    assert isinstance(recording.camera, LensCamera)
-    # Calibrated without the 300 columns at the left, pictured with them.
-    assert recording.camera.centre == pytest.approx((974.318875, 545.872616))
-    edges = upright_edges(unwrapped(recording, VIEW), 100)
-    assert len(edges) >= 25
-    assert np.median(edges.bow) < 0.7  # pixels of 2400, on edges of 100 to 300 rows
-    bearing = np.pi - edges.column * 2.0 * np.pi / (VIEW.width - 1)
-    tilt, left = without_tilt(bearing, edges.lean)
-    assert np.degrees(np.hypot(*tilt)) < 3.5
-    assert np.degrees(np.median(np.abs(left))) < 1.0
-
-
-def without_tilt(bearing: FloatArray, lean: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tilt (2,) in radians and what remains of the leans (n,): a trimmed fit."""
-    design = np.column_stack([np.cos(bearing), np.sin(bearing)])
-    kept = np.ones(len(lean), np.bool_)
-    for _ in range(10):
-        tilt = np.linalg.lstsq(design[kept], lean[kept], rcond=None)[0]
-        left = lean - design @ tilt
-        kept = np.abs(left) < max(3.0 * 1.4826 * float(np.median(np.abs(left))), 1e-3)
-    return tilt, left
-
-
 def test_a_chessboard_in_the_mirror_is_a_plane(shared_data: Path) -> None:
     """Its corners' rays, over 34 degrees of elevation, map to a grid by one homography."""
     recording = ocamcalib(shared_data)
@@ -146,12 +118,3 @@ def plane_error(rays: FloatArray) -> float:
     mapped = np.column_stack([grid, np.ones(len(grid))]) @ homography.T
     away = mapped[:, :2] / mapped[:, 2:] - image
     return float(np.sqrt((away**2).sum(axis=1).mean()))
-
-
-@pytest.mark.parametrize("name", ["kit_pair_left.png", "hypercat_1280x1024_01.jpg"])
-def test_mirror_circles_of_real_pictures(shared_data: Path, name: str) -> None:
-    image = read_colour_image(present(shared_data, f"omni_mirror/{name}"))
-    circle = find_mirror_circle(image, np.random.default_rng(0))
-    middle = np.array([image.shape[1], image.shape[0]]) / 2.0
-    assert np.hypot(*(circle.centre - middle)) < 60.0
-    assert circle.radius == pytest.approx(max(image.shape) / 2.0, rel=0.1)

@@ -22,10 +22,8 @@ from fgslam.cameras.rig import (
 from fgslam.cameras.write_formats import write_calibration
 from fgslam.core.arrays import FloatArray
 from fgslam.core.correction import (
-    SHARED,
     RigCorrection,
     camera_displacements,
-    shared_displacements,
     term_names,
 )
 from fgslam.core.errors import CalibrationError
@@ -121,12 +119,6 @@ def test_what_is_no_correction_is_refused(
     path.write_text(json.dumps(values | {"corrections": [1.0]}))
     with pytest.raises(CalibrationError, match="must be an object"):
         StereoRig.load(path)
-
-
-@pytest.mark.parametrize("rig", [PAIR, THREE], ids=["two cameras", "three cameras"])
-def test_a_frame_that_shows_nothing_is_displaced_by_nothing(rig: CameraRig) -> None:
-    found = shared_displacements(rig, np.empty((0, rig.cameras, 2)))
-    assert found.shape == (0, 2 * rig.cameras, len(SHARED))
 
 
 # --------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ def normalised_error(found: BoardCalibration, true: list[RawCamera]) -> float:
 )
 def test_cameras_are_found_and_their_uncertainty_is_honest(model: str, cameras: int) -> None:
     errors = []
-    for seed in range(6):
+    for seed in range(4):
         true = rig(model, cameras)
         views = seen_by(true, np.random.default_rng(seed))
         found = calibrate(BOARD, views, SIZE, model)
@@ -246,17 +246,6 @@ def test_the_true_camera_is_found_within_its_sigmas(name: str) -> None:
     # 32 to 36 numbers, of which those of a lens correlate.
     assert 0.5 < np.mean(np.square(errors)) < 1.8
     assert np.abs(errors).max() < 4.0
-
-
-def test_rays_of_a_fisheye_of_185_degrees_agree_over_the_whole_view() -> None:
-    true = CAMERAS["fisheye"]
-    found = calibrate(BOARD, views_of("fisheye", 0, count=30), true.size, true.model).cameras[0]
-    angle, around = np.meshgrid(np.radians([10, 45, 80, 92]), np.linspace(0.0, 6.0, 13))
-    rays = np.column_stack(
-        [(np.sin(angle) * f(around)).ravel() for f in (np.cos, np.sin)] + [np.cos(angle).ravel()]
-    )
-    off = np.linalg.norm(found.project(rays) - true.project(rays), axis=1)
-    assert off.max() < 0.3
 
 
 def test_a_picture_in_a_mirror_gives_the_same_camera() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 import pytest
 from numpy.polynomial import polynomial
@@ -27,7 +26,6 @@ from fgslam.cameras.omni import (
 )
 from fgslam.cameras.omni_files import make_camera
 from fgslam.cameras.settings import OCamCalibSettings
-from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
 from fgslam.core.geometry import wrap
 
@@ -42,10 +40,6 @@ def mirror(**changes: float) -> HyperbolicMirror:
         xi=values["xi"],
         focal_px=values["focal_px"],
     )
-
-
-def rays_all_around(rng: np.random.Generator, count: int) -> FloatArray:
-    return rng.normal(size=(count, 3)) * rng.uniform(0.1, 10.0, (count, 1))
 
 
 # --------------------------------------------------------------------------------------------
@@ -86,7 +80,7 @@ def test_the_raw_mirror_image_is_seen_from_below() -> None:
 # The hyperbolic mirror
 
 
-@pytest.mark.parametrize(("a", "b"), [(28.0, 23.4), (40.0, 20.0), (10.0, 30.0)])
+@pytest.mark.parametrize(("a", "b"), [(28.0, 23.4), (10.0, 30.0)])
 def test_the_unified_model_is_reflection_on_the_hyperboloid(a: float, b: float) -> None:
     """Rays of a pinhole camera at the lower focus, reflected: all through the upper focus."""
     c = np.hypot(a, b)
@@ -117,26 +111,6 @@ def test_the_unified_model_is_reflection_on_the_hyperboloid(a: float, b: float) 
     np.testing.assert_allclose(camera.radius(expected), radius, rtol=1e-9)
 
 
-def test_gtsam_agrees_in_the_half_space_that_it_covers() -> None:
-    """Cal3Unified looks along its z axis; a mirror's picture is about the nadir."""
-    camera = HyperbolicMirror(
-        MirrorFrame(640, 480, (321.5, 236.25)), 0.0, 300.0, xi=0.9, focal_px=120.0
-    )
-    gtsam_camera = gtsam.Cal3Unified(120.0, 120.0, 0.0, 321.5, 236.25, 0, 0, 0, 0, 0.9)
-    rng = np.random.default_rng(2)
-    rays = rays_all_around(rng, 500)
-    rays = rays[rays[:, 2] < -0.05]
-    pixels = camera.pixels(rays)
-    seen = np.isfinite(pixels[:, 0])
-    assert seen.sum() > 100
-    for ray, pixel in zip(rays[seen], pixels[seen], strict=True):
-        # Camera's axes, seen from below: columns to the robot's left, rows backward, z down.
-        x, y, z = ray[1], -ray[0], -ray[2]
-        np.testing.assert_allclose(
-            gtsam_camera.uncalibrate(np.array([x / z, y / z])), pixel, atol=1e-9
-        )
-
-
 def test_nothing_is_seen_outside_the_ring_or_the_picture() -> None:
     camera = mirror(outer_radius=300.0)
     centre = np.array(camera.frame.centre)
@@ -159,13 +133,10 @@ def test_a_mirror_with_a_given_view_has_that_view() -> None:
     [
         (lambda: mirror(inner_radius=230.0), "radii from 230 to 225"),
         (lambda: mirror(xi=1.2), "xi 1.2 must lie in"),
-        (lambda: mirror(focal_px=float("nan")), "focal_px nan"),
         (lambda: MirrorFrame(320, 240, (400.0, 120.0)), "lies outside the 320x240 picture"),
-        (lambda: MirrorFrame(320, 240, (float("nan"), 1.0)), "lies outside"),
         (lambda: MirrorFrame(320, 240, (9.0, 9.0), float("inf")), "ahead is inf"),
         (lambda: Equirectangular(1, 10), "at least 2x2"),
         (lambda: Equirectangular(10, 10, -1.0, 1.0), "they must rise"),
-        (lambda: Cylinder(10, 10, 1.0, -1.0), "they must rise"),
         (lambda: HyperbolicMirror.with_view((9, 9), 0.9, (-1.0, 1.3)), "below arcsin"),
     ],
 )
@@ -208,30 +179,6 @@ def test_a_vertical_segment_scales_about_the_horizon_alone_when_its_distance_cha
 MIRROR = HyperbolicMirror.with_view((640, 480), 0.92, (np.radians(-70), np.radians(25)))
 
 
-def test_a_panoramas_covariance_is_its_pixel_size() -> None:
-    camera = Equirectangular(1025, 513)
-    pixels = np.array([[100.0, 100.0], [512.0, 256.0], [1000.3, 400.7]])
-    bearing, elevation, covariance = measure(camera, pixels, 0.5)
-    np.testing.assert_allclose(bearing, np.pi - pixels[:, 0] * 2 * np.pi / 1024, atol=1e-12)
-    np.testing.assert_allclose(elevation, np.pi / 2 - pixels[:, 1] * np.pi / 512, atol=1e-12)
-    pixel = np.array([2 * np.pi / 1024, np.pi / 512])
-    expected = np.broadcast_to(np.diag((0.5 * pixel) ** 2), (3, 2, 2))
-    np.testing.assert_allclose(covariance, expected, rtol=1e-9, atol=1e-15)
-
-
-def test_a_mirrors_covariance_is_its_radial_slope() -> None:
-    """Across the radius a pixel is 1 / r; along it the slope of elevation over radius."""
-    frame = MIRROR.frame
-    radius = np.array([30.0, 90.0, 150.0, 230.0])
-    bearing = np.array([0.2, 1.7, -2.0, 3.0])
-    _, _, covariance = measure(MIRROR, frame.pixels(radius, bearing), np.array([0.3, 1, 2, 0.5]))
-    slope = (MIRROR.elevation(radius + 1e-4) - MIRROR.elevation(radius - 1e-4)) / 2e-4
-    sigma = np.array([0.3, 1.0, 2.0, 0.5])
-    np.testing.assert_allclose(np.sqrt(covariance[:, 0, 0]), sigma / radius, rtol=1e-5)
-    np.testing.assert_allclose(np.sqrt(covariance[:, 1, 1]), sigma * slope, rtol=1e-5)
-    np.testing.assert_allclose(covariance[:, 0, 1], 0.0, atol=1e-8)
-
-
 @pytest.mark.parametrize(
     "camera",
     [
@@ -268,12 +215,6 @@ def test_outside_and_at_the_border() -> None:
     near = MIRROR.frame.pixels(np.array([ring - 1.0]), np.array([0.5]))
     _, _, within = measure(MIRROR, near, 1.0)
     np.testing.assert_allclose(covariance[0], within[0], rtol=0.05, atol=1e-7)
-
-
-def test_measuring_no_pixels_gives_empty_arrays() -> None:
-    bearing, elevation, covariance = measure(MIRROR, np.empty((0, 2)), 1.0)
-    assert bearing.shape == elevation.shape == (0,)
-    assert covariance.shape == (0, 2, 2)
 
 
 # --------------------------------------------------------------------------------------------
@@ -322,7 +263,7 @@ def exact_mirror(xi: float) -> HyperbolicMirror:
     return HyperbolicMirror.with_view((320, 240), xi, (np.radians(-60), np.radians(20)))
 
 
-@pytest.mark.parametrize("xi", [0.85, 0.9, 0.92, 0.95, 0.97])
+@pytest.mark.parametrize("xi", [0.85, 0.97])
 def test_degree_five_fits_the_hyperbolic_mirror_within_a_tenth_of_a_degree(xi: float) -> None:
     camera = exact_mirror(xi)
     radii = (camera.inner_radius, camera.outer_radius)
@@ -350,21 +291,6 @@ def test_elevation_may_fall_with_the_radius() -> None:
     camera = RadialPolynomial(FRAME, 30.0, 110.0, coefficients=(0.2, -0.6))
     np.testing.assert_allclose(camera.elevation(np.array([30.0, 70.0, 110.0])), [0.8, 0.2, -0.4])
     np.testing.assert_allclose(camera.radius(np.array([0.8, 0.2, -0.4])), [30.0, 70.0, 110.0])
-
-
-def test_noise_of_25_points_gives_the_designs_error() -> None:
-    """25 points at 0.3 pixels of noise calibrate to 0.15 degrees rms."""
-    camera = exact_mirror(0.92)
-    radii = (camera.inner_radius, camera.outer_radius)
-    dense = np.linspace(*radii, 300)
-    rng = np.random.default_rng(5)
-    errors = []
-    for _ in range(50):
-        radius = np.linspace(*radii, 25)
-        samples = (radius + rng.normal(0.0, 0.3, 25), camera.elevation(radius))
-        fitted = fit_radial_polynomial(FRAME, radii, samples)[0]
-        errors.append(fitted.elevation(dense) - camera.elevation(dense))
-    assert np.degrees(np.sqrt(np.mean(np.square(errors)))) < 0.25
 
 
 @pytest.mark.parametrize(
@@ -500,21 +426,14 @@ def test_without_a_ring_the_largest_circle_is_taken(tmp_path: Path) -> None:
     ("content", "reported"),
     [
         (text(direct="5 -266 0 1e-3 -5e-7"), "line 3: direct.*states 5 .* has 4"),
-        (text(direct="5 -266 0 1e-3 -5e-7 x"), "line 3: direct.*'x' is no finite number"),
-        (text(inverse="2 nan 3"), "line 7: inverse.*'nan'"),
-        (text(centre="545.9"), "line 11: centre.*1 numbers, expected 2"),
-        (text(affine="1 0"), "line 15: affine.*2 numbers, expected 3"),
         (text(affine="0 1 1"), "c - d e > 0"),
         (text(size="1080.5 1300"), "line 19: size.*whole numbers"),
-        (text(size="0 0"), "at least 2x2"),
         (text(centre="5450 674"), "principal point .* is far from the image of 1300x1080"),
         (text(ring="235 530"), "line 23: ring: largest radius 235"),
-        (text(crop="300"), "line 27: cropped"),
         (text(extra="1 2 3"), "line 31: an entry that is not known"),
         (text(direct="5 266 0 -1e-3 5e-7 -2e-9"), "turns back|inverse polynomial is"),
         (text(inverse="2 400.0 300.0"), "inverse polynomial is .* px off"),
         ("#only a comment\n", "has 0 entries"),
-        ("5 1 2 3 4 5\n", "has 1 entries"),
     ],
 )
 def test_malformed_files_name_the_line(tmp_path: Path, content: str, reported: str) -> None:
@@ -522,11 +441,3 @@ def test_malformed_files_name_the_line(tmp_path: Path, content: str, reported: s
         read_ocamcalib(written(tmp_path, content))
     assert "calib_results.txt" in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_unreadable_files(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"cannot read .*No such file"):
-        read_ocamcalib(tmp_path / "absent.txt")
-    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00\x81")
-    with pytest.raises(CalibrationError, match="it is not text"):
-        read_ocamcalib(tmp_path / "binary.txt")

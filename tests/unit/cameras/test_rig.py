@@ -57,13 +57,9 @@ def test_a_rig_needs_seven_numbers() -> None:
     ("change", "words"),
     [
         ({"baseline": 0.0}, "baseline is 0.0, .*one camera alone cannot measure depth"),
-        ({"baseline": None}, "baseline is None"),
-        ({"baseline": float("nan")}, "baseline is nan"),
         ({"vertical_baseline": -0.1}, "vertical_baseline is -0.1"),
         ({"fx": float("inf")}, "fx is inf"),
         ({"fy": True}, "fy is True"),
-        ({"height": 0}, "height is 0"),
-        ({"cy": float("nan")}, "cy is nan"),
         ({"cx": -700.0}, "cx is -700.0, far from the image"),
         ({"bTc": np.diag([1.0, 1.0, -1.0, 1.0])}, "bTc must be a rigid motion"),
     ],
@@ -213,7 +209,6 @@ def test_rows_of_numbers_as_opencv_5_writes_them(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"K1": [[30.0, 0.0, 0.0], [0.0, 30.0, 0.0], [80.0, 60.0, 1.0]]}, "0 0 1 by rows; it is"),
         ({"K1": [[3e9, 0.0, 80.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]]}, "nearly square"),
         ({"K1": [[30.0, 80.0, 0.0], [0.0, 30.0, 60.0], [0.0, 0.0, 1.0]]}, "nearly right angles"),
         ({"K1": [[3e9, 0.0, 80.0], [0.0, 3e9, 60.0], [0.0, 0.0, 1.0]]}, "show 3.* degrees in 160x"),
@@ -222,7 +217,6 @@ def test_rows_of_numbers_as_opencv_5_writes_them(tmp_path: Path) -> None:
             r"principal point \(-1e\+300, 60\) is far from the image of 160x",
         ),
         ({"D1": [1e4, 0.0, 0.0, 0.0, 0.0]}, "lens model show .* degrees in 160x"),
-        ({"D1": [-1e300, 0.0, 0.0, 0.0, 0.0]}, "has no ray for any of 160x120 pixels"),
         ({"T": [-1e300, 0.0, 0.0]}, "it is 1e[+]300 m from"),
         ({"size": [1e12, 120]}, "no image is 1000000000000x120 pixels large"),
     ],
@@ -289,11 +283,8 @@ def test_our_own_and_kittis_files_need_no_rectification(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"distortion_model": "kb9"}, "cam1.camera_model pinhole with distortion_model kb9 is not"),
-        ({"camera_model": "omni"}, "cam1.intrinsics is .*, expected 5 finite numbers"),
         ({"T_cn_cnm1": None}, "T_cn_cnm1"),
-        ({"T_cn_cnm1": [[1.0, 0.0], [0.0]]}, "expected finite numbers"),
         ({"T_cn_cnm1": np.diag([2.0, 1, 1, 1]).tolist()}, "not a rigid motion"),
-        ({"intrinsics": [1.0, 2.0]}, "intrinsics"),
         ({"resolution": [80, 60]}, "one resolution"),
     ],
 )
@@ -301,12 +292,6 @@ def test_what_a_camchain_lacks_is_named(tmp_path: Path, changes: Any, words: str
     path = write_camchain(tmp_path, **changes)
     with pytest.raises(CalibrationError, match=words):
         StereoRig.load(path)
-
-
-def test_cameras_behind_each_other_are_refused(tmp_path: Path) -> None:
-    behind = pose(np.eye(3), np.array([0.0, 0.0, 0.1]))
-    with pytest.raises(CalibrationError, match="not side by side"):
-        StereoRig.load(write_camchain(tmp_path, T_cn_cnm1=behind.tolist()))
 
 
 def test_camera_info_of_no_pair_is_refused(tmp_path: Path) -> None:
@@ -341,12 +326,6 @@ def test_a_size_that_is_none_is_refused(tmp_path: Path) -> None:
     no_size: Any = 640
     with pytest.raises(CalibrationError, match=r"give \(width, height\)"):
         StereoRig.load(tmp_path, no_size)
-
-
-def test_a_loaded_rig_is_described_in_one_line(tmp_path: Path) -> None:
-    text = repr(StereoRig.load(write_camchain(tmp_path)))
-    assert "\n" not in text
-    assert len(text) < 600
 
 
 def test_the_vertical_is_the_body_s_and_of_a_camera_alone_the_image_s() -> None:

@@ -101,12 +101,9 @@ def test_five_formats_one_after_another(tmp_path: Path) -> None:
     ("given", "name", "form", "words"),
     [
         (calibration("ds"), "a.yml", None, "OpenCV has no model ds; write calib.json"),
-        (calibration("ocam"), "a.yaml", None, "Kalibr has no model ocam"),
         (calibration(parameters=[0.1] * 5), "a.yaml", None, "no radial-tangential model of 5"),
         (calibration(), "a.csv", None, "no format ends like that; known: .json"),
-        (calibration("fov"), "a", None, "ROS has no model fov"),
         (calibration(), "a.txt", "kalibr", "is written as .yaml or .yml"),
-        (calibration(), "a.yaml", "ros", "is written as no ending, a folder"),
         (calibration(), "a.yaml", "okvis", "format 'okvis' is not known; use fgslam, opencv"),
     ],
 )
@@ -145,9 +142,7 @@ def test_black_borders_are_counted(tmp_path: Path) -> None:
     [
         ({"size": "wide"}, "--size wide: give whole numbers, as --size 640x480"),
         ({"size": "128x96"}, "is for images of 64x48 pixels, the images have 128x96"),
-        ({"size": "128x128", "scale": True}, "has another shape"),
         ({"cameras": "0"}, "give two or three of 0 to 1"),
-        ({"unit_m": 0.0}, "give metres"),
         ({"fov_deg": 190.0}, "perspective view takes 0 to 170"),
     ],
 )
@@ -155,12 +150,6 @@ def test_wrong_options(asked: dict[str, object], words: str, tmp_path: Path) -> 
     write_calibration(calibration(), tmp_path / "a.json")
     with pytest.raises(FgslamError, match=words):
         show_calibration(Asked(tmp_path / "a.json", **asked), None)  # type: ignore[arg-type]
-
-
-def test_it_is_scaled_when_asked(tmp_path: Path) -> None:
-    write_calibration(calibration(), tmp_path / "a.json")
-    lines = show_calibration(Asked(tmp_path / "a.json", size="128x96", scale=True), None)
-    assert "128x96" in lines[2]
 
 
 def test_millimetres_are_noticed_and_mended(tmp_path: Path) -> None:

@@ -26,15 +26,6 @@ def test_tum_file_round_trip_keeps_the_poses(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.poses, written.poses, atol=2e-12)
 
 
-def test_tum_there_and_back_keeps_the_bytes(tmp_path: Path) -> None:
-    trajectory().save(tmp_path / "a.tum")
-    Trajectory.load(tmp_path / "a.tum").save(tmp_path / "b.tum")
-    first = np.loadtxt(tmp_path / "a.tum")
-    np.testing.assert_allclose(np.loadtxt(tmp_path / "b.tum"), first, atol=2e-12)
-    trajectory().save(tmp_path / "c.tum")
-    assert (tmp_path / "c.tum").read_bytes() == (tmp_path / "a.tum").read_bytes()
-
-
 def test_tum_lines_are_in_the_formats_order(tmp_path: Path) -> None:
     turn = se3_exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
     turn[:3, 3] = [1.0, -2.0, 3.5]
@@ -67,13 +58,6 @@ def test_evo_reads_both(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(kitti.poses_se3), written.poses, atol=1e-10)
 
 
-def test_kitti_file_round_trip_keeps_the_poses(tmp_path: Path) -> None:
-    written = trajectory(2)
-    written.save(tmp_path / "a.kitti")
-    read = np.loadtxt(tmp_path / "a.kitti").reshape(-1, 3, 4)
-    np.testing.assert_allclose(read, written.poses[:, :3], rtol=1e-12)
-
-
 def test_the_suffix_chooses_the_format_in_any_case(tmp_path: Path) -> None:
     for suffix in ("tum", "kitti", "csv"):
         trajectory().save(tmp_path / f"a.{suffix}")
@@ -101,12 +85,10 @@ def test_comments_blank_lines_and_windows_line_ends_are_accepted(tmp_path: Path)
     ("line", "words"),
     [
         ("2 0 0 0 0 0 0", "7 numbers instead of 8"),
-        ("2 0 0 0 0 0 0 1 9", "9 numbers instead of 8"),
         ("2 0 0 zero 0 0 0 1", "zero"),
         ("2 0 0 nan 0 0 0 1", "not finite"),
         ("2 0 0 0 0 0 0 0", "quaternion"),
         ("1 0 0 0 0 0 0 1", "does not increase"),
-        ("2,0,0,0,0,0,0,1", "2,0,0"),
     ],
 )
 def test_broken_tum_lines_are_named(tmp_path: Path, line: str, words: str) -> None:

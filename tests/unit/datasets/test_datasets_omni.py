@@ -153,15 +153,10 @@ def test_reduced_panoramas(home: Path) -> None:
     [
         ("", "line 1: no column id, file"),
         ("id,file,x_m,y_m\n1,a.png,0,0\n", "no column heading_deg"),
-        (HEADER, "lists no panorama"),
         (HEADER + "3,b.png,nan,0,0,\n", "line 2: x_m is nan, not finite"),
         (HEADER + "3,b.png,1,zwei,0,\n", "line 2: y_m is 'zwei'"),
-        (HEADER + "3,b.png,1\n", "line 2: y_m is empty"),
-        (HEADER + "x,b.png,1,2,3,\n", "line 2: id is 'x'"),
         (HEADER + "3,c.png,1,2,3,\n", "line 2: there is no picture c.png"),
         (HEADER + ROWS + "3,a.png,1,2,3,\n", "line 4: id 3 is in line 2 already"),
-        (HEADER + ROWS + "4,a.png,1,2,3,\n", "line 4: file a.png is in line 3 already"),
-        (HEADER + '3,"b.png,1,2,3\n', "line 2"),
     ],
 )
 def test_bad_pose_tables(home: Path, content: str, reported: str) -> None:
@@ -345,9 +340,7 @@ def test_a_calibration_file_is_looked_for_beside_the_pictures(tmp_path: Path) ->
     [
         (BLOGGIE.replace("INPUT_WIDTH, 64\n", ""), "lacks INPUT_WIDTH"),
         (BLOGGIE.replace("0.97", "much"), "line 6: MAX_R_PERCENT is 'much'"),
-        (BLOGGIE.replace("0.97", "nan"), "line 6: MAX_R_PERCENT is 'nan'"),
         (BLOGGIE.replace("0.97", "0.2"), "radii from 5.28 to 4.8"),
-        (BLOGGIE.replace("64", "340"), "pictures of 340x48 pixels, but these have 64x48"),
         (BLOGGIE.replace("OPTICAL_CENTER_X, 0.5", "OPTICAL_CENTER_X, 5"), "lies outside"),
     ],
 )

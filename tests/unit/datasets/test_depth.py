@@ -111,7 +111,7 @@ def test_the_layout_of_tum(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("name", ["odom.txt", "odometry.txt", "odom.csv"])
+@pytest.mark.parametrize("name", ["odometry.txt", "odom.csv"])
 def test_odometry_beside_colour_and_depth(tmp_path: Path, name: str) -> None:
     root = tum(tmp_path / "walk")
     head = "time,speed,yaw_rate\n" if name.endswith(".csv") else "#Time px py pz ox oy oz ow vx\n"
@@ -239,13 +239,6 @@ def test_distortion_that_goes_the_other_way_is_refused(tmp_path: Path) -> None:
     (root / "camera.json").write_text(json.dumps(values), encoding="utf-8")
     with pytest.raises(CalibrationError, match="inverse_brown_conrady is not known with coeff"):
         opened(root)
-
-
-def test_a_folder_as_calibration_states_no_unit(tmp_path: Path) -> None:
-    root = tum(tmp_path / "walk")
-    (tmp_path / "mine").mkdir()
-    (root / "calib.json").rename(tmp_path / "mine" / "calib.json")
-    assert opened(root, camera_file=str(tmp_path / "mine")).rig.fx == FOCAL
 
 
 def test_a_colour_image_without_depth_takes_its_time_along(tmp_path: Path) -> None:

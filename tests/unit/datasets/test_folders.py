@@ -94,8 +94,6 @@ def test_top_camera_comes_third_and_can_be_left_out(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "expected"),
     [
-        ({"start": 2}, [2, 3, 4, 5]),
-        ({"stop": 3}, [0, 1, 2]),
         ({"stop": 99, "stride": 2}, [0, 2, 4]),
         ({"start": 1, "stop": 6, "stride": 4}, [1, 5]),
     ],
@@ -142,22 +140,6 @@ def test_truth_of_the_left_camera_becomes_the_right_ones(tmp_path: Path) -> None
     np.testing.assert_allclose(offset[:3, 3], [0.2, 0.0, 0.0], atol=1e-7)
 
 
-def test_truth_of_the_right_camera_is_taken_as_it_is(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(6), curve(6))
-    truth = opened(root).ground_truth
-    assert truth is not None
-    np.testing.assert_allclose(truth.poses, curve(6), atol=1e-8)
-
-
-def test_truth_that_covers_part_of_the_frames(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(2, 5), curve(6)[2:5])
-    truth = opened(root).ground_truth
-    assert truth is not None
-    np.testing.assert_allclose(truth.timestamps, [0.2, 0.3, 0.4])
-
-
 def test_mounting_from_calibration_and_from_settings(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     np.testing.assert_array_equal(opened(root).rig.bTc, BODY_FORWARD_LEFT_UP_FROM_CAMERA)
@@ -195,21 +177,11 @@ def flip_bit(path: Path) -> None:
     path.write_bytes(bytes(data))
 
 
-def empty(path: Path) -> None:
-    path.write_bytes(b"")
-
-
-def no_image(path: Path) -> None:
-    path.write_text("hello", encoding="utf-8")
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
         (truncate, ["truncated", "copy the file again"]),
         (flip_bit, ["damaged", "copy the file again"]),
-        (empty, ["empty", "copy the file again"]),
-        (no_image, ["not an image", "restore"]),
     ],
 )
 def test_damaged_image_is_refused(tmp_path: Path, damage: object, words: list[str]) -> None:
@@ -234,16 +206,6 @@ def test_png_cut_between_its_data_chunks_is_refused(tmp_path: Path) -> None:
         path.write_bytes(data[:cut])
         with pytest.raises(FrameError, match=f"truncated at {cut} bytes"):
             read_grey_image(path)
-
-
-def test_truncated_jpeg_is_refused(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    (root / "right" / "000002.png").unlink()
-    save(root / "right" / "000002.jpg", picture(12))
-    assert opened(root).frame(2).images[0].shape == (24, 32)
-    truncate(root / "right" / "000002.jpg")
-    with pytest.raises(FrameError, match=r"000002\.jpg is truncated"):
-        opened(root).frame(2)
 
 
 def test_later_frame_of_another_size(tmp_path: Path) -> None:
@@ -314,24 +276,17 @@ BAD_RECORDINGS = [
     (no_common_frame, DatasetError, ["not one of 6 frames", "2 cameras", "check"]),
     (two_images_of_a_frame, DatasetError, ["left", "two images of frame 3", "remove"]),
     (times(""), DatasetError, ["no frame at all", "check"]),
-    (times("# number time\n"), DatasetError, ["no frame at all"]),
     (times("0 0.0\n1 0.1\n2 0.1\n"), DatasetError, ["times.txt, line 3", "0.100000", "line 2"]),
-    (times("0 0.0\n\n1 0.2\n2 0.1\n"), DatasetError, ["line 4", "time order"]),
     (times("0 0.0\n1\n"), DatasetError, ["line 2", "1 columns, expected 2", "complete"]),
     (times("0 0.0\n1 soon\n"), DatasetError, ["line 2", "'soon'", "not a number"]),
-    (times("0 0.0\n1 nan\n"), DatasetError, ["line 2", "nan", "not finite"]),
     (times("0 0.0\n0 1.0\n"), DatasetError, ["line 2", "image number 0", "twice"]),
     (times("0 0.0\n1e300 1.0\n"), DatasetError, ["line 2", "1e+300 is not a whole number"]),
-    (times("0 0.0\n1.5 1.0\n"), DatasetError, ["line 2", "1.5", "whole number"]),
     (calibrated(fx=float("nan")), CalibrationError, ["calib.json", "fx is nan", "correct"]),
-    (calibrated(cx=float("inf")), CalibrationError, ["cx is inf"]),
-    (calibrated(fy="31"), CalibrationError, ["fy is '31'"]),
     (calibrated(baseline_m=0.0), CalibrationError, ["baseline_m is 0", "positive"]),
     (calibrated(baseline_m=-0.2), CalibrationError, ["baseline_m is -0.2", "swap the folders"]),
     (calibrated(width=32.5), CalibrationError, ["width is 32.5", "whole number"]),
     (calibrated(width=64), CalibrationError, ["32x24", "64x24", "scale"]),
     (calibrated(bTc=[[1, 0], [0, 1]]), CalibrationError, ["bTc", "rigid 4x4"]),
-    (calibrated(bTc=np.diag([1, 1, -1, 1]).tolist()), CalibrationError, ["bTc", "rigid"]),
     (calibrated(rectified=False), CalibrationError, ["not rectified", "rectify them"]),
     (without_key, CalibrationError, ["no 'height'", "add it"]),
     (
@@ -339,7 +294,6 @@ BAD_RECORDINGS = [
         CalibrationError,
         ["no 'baseline_m'", "if 'baseline' means it, rename it", "metres"],
     ),
-    (renamed_key('"fx"', '"gx"'), CalibrationError, ["no 'fx'; add it"]),
     (broken_json, CalibrationError, ["not JSON", "correct"]),
     (no_calibration, CalibrationError, ["calib.json", "No such file"]),
 ]
@@ -356,11 +310,6 @@ def test_bad_recording_is_refused_in_one_line(
         opened(root)
     assert type(raised.value) is error
     assert_one_line(str(raised.value), str(tmp_path), *words)
-
-
-def test_absent_recording(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="does not exist; check dataset"):
-        opened(tmp_path / "nowhere")
 
 
 def test_of_three_cameras_in_a_line_the_outer_two_are_used(tmp_path: Path) -> None:
@@ -386,14 +335,6 @@ def test_top_camera_needs_a_vertical_baseline(tmp_path: Path) -> None:
         opened(root)
     (root / "top").rename(root / "third")
     assert opened(root).rig.cameras == 2
-
-
-def test_truth_with_a_bad_quaternion_names_the_line(tmp_path: Path) -> None:
-    root = image_folder(tmp_path)
-    (root / "gt_left_cam.txt").write_text("# t\n0 0 0 0 0 0 0 1\n0.1 0 0 0 1 1 0 1\n")
-    with pytest.raises(DatasetError) as error:
-        opened(root)
-    assert_one_line(str(error.value), "gt_left_cam.txt, line 3", "quaternion", "order")
 
 
 def test_calibrated_top_camera_without_images_is_noted(tmp_path: Path) -> None:
@@ -430,13 +371,9 @@ STAMP = 1_403_715_273_262_142_976
 
 NAMES: dict[str, Callable[[int], tuple[str, str]]] = {
     "left, right": lambda k: (f"left/{k}.png", f"right/{k}.png"),
-    "L, R": lambda k: (f"L/img{k}.png", f"R/img{k}.png"),
-    "image_0, image_1": lambda k: (f"image_0/{k:04d}.png", f"image_1/{k:04d}.png"),
     "cam0/data, cam1/data": lambda k: (f"cam0/data/{k}.png", f"cam1/data/{k}.png"),
     "side in both": lambda k: (f"left/left_{k}.png", f"right/right_{k}.png"),
     "side behind": lambda k: (f"{k}_left.png", f"{k}_right.png"),
-    "side before": lambda k: (f"left{k}.png", f"right{k}.png"),
-    "letters": lambda k: (f"frame{k}-L.png", f"frame{k}-R.png"),
     "cam0, cam1 in one": lambda k: (f"cam0_{k}.png", f"cam1_{k}.png"),
     "WebP, capitals": lambda k: (f"Left Camera/im {k}.WEBP", f"Right Camera/im {k}.WEBP"),
     "the same numbers": lambda k: (f"left/a{k}.png", f"right/b{k}.png"),
@@ -501,7 +438,6 @@ def test_words_that_hold_a_side_are_none() -> None:
 LISTS: dict[str, tuple[str, list[str], str]] = {
     "seconds": ("times.txt", ["0.0", "0.2", "0.4"], ""),
     "name and time": ("times.txt", ["3 0.4", "1 0.0", "2 0.2"], ""),
-    "time and file": ("times.csv", ["time,file", "5.0,1.png", "5.2,2.png", "5.4,right/3.png"], ""),
     "number, time and file": (
         "right_images.txt",
         ["# id timestamp image_name", *(f"{k} 9.{2 * k} right/{k + 1}.png" for k in range(3))],
@@ -509,7 +445,6 @@ LISTS: dict[str, tuple[str, list[str], str]] = {
     ),
     "file, time and exposure": ("times.txt", [f"{k} 5.{2 * k} 7" for k in (1, 2, 3)], ""),
     "nanoseconds": ("timestamps.txt", [str(STAMP + k * 200_000_000) for k in range(3)], "nano"),
-    "milliseconds": ("times.txt", ["0", "200", "400"], "milli"),
     "dates": ("timestamps.txt", [f"2011-09-26 13:02:25.{k}00000001" for k in (1, 3, 5)], ""),
 }
 
@@ -561,8 +496,6 @@ def named(k: int, form: str, places: int = 3) -> str:
     [
         ("%Y-%m-%dT%H-%M-%S.#Z_{}", 3),
         ("%Y%m%d_%H%M%S_#_{}", 6),
-        ("{}_%Y%m%d%H%M%S#", 3),
-        ("IMG_{}_%Y-%m-%d %H.%M.%S,#", 2),
         ("2026-11-23-23-10-50_%Y-%m-%d-%H-%M-%S-#_{}", 3),
     ],
 )
@@ -645,9 +578,7 @@ def test_a_board_at_rest_is_paired_without_times(tmp_path: Path) -> None:
     "names",
     [
         [f"20230101_120000_{k:02d}" for k in range(30)],
-        [f"20230101_120000_{k:04d}" for k in range(30)],
         [f"20230101_{k:06d}" for k in range(40)],
-        [f"{k:010d}" for k in range(40)],
         [f"1700000000_{k:06d}" for k in range(40)],
     ],
 )
@@ -687,16 +618,6 @@ def test_bad_lists_of_times(tmp_path: Path, lines: list[str], message: str) -> N
 # Pictures
 
 
-def test_colour_16_bits_and_grey_are_the_same_picture(tmp_path: Path) -> None:
-    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
-    image = picture(11)
-    save(root / "right" / "2.png", np.dstack([image, image, image]))
-    save(root / "right" / "3.png", image.astype(np.uint16) << 8)
-    recording = opened_loose(root)
-    for i in (1, 2):
-        assert np.array_equal(recording.frame(i).images[0], image)
-
-
 def test_a_phone_that_was_turned_is_turned_back(tmp_path: Path) -> None:
     """EXIF orientation 6: the camera was turned to the right, the picture is stored lying."""
     root = loose(tmp_path, NAMES["left, right"], [1])
@@ -714,16 +635,6 @@ def turned_jpeg(image: np.ndarray, orientation: int) -> bytes:
     entry = struct.pack("<HHIHH", 0x0112, 3, 1, orientation, 0)
     exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 1) + entry + struct.pack("<I", 0)
     return data[:2] + b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif + data[2:]
-
-
-def test_a_damaged_image_is_one_lost_frame(tmp_path: Path) -> None:
-    root = loose(tmp_path, NAMES["left, right"], [1, 2, 3])
-    file = root / "left" / "2.png"
-    file.write_bytes(file.read_bytes()[:-30])
-    recording = opened_loose(root)
-    with pytest.raises(FrameError, match=r"2\.png is truncated"):
-        recording.frame(1)
-    assert recording.frame(2).images[1][0, 0] == 62
 
 
 def test_a_calibration_of_another_size_and_none(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from scipy import stats
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError, DatasetError, OdometryError
 from fgslam.core.geometry import (
-    body_to_camera_motion,
     inverse,
     rotation_angle,
     se3_log,
@@ -113,12 +112,6 @@ def test_gaps_leave_steps_without_odometry_and_ends_are_held() -> None:
     assert steps[0].motion[0, 3] == pytest.approx(1.0)
 
 
-def test_gap_wholly_inside_one_step() -> None:
-    stamps = np.array([0.0, 0.1, 0.9, 1.0])
-    np.testing.assert_array_equal(steps_covered(stamps, np.array([0.05, 0.95]), 0.5, 0.5), [False])
-    np.testing.assert_array_equal(steps_covered(stamps, np.array([0.05, 0.95]), 0.8, 0.5), [True])
-
-
 @given(
     stamps=st.lists(st.integers(0, 60), min_size=2, max_size=12, unique=True),
     frames=st.lists(st.integers(-10, 70), min_size=2, max_size=8, unique=True),
@@ -158,14 +151,6 @@ def opened(root: Path, odometry: RecordedOdometrySettings = DEFAULT, **s: object
     return open_recording(ImageFolderSettings(path=str(root), **s), odometry)  # type: ignore[arg-type]
 
 
-def test_folder_with_speed_and_yaw_rate(tmp_path: Path) -> None:
-    recording = opened(with_speeds(tmp_path), stride=2)
-    step = recording.odometry(1)
-    assert step is not None
-    assert np.linalg.norm(step.motion[:3, 3]) == pytest.approx(1.0, rel=1e-4)
-    assert np.arctan2(step.motion[1, 0], step.motion[0, 0]) == pytest.approx(0.02)
-
-
 def test_time_offset_moves_the_log(tmp_path: Path) -> None:
     image_folder(tmp_path)
     rows = "".join(f"{0.05 * k:.2f},{k}.0,0.0\n" for k in range(12))
@@ -202,11 +187,9 @@ def test_poses_are_not_held_beyond_their_ends(tmp_path: Path) -> None:
 
 BAD_LOGS = [
     ("0.1,1,0\n0.2,nan,0\n", ["line 3", "forward speed is nan", "not finite"]),
-    ("0.1,1,0\n0.2,1,inf\n", ["line 3", "yaw rate is inf", "not finite"]),
     ("0.1,1,0\n0.2,400,0\n", ["line 3", "400 m/s is absurd", "limit 60"]),
     ("0.1,1,0\n0.2,1,-99\n", ["line 3", "yaw rate", "absurd", "limit 720"]),
     ("0.1,1,0\n0.3,1,0\n0.2,1,0\n", ["line 4", "0.200000", "time order"]),
-    ("0.1,1,0\n0.1,1,0\n", ["line 3", "duplicates"]),
     ("0.1,1\n", ["line 2", "2 columns, expected 3"]),
     ("0.1,1,0\n0.2,fast,0\n", ["line 3", "'fast'", "not a number"]),
     ("", ["0 samples", "at least 2", "constant_velocity"]),
@@ -326,8 +309,9 @@ TABLES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("separator", [",", ";", " "])
-@pytest.mark.parametrize("name", TABLES)
+@pytest.mark.parametrize(
+    ("name", "separator"), [*((name, ",") for name in TABLES), ("poses", ";"), ("poses", " ")]
+)
 def test_every_table_gives_the_same_arc(tmp_path: Path, name: str, separator: str) -> None:
     columns = TABLES[name]
     if separator == " ":
@@ -352,14 +336,6 @@ def test_bad_tables(tmp_path: Path, columns: dict[str, Any], message: str) -> No
     with pytest.raises(OdometryError, match=message) as caught:
         step_of(table(tmp_path / "odom.csv", columns))
     assert "\n" not in str(caught.value)
-
-
-def test_words_and_short_lines_are_named_by_their_line(tmp_path: Path) -> None:
-    path = tmp_path / "odom.csv"
-    for line, message in (("0.1,fast,0", "line 3: v is 'fast'"), ("0.1,1", "line 3: 2 columns")):
-        path.write_text(f"time,v,w\n0.0,1,0\n{line}\n", encoding="utf-8")
-        with pytest.raises(OdometryError, match=message):
-            step_of(path)
 
 
 def test_without_names_the_columns_are_time_speed_and_yaw_rate(tmp_path: Path) -> None:
@@ -416,15 +392,6 @@ def test_integration_is_that_of_many_small_steps() -> None:
     for axis in np.eye(3):
         moved = so3_log(fine.T @ finely(stamps, 0.103, 0.9, 1e-3 * axis)) / 1e-3
         np.testing.assert_allclose(jacobians[0] @ axis, moved, rtol=0.0, atol=1e-3)
-
-
-def test_a_steady_turn_is_exact_at_any_rate_of_samples() -> None:
-    for period in (0.005, 0.05):
-        stamps = np.arange(0.0, 1.0, period)
-        rates = np.tile(RATE, (len(stamps), 1))
-        turned, _ = integrate_rates(stamps, rates, np.array([0.1, 0.333, 0.8]))
-        np.testing.assert_allclose(turned[0], so3_exp(0.233 * RATE), rtol=0.0, atol=1e-12)
-        np.testing.assert_allclose(turned[1], so3_exp(0.467 * RATE), rtol=0.0, atol=1e-12)
 
 
 def test_steps_beyond_the_samples_and_over_gaps_are_not_measured() -> None:
@@ -619,32 +586,6 @@ def test_standard_deviations_follow_the_settings(folder: Path) -> None:
     np.testing.assert_allclose(sigmas[3:], 0.02 * np.linalg.norm(body[:3, 3]))
 
 
-def test_without_noise_but_the_floor_it_is_the_truth(folder: Path) -> None:
-    still = SyntheticOdometrySettings(translation_sigma_fraction=0.0, rotation_sigma_deg=0.0)
-    sequence = with_synthetic_odometry(mounted(folder), still, 1)
-    truth = sequence.ground_truth
-    assert truth is not None
-    for i in range(1, 8):
-        found = synthetic_step(sequence, i)
-        sigmas = np.sqrt(np.diag(found.covariance))
-        np.testing.assert_allclose(sigmas, np.repeat([np.radians(0.01), 0.001], 3))
-        camera = body_to_camera_motion(found.motion, sequence.rig.bTc)
-        expected = inverse(truth.poses[i - 1]) @ truth.poses[i]
-        np.testing.assert_allclose(camera, expected, atol=5.0 * 0.001)
-
-
-def test_seeds_repeat_and_differ(folder: Path) -> None:
-    recording = mounted(folder)
-    first, again, other = (with_synthetic_odometry(recording, SETTINGS, seed) for seed in (5, 5, 6))
-    np.testing.assert_array_equal(synthetic_step(first, 9).motion, synthetic_step(again, 9).motion)
-    assert not np.allclose(
-        synthetic_step(first, 9).motion, synthetic_step(other, 9).motion, atol=1e-6
-    )
-    assert not np.allclose(
-        synthetic_step(first, 9).motion, synthetic_step(first, 10).motion, atol=1e-6
-    )
-
-
 def test_a_part_of_the_recording_repeats_the_same_noise(folder: Path) -> None:
     whole = with_synthetic_odometry(mounted(folder), SETTINGS, 5)
     part = with_synthetic_odometry(mounted(folder, start=100, stop=200), SETTINGS, 5)
@@ -652,13 +593,6 @@ def test_a_part_of_the_recording_repeats_the_same_noise(folder: Path) -> None:
         np.testing.assert_array_equal(
             synthetic_step(part, i).motion, synthetic_step(whole, 100 + i).motion
         )
-
-
-def test_order_of_asking_does_not_matter(folder: Path) -> None:
-    sequence = with_synthetic_odometry(mounted(folder), SETTINGS, 5)
-    forwards = [synthetic_step(sequence, i).motion for i in (1, 2, 3)]
-    backwards = [synthetic_step(sequence, i).motion for i in (3, 2, 1)][::-1]
-    np.testing.assert_array_equal(forwards, backwards)
 
 
 def test_needs_ground_truth(tmp_path: Path) -> None:

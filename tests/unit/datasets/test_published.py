@@ -29,7 +29,7 @@ from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rectify import Rectifier
 from fgslam.cameras.rig import load_rig, read_calibration_file
 from fgslam.core.arrays import FloatArray
-from fgslam.core.errors import CalibrationError, DatasetError, FgslamError, FrameError
+from fgslam.core.errors import CalibrationError, DatasetError, FgslamError
 from fgslam.core.geometry import inverse, pose, project, se3_exp, so3_exp, transform_to_camera
 from fgslam.core.log import ImageSequence
 from fgslam.datasets.opening import open_recording
@@ -124,30 +124,6 @@ def test_images_are_the_raw_ones_remapped(tmp_path: Path) -> None:
         np.testing.assert_array_equal(frame.images[k], expected)
 
 
-def test_rectified_images_of_a_scene_agree_row_by_row(tmp_path: Path) -> None:
-    """Bright points rendered into the raw images appear on one row, at the right disparity."""
-    root = euroc(tmp_path, (LEFT, RIGHT), frames=1)
-    cameras = dict(enumerate(read_calibration_file(root).cameras))
-    point = np.array([[4.0, 0.1, -0.2]])
-    for k, camera in cameras.items():
-        column, row = seen_raw(camera, point)[0]
-        x, y = np.meshgrid(np.arange(EUROC_SIZE[0]), np.arange(EUROC_SIZE[1]))
-        blob = 250.0 * np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * 2.0**2))
-        (path,) = (root / "mav0" / f"cam{k}" / "data").iterdir()
-        save(path, np.round(blob).astype(np.uint8))
-    recording = opened(root)
-    centres = []
-    for image in recording.frame(0).images:
-        weight = image.astype(np.float64)
-        y, x = np.indices(weight.shape)
-        centres.append([(weight * x).sum() / weight.sum(), (weight * y).sum() / weight.sum()])
-    expected = project(recording.rig, transform_to_camera(recording.rig.bTc, point))[0]
-    (right, left) = centres
-    assert left[1] - right[1] == pytest.approx(0.0, abs=0.05)
-    assert left[0] - right[0] == pytest.approx(expected[2], abs=0.05)
-    assert right == pytest.approx(expected[:2], abs=0.1)
-
-
 def test_truth_is_interpolated_and_carried_to_the_rectified_right_camera(tmp_path: Path) -> None:
     root = euroc(tmp_path, (LEFT, RIGHT))
     # The body turns and moves at constant rate; truth at 100 Hz, frames 1 ms off its stamps.
@@ -206,15 +182,6 @@ def test_path_may_be_mav0_itself(tmp_path: Path) -> None:
     assert opened(root / "mav0").name == opened(root).name == "V1_01"
 
 
-def test_missing_image(tmp_path: Path) -> None:
-    root = euroc(tmp_path, (LEFT, RIGHT))
-    (root / "mav0" / "cam0" / "data" / f"{START_NS + PERIOD_NS}.png").unlink()
-    recording = opened(root)
-    assert recording.notes == ("1 of 4 frames lack an image: 1 (left)",)
-    with pytest.raises(FrameError, match=r"cam0/data/.* cannot be read"):
-        recording.frame(1)
-
-
 def changed_sensor(**changes: object) -> object:
     def spoil(mav: Path) -> None:
         values = {**sensor_yaml(LEFT), **changes}
@@ -252,7 +219,6 @@ UPWARDS = pose(so3_exp(np.array([0.0, 1.2, 0.0])) @ AHEAD, LEFT[:3, 3])
 BAD = [
     (mono, DatasetError, ["two cameras", "cam1", "does not exist"]),
     (text("cam0/sensor.yaml", "a: ["), CalibrationError, ["cam0/sensor.yaml", "not YAML"]),
-    (text("cam0/sensor.yaml", "- 1"), CalibrationError, ["cam0/sensor.yaml", "keys and values"]),
     (
         changed_sensor(distortion_model="kb9"),
         CalibrationError,
@@ -264,9 +230,7 @@ BAD = [
         ["intrinsics", "nan", "4 finite numbers"],
     ),
     (changed_sensor(intrinsics=[0.0, 1.0, 2.0, 3.0]), CalibrationError, ["must be positive"]),
-    (changed_sensor(resolution=[64]), CalibrationError, ["resolution", "2 finite numbers"]),
     (changed_sensor(resolution=[32, 24]), CalibrationError, ["32x24", "64x48", "one resolution"]),
-    (changed_sensor(T_BS=7), CalibrationError, ["T_BS is 7", "16 finite numbers"]),
     (mounted(SCALED), CalibrationError, ["T_BS is not a rigid motion"]),
     (mounted(ABOVE), CalibrationError, ["not side by side", "check T_BS"]),
     (mounted(RIGHT), CalibrationError, ["are 0 mm apart, as one camera", "--unit"]),
@@ -274,7 +238,6 @@ BAD = [
     (text("cam0/data.csv", "#empty\n"), DatasetError, ["cam0/data.csv", "no image", "restore"]),
     (text("cam0/data.csv", "12.5,a.png\n"), DatasetError, ["line 1", "nanoseconds", "times 1e9"]),
     (text("cam0/data.csv", "1000,a.png\n51000,b.png\n"), DatasetError, ["50000 ns apart", "micro"]),
-    (text("cam0/data.csv", "#\n20,a.png\n20,b.png\n"), DatasetError, ["line 3", "time order"]),
     (shifted_stamps, DatasetError, ["no image", "partner", "20 ms", "restore the stamps"]),
 ]
 
@@ -372,32 +335,6 @@ def test_colour_cameras_have_lines_and_a_place_of_their_own(
     np.testing.assert_allclose(offsets[:, :3, 3], np.tile([0.45, 0.0, 0.0], (5, 1)), atol=1e-8)
 
 
-def test_selection_applies_to_truth_as_well(tmp_path: Path) -> None:
-    root, _ = kitti(tmp_path)
-    whole, part = kitti_opened(root), kitti_opened(root, start=1, stride=2)
-    assert part.ground_truth is not None
-    assert whole.ground_truth is not None
-    np.testing.assert_array_equal(part.ground_truth.poses, whole.ground_truth.poses[1::2])
-    np.testing.assert_array_equal(part.ground_truth.timestamps, part.timestamps)
-    assert part.frame(1).index == 3
-
-
-def test_without_poses_there_is_no_truth(tmp_path: Path) -> None:
-    root, _ = kitti(tmp_path)
-    (root / "poses" / "06.txt").unlink()
-    assert kitti_opened(root).ground_truth is None
-
-
-def test_missing_frame_is_noted_and_raises_when_read(tmp_path: Path) -> None:
-    root, _ = kitti(tmp_path)
-    (root / "sequences" / "06" / "image_1" / "000000.png").unlink()
-    recording = kitti_opened(root)
-    assert recording.notes == ("1 of 5 frames lack an image: 0 (right)",)
-    assert recording.frame(1).images[0].shape == (24, 32)
-    with pytest.raises(FrameError, match=r"image_1/000000\.png cannot be read"):
-        recording.frame(0)
-
-
 def replaced(name: str, old: str, new: str) -> object:
     def spoil(folder: Path) -> None:
         path = folder / name
@@ -417,24 +354,17 @@ def other_size(folder: Path) -> None:
         save(folder / "image_1" / f"{k:06d}.png", picture(k, 16, 12))
 
 
-def no_calibration(folder: Path) -> None:
-    (folder / "calib.txt").unlink()
-
-
 KITTI_BAD = [
     (kitti_mono, DatasetError, ["no image_1/", "both grey cameras", "unpack"]),
     (other_size, DatasetError, ["differ in size", "right 16x12", "left 32x24"]),
-    (no_calibration, CalibrationError, ["calib.txt", "No such file", "restore"]),
     (replaced("calib.txt", "P1:", "P9:"), CalibrationError, ["calib.txt", "P1 is missing"]),
     (replaced("calib.txt", "-12.0", "nan"), CalibrationError, ["calib.txt: P1 is", "12 finite"]),
     (replaced("calib.txt", "-12.0", "12.0"), CalibrationError, ["baseline is -0.4", "swapped"]),
-    (replaced("calib.txt", "-12.0", "0.0"), CalibrationError, ["baseline is 0", "positive"]),
     (
         replaced("calib.txt", "P1: 30.0", "P1: 33.0"),
         CalibrationError,
         ["P0 and P1", "not rectified"],
     ),
-    (replaced("times.txt", "3.00", "2.00"), DatasetError, ["times.txt, line 4", "line 3", "order"]),
     (replaced("../../poses/06.txt", "e", "x"), DatasetError, ["06.txt, line 1", "not a number"]),
 ]
 
@@ -603,18 +533,8 @@ def cut(path: Path) -> None:
     file.write_text(file.read_text(encoding="utf-8")[:40], encoding="utf-8")
 
 
-def no_number(path: Path) -> None:
-    (path / "oxts" / "data" / "0000000003.txt").write_text("nan " * 30, encoding="utf-8")
-
-
 def no_times(path: Path) -> None:
     (path / "oxts" / "timestamps.txt").unlink()
-
-
-def backwards(path: Path) -> None:
-    file = path / "oxts" / "timestamps.txt"
-    lines = file.read_text(encoding="utf-8").splitlines()
-    file.write_text("\n".join([lines[1], lines[0], *lines[2:]]), encoding="utf-8")
 
 
 def turned(path: Path) -> None:
@@ -625,9 +545,7 @@ def turned(path: Path) -> None:
     ("spoil", "error", "words"),
     [
         (cut, DatasetError, r"0000000003\.txt: expected 30 numbers; restore"),
-        (no_number, DatasetError, r"0000000003\.txt: expected 30 numbers"),
         (no_times, DatasetError, r"oxts has no timestamps\.txt; restore it"),
-        (backwards, DatasetError, "time of image 2 does not come after"),
         (turned, CalibrationError, "R is .*, expected 9 finite numbers"),
     ],
 )

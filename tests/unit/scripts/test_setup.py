@@ -115,12 +115,8 @@ def test_setup_refuses_unknown_kinds(tmp_path: Path) -> None:
     ("target", "stamps"),
     [
         ("demo", ["runtime"]),
-        ("setup", ["runtime", "dev"]),
         ("test", ["runtime", "dev"]),
-        ("test-all", ["runtime", "dev"]),
         ("check", ["runtime", "dev"]),
-        ("bench", ["runtime", "dev"]),
-        ("bench-long", ["runtime", "dev"]),
     ],
 )
 def test_every_target_sets_up_first_and_once(

@@ -39,8 +39,7 @@ def test_clearance_is_the_distance_to_a_box() -> None:
     ]
 
 
-@pytest.mark.parametrize("within", [None, "hall"])
-@pytest.mark.parametrize("spacing", [2.0, 3.0, 4.0])
+@pytest.mark.parametrize(("spacing", "within"), [(2.0, None), (4.0, None), (2.0, "hall")])
 def test_reference_path_is_drivable(space: FloorSpace, spacing: float, within: str | None) -> None:
     planner = PathPlanner(space, 0.55)
     rooms = set()

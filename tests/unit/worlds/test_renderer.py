@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from omni_house import PANORAMA, plain, room
-from scipy import ndimage
 
 from fgslam.cameras.omni import HyperbolicMirror, OmniCamera
 from fgslam.core import geometry
@@ -93,16 +92,6 @@ def test_depth_is_exact_on_a_slanted_wall() -> None:
     np.testing.assert_allclose(points[:, 2], 5.0, atol=1e-12)
 
 
-def test_where_nothing_is_seen_levels_are_0_depth_infinite_and_object_minus_1() -> None:
-    bank = ramps(16)
-    layer = make_layer([wall("across", 5.0)], bank)
-    away = geometry.pose(geometry.so3_exp(np.array([0.0, np.pi, 0.0])), np.zeros(3))
-    renderer = Renderer(CAMERA, bank)
-    assert renderer.image(layer, away)[..., 0].max() == 0.0
-    assert np.isinf(renderer.distances(layer, away)).all()
-    assert (renderer.things(layer, away) == -1).all()
-
-
 def test_fine_texture_fades_to_its_mean_instead_of_aliasing() -> None:
     checks = np.indices((256, 256)).sum(axis=0) % 2 * 200.0 + 20.0
     bank = GreyBank({"checks": checks.astype(np.float32)})
@@ -111,21 +100,6 @@ def test_fine_texture_fades_to_its_mean_instead_of_aliasing() -> None:
     np.testing.assert_allclose(far, 120.0, atol=1.0)
     near = renderer.image(make_layer([wall("checks", 0.05, tile_m=1.0)], bank), np.eye(4))[..., 0]
     assert near.std() > 25.0
-
-
-def test_shift_of_a_tenth_of_a_pixel_shows_as_such() -> None:
-    """Sub-pixel truth: moving the camera moves the picture by what projection says."""
-    rng = np.random.default_rng(0)
-    smooth = ndimage.gaussian_filter(rng.standard_normal((256, 256)), 8.0)
-    smooth = 128 + 40 * (smooth - smooth.mean()) / smooth.std()
-    bank = GreyBank({"smooth": smooth.astype(np.float32)})
-    renderer, layer = Renderer(CAMERA, bank), make_layer([wall("smooth", 4.0)], bank)
-    here = renderer.image(layer, np.eye(4)).astype(float)[..., 0]
-    moved = geometry.pose(np.eye(3), np.array([0.1 * 4.0 / FOCAL, 0.0, 0.0]))
-    there = renderer.image(layer, moved).astype(float)[..., 0]
-    gradient = np.gradient(here, axis=1)
-    shift = np.sum((there - here) * gradient) / np.sum(gradient**2)
-    assert shift == pytest.approx(0.1, abs=0.005)
 
 
 def test_nearer_layer_hides_the_farther_one_and_edges_are_mixed() -> None:
@@ -176,11 +150,6 @@ def test_textures_are_not_mirrored_on_any_side_of_a_box() -> None:
         assert len(face) > 20
         assert (np.diff(face[1:-1]) > 0).all()
         assert face[-2] - face[1] > 100.0
-
-
-def test_textures_must_have_sides_that_are_powers_of_two() -> None:
-    with pytest.raises(ValueError, match="powers of two"):
-        GreyBank({"odd": np.zeros((48, 64), dtype=np.float32)})
 
 
 # --------------------------------------------------------------------------------------------
@@ -263,18 +232,6 @@ def test_hidden_point_does_not_show(scene: Layer) -> None:
     assert not visible(scene, PANORAMA, POSE, behind)[1].any()
 
 
-def test_edge_pixels_are_mixed(bank: ColourBank) -> None:
-    """Over a mark's border redness goes through intermediate levels in proportion to coverage."""
-    layer = room(bank, np.array([[0.0, 3.0, 1.2]]), side=1.0)
-    upright = camera_pose(np.array([0.0, 0.5, np.pi / 2]), 1.2, np.zeros(2))
-    levels = Renderer(omni_view(PANORAMA), bank, 24.0).levels(layer, upright).reshape(3, 256, 512)
-    share = (levels[0] - GREY[0]) / (RED[0] - GREY[0])
-    # On the horizon's row the mark spans +-atan(0.5 / 2.498): its width in pixels is known.
-    width = 2.0 * np.arctan(0.5 / 2.498) * 511 / (2 * np.pi)
-    assert share[127].sum() == pytest.approx(width, abs=0.5)
-    assert ((share > 0.1) & (share < 0.9)).sum() > 10
-
-
 def test_body_hides_what_is_behind_it_and_nothing_before_it(bank: ColourBank) -> None:
     layer = room(bank, MARKS)
     things = stack([Thing("box", tuple(box((-0.2, -0.2, 0.0), (0.2, 0.2, 1.8), Surface("c1"))))])
@@ -310,18 +267,6 @@ def test_each_channel_is_filtered_as_a_grey_texture() -> None:
         grey = GreyBank({f"t{i}": t[..., k] for i, t in enumerate(textures)})
         # Coarser levels are rounded to whole levels in colour, hence half a level.
         np.testing.assert_allclose(seen[k], grey.sample(texture, u, v, footprint)[0], atol=0.75)
-
-
-def test_white_stays_white_and_black_black() -> None:
-    """No lane of a packed texel runs over into the next one."""
-    extremes = plain((255, 0, 255), (0, 255, 0))
-    n = 2000
-    rng = np.random.default_rng(5)
-    u, v = rng.random((2, n)).astype(np.float32)
-    footprint = np.exp(rng.uniform(-2.0, 3.0, n)).astype(np.float32)
-    for texture, expected in ((0, (255, 0, 255)), (1, (0, 255, 0))):
-        seen = extremes.sample(np.full(n, texture, np.int32), u, v, footprint)
-        np.testing.assert_allclose(seen.T, np.broadcast_to(expected, (n, 3)), atol=0.13)
 
 
 def test_texture_sides_must_be_powers_of_two() -> None:
@@ -384,12 +329,6 @@ def test_every_kind_of_damage_is_seen(cache: RenderCache) -> None:
         assert cache.read(0) is None
     cache.path(0).write_bytes(whole)
     np.testing.assert_array_equal(cache.read(0), images(0))
-
-
-def test_a_cached_frame_of_the_wrong_length_counts_as_absent(cache: RenderCache) -> None:
-    cache.write(1, images(1))
-    cache.path(1).write_bytes(cache.path(1).read_bytes()[:50])
-    assert not cache.present(1)
 
 
 def test_cache_folder_that_cannot_be_made_gives_a_one_line_error(

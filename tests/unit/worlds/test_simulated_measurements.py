@@ -382,15 +382,6 @@ def test_the_filter_finds_the_truth_without_noise() -> None:
     np.testing.assert_allclose(found.poses, recording.ground_truth.poses, atol=1e-7)
 
 
-def test_the_paper_s_drive_is_as_good_as_rendered() -> None:
-    recording = recorded(stop=None)
-    _, ate = filtered(recording)
-    assert ate < 0.03
-    assert len(recording.log) == 249
-    _, spoilt = filtered(recorded(stop=None, outlier_fraction=0.2))
-    assert spoilt < 0.03
-
-
 SIMULATED = {
     path.stem: config
     for path in sorted((Path(__file__).parents[3] / "experiments").glob("*.yaml"))
@@ -398,17 +389,6 @@ SIMULATED = {
     if isinstance(config, ExperimentConfig)
     and isinstance(config.dataset, SimulatedMeasurementsSettings)
 }
-
-
-def test_there_are_simulated_experiments() -> None:
-    assert SIMULATED.keys() >= {
-        "lab_trials",
-        "sharp_turns",
-        "outliers",
-        "long_drive",
-        "sparse_features",
-        "poor_odometry",
-    }
 
 
 @pytest.mark.parametrize("name", SIMULATED)
