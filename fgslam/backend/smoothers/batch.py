@@ -9,7 +9,13 @@ from fgslam.backend.loops import Constraint
 from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.elimination import reduced
-from fgslam.backend.smoothers.final import MINIMUM, WholeGraphSolver, graduated, trimmed
+from fgslam.backend.smoothers.final import (
+    ITERATIONS,
+    TOLERANCE,
+    WholeGraphSolver,
+    graduated,
+    trimmed,
+)
 from fgslam.backend.smoothers.graph import (
     ClosedLoop,
     Drive,
@@ -71,7 +77,7 @@ class BatchSolver(WholeGraphSolver):
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
         if self._settings.method == "gnc":
-            return graduated(graph, state, MINIMUM, self.builder.noise_factor)
+            return graduated(graph, state, self.builder.noise_factor)
         if self._settings.trim:
-            return trimmed(graph, state, MINIMUM, self.builder.noise_factor)
-        return graph.minimum(state, MINIMUM.iterations, MINIMUM.tolerance), graph
+            return trimmed(graph, state, self.builder.noise_factor)
+        return graph.minimum(state, ITERATIONS, TOLERANCE), graph

@@ -163,20 +163,12 @@ Minimise: TypeAlias = Callable[[WholeGraph, State], tuple[State, WholeGraph]]
 """From a graph and initial values to those at the minimum and the factors that count there."""
 
 
-@dataclass(frozen=True, slots=True)
-class Effort:
-    """How far a minimum is followed: iterations, and the part of the cost that is let go."""
-
-    iterations: int
-    tolerance: float
-
-
-MINIMUM = Effort(100, 1e-9)
-"""A bound, for graphs that do not settle; the estimate then moves by less than a micrometre."""
+ITERATIONS = 100  # a bound, for graphs that do not settle
+TOLERANCE = 1e-9  # of the cost: the estimate then moves by less than a micrometre
 
 
 def graduated(
-    graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
+    graph: WholeGraph, state: State, noise_factor: float = 1.0
 ) -> tuple[State, WholeGraph]:
     """Graduated non-convexity (Yang et al. 2020, eqs. 12 to 14) with truncated least squares.
 
@@ -185,26 +177,25 @@ def graduated(
     Args:
         graph: factors without kernels.
         state: initial values.
-        effort: of each of its solutions.
         noise_factor: by which the factors' deviations exceed the stated ones.
 
     Returns:
         Values at the minimum, and the graph without the observations that were rejected.
     """
     gate = _GATE / noise_factor**2
-    state = graph.minimum(state, effort.iterations, _ROUGH)
+    state = graph.minimum(state, ITERATIONS, _ROUGH)
     ratio = graph.squared(state) / gate
     worst = 2.0 * float(ratio.max(initial=0.0)) - 1.0
     control = 1.0 / worst if worst > 0.0 else np.inf
     weights = np.ones(len(ratio))
     while worst > 0.0 and control < _CONTROL_ENDS:
         weights = truncated_weights(graph.squared(state) / gate, control)
-        state = graph.weighed(weights).minimum(state, 1, effort.tolerance)
+        state = graph.weighed(weights).minimum(state, 1, TOLERANCE)
         if np.minimum(weights, 1.0 - weights).max() < _DECIDED:
             break
         control *= _CONTROL_GROWS
     kept = graph.weighed(weights > _KEPT)
-    return kept.minimum(state, effort.iterations, effort.tolerance), kept
+    return kept.minimum(state, ITERATIONS, TOLERANCE), kept
 
 
 def truncated_weights(ratio: FloatArray, control: float) -> FloatArray:
@@ -213,9 +204,7 @@ def truncated_weights(ratio: FloatArray, control: float) -> FloatArray:
     return np.asarray(np.clip(middle, 0.0, 1.0))
 
 
-def trimmed(
-    graph: WholeGraph, state: State, effort: Effort, noise_factor: float = 1.0
-) -> tuple[State, WholeGraph]:
+def trimmed(graph: WholeGraph, state: State, noise_factor: float = 1.0) -> tuple[State, WholeGraph]:
     """Minimises roughly with the graph's own kernel, then without it over what fits.
 
     In between the weights go from the kernel's to 0 and 1 by the last part of the graduation: cut
@@ -227,7 +216,6 @@ def trimmed(
     Args:
         graph: factors, landmark observations with a kernel.
         state: initial values.
-        effort: of the last solution.
         noise_factor: by which the factors' deviations exceed the stated ones, which judge.
 
     Returns:
@@ -235,18 +223,18 @@ def trimmed(
     """
     gate, descent = _GATE / noise_factor**2, Descent()
     if graph.weights.all():  # else it is known already what fits, but for a few
-        state = graph.minimum(state, effort.iterations, _ROUGH)
+        state = graph.minimum(state, ITERATIONS, _ROUGH)
         control = _NEAR_BEGINS
         while control < _NEAR_ENDS:
             weights = truncated_weights(graph.squared(state) / gate, control)
             weighed = graph.weighed(weights)
-            state = weighed.minimum(state, 1, effort.tolerance, descent=descent)
+            state = weighed.minimum(state, 1, TOLERANCE, descent=descent)
             control *= _NEAR_GROWS
-    return _settled(graph, state, gate, effort, descent)
+    return _settled(graph, state, gate, descent)
 
 
 def _settled(
-    graph: WholeGraph, state: State, gate: float, effort: Effort, descent: Descent
+    graph: WholeGraph, state: State, gate: float, descent: Descent
 ) -> tuple[State, WholeGraph]:
     """The minimum over what fits there: chosen and solved for by turns, until that is the same."""
     fits, kept = graph.weights > 0.0, graph.weighed(graph.weights)
@@ -255,8 +243,8 @@ def _settled(
         if (fits == before).all():
             break
         kept = graph.weighed(fits)
-        state = kept.minimum(state, 1, effort.tolerance, descent=descent)
-    return kept.minimum(state, effort.iterations, effort.tolerance, descent=descent), kept
+        state = kept.minimum(state, 1, TOLERANCE, descent=descent)
+    return kept.minimum(state, ITERATIONS, TOLERANCE, descent=descent), kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,7 +318,7 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
         return found
     ratio = power_ratio(found.graph, found.state)
     weighed = dataclasses.replace(found.graph, weights=found.graph.weights / ratio)
-    state = weighed.minimum(found.state, MINIMUM.iterations, MINIMUM.tolerance)
+    state = weighed.minimum(found.state, ITERATIONS, TOLERANCE)
     return dataclasses.replace(found, graph=weighed, state=state, noise_ratio=ratio)
 
 
@@ -408,7 +396,7 @@ class WholeGraphSolver:
 
     def _minimise(self, graph: WholeGraph, state: State) -> tuple[State, WholeGraph]:
         """Values at the minimum, and the factors that count there."""
-        return trimmed(graph, state, MINIMUM, self.builder.noise_factor)
+        return trimmed(graph, state, self.builder.noise_factor)
 
     @one_blas_thread()
     def _accepted(

@@ -32,7 +32,7 @@ from fgslam.backend.smoothers.elimination import (
     reduced,
     with_border,
 )
-from fgslam.backend.smoothers.final import MINIMUM, Refined
+from fgslam.backend.smoothers.final import ITERATIONS, TOLERANCE, Refined
 from fgslam.backend.smoothers.graph import GraphBuilder, solved
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
@@ -94,7 +94,7 @@ def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str) -> None:
     graph, values, builder = problem(name)
     expected = by_gtsam(graph, values)
     whole, state = builder.whole_graph(values)
-    found = whole.minimum(state, MINIMUM.iterations, MINIMUM.tolerance)
+    found = whole.minimum(state, ITERATIONS, TOLERANCE)
     assert whole.cost(found) <= graph.error(expected) * (1.0 + 1e-6)
     if name == "cauchy":  # the others have minima beside each other
         np.testing.assert_allclose(found.poses, State.of(expected).poses, rtol=0, atol=1e-4)

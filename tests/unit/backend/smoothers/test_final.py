@@ -13,7 +13,7 @@ from smoothing import SMOOTHERS, answer, ate, counting, drawn, run, wrong_matche
 
 from fgslam.backend.settings import BatchSettings, EstimatorSettings, KernelSettings
 from fgslam.backend.smoothers.bundle import WholeGraph
-from fgslam.backend.smoothers.final import MINIMUM, graduated, trimmed
+from fgslam.backend.smoothers.final import graduated, trimmed
 from fgslam.core.arrays import FloatArray
 
 CAUCHY = KernelSettings("cauchy", 3.0)
@@ -51,7 +51,7 @@ def solved(
     method: Callable[..., Any], graph: Any, values: Any, kernel: KernelSettings
 ) -> tuple[Any, Any]:
     """GTSAM's values and factors that a treatment of outliers ends with."""
-    state, kept = method(*WholeGraph.of(graph, values, kernel), MINIMUM)
+    state, kept = method(*WholeGraph.of(graph, values, kernel))
     return kept.values(state), counting(graph, kept)
 
 
