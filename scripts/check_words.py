@@ -18,6 +18,7 @@ CLEAN = (
     "fgslam/slam",
     "fgslam/datasets",
     "fgslam/evaluation",
+    "fgslam/factors",
     "fgslam/homing",
     "fgslam/worlds",
     "README.md",

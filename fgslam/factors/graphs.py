@@ -1,8 +1,8 @@
 """Keys of a graph's variables, and small helpers on GTSAM's graphs and values.
 
 The pose of frame k is ``x k``, the n-th landmark variable ``l n``: numbered by the graph, not by
-the landmark's identity. An identity that starts anew (it moved, or left a fixed lag and came back)
-gets a new variable.
+the landmark's identity. An identity that starts again (it moved, or left a fixed lag and came
+back) gets a new variable.
 """
 
 from __future__ import annotations
@@ -70,12 +70,12 @@ def poses_of_frame(values: Any, frame: int) -> FloatArray:
 
 
 RELINEARISED = 0.01
-"""Radians, and metres or legs: a variable that moves by more is linearised anew. 0.1, GTSAM's own,
+"""Radians, and metres or legs: a variable that moves by more is relinearised. 0.1, GTSAM's own,
 leaves a drive of 50 m twice as far off."""
 
 
 def isam2_parameters(method: Any, factorization: str = "CHOLESKY") -> Any:
-    """Parameters of iSAM2; in every update it looks for variables to linearise anew.
+    """Parameters of iSAM2; every update checks which variables to relinearise.
 
     Args:
         method: GTSAM's parameters of Gauss-Newton or of the dog leg.

@@ -15,7 +15,7 @@ from fgslam.factors.noise import STIFF_M, STIFF_RAD, positive_definite, robust
 _GUESSED_WIDTH = float(np.sqrt(10.0))
 """Kernel of a step that a motion model made: Student's t with ten degrees of freedom, of Cauchy's
 shape. A variance known from as many samples foretells so; the model's fading memory is worth twenty
-equal ones, and ten allow for starts and bends besides."""
+equal ones, and ten allow for starts and turns besides."""
 
 
 def pose_prior(pose: int, prior: Prediction) -> Any:
@@ -36,7 +36,7 @@ def odometry_factor(before: int, after: int, odometry: Odometry) -> Any:
 def step_factor(before: int, after: int, step: Odometry) -> Any:
     """Motion between two poses as measured, or as foretold from the last ones.
 
-    What is foretold fails where a drive starts, stops or bends, by far more than its noise: it has
+    What is foretold fails where a drive starts, stops or turns, by far more than its noise: it has
     a kernel. Where a gyroscope has measured the rotation there is none.
     """
     factor = odometry_factor(before, after, step)
@@ -78,7 +78,7 @@ def _one_direction(directions: FloatArray, sigma: float) -> Any:
     """Noise model that weighs only the components along orthonormal ``directions`` (3, m)."""
     root = np.zeros((3, 3))
     root[: directions.shape[1]] = directions.T / sigma
-    # GTSAM's shortcut for diagonal roots looks above the diagonal only; see the derivation.
+    # GTSAM's shortcut for diagonal roots checks above the diagonal only; see the derivation.
     return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
 
 

@@ -444,6 +444,7 @@ class HomingChain:
         self._skipped = 0
         self._ended: Command | None = None
         self.outcomes: list[LegOutcome] = []
+        self._began: float | None = None  # time of the leg's first image
         self._aim(0, None)
 
     @property
