@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from fgslam.cameras.lenses import Calibration, RawCamera
+from fgslam.cameras.rectify import chosen_view
 from fgslam.cameras.rig import StereoRig, at_size, load_rig, read_calibration_file, rig_of
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
@@ -299,6 +300,12 @@ def test_a_full_view_has_no_margins_and_a_wider_one_has() -> None:
         assert 0.2 < float(np.mean(margin == 0.0)) < 0.6
         assert (image[margin == 0.0] < 255).all()
         assert (image[margin > 1.5] == 255).all()
+
+
+def test_an_asked_angle_of_view_is_shown_about_the_middle_pixel() -> None:
+    size = (101, 51)
+    view = chosen_view(cameras_at((0.0, 0.0, 0.0)), [np.eye(3)], size, 90.0)
+    np.testing.assert_allclose(view.matrix, [[50.5, 0, 50], [0, 50.5, 25], [0, 0, 1]])
 
 
 def write_rectified(folder: Path) -> Path:

@@ -74,10 +74,18 @@ def test_scales_start_so_that_the_best_can_be_seen() -> None:
     """Next to dead reckoning, errors are logarithmic and ellipses of true size at first."""
     similar, unlike = two(0.008), two(0.15)
     assert error_over_time(similar).drawing.layout.yaxis.type == "linear"
-    assert re.search(r"Ellipses are drawn \d+ times larger", drive_from_above(similar).note)
+    factor = re.search(r"Ellipses are drawn (\d+) times larger", drive_from_above(similar).note)
+    assert factor is not None
+    widths = [np.ptp(first_ellipse(drive_from_above(data))) for data in (similar, unlike)]
+    assert widths[0] == pytest.approx(int(factor[1]) * widths[1])
     assert error_over_time(unlike).drawing.layout.yaxis.type == "log"
     assert "larger" not in drive_from_above(unlike).note
     assert {"good, 3 sigma", "other, 3 sigma"} <= shown(drive_from_above(unlike))
+
+
+def first_ellipse(figure: Figure) -> FloatArray:
+    x = np.asarray(named(figure, "good, 3 sigma").x, np.float64)
+    return x[: np.flatnonzero(np.isnan(x))[0]]
 
 
 def test_ellipses_that_would_hide_the_view_wait_until_asked_for() -> None:
