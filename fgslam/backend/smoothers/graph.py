@@ -275,11 +275,6 @@ class GraphBuilder:
         np.minimum.at(first, self.observed["variable"], self.observed["frame"])
         return np.where(first < np.iinfo(np.int64).max, first, 0)
 
-    def add_factor(self, factor: Any) -> int:
-        """Adds a factor between variables of the graph, as of a loop; returns its row."""
-        self.graph.add(factor)
-        return int(self.graph.size()) - 1
-
     def of_saved_map(self, variable: int) -> bool:
         """Whether a landmark variable is on the prior of a saved map's landmark."""
         return self.admission.saved(self.identities[variable]) is not None
@@ -767,12 +762,8 @@ class GraphLoops:
     def accept(self, known: Constraint) -> None:
         """Believed now, it is doubted when later ones contradict it."""
         known = dataclasses.replace(known, doubted=True)
-        self.builder.add_factor(constraint_factor(known))
+        self.builder.graph.add(constraint_factor(known))
         self.accepted.append(known)
-
-    def last_factor(self) -> Any:
-        """The factor of the loop accepted last."""
-        return constraint_factor(self.accepted[-1])
 
 
 def found_again(frames: IntArray, variables: IntArray) -> BoolArray:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.loops import Constraint
+from fgslam.backend.loops import Constraint, constraint_factor
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.bundle import State, WholeGraph
@@ -133,7 +133,7 @@ class Isam2Solver(WholeGraphSolver):
         """Goes on with the graph that has the loop; from these values where they are given."""
         if found is None:
             graph = gtsam.NonlinearFactorGraph()
-            graph.add(self.loops.last_factor())
+            graph.add(constraint_factor(self.loops.accepted[-1]))
             self._update(graph, gtsam.Values())
             return
         try:

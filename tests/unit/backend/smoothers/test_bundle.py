@@ -67,7 +67,7 @@ def problem(name: Any, seed: int = 0, wrong: float = 0.05) -> tuple[Any, Any, Gr
         motion = inverse(poses_of_frame(values, before)) @ poses_of_frame(values, after)
         motion = motion @ se3_exp(0.01 * rng.standard_normal(6))
         known = Constraint(before, after, motion, random_covariance(rng, 6, 0.01))
-        builder.add_factor(constraint_factor(dataclasses.replace(known, doubted=True)))
+        builder.graph.add(constraint_factor(dataclasses.replace(known, doubted=True)))
     return builder.kept_factors(), values, builder
 
 
