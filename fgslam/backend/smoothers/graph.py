@@ -55,18 +55,10 @@ from fgslam.factors.noise import Whitening, scaled
 # A loop closure in a window: what its last pose has drifted by, undone as far as is measured
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Undone:
-    """The last pose by a loop; None where that is refused; and what became of it, in words."""
-
-    last: Prediction | None
-    remark: str
-
-
 def drift_undone(
     floor: Floor, before: Prediction, last: Prediction, known: Constraint, what: str
-) -> Undone:
-    """The last pose moved to where a loop has it.
+) -> tuple[Prediction | None, str]:
+    """The last pose moved to where a loop has it, None where that is refused; and the remark.
 
     The earlier frame's pose is known as it was when it left. What the last pose is less certain
     by than that one is drift, and the loop measures the drift: a Kalman correction of one pose.
@@ -87,13 +79,13 @@ def drift_undone(
     gain = np.linalg.solve(innovation, drift).T
     refused = refusal(what, float(off @ np.linalg.solve(innovation, off)))
     if refused:
-        return Undone(None, refused)
+        return None, refused
     target = last.wTc @ se3_exp(basis @ gain @ off)
     target = floor.constrain(target) if floor.rigid_dof < 6 else target
     covariance = shared + congruence(basis, nearest_positive(drift - gain @ drift))
     shift = float(np.linalg.norm(target[:3, 3] - last.wTc[:3, 3]))
     remark = f"{what}: the camera moved by {shift:.2f} m"
-    return Undone(Prediction(target, floor.allowed_part(target, covariance)), remark)
+    return Prediction(target, floor.allowed_part(target, covariance)), remark
 
 
 # ------------------------------------------------------------------------------------------

@@ -128,17 +128,17 @@ class FixedLagSolver:
             Prediction(self.poses[frame], self._covariances[frame])
             for frame in (loop.before, loop.after)
         )
-        found = drift_undone(self._floor, earlier, last, loop, what)
-        if found.last is None:
-            self.remarks.append(found.remark)
+        found, remark = drift_undone(self._floor, earlier, last, loop, what)
+        if found is None:
+            self.remarks.append(remark)
             return None
         if inside:
             self.window.factors.add(constraint_factor(loop))
             self._solve()
-            self.remarks.append(f"{found.remark}; within the lag, it is a factor more")
+            self.remarks.append(f"{remark}; within the lag, it is a factor more")
         else:
-            self.remarks.append(f"{found.remark}, and what lies within the lag")
-            self._move_all(found.last)
+            self.remarks.append(f"{remark}, and what lies within the lag")
+            self._move_all(found)
         return ClosedLoop(self._smoothed({loop.after}))
 
     def _move_all(self, last: Prediction) -> None:
@@ -553,21 +553,21 @@ class SlidingWindowSolver(WholeGraphSolver):
         if inside:
             self._measured(solved, solved.frames.index(loop.before))
         before, last = self._at(loop.before), self._at(loop.after)
-        found = drift_undone(self._floor, before, last, loop, what)
-        self.remarks.append(found.remark + ("" if found.last is None else ", the drive with it"))
-        if found.last is None:
+        found, remark = drift_undone(self._floor, before, last, loop, what)
+        self.remarks.append(remark + ("" if found is None else ", the drive with it"))
+        if found is None:
             return None
         self.loops.accept(loop)
         self._answer = None
         if inside:
             return self._closed_inside(loop)
-        self.move_by_loop(found.last, loop, drive)
+        self.move_by_loop(found, loop, drive)
         every = range(len(self.held))
         values = WindowValues(
             dict(zip(map(pose_key, range(len(self.poses))), self.poses, strict=True)),
             dict(zip(map(landmark_key, every), self.held.points, strict=True)),
         )
-        return ClosedLoop(Smoothed(values, found.last, by_loop=True))
+        return ClosedLoop(Smoothed(values, found, by_loop=True))
 
     def _closed_inside(self, loop: Constraint) -> ClosedLoop:
         self.window.factors.add(constraint_factor(loop))
