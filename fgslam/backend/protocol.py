@@ -11,12 +11,14 @@ To add an estimator:
    covariances in the pose's tangent space, rotation first. ``examples/`` shows a small one; an
    object of it can be given to ``fgslam.Slam(rig, estimator=...)`` as it is.
 2. Where it can do more, add the members of :class:`~fgslam.core.store.Resumable` (interrupted runs;
-   or mark what it keeps as :class:`~fgslam.core.store.Kept`), :class:`JointCovariances` or
+   or mark what it keeps as :class:`~fgslam.core.store.Kept`), :class:`FullEstimator` or
    :class:`MapUser` (beginning in a saved map). What asks for them refuses an estimator without, in
-   one line. :class:`NoiseEstimating` is only shown.
+   one line. A ``recalibrate(correction)`` follows a rig that calibrates itself
+   (:func:`recalibrated`); ``noise_factors``, on the stated deviations of a single measurement and
+   as it is weighed, is only shown.
 3. To choose it in configurations, too: a frozen dataclass in :mod:`fgslam.backend.settings`,
    derived from ``NamedSettings``, with its own ``kind`` and, for the paired tests of many trials,
-   its family; add it to the union there, and one ``case`` to ``make_estimator`` in
+   its ``family``; add it to the union there, and one row to the table of makers in
    :mod:`fgslam.slam.build`.
 
 ``tests/contract/test_estimators.py`` then holds it to the protocol without further ado: predicting
@@ -97,10 +99,10 @@ class Estimator(Protocol):
         ...
 
 
-class JointCovariances(Protocol):
-    """An estimator that knows how its landmarks' errors hang together; optional.
+class FullEstimator(Estimator, Protocol):
+    """What the estimators of this package offer: also how their landmarks' errors are correlated.
 
-    Each raises KeyError for a landmark that it does not hold.
+    Both raise KeyError for a landmark that the estimator does not hold.
     """
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
@@ -139,37 +141,6 @@ class MapUser(Protocol):
         ...
 
 
-@runtime_checkable
-class Recalibrated(Protocol):
-    """An estimator whose map follows the correction of a rig that calibrates itself; optional."""
-
-    def recalibrate(self, correction: FloatArray) -> object:
-        """Takes the correction (p,) that the next frame's measurements contain.
-
-        Called before that frame is predicted. Landmarks that were measured with another one, and
-        are contradicted, move to where this one would have put them; those of a saved map stay.
-        What is returned is not used.
-        """
-        ...
-
-
-@runtime_checkable
-class NoiseEstimating(Protocol):
-    """An estimator that finds from the drive how large its measurements' errors are; optional."""
-
-    @property
-    def noise_factors(self) -> tuple[float, float]:
-        """Factors on the stated deviations of measurements: of a single one, and as it is weighed.
-
-        The second is larger where errors persist from frame to frame.
-        """
-        ...
-
-
-class FullEstimator(Estimator, JointCovariances, Protocol):
-    """What the estimators of this package offer: everything but, in some, :class:`MapUser`."""
-
-
 def predicted(estimator: Estimator, odometry: Odometry | None) -> Prediction:
     """What the estimator predicts. Raises EstimatorError where that is no pose with covariance."""
     prediction = estimator.predict(odometry)
@@ -178,8 +149,12 @@ def predicted(estimator: Estimator, odometry: Odometry | None) -> Prediction:
 
 
 def recalibrated(estimator: Estimator, correction: FloatArray | None) -> None:
-    """Tells an estimator that follows it the correction of the next frame; None: there is none."""
-    if correction is not None and isinstance(estimator, Recalibrated):
+    """Hands the correction (p,) of the next frame to an estimator that has a ``recalibrate``.
+
+    Landmarks that were measured with another one, and are contradicted, move to where this one
+    would have put them; those of a saved map stay. None: there is no correction.
+    """
+    if correction is not None and hasattr(estimator, "recalibrate"):
         estimator.recalibrate(correction)
 
 

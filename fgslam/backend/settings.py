@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -15,15 +16,6 @@ Family: TypeAlias = Literal["filter", "smoother", "other"]
 
 An `other` corrects nothing by landmarks seen again: dead reckoning.
 """
-_FAMILIES: dict[str, Family] = {
-    "landmark_kalman": "filter",
-    "landmark_kalman_graph": "filter",
-    "ekf": "filter",
-    "fixed_lag": "smoother",
-    "sliding_window": "smoother",
-    "isam2": "smoother",
-    "batch": "smoother",
-}
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -42,6 +34,7 @@ class KernelSettings:
 class NamedSettings:
     """What every estimator has."""
 
+    family: ClassVar[Family] = "other"
     label: str | None = Field(
         default=None,
         pattern=r"^[A-Za-z0-9][\w.+-]*$",
@@ -65,6 +58,7 @@ class DeadReckoningSettings(NamedSettings):
 class PerLandmarkSettings(NamedSettings):
     """What the paper's filter and the same filter as factor graphs share."""
 
+    family: ClassVar[Family] = "filter"
     pose_covariance: bool = Field(
         default=True, description="add the pose's covariance to the observation's"
     )
@@ -96,6 +90,7 @@ class LandmarkKalmanGraphSettings(PerLandmarkSettings):
 class EkfSettings(NamedSettings):
     """Full stochastic mapping: one joint covariance of pose and landmarks, no relinearisation."""
 
+    family: ClassVar[Family] = "filter"
     kind: Literal["ekf"] = "ekf"
     floor: FloorMode = Field(
         default="auto",
@@ -115,6 +110,7 @@ class EkfSettings(NamedSettings):
 class GraphSettings(NamedSettings):
     """What all smoothers share: how measurements become a graph that can be solved."""
 
+    family: ClassVar[Family] = "smoother"
     floor: FloorMode = Field(
         default="auto",
         description="the floor under the robot: `auto` as frontend.ego_motion.dof; `none`; `hard` "
@@ -199,7 +195,10 @@ EstimatorSettings: TypeAlias = Annotated[
     | BatchSettings,
     Field(discriminator="kind"),
 ]
-
+ESTIMATORS: Mapping[str, type[Any]] = {
+    one.kind: one for one in get_args(get_args(EstimatorSettings)[0])
+}
+"""Settings of the estimators of SLAM by kind."""
 
 DEFAULT_ESTIMATOR = Isam2Settings.kind
 """Of a recording that comes without a configuration, and of a session; why: the table in
@@ -208,7 +207,7 @@ docs/howto/your_recording.md."""
 
 def family_of(kind: str) -> Family:
     """Whether estimators of a kind are filters, smoothers or neither."""
-    return _FAMILIES.get(kind, "other")
+    return getattr(ESTIMATORS.get(kind), "family", "other")
 
 
 # ------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ from enum import Enum
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Generic, Protocol, Self, TypeAlias, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Generic, Protocol, TypeAlias, TypeVar, get_args, get_origin
 
 import numpy as np
 
@@ -49,20 +49,6 @@ UNFIT = (KeyError, ValueError, TypeError, IndexError, AttributeError)
 
 _SINGLE = 16
 """Numbers of a list that stand in the structure; more of them are an array."""
-
-
-@typing.runtime_checkable
-class Compact(Protocol):
-    """A value with room or caches that are no state: it is stored as what :meth:`packed` gives."""
-
-    def packed(self) -> Any:
-        """An array or a mapping of arrays that determines the value."""
-        ...
-
-    @classmethod
-    def unpacked(cls, packed: Any) -> Self:
-        """The value back."""
-        ...
 
 
 @typing.runtime_checkable
@@ -131,7 +117,7 @@ class _Packing:
             return {"bytes": self.column([np.frombuffer(v, np.uint8) for v in values], at)}
         if kind in (list, tuple, deque) or issubclass(kind, abc.Mapping):
             return self.containers(values, kind, at)
-        if _has_members(kind, Compact):
+        if hasattr(kind, "packed"):  # it has room or caches that are no state
             return {"compact": self.column([value.packed() for value in values], at)}
         if _has_members(kind, Resumable):
             states = [value.state().items() for value in values]
@@ -239,7 +225,7 @@ class _Unpacking:
             case {"bytes": inner}:
                 out = [one.tobytes() for one in self.column(inner, Any)]
             case {"compact": inner}:
-                made = next(m for m in members if isinstance(m, type) and issubclass(m, Compact))
+                made: Any = next(m for m in members if hasattr(m, "unpacked"))
                 out = [made.unpacked(one) for one in self.column(inner, Any)]
             case _:
                 out = self.containers(node, members, now)
@@ -303,7 +289,7 @@ class _Unpacking:
         for part, state in zip(now, states, strict=True):
             for name, value in state.items():
                 setattr(part, name, value)
-            if isinstance(part, Remade):
+            if hasattr(part, "remake"):
                 part.remake()
         return list(now)
 
@@ -389,15 +375,6 @@ def from_upper(upper: np.ndarray[Any, Any], size: int) -> np.ndarray[Any, Any]:
 
 # --------------------------------------------------------------------------------------------
 # State of parts
-
-
-@typing.runtime_checkable
-class Remade(Protocol):
-    """A part that makes its caches again when its state is put back."""
-
-    def remake(self) -> None:
-        """Makes them."""
-        ...
 
 
 @cache

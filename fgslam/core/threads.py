@@ -11,17 +11,10 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any
 
 import scipy.linalg  # noqa: F401  its BLAS is not NumPy's, and a limit reaches what is loaded
 from threadpoolctl import ThreadpoolController
-
-
-class _Limit(Protocol):
-    """A limit that is set, as threadpoolctl gives it."""
-
-    def restore_original_limits(self) -> None:
-        """Undoes it."""
 
 
 class BlasLimits:
@@ -33,15 +26,15 @@ class BlasLimits:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._set: list[_Limit] = []
+        self._set: list[Any] = []  # as threadpoolctl gives them
         self._left: set[int] = set()
         self._loaded: ThreadpoolController | None = None
         self._modules = 0  # imported when the libraries were last looked for
 
-    def enter(self) -> _Limit:
+    def enter(self) -> Any:
         """Sets a limit of one thread."""
         with self._lock:
-            limits: _Limit = self._libraries().limit(limits=1, user_api="blas")
+            limits = self._libraries().limit(limits=1, user_api="blas")
             self._set.append(limits)
             return limits
 
@@ -52,7 +45,7 @@ class BlasLimits:
             self._loaded, self._modules = ThreadpoolController(), modules
         return self._loaded
 
-    def leave(self, limits: _Limit) -> None:
+    def leave(self, limits: Any) -> None:
         """Undoes a limit, and those before it that have left already."""
         with self._lock:
             self._left.add(id(limits))

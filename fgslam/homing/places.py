@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeAlias, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from scipy.sparse import csr_matrix, diags
@@ -110,12 +110,11 @@ class PathPlaces:
         self._continuity = Continuity(localisation.leap)
         self._before: OmniFeatures | None = None
         self._localiser = Localiser(
-            path,
+            _forward(len(path)),
             VisualWords(path.images, self._rng),
             self._link,
             localisation,
             self._weighed,
-            _forward(len(path)),
             _POWER,
         )
         self._aim: _Aim | None = None
@@ -391,16 +390,6 @@ Weigher: TypeAlias = Callable[[Mapping[int, Answer]], Mapping[int, float]]
 """What speaks for each node, in inliers, of the answers of those that were matched."""
 
 
-class Places(Protocol):
-    """Images as nodes, a map's or a path's."""
-
-    def __len__(self) -> int: ...
-
-    def graph(self) -> csr_matrix:
-        """(n, n) costs of going from one node to another."""
-        ...
-
-
 class Localiser:
     """Probability of each node to be where the robot is, or nearest to it.
 
@@ -413,37 +402,34 @@ class Localiser:
 
     def __init__(
         self,
-        topology: Places,
+        transition: FloatArray,
         words: VisualWords,
         linker: Linker,
         settings: LocalisationSettings,
         weigh: Weigher | None = None,
-        transition: FloatArray | None = None,
         power: float = 1.0,
     ) -> None:
         """Begins with a uniform belief.
 
         Args:
-            topology: the map.
+            transition: (n, n) chances to go from row to column between two images, without leaps;
+                along links: :func:`transition_along`.
             words: of the map's images, in their order.
             linker: homing vector from the robot's image to a node's.
             settings: chances and the number of nodes to match with.
             weigh: evidence of answers; None: their inliers.
-            transition: (n, n) chances to go from row to column between two images, without leaps;
-                None: along the links, those that cost less sooner.
             power: of the likelihood of an image: how much it counts.
         """
-        self._map = topology
         self._words = words
         self._linker = linker
         self._settings = settings
         self._weigh = weigh or inliers_of
-        self._transition = _transition(topology) if transition is None else transition
+        self._transition = transition
         self._power = power
         self.leap = settings.leap
-        self.belief: FloatArray = np.full(len(topology), 1.0 / max(len(topology), 1))
+        self.belief: FloatArray = np.full(len(transition), 1.0 / max(len(transition), 1))
         self.answers: dict[int, Answer] = {}
-        self.likelihood: FloatArray = np.ones(len(topology))
+        self.likelihood: FloatArray = np.ones(len(transition))
         self._fresh = True
 
     def update(self, image: OmniFeatures, also: Collection[int] = ()) -> FloatArray:
@@ -482,7 +468,7 @@ class Localiser:
         """(n,) evidence of the nodes that are worth a match; 0 for the others."""
         nodes = np.union1d(self._candidates(image, expected), np.array([*also], dtype=np.int64))
         self.answers = {node: self._linker(image, node) for node in nodes.tolist()}
-        out = np.zeros(len(self._map))
+        out = np.zeros(len(self.belief))
         for node, evidence in self._weigh(self.answers).items():
             out[node] = evidence
         return out
@@ -490,8 +476,8 @@ class Localiser:
     def _candidates(self, image: OmniFeatures, expected: FloatArray) -> IntArray:
         """Nodes that look alike, and those that the belief expects, half and half."""
         most = self._settings.candidates
-        if most == 0 or most >= len(self._map):
-            return np.arange(len(self._map))
+        if most == 0 or most >= len(self.belief):
+            return np.arange(len(self.belief))
         alike = np.argsort(-self._words.likeness(image), kind="stable")
         likely = np.argsort(-expected, kind="stable")[: most // 2]
         rest = alike[~np.isin(alike, likely)][: most - len(likely)]
@@ -516,9 +502,12 @@ def likelihoods(supports: FloatArray, background: float) -> FloatArray:
     return np.asarray(supports, dtype=np.float64) + background
 
 
-def _transition(topology: Places) -> FloatArray:
-    """(n, n) chances to go from row to column between two images, without leaps."""
-    graph = topology.graph()
+def transition_along(links: csr_matrix) -> FloatArray:
+    """(n, n) chances to go from row to column between two images, without leaps.
+
+    ``links`` (n, n) are costs; of a place's links those that cost less are taken sooner.
+    """
+    graph = links.copy()
     graph.data = 1.0 / graph.data
     out = np.asarray(graph.sum(axis=1)).ravel()
     alone = out == 0.0

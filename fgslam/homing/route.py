@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.sparse import csr_matrix, diags
 
 from fgslam.cameras.omni import OmniCamera
 from fgslam.cameras.omni_files import camera_of, camera_values
@@ -390,11 +389,6 @@ class PathMemory:
 
     def __len__(self) -> int:
         return len(self.images)
-
-    def graph(self) -> csr_matrix:
-        """(n, n) symmetric matrix of costs between neighbours: 1 a leg."""
-        n = len(self)
-        return diags([[1.0] * (n - 1)] * 2, [-1, 1], shape=(n, n), format="csr")
 
     def save(self, path: str | Path) -> float:
         """Writes the memory atomically.

@@ -339,9 +339,8 @@ class Slam(Session):
 
         Args:
             rig: the rectified cameras, two or three; those that made ``start_map``.
-            estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
-                `ekf`, `fixed_lag`, `sliding_window`, `isam2` or `batch`), settings of one, or an
-                own object with the members of :class:`fgslam.Estimator`.
+            estimator: the kind (``fgslam.backend.settings.ESTIMATORS``), settings of one, or an own
+                object with the members of :class:`fgslam.Estimator`.
                 In a saved map `landmark_kalman`, `ekf`, `sliding_window`, `isam2` or `batch`.
             frontend: settings of features, matching and tracking; None for the defaults; a mapping
                 for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.

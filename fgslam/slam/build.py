@@ -9,24 +9,14 @@ import dataclasses
 import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeGuard, cast, get_args
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from fgslam.backend.protocol import Estimator, FullEstimator, MapUser
-from fgslam.backend.settings import (
-    BatchSettings,
-    DeadReckoningSettings,
-    EkfSettings,
-    EstimatorSettings,
-    FixedLagSettings,
-    FloorMode,
-    Isam2Settings,
-    LandmarkKalmanGraphSettings,
-    LandmarkKalmanSettings,
-    SlidingWindowSettings,
-)
+from fgslam.backend.settings import ESTIMATORS, EstimatorSettings, FloorMode
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import ConfigError, MapError
 from fgslam.core.log import ImageSequence
@@ -147,43 +137,36 @@ def make_estimator(
     """
     prior = prior or Prediction(np.eye(4), np.zeros((6, 6)))
     ego_motion = ego_motion or EgoMotionSettings()
-    made: FullEstimator
-    match settings:
-        case DeadReckoningSettings():
-            from fgslam.backend.filters.dead_reckoning import DeadReckoning
+    return _MAKERS[settings.kind](rig, settings, prior, ego_motion)
 
-            return DeadReckoning(rig, prior)
-        case LandmarkKalmanSettings():
-            from fgslam.backend.filters.kalman import LandmarkKalman
 
-            return LandmarkKalman(rig, settings, prior, ego_motion)
-        case LandmarkKalmanGraphSettings():
-            from fgslam.backend.filters.kalman_graph import LandmarkKalmanGraph
-
-            return LandmarkKalmanGraph(rig, settings, prior, ego_motion)
-    floor = make_floor(rig, settings.floor, ego_motion.dof)
-    match settings:
-        case EkfSettings():
-            from fgslam.backend.filters.ekf import FullEkf
-
-            made = FullEkf(rig, settings, floor, prior)
-        case FixedLagSettings():
-            from fgslam.backend.smoothers.lag import fixed_lag_smoother
-
-            made = fixed_lag_smoother(rig, settings, floor, prior)
-        case Isam2Settings():
-            from fgslam.backend.smoothers.isam2 import isam2_smoother
-
-            made = isam2_smoother(rig, settings, floor, prior)
-        case SlidingWindowSettings():
-            from fgslam.backend.smoothers.lag import sliding_window_smoother
-
-            made = sliding_window_smoother(rig, settings, floor, prior)
-        case BatchSettings():
-            from fgslam.backend.smoothers.batch import batch_smoother
-
-            made = batch_smoother(rig, settings, floor, prior)
-    return made
+_MAKERS: Mapping[str, Callable[[CameraRig, Any, Prediction, EgoMotionSettings], FullEstimator]] = {
+    "odometry": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.filters.dead_reckoning"
+    ).DeadReckoning(rig, prior),
+    "landmark_kalman": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.filters.kalman"
+    ).LandmarkKalman(rig, own, prior, ego),
+    "landmark_kalman_graph": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.filters.kalman_graph"
+    ).LandmarkKalmanGraph(rig, own, prior, ego),
+    "ekf": lambda rig, own, prior, ego: import_module("fgslam.backend.filters.ekf").FullEkf(
+        rig, own, make_floor(rig, own.floor, ego.dof), prior
+    ),
+    "fixed_lag": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.smoothers.lag"
+    ).fixed_lag_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+    "isam2": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.smoothers.isam2"
+    ).isam2_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+    "sliding_window": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.smoothers.lag"
+    ).sliding_window_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+    "batch": lambda rig, own, prior, ego: import_module(
+        "fgslam.backend.smoothers.batch"
+    ).batch_smoother(rig, own, make_floor(rig, own.floor, ego.dof), prior),
+}
+"""By kind what makes an estimator, at its prior pose."""
 
 
 def make_floor(rig: CameraRig, mode: FloorMode, dof: DegreesOfFreedom) -> Floor:
@@ -355,15 +338,12 @@ def make_extractor(settings: FrontendSettings) -> FeatureExtractor:
 
 _ESSENTIAL = ("kind", "supports", "predict", "landmarks", "update", "estimate")
 """What the loop needs of an estimator; the protocol's other members serve resuming and tests."""
-_ESTIMATORS: dict[str, type[Any]] = {
-    one.kind: one for one in get_args(get_args(EstimatorSettings)[0])
-}
 _ODOMETRIES = get_args(get_args(OdometrySettings)[0])
 
 
 def is_settings(value: object) -> TypeGuard[EstimatorSettings]:
     """True if the value is the settings of an estimator of this package."""
-    return isinstance(value, tuple(_ESTIMATORS.values()))
+    return isinstance(value, tuple(ESTIMATORS.values()))
 
 
 def chosen_estimator(
@@ -374,13 +354,13 @@ def chosen_estimator(
     Raises:
         ConfigError: there is no such kind, or the object lacks members of an estimator.
     """
-    kinds = ", ".join(_ESTIMATORS)
+    kinds = ", ".join(ESTIMATORS)
     if isinstance(estimator, str):
-        if estimator not in _ESTIMATORS:
-            close = difflib.get_close_matches(estimator, _ESTIMATORS, n=1, cutoff=0.4)
+        if estimator not in ESTIMATORS:
+            close = difflib.get_close_matches(estimator, ESTIMATORS, n=1, cutoff=0.4)
             hint = f"did you mean {close[0]}? " if close else ""
             raise ConfigError(f"estimator: no kind {estimator!r}; {hint}known: {kinds}")
-        return cast("EstimatorSettings", _ESTIMATORS[estimator]())
+        return cast("EstimatorSettings", ESTIMATORS[estimator]())
     if is_settings(estimator):
         return estimator
     give = f"give a kind ({kinds}), its settings, or an object with the members of fgslam.Estimator"

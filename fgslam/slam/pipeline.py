@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from fgslam.backend.protocol import Estimator, NoiseEstimating, predicted, recalibrated, updated
+from fgslam.backend.protocol import Estimator, predicted, recalibrated, updated
 from fgslam.core.arrays import IntArray
 from fgslam.core.correction import RigCorrection
 from fgslam.core.sensors import Increment, LoopClosure, Odometry
@@ -432,9 +432,7 @@ def noise_in_use(
         estimator: after its update.
     """
     rotation, translation = _of_motion(motion, odometry)
-    single, correlated = (
-        estimator.noise_factors if isinstance(estimator, NoiseEstimating) else (math.nan, math.nan)
-    )
+    single, correlated = getattr(estimator, "noise_factors", (math.nan, math.nan))
     turned = odometry is not None and odometry.turned
     return FrameNoise(
         rotation_sigma_dps2=rotation,

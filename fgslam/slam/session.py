@@ -92,9 +92,8 @@ class Session:
 
         Args:
             rig: the rectified cameras, two or three.
-            estimator: the kind (`odometry`, `landmark_kalman`, `landmark_kalman_graph`,
-                `ekf`, `fixed_lag`, `sliding_window`, `isam2` or `batch`), settings of one, or an
-                own object with the members of :class:`fgslam.backend.protocol.Estimator`.
+            estimator: the kind (``fgslam.backend.settings.ESTIMATORS``), settings of one, or an own
+                object with the members of :class:`fgslam.backend.protocol.Estimator`.
             frontend: settings of features, matching and tracking; None for the defaults; a mapping
                 for what differs from these: ``{"stereo": {"max_disparity_px": 80}}``.
             odometry: what predicts the motion. None: the odometry that is handed in, and constant

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_right
 from dataclasses import dataclass
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from scipy.sparse import lil_array
@@ -30,6 +30,7 @@ from fgslam.core.types import (
     UpdateStats,
 )
 from fgslam.frontend.features.matching import choose
+from fgslam.frontend.places.relocalisation import Relocaliser
 from fgslam.frontend.settings import AppearanceSettings
 from fgslam.frontend.tracking.ego_motion import PoseProblem, Resection
 from fgslam.frontend.tracking.tracker import Association, LandmarkTracker, Tracked
@@ -454,18 +455,6 @@ _NOBODY: IntArray = np.empty(0, np.int64)
 _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
 
-class Locator(Protocol):
-    """Finds a frame in a map without a prior, as ``frontend.places.relocalisation`` does."""
-
-    def learn(self, landmarks: LandmarkMap, appearances: LandmarkAppearances) -> None:
-        """Makes these landmarks the ones to be found."""
-        ...
-
-    def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
-        """The frame's pose among them, or why there is none to be believed."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class LostRules:
     """Unlocated frames in a row until the whole map is searched, and until mapping goes on."""
@@ -485,7 +474,7 @@ class RecognitionParts:
     loops: LoopGates | None
     lost: LostRules | None
     appearance: AppearanceSettings
-    relocaliser: Locator
+    relocaliser: Relocaliser
     seed: int
 
 

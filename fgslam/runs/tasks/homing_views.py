@@ -39,7 +39,7 @@ from fgslam.frontend.homing.two_view import PLAIN_MATCHING, plain_sift
 from fgslam.frontend.homing.vector import pair_generator, vector_between
 from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings, OmniMatchingSettings
 from fgslam.homing.links import UNORDERED, Answer, Link, Pair, VisualWords, Walks, sift_inliers
-from fgslam.homing.places import Localiser
+from fgslam.homing.places import Localiser, transition_along
 from fgslam.homing.topological_map import TopologicalMap, map_candidates, map_of_answers
 from fgslam.report.content import Column, Figure, Picture, TextTable, write_csv
 from fgslam.report.homing_figures import (
@@ -300,7 +300,8 @@ def _localise(
         matching, vector = config.features.matching, config.homing_vector
         return vector_between(image, nodes[node], matching, vector, rng)[0]
 
-    localiser = Localiser(topology, VisualWords(nodes, rng), linker, config.localisation)
+    moves = transition_along(topology.graph())
+    localiser = Localiser(moves, VisualWords(nodes, rng), linker, config.localisation)
     located: list[Localised] = []
     context.progress("localising", 0, len(out))
     for done, view in enumerate(out):

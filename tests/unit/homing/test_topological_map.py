@@ -38,7 +38,7 @@ from fgslam.homing.links import (
     heading_residuals,
     link_pair,
 )
-from fgslam.homing.places import Localiser
+from fgslam.homing.places import Localiser, transition_along
 from fgslam.homing.settings import LocalisationSettings, TopologicalMapSettings
 from fgslam.homing.topological_map import (
     RouteMap,
@@ -367,7 +367,7 @@ def localiser(topology: TopologicalMap, settings: LocalisationSettings) -> Local
     def linked(image: OmniFeatures, node: int) -> Answer:
         return link_by_landmarks(image, topology.images[node])
 
-    return Localiser(topology, words, linked, settings)
+    return Localiser(transition_along(topology.graph()), words, linked, settings)
 
 
 def views_at(places: Iterable[float]) -> list[OmniFeatures]:
