@@ -55,7 +55,8 @@ SAME = ("final.tum", "online.tum", "covariance.csv", "map.ply")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run on simulated measurements, two estimators; read only."""
     folder = tmp_path_factory.mktemp("measured") / "run"
-    run_experiment(make_config(DRIVE, "test"), folder)
+    with units_in_this_process():
+        run_experiment(make_config(DRIVE, "test"), folder)
     return folder
 
 
@@ -229,6 +230,7 @@ def test_two_runs_are_compared_side_by_side(
     assert (out / plain.name / "odometry" / "final.tum").is_file()
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(
     "existing",
     [pytest.param((), marks=pytest.mark.slow), ("--overwrite",), ("--resume",)],
@@ -253,8 +255,7 @@ def test_the_command_that_an_interrupted_comparison_shows_goes_on_with_it(
         assert main(monkeypatch, *given, *existing) == 130
     shown = capsys.readouterr().out.splitlines()[-1].partition("go on: fgslam ")[2]
     assert shlex.split(shown) == [*map(str, given), "--resume"]
-    with units_in_this_process():
-        assert main(monkeypatch, *shlex.split(shown)) == 0
+    assert main(monkeypatch, *shlex.split(shown)) == 0
     assert metrics_of(tmp_path / "out")["status"] == "finished"
 
 

@@ -7,6 +7,7 @@ and, to show that it can fail, on packages written to break each rule.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -386,21 +387,24 @@ _SETTERS = frozenset({"setattr", "getattr", "hasattr", "delattr"})
 
 def private_name_violations(tests: Path, modules: list[Module]) -> list[Violation]:
     """Private names of the package that tests reach: a change of a module may rename them."""
-    defined = {name for module in modules for name in _defined_names(module.tree)}
+    defined = {name for module in modules for name in _defined_names(module.nodes)}
     private = {name for name in defined if name.startswith("_") and not name.startswith("__")}
     private -= {"_fields", "_replace", "_asdict"}  # public, of named tuples
     found: list[Violation] = []
     for path in sorted(tests.rglob("*.py")):
         name = path.relative_to(tests.parent).as_posix()
-        tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
-        reached = sorted(_reached_names(tree, private - set(_defined_names(tree))))
+        text = path.read_text(encoding="utf-8")
+        if private.isdisjoint(re.findall(r"\b_\w+", text)):
+            continue  # parsing takes seconds
+        nodes = tuple(ast.walk(ast.parse(text, str(path))))
+        reached = sorted(_reached_names(nodes, private - set(_defined_names(nodes))))
         found += [Violation(name, line, f"reaches the private {what}") for line, what in reached]
     return found
 
 
-def _defined_names(tree: ast.Module) -> Iterator[str]:
+def _defined_names(nodes: tuple[ast.AST, ...]) -> Iterator[str]:
     """Names of functions, classes, variables and attributes that a module defines."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, FunctionNode | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
@@ -413,8 +417,8 @@ def _of_self(node: ast.Attribute) -> bool:
     return getattr(node.value, "id", "") in ("self", "cls")
 
 
-def _reached_names(tree: ast.Module, private: set[str]) -> Iterator[tuple[int, str]]:
-    for node in ast.walk(tree):
+def _reached_names(nodes: tuple[ast.AST, ...], private: set[str]) -> Iterator[tuple[int, str]]:
+    for node in nodes:
         if isinstance(node, ast.Attribute) and node.attr in private:
             if not _of_self(node):
                 yield node.lineno, node.attr
