@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Iterator
@@ -16,11 +17,21 @@ from fgslam.core.errors import MissingDependencyError
 from fgslam.core.threads import one_blas_thread
 from fgslam.worlds.open3d_library import load_open3d
 
+# Collecting thousands of tests makes objects that stay: looking for cycles among them again and
+# again took two fifths of that time.
+gc.set_threshold(50_000, 20, 100)
+
 # A red test must be red again on the next run, and slow machines must not make one red.
 settings.register_profile(
     "fgslam", max_examples=50, derandomize=True, deadline=None, print_blob=True
 )
 settings.load_profile("fgslam")
+
+
+def pytest_collection_finish() -> None:
+    """What has been collected stays to the end: no search for cycles looks at it again."""
+    gc.freeze()
+
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 
