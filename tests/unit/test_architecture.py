@@ -221,8 +221,8 @@ def test_every_room_of_the_order_exists() -> None:
 def test_light_modules_load_no_heavy_library() -> None:
     # `fgslam --help` must answer at once, and work where a library cannot be loaded.
     script = (
-        "import sys; from fgslam.core import arrays, geometry, log; from fgslam.runs import config\n"
-        "from fgslam.cli import main\n"
+        "import sys; from fgslam.core import arrays, geometry, log\n"
+        "from fgslam.runs import config; from fgslam.cli import main\n"
         "print([m for m in ('cv2', 'gtsam', 'open3d', 'matplotlib', 'scipy') if m in sys.modules])"
     )
     done = subprocess.run(  # noqa: S603 - our own interpreter and our own script
