@@ -17,8 +17,8 @@ from fgslam.core.errors import MissingDependencyError
 from fgslam.core.threads import one_blas_thread
 from fgslam.worlds.open3d_library import load_open3d
 
-# Collecting thousands of tests makes objects that stay: looking for cycles among them again and
-# again took two fifths of that time.
+# Thousands of collected tests are objects that stay: to look for cycles among them every 700 new
+# ones took two fifths of the time of collecting.
 gc.set_threshold(50_000, 20, 100)
 
 # A red test must be red again on the next run, and slow machines must not make one red.
@@ -26,12 +26,6 @@ settings.register_profile(
     "fgslam", max_examples=50, derandomize=True, deadline=None, print_blob=True
 )
 settings.load_profile("fgslam")
-
-
-def pytest_collection_finish() -> None:
-    """What has been collected stays to the end: no search for cycles looks at it again."""
-    gc.freeze()
-
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 

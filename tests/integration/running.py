@@ -88,14 +88,25 @@ def stop_after(frames: int) -> Callable[[], bool]:
     return stopped
 
 
+class Here(Executor):
+    """Does units in this process; what cannot be sent to a worker and back fails as it would."""
+
+    def run(self, function: Any, arguments: Any, stopped: Any, fresh: bool = False) -> Any:
+        from distributed.protocol.pickle import dumps, loads  # half a second
+
+        def sent(value: Any) -> Any:
+            return loads(dumps(value))
+
+        return super().run(lambda one: sent(sent(function)(sent(one))), arguments, stopped)
+
+
 @contextmanager
 def units_in_this_process() -> Iterator[None]:
     """The units of a run are done in this process, one after the other."""
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("fgslam.runs.engine.Pool", lambda jobs: nullcontext(Executor()))
-        for module in ("library", "workers"):
-            patch.setattr(f"fgslam.runs.{module}.Pool", lambda *_: nullcontext(Executor()))
+        for module in ("engine", "library", "workers"):
+            patch.setattr(f"fgslam.runs.{module}.Pool", lambda *_, **__: nullcontext(Here()))
         yield
 
 

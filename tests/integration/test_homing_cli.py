@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image as PictureFile
-from running import main, mistake, write_config
+from running import main, mistake, units_in_this_process, write_config
 
 from fgslam.core.bearings import BearingLog
 from fgslam.core.errors import DatasetError
@@ -44,7 +44,8 @@ def values_of(run: Path) -> dict[str, Any]:
 def trials(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("homing") / "run"
     values = TRIALS | {"estimator": {"kind": "homing_ekf"}}
-    run_experiment(make_experiment(values, "test"), folder)
+    with units_in_this_process():
+        run_experiment(make_experiment(values, "test"), folder)
     return folder
 
 

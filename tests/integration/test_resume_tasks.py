@@ -570,7 +570,7 @@ def test_trials_and_comparisons_are_resumed_only_on_what_they_were_begun_with(
 def test_of_several_comparisons_those_that_had_finished_stay_as_they_are(
     values_of: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
-    values = values_of("measurements") | {"compare": ["odometry"]}
+    values = values_of("measurements") | {"compare": ["odometry"], "output": QUIET}
     runs, out = [tmp_path / name for name in ("a", "b", "c")], tmp_path / "out"
     for folder in runs:
         run(values, folder)
@@ -599,7 +599,7 @@ def test_of_several_comparisons_one_that_finished_otherwise_is_refused(
     values_of: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
     """Other estimators or another log would make a table of two different comparisons."""
-    values = values_of("measurements") | {"compare": []}
+    values = values_of("measurements") | {"compare": [], "output": QUIET}
     runs, out = [tmp_path / name for name in ("a", "b")], tmp_path / "out"
     for seed, folder in enumerate(runs):
         run(values | {"seed": seed}, folder)
@@ -621,7 +621,7 @@ def test_of_several_comparisons_one_that_finished_otherwise_is_refused(
 def test_of_several_comparisons_a_finished_failure_stays_one_when_resumed(
     values_of: Callable[[str], dict[str, Any]], tmp_path: Path
 ) -> None:
-    values = values_of("measurements") | {"compare": []}
+    values = values_of("measurements") | {"compare": [], "output": QUIET}
     runs, out = [tmp_path / name for name in ("a", "b")], tmp_path / "out"
     for folder in runs:
         run(values, folder)

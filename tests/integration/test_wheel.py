@@ -2,60 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import re
 import shutil
 import subprocess
 import sys
 import sysconfig
-import tomllib
 import venv
 from pathlib import Path
 
 import pytest
-from running import HANGS_AFTER_S, ROOT, copy_of_checkout
-
-import fgslam
-
-_DISTRIBUTIONS = {
-    "PIL": "pillow",
-    "cv2": "opencv-python-headless",
-    "dask": "distributed",  # its other half
-    "pydantic_core": "pydantic",  # its other half
-    "rerun": "rerun-sdk",
-    "skimage": "scikit-image",
-    "yaml": "pyyaml",
-}
-"""Where a module's distribution has another name."""
-_LOADED_BY_NAME = {"open3d", "skimage", "libusb_package"}
-
-
-def imported() -> set[str]:
-    """Top names of all that the package's modules import."""
-    found = set(_LOADED_BY_NAME)
-    for path in Path(fgslam.__file__).parent.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Import):
-                found |= {alias.name for alias in node.names}
-            elif isinstance(node, ast.ImportFrom) and node.level == 0:
-                found.add(node.module or "")
-    return {name.partition(".")[0] for name in found} - set(sys.stdlib_module_names) - {"fgslam"}
-
-
-def plain(name: str) -> str:
-    """A distribution's name as package indices compare it."""
-    return re.sub(r"[-_.]+", "-", re.split(r"[<>=!~\[ ]", name)[0]).lower()
-
-
-def test_what_the_package_imports_is_declared() -> None:
-    """A library that comes along with another one today need not do so tomorrow."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    declared = {plain(name) for name in project["dependencies"]}
-    declared |= {plain(name) for name in project["optional-dependencies"]["viewer"]}
-    assert not {
-        module for module in imported() if plain(_DISTRIBUTIONS.get(module, module)) not in declared
-    }
+from running import HANGS_AFTER_S, copy_of_checkout
 
 
 def run(folder: Path, *command: object, **changes: str) -> subprocess.CompletedProcess[str]:

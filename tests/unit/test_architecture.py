@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import re
 import subprocess
 import sys
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from architecture_rules import (
     Module,
     check_modules,
     check_package,
+    imports_of,
     load_package,
     private_name_violations,
 )
@@ -211,6 +214,37 @@ def test_a_new_room_needs_a_place_in_the_order(tmp_path: Path) -> None:
     found = findings(tmp_path, {"gadgets/__init__.py": "x = 1\n"})
     assert len(found) == 1
     assert "'gadgets' is no room" in found[0]
+
+
+_DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "cv2": "opencv-python-headless",
+    "dask": "distributed",  # its other half
+    "pydantic_core": "pydantic",  # its other half
+    "rerun": "rerun-sdk",
+    "skimage": "scikit-image",
+    "yaml": "pyyaml",
+}
+"""Where a module's distribution has another name."""
+_LOADED_BY_NAME = {"open3d", "skimage", "libusb_package"}
+
+
+def plain(name: str) -> str:
+    """A distribution's name as package indices compare it."""
+    return re.sub(r"[-_.]+", "-", re.split(r"[<>=!~\[ ]", name)[0]).lower()
+
+
+def test_what_the_package_imports_is_declared() -> None:
+    """A library that comes along with another one today need not do so tomorrow."""
+    modules = whole_package()
+    imported = {item.target for module in modules for item in imports_of(module, modules)}
+    libraries = _LOADED_BY_NAME | {name.partition(".")[0] for name in imported}
+    libraries -= set(sys.stdlib_module_names) | {"fgslam"}
+    text = (PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8")
+    project = tomllib.loads(text)["project"]
+    declared = {plain(name) for name in project["dependencies"]}
+    declared |= {plain(name) for name in project["optional-dependencies"]["viewer"]}
+    assert not {name for name in libraries if plain(_DISTRIBUTIONS.get(name, name)) not in declared}
 
 
 def test_every_room_of_the_order_exists() -> None:
