@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
@@ -26,7 +26,7 @@ from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
 from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd
-from fgslam.homing.settings import FrontEndSettings, HomingControlSettings
+from fgslam.homing.settings import FrontEndSettings
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
 
@@ -44,8 +44,6 @@ ESTIMATORS: dict[str, HomingEstimatorSettings] = {
 SEEDS = (0, 1, 2)
 IMAGES = 26  # at 10 a second and 0.4 m/s: the first half of a leg
 REPEATS = 7
-# Never matched anew, so that every timed step is an update and nothing else.
-CONTROL = replace(HomingControlSettings(), retry_s=1e3)
 
 
 Step: TypeAlias = Callable[[Image, float], object]
@@ -122,7 +120,7 @@ def update_ratios(leg: Leg, settings: HomingEstimatorSettings) -> list[tuple[flo
     def begin(noted: NotedFrontEnd, target: OmniFeatures) -> Step:
         front_end: HomingFrontEnd = noted  # type: ignore[assignment]
         controller = HomingController(
-            front_end, target, lambda start: make_homing_estimator(start, settings), CONTROL
+            front_end, target, lambda start: make_homing_estimator(start, settings)
         )
         controller.step(leg.images[0], 0.0)
         return controller.step

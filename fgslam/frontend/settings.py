@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, Count, Degrees, NonNegative, Positive, Share
+from fgslam.core.settings import STRICT, Count, NonNegative, Positive, Share
 
 # ------------------------------------------------------------------------------------------
 # Settings of features: SIFT, how descriptors are compared, omnidirectional features
@@ -107,13 +107,6 @@ class StereoSettings:
     )
     max_disparity_px: Positive | None = Field(
         default=None, description="largest disparity; 20 in IJRR 2002; null: any"
-    )
-    scale_ratio: float = Field(
-        default=1.5, gt=1.0, description="largest ratio of scales; one level is 1.5 in IJRR 2002"
-    )
-    orientation_deg: Degrees = Field(default=20.0, description="largest difference of orientations")
-    disparity_agreement_px: Positive = Field(
-        default=1.0, description="largest difference of horizontal and vertical disparity"
     )
     others: Literal["auto", "sift", "patches"] = Field(
         default="auto",

@@ -34,6 +34,11 @@ Linear: TypeAlias = tuple[FloatArray, FloatArray]
 """A map (3, 2 * cameras) from pixels to (column, row, disparity), and their covariance (3, 3)."""
 
 
+_SCALE_RATIO = 1.5  # of partners' scales, at most: one level in IJRR 2002
+_ORIENTATION = np.deg2rad(20.0)  # difference of partners' orientations, at most (IJRR 2002)
+_DISPARITY_AGREEMENT_PX = 1.0  # between horizontal and vertical disparity, at most (IJRR 2002)
+
+
 class StereoMatcher:
     """Turns the features of a frame's images into matched stereo features with covariance."""
 
@@ -44,7 +49,6 @@ class StereoMatcher:
         self._rig = rig
         self._settings = settings
         self._appearance = appearance
-        self._angle = np.deg2rad(settings.orientation_deg)
         self._vertical_to_horizontal = vertical_to_horizontal(rig)
         paper = settings.measurement == "paper"
         ratio = self._vertical_to_horizontal
@@ -106,7 +110,7 @@ class StereoMatcher:
             top = straight[2].xy
             vertical = (top[:, 1] - right[:, 1]) * self._vertical_to_horizontal
             good &= np.abs(top[:, 0] - right[:, 0]) <= s.epipolar_px
-            good &= np.abs(vertical - horizontal) <= s.disparity_agreement_px
+            good &= np.abs(vertical - horizontal) <= _DISPARITY_AGREEMENT_PX
         kept = np.flatnonzero(good)
         every = (kept,) * len(found)
         return self._measure(found, straight, every, linear), np.asarray(good)
@@ -139,13 +143,13 @@ class StereoMatcher:
         horizontal = left.xy[j, 0] - right.xy[i, 0]
         p, k = pairs_within(right.xy[i, 0], s.epipolar_px, top.xy[:, 0])
         vertical = (top.xy[k, 1] - right.xy[i[p], 1]) * self._vertical_to_horizontal
-        ok = np.abs(vertical - horizontal[p]) <= s.disparity_agreement_px
+        ok = np.abs(vertical - horizontal[p]) <= _DISPARITY_AGREEMENT_PX
         p, k = p[ok], k[ok]
         ok = alike(
             (right.scale[i[p]], top.scale[k]),
             (right.orientation[i[p]], top.orientation[k]),
-            s.scale_ratio,
-            self._angle,
+            _SCALE_RATIO,
+            _ORIENTATION,
         )
         descriptors = (right.descriptors[i], top.descriptors)
         return choose(p[ok], k[ok], descriptors, self._appearance)
@@ -171,8 +175,8 @@ class StereoMatcher:
         ok = alike(
             (right.scale[i], other.scale[j]),
             (right.orientation[i], other.orientation[j]),
-            s.scale_ratio,
-            self._angle,
+            _SCALE_RATIO,
+            _ORIENTATION,
         )
         return choose(i[ok], j[ok], (right.descriptors, other.descriptors), self._appearance)
 

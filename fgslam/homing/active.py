@@ -21,7 +21,6 @@ from fgslam.core.bearings import (
 )
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import circular_median, wrap
-from fgslam.homing.settings import HomingControlSettings
 
 MAX_ACROSS = 0.1
 """Deviation of the target's place across the way, in parts of the leg, beyond which the target is
@@ -88,7 +87,6 @@ class ActiveHoming:
         start: HomingStart,
         make_estimator: EstimatorMaker,
         unit: float,
-        settings: HomingControlSettings,
     ) -> None:
         """Makes the estimator.
 
@@ -96,7 +94,6 @@ class ActiveHoming:
             EstimatorError: the start cannot be solved.
         """
         self.start, self.unit = start, unit
-        self._settings = settings
         self._estimator = make_estimator(start)
         self.estimate = self._estimator.estimate()
         # Averages of bearings have neither map nor covariance; estimators with a map have both.

@@ -233,7 +233,6 @@ class PathFollower:
             make_front_end(camera, front_end, seed),
             path.images,
             lambda start: make_homing_estimator(start, settings),
-            behaviour.control,
         )
         self._homing = GuidedHoming(chain, path, (camera, front_end, seed), tracks=by == "tracks")
         self._steering = Steering(behaviour.steering)

@@ -28,9 +28,10 @@ from fgslam.homing.active import (
     surely_left,
 )
 from fgslam.homing.front_end import HomingFrontEnd
-from fgslam.homing.settings import HomingControlSettings
 from fgslam.homing.steering import Command, HomingState
 
+SWITCH_FRACTION = 0.07  # of the leg left when the target counts as reached
+RETRY_S = 0.5  # between two attempts to match the target again
 BLIND_S = 1.0  # longest drive straight on, at reduced speed, without tracks
 GIVE_UP_S = 3.0  # of refusals, standing: the robot tries from farther on, or ends the homing
 WAIT_S = 60.0  # on one leg, on top of the time without progress, for a blocked way to clear
@@ -67,12 +68,10 @@ class HomingController:
         front_end: HomingFrontEnd,
         target: OmniFeatures,
         make_estimator: EstimatorMaker,
-        settings: HomingControlSettings,
     ) -> None:
         self._front_end = front_end
         self._target = target
         self._make_estimator = make_estimator
-        self._settings = settings
         self.active: ActiveHoming | None = None
         self.initialisations = 0
         self.remaining = 1.0
@@ -154,7 +153,7 @@ class HomingController:
     def _arrival(self, unit: float) -> str:
         """Reason for which the target counts as reached; empty if it does not."""
         behind = abs(self._heading) > np.pi / 2
-        if self.remaining <= self._settings.switch_fraction:
+        if self.remaining <= SWITCH_FRACTION:
             return f"reached: {self.remaining:.2f} of the leg left"
         # A renewed homing's own distance counts, too: its unit may be wrong, not its zero.
         near = min(self.remaining, self.remaining / unit) <= _PASS_FRACTION
@@ -174,7 +173,7 @@ class HomingController:
         due = time >= self._next_look and self.remaining <= NEAR_FRACTION
         if self._recognised or not (due or arrival):
             return None
-        self._next_look = time + self._settings.retry_s
+        self._next_look = time + RETRY_S
         answer = self._front_end.look(image, self._target)
         if isinstance(answer, Sighting):
             if homing.contradicts(answer.vector):
@@ -208,7 +207,7 @@ class HomingController:
             return self._doubt(time, "near the target it is seen elsewhere", seen.vector)
         left = self._surely_left(seen)
         behind = abs(seen.vector.direction) > np.pi / 2 and self._was_ahead
-        if left <= self._settings.switch_fraction or (behind and left <= _PASS_FRACTION):
+        if left <= SWITCH_FRACTION or (behind and left <= _PASS_FRACTION):
             self.remaining = left
             return self._end(time, HomingState.ARRIVED, f"passed: seen at {left:.2f} of the leg")
         return self._doubt(time, "near the target it is seen elsewhere", seen.vector, left)
@@ -280,12 +279,12 @@ class HomingController:
         return self._refused(time, Refusal(RefusalReason.AMBIGUOUS, words))
 
     def _begin(self, image: ByteArray, time: float) -> ActiveHoming | Refusal:
-        self._next_try = time + self._settings.retry_s
+        self._next_try = time + RETRY_S
         answer = self._front_end.begin(image, self._target, time)
         if isinstance(answer, Refusal):
             return answer
         try:
-            return ActiveHoming(answer, self._make_estimator, self.remaining, self._settings)
+            return ActiveHoming(answer, self._make_estimator, self.remaining)
         except EstimatorError as error:
             return Refusal(RefusalReason.UNCERTAIN, str(error))
 
@@ -428,7 +427,6 @@ class HomingChain:
         front_end: HomingFrontEnd,
         path: Sequence[OmniFeatures],
         make_estimator: EstimatorMaker,
-        control: HomingControlSettings,
     ) -> None:
         """Begins before the first target.
 
@@ -440,7 +438,6 @@ class HomingChain:
         self._front_end = front_end
         self._path = tuple(path)
         self._make_estimator = make_estimator
-        self._control = control
         self._skipped = 0
         self._ended: Command | None = None
         self.outcomes: list[LegOutcome] = []
@@ -510,7 +507,7 @@ class HomingChain:
         """Begins the leg to a target."""
         self._target, self._began = target, time
         self.controller = HomingController(
-            self._front_end, self._path[target], self._make_estimator, self._control
+            self._front_end, self._path[target], self._make_estimator
         )
 
     def _step(self, image: ByteArray, time: float) -> Command:

@@ -55,7 +55,7 @@ _NEAR = 0.25
 a third of a leg is left. Nearer, the direction to it is noise."""
 
 _REACHED, _BESIDE = 0.07, 0.25
-"""Parts of the last leg: along it, as `switch_fraction` of control, and in all."""
+"""Parts of the last leg: along it, as `SWITCH_FRACTION` of the controller, and in all."""
 
 _CONTRADICTION = np.deg2rad(CONTRADICTION_DEG)
 _AGREEING = 3  # images in a row that agree, until what contradicts those before is believed

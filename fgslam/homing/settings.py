@@ -9,23 +9,8 @@ from __future__ import annotations
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from fgslam.core.settings import STRICT, Index, NonNegative, Positive
+from fgslam.core.settings import STRICT, Index, Positive
 from fgslam.frontend.settings import HomingVectorSettings, OmniFeatureSettings
-
-
-@dataclass(frozen=True, config=STRICT)
-class HomingControlSettings:
-    """When a target is reached, when matching begins again, and when to stop."""
-
-    switch_fraction: float = Field(
-        default=0.07,
-        gt=0.0,
-        lt=0.5,
-        description="part of the leg left when the target counts as reached",
-    )
-    retry_s: NonNegative = Field(
-        default=0.5, description="between two attempts to match the target again"
-    )
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -48,7 +33,6 @@ class ClosedLoopSettings:
 class HomingBehaviourSettings:
     """All that the robot does between image and wheels."""
 
-    control: HomingControlSettings = HomingControlSettings()
     steering: SteeringSettings = SteeringSettings()
     loop: ClosedLoopSettings = ClosedLoopSettings()
 

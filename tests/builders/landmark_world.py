@@ -274,9 +274,7 @@ def winding_path(seed: int, legs: int, spacing: float, offset: float = 0.2) -> S
 
 
 def make_follower(
-    setting: Setting,
-    settings: HomingBehaviourSettings,
-    estimator: HomingEstimatorSettings | None = None,
+    setting: Setting, estimator: HomingEstimatorSettings | None = None
 ) -> HomingChain:
     """Over the whole path."""
     kind = HomingEkfSettings() if estimator is None else estimator
@@ -284,7 +282,6 @@ def make_follower(
         setting.front_end,
         setting.path(),
         lambda start: make_homing_estimator(start, kind),
-        settings.control,
     )
 
 
@@ -296,7 +293,7 @@ def drive_path(
 ) -> DriveRecord:
     """The whole path in closed loop."""
     behaviour = HomingBehaviourSettings() if settings is None else settings
-    follower = make_follower(setting, behaviour, estimator)
+    follower = make_follower(setting, estimator)
     return follow(
         setting.world,
         follower,

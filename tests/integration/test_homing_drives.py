@@ -229,7 +229,7 @@ class ShowingFrontEnd:
 
 def test_the_camera_s_last_view_of_each_leg_is_drawn(tmp_path: Path) -> None:
     setting, behaviour = winding_path(4, 3, 2.0), HomingBehaviourSettings()
-    follower = make_follower(setting, behaviour, None)
+    follower = make_follower(setting)
     assert not isinstance(setting.front_end, Unwrapping)
     watcher = DriveWatcher(cast(Unwrapping, ShowingFrontEnd(setting.front_end)), follower)
     steering, loop = Steering(behaviour.steering), behaviour.loop

@@ -208,7 +208,6 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
         front_end,
         memory.images,
         lambda start: make_homing_estimator(start, config.estimator),
-        behaviour.control,
     )
     steering = Steering(behaviour.steering)
     avoider = CorridorAvoidance(behaviour.steering.max_turn_deg_s)

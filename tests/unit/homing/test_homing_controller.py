@@ -52,17 +52,17 @@ from fgslam.homing.controller import (
     GIVE_UP_S,
     MAX_STALLS,
     NEAR_FRACTION,
+    RETRY_S,
+    SWITCH_FRACTION,
     HomingChain,
     HomingController,
 )
 from fgslam.homing.settings import (
     ClosedLoopSettings,
     HomingBehaviourSettings,
-    HomingControlSettings,
 )
 from fgslam.homing.steering import Command, CorridorAvoidance, Drive, HomingState, RangeScan
 
-SETTINGS = HomingControlSettings()
 POINTS = 3.0 * unit(np.linspace(-3.0, 3.0, 20)) * np.linspace(0.6, 1.4, 20)[:, None]
 """(20, 2) landmarks around start and target, legs."""
 
@@ -173,14 +173,13 @@ class Bench:
     """A controller with scripted front-end and an estimator that one can set."""
 
     front_end: ScriptedFrontEnd
-    settings: HomingControlSettings = SETTINGS
     estimators: list[OracleEstimator] = field(default_factory=list)
     time: float = -0.1
 
     def __post_init__(self) -> None:
         """Makes the controller."""
         target = OmniFeatures(None, None)  # type: ignore[arg-type]  # never looked at
-        self.controller = HomingController(self.front_end, target, self._make, self.settings)
+        self.controller = HomingController(self.front_end, target, self._make)
 
     def _make(self, start: HomingStart) -> OracleEstimator:
         self.estimators.append(OracleEstimator(start))
@@ -225,9 +224,9 @@ def test_reached_and_stays_reached() -> None:
     """Less than the switch fraction left: stop; later images change nothing but the time."""
     b = bench(vector_to(0.0))
     b.step()
-    b.at(1.0 - 1.01 * SETTINGS.switch_fraction)
+    b.at(1.0 - 1.01 * SWITCH_FRACTION)
     assert b.step().state is HomingState.DRIVE
-    b.at(1.0 - 0.99 * SETTINGS.switch_fraction)
+    b.at(1.0 - 0.99 * SWITCH_FRACTION)
     arrived = b.step()
     assert arrived.state is HomingState.ARRIVED
     assert arrived.stop
@@ -273,7 +272,7 @@ def test_refused_target_is_tried_for_a_while_and_then_given_up() -> None:
     assert all(c.stop for c in commands)
     assert commands[-1].state is HomingState.REFUSED
     assert commands[-1].refusal is FEW
-    assert np.all(np.diff(b.front_end.begun) > SETTINGS.retry_s - 0.01)
+    assert np.all(np.diff(b.front_end.begun) > RETRY_S - 0.01)
     assert commands[0].reason == FEW.details
 
 
@@ -284,7 +283,7 @@ def test_few_tracks_match_anew_while_driving_on() -> None:
     b.at(0.4)
     b.step()
     b.front_end.tracks = MIN_TRACKS - 1
-    refused = b.step(SETTINGS.retry_s)
+    refused = b.step(RETRY_S)
     assert refused.state is HomingState.DRIVE
     assert FEW.details in refused.reason
     assert refused.remaining == pytest.approx(0.6)
@@ -302,7 +301,7 @@ def test_remaining_goes_on_in_the_old_unit() -> None:
     b.at(0.6)
     b.step()
     b.front_end.tracks = 9
-    assert b.step(SETTINGS.retry_s).remaining == pytest.approx(0.4)
+    assert b.step(RETRY_S).remaining == pytest.approx(0.4)
     b.front_end.tracks = 20
     b.at(0.5)  # half of the new leg
     command = b.step()
@@ -318,7 +317,7 @@ def test_estimate_without_a_covariance_is_uncertain() -> None:
     b.step()
     b.at(0.4)
     b.estimators[-1].sigma = float("nan")
-    command = b.step(SETTINGS.retry_s)
+    command = b.step(RETRY_S)
     assert command.state is HomingState.DRIVE
     assert "no covariance" in command.reason
     assert len(b.front_end.begun) == 2
@@ -334,7 +333,7 @@ def test_arrival_needs_tracks_in_the_map() -> None:
     b.step()
     b.at(0.999)
     b.estimators[-1].mapped = 2
-    command = b.step(SETTINGS.retry_s)
+    command = b.step(RETRY_S)
     assert command.state is HomingState.DRIVE
     assert "no track confirms it: reached" in command.reason
     assert len(b.front_end.begun) == 2
@@ -346,7 +345,7 @@ def test_arrival_needs_tracks_in_the_map() -> None:
 def test_averages_without_map_and_covariance_drive(settings: HomingEstimatorSettings) -> None:
     """They never have any; that is no fault of theirs."""
     start = start_at(0.0, vector_to(0.0))
-    homing = ActiveHoming(start, lambda s: make_homing_estimator(s, settings), 1.0, SETTINGS)
+    homing = ActiveHoming(start, lambda s: make_homing_estimator(s, settings), 1.0)
     front_end = ScriptedFrontEnd([FEW], robot=np.array([0.2, 0.0, 0.0]))
     assert homing.update(front_end.track(DARK, 0.1)) is None
     assert homing.supported
@@ -438,7 +437,7 @@ def test_contradicting_vector_is_confirmed_before_it_is_driven_by() -> None:
     b.step()
     b.step()
     b.front_end.tracks = 9
-    doubt = b.step(SETTINGS.retry_s)
+    doubt = b.step(RETRY_S)
     assert doubt.state is HomingState.CONFIRM
     assert doubt.stop
     b.front_end.tracks = 20
@@ -456,7 +455,7 @@ def test_vectors_that_keep_contradicting_end_the_homing() -> None:
     b.step()
     b.step()
     b.front_end.tracks = 9
-    commands = [b.step(SETTINGS.retry_s) for _ in range(12)]
+    commands = [b.step(RETRY_S) for _ in range(12)]
     assert all(c.stop for c in commands)
     assert commands[-1].state is HomingState.REFUSED
 
@@ -474,7 +473,7 @@ def test_no_progress_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_refused_target_is_looked_for_from_farther_on() -> None:
     """Standing did not help: slowly straight on, and the first answer is driven by."""
-    standing = int(GIVE_UP_S / SETTINGS.retry_s) + 1
+    standing = int(GIVE_UP_S / RETRY_S) + 1
     b = bench(*[FEW] * (standing + 2), vector_to(0.1))
     commands = [b.step() for _ in range(60)]
     states = [c.state for c in commands]
@@ -585,7 +584,7 @@ def test_arrival_of_an_estimate_matched_anew_is_confirmed_by_common_features(
     b.at(0.6)
     b.step()
     b.front_end.tracks = 9
-    b.step(SETTINGS.retry_s)
+    b.step(RETRY_S)
     assert b.controller.initialisations == 2
     b.front_end.tracks = 20
     seen = sighting_of(vector_to(0.0), 0.05)
@@ -611,7 +610,7 @@ def test_start_that_was_contradicted_bounds_no_later_arrival(near: float, state:
     assert anew.remaining == 1.0
     b.front_end.looks = [sighting_of(vector_to(0.0), near)]
     b.at(0.95)
-    assert b.step(SETTINGS.retry_s).state.value == state
+    assert b.step(RETRY_S).state.value == state
 
 
 def test_what_is_left_is_bounded_by_common_features() -> None:
@@ -655,7 +654,7 @@ def test_estimate_that_takes_another_s_place_is_looked_at_itself() -> None:
     b.step()
     assert b.front_end.looked == 1
     b.front_end.tracks = 9
-    assert b.step(SETTINGS.retry_s).state is HomingState.CONFIRM
+    assert b.step(RETRY_S).state is HomingState.CONFIRM
     b.front_end.robot, b.front_end.tracks = np.zeros(3), 20
     assert b.step().state is HomingState.DRIVE
     b.at(*(0.8 * unit(np.array(1.5))))
@@ -718,7 +717,6 @@ def real_controller(
         setting.front_end,
         setting.path()[0],
         lambda start: make_homing_estimator(start, kind),
-        SETTINGS,
     )
 
 
@@ -805,7 +803,6 @@ def follower_with_unknown(count: int) -> HomingChain:
         setting.front_end,
         images,
         lambda start: make_homing_estimator(start, kind),
-        HomingControlSettings(),
     )
 
 
@@ -883,9 +880,9 @@ def test_empty_path_and_wrong_times_are_refused() -> None:
     setting = winding_path(7, 1, 2.0)
     with pytest.raises(ConfigError, match="no target image"):
         HomingChain(
-            setting.front_end, [], lambda _: pytest.fail("no start"), HomingControlSettings(),
+            setting.front_end, [], lambda _: pytest.fail("no start"),
         )  # fmt: skip
-    follower = make_follower(setting, HomingBehaviourSettings())
+    follower = make_follower(setting)
     follower.step(DARK, 1.0)
     with pytest.raises(EstimatorError, match=r"1\.000000000 s"):
         follower.step(DARK, 1.0)
