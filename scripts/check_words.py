@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 CLEAN = (
+    "fgslam/backend",
     "fgslam/cameras",
     "fgslam/cli",
     "fgslam/core",
@@ -19,6 +20,7 @@ CLEAN = (
     "fgslam/datasets",
     "fgslam/evaluation",
     "fgslam/factors",
+    "fgslam/frontend",
     "fgslam/homing",
     "fgslam/worlds",
     "README.md",

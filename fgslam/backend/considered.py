@@ -9,9 +9,9 @@ landmarks keeps. Estimates stay as they are.
 
 Two estimators of errors keep such columns:
 
-* :class:`ConsiderCovariance`, beside a filter that keeps all correlations and a smoother's tracker:
-  the rig's terms alone, as derivatives; what they add to the covariances that are there.
-* :class:`SampledErrors`, beside the filter of single landmarks: the rig's terms and samples of all
+* :class:`ConsiderCovariance`, next to a filter that keeps all correlations and a smoother's
+  tracker: the rig's terms alone, as derivatives; what they add to the covariances that are there.
+* :class:`SampledErrors`, next to the filter of single landmarks: the rig's terms and samples of all
   noise, through the filter's own gains; they replace its covariances.
 """
 
@@ -89,7 +89,7 @@ class ErrorColumns:
         self._held = False
         self._pose_columns = np.zeros((6, count))
         self._order = GrowingColumns(ids=np.empty(0, np.int64), row=np.empty(0, np.int64))
-        """Identities, ascending, and the rows that are theirs in the map; free ones are nobody's"""
+        """Identities, ascending, and the rows that are theirs in the map; free ones have none."""
         self._map = GrowingColumns(columns=np.empty((0, 3, count), kind), **more)
         self._free = np.empty(0, np.int64)
 
@@ -154,7 +154,7 @@ class ErrorColumns:
 
 
 # --------------------------------------------------------------------------------------------
-# The rig's terms, beside a filter that keeps all correlations, and a smoother's tracker.
+# The rig's terms, next to a filter that keeps all correlations, and a smoother's tracker.
 #
 # The Schmidt-Kalman filter's cross terms (Schmidt 1966), as derivatives: how the newest pose and
 # each landmark follow the terms that all cameras share, and the field that no term follows,
@@ -386,7 +386,7 @@ def shared_covariance(correction: RigCorrection) -> FloatArray:
 
 
 # --------------------------------------------------------------------------------------------
-# All noise, beside a filter of single landmarks: samples of it through the filter's own gains.
+# All noise, next to a filter of single landmarks: samples of it through the filter's own gains.
 #
 # The filter drops the correlations of landmarks and pose, so what it calculates is not the
 # covariance of its errors. That follows the same gains with the true noise (sensitivity of
@@ -399,7 +399,7 @@ def shared_covariance(correction: RigCorrection) -> FloatArray:
 
 SAMPLES = 48
 """A variance from them is known to the root of 2 / SAMPLES, a deviation to 10 %."""
-_STREAM = 17  # of random numbers, beside those of the recording
+_STREAM = 17  # of random numbers, next to those of the recording
 _FARTHEST_M = 1e9  # beyond, a point has no derivative; and nothing to tell
 _FLAT, _PADDING = 1e-20, 1e-9  # of the variances' sum: far below any landmark's, above rounding
 _LEAST_PLACING = 6  # that place a frame by an old part of the drive
@@ -447,7 +447,7 @@ class TrackedStep:
 
     @property
     def expected(self) -> Prediction:
-        """What the least squares had beside the matches; nothing where it looked everywhere."""
+        """What the least squares had besides the matches; nothing where it searched everywhere."""
         free = self.increment.relocalised
         return Prediction(self.prediction.wTc, FREE) if free else self.prediction
 

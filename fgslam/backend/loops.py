@@ -22,9 +22,9 @@ from fgslam.core.sensors import Increment, LoopClosure, Odometry
 from fgslam.core.store import Kept
 from fgslam.core.types import EgoMotion, Prediction
 
-_DOUBT_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
+_KERNEL_WIDTH = 3.0  # deviations of the whole closure; its squared residual is 6 on average
 SUBMAP_FRAMES = 10
-"""Enough that the pose graph of a long drive stays small, few enough that a submap hardly bends."""
+"""Enough that the pose graph of a long drive stays small, few enough that submaps are rigid."""
 CLOSURE_FACTOR = 3.0
 """By which deviations of a loop closure are multiplied: its own covariance takes the map around
 both frames as rigid, whose landmarks are as uncertain as the poses that saw them."""
@@ -80,7 +80,7 @@ class Constraint:
         before, after: frames.
         motion: (4, 4) pose of ``after`` in ``before``.
         covariance: (6, 6) in the tangent space at it.
-        doubted: it may be wrong: the farther off, the less it pulls (Cauchy's kernel).
+        uncertain: it may be wrong: the farther off, the less it pulls (Cauchy's kernel).
         matches: landmarks that agree on it; 0 where they were not counted.
     """
 
@@ -88,7 +88,7 @@ class Constraint:
     after: int
     motion: FloatArray
     covariance: FloatArray
-    doubted: bool = False
+    uncertain: bool = False
     matches: int = 0
 
 
@@ -169,9 +169,9 @@ def constraint_factor(known: Constraint) -> Any:
 
     step = Odometry(known.motion, known.covariance)
     factor = odometry_factor(pose_key(known.before), pose_key(known.after), step)
-    if not known.doubted:
+    if not known.uncertain:
         return factor
-    return robust(factor, "cauchy", _DOUBT_WIDTH)
+    return robust(factor, "cauchy", _KERNEL_WIDTH)
 
 
 def rotated(transforms: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -336,7 +336,7 @@ class DriveRecord:
     ) -> None:
         """Adds the step (4, 4) to a frame.
 
-        Two frames that were tracked well lie beside the same landmarks. Where most of what a frame
+        Two frames that were tracked well lie next to the same landmarks. Where most of what a frame
         matched contradicts its pose, as at a return to places that the drift has displaced, old
         landmarks and new ones pull apart: nothing measures the step to that pose, nor the one back
         from it, but the odometry.
@@ -361,7 +361,7 @@ class DriveRecord:
     ) -> None:
         """Adds a constraint if the last frame was placed by landmarks of an old part of the drive.
 
-        Once a submap; a frame found without a prior hangs on nothing else.
+        Once a submap; a frame found without a prior depends on nothing else.
 
         Args:
             homes: (k,) home frames of the landmarks that placed it; -1 of those that never move.
@@ -380,7 +380,7 @@ class DriveRecord:
         home = int(np.sort(old)[len(old) // 2])
         covariance = _TIE_FACTOR**2 * tracking.covariance
         motion = inverse(poses[home]) @ tracking.wTc
-        self._chain.constraints.append(Constraint(home, frame, motion, covariance, doubted=True))
+        self._chain.constraints.append(Constraint(home, frame, motion, covariance, uncertain=True))
 
     def close(self, loop: LoopClosure, here: FloatArray, where: str) -> FloatArray | None:
         """All poses (n, 4, 4) with the loop closed; None, and a remark, where it is refused.
@@ -407,7 +407,7 @@ class DriveRecord:
         if refused:
             self.remarks.append(refused)
             return None
-        self._chain.constraints.append(dataclasses.replace(known, doubted=True))
+        self._chain.constraints.append(dataclasses.replace(known, uncertain=True))
         shift = poses[-1, :3, 3] - here[:3, 3]
         self.remarks.append(
             f"{what}: the camera moved by {np.linalg.norm(shift):.2f} m, the drive with it"

@@ -30,8 +30,8 @@ from fgslam.core.types import EgoMotion
 
 _EVERY = 5  # frames between judgements
 _ITERATIONS = 5
-_BENDS = 4.0  # deviations at which the weight of a residual falls while the place is fitted
-_ASTRAY = 4.0  # times the track's own median residual: it holds a wrong match
+_KERNEL_WIDTH = 4.0  # deviations at which the weight of a residual falls while the place is fitted
+_OUTLIER = 4.0  # times the track's own median residual: it holds a wrong match
 _SINGULAR = 1e12  # of a condition number: what is beyond has hardly a digit
 _LEAST_PART = 0.1  # of a leaning, that no other place of the landmark explains
 STATED = np.array([30.0, 0.3])
@@ -147,7 +147,7 @@ class Persistence:
     def smoothed(self, frames: list[int], poses: FloatArray) -> None:
         """Takes in how the latest frames lie to each other, for tracks that are still to be judged.
 
-        Steps alone would lean tracks where a tracker's map is in doubt: where some of it has moved.
+        Steps alone would lean tracks where some of a tracker's map has moved.
         """
         known = [frame in self._poses for frame in frames]
         if any(known):
@@ -201,7 +201,7 @@ def _fits(tracking: EgoMotion) -> BoolArray:
     """(k,) matches that teach the noise: those that the pose was found by.
 
     Where these are the fewer, the noise is not what they were judged by: then what is not far off
-    beside the others.
+    next to the others.
     """
     if tracking.coherent:
         return tracking.inliers
@@ -267,7 +267,7 @@ class _Sightings:
                     return None
                 points = found._points(places)
             residual, jacobian = found._linear(sensor, points)
-            length = np.linalg.norm(residual, axis=1) / _BENDS
+            length = np.linalg.norm(residual, axis=1) / _KERNEL_WIDTH
             # At first all count: where the last sighting has the landmark may be wrong itself.
             weight = 1.0 / (1.0 + length**2) if iteration else np.ones(len(length))
             places = places + found._step(residual, jacobian, weight)
@@ -313,7 +313,7 @@ class Fitted:
         start, counts = tracks.start, tracks.counts
         ranked = length[np.lexsort((length, tracks.track))]
         median = 0.5 * (ranked[start + (counts - 1) // 2] + ranked[start + counts // 2])
-        good = np.maximum.reduceat(length, start) <= _ASTRAY * median
+        good = np.maximum.reduceat(length, start) <= _OUTLIER * median
         if not good.any():
             return None
         rows = good[tracks.track]
@@ -341,6 +341,6 @@ class Fitted:
         by_place = np.add.reduceat(ramp[:, None, None] * self.jacobian, start)
         part = 1.0 - np.einsum("mci,mij,mcj->mc", by_place, self.inverse_normal, by_place)
         counted = part >= _LEAST_PART
-        # What a track says of a drift goes with the square of its length, times its sightings.
+        # What a track measures of a drift goes with the square of its length, times its sightings.
         weight = np.broadcast_to((counts / LONGEST)[:, None] ** 3, part.shape)[counted]
         return np.array([single, (weight @ (lean**2)[counted], weight @ part[counted])])

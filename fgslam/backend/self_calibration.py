@@ -49,7 +49,7 @@ from fgslam.core.store import Kept
 WINDOW = 6
 """Frames of one window: motion enough to see depth change, few enough to cost little."""
 
-TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, beside the observed one
+TRUSTED_WINDOWS = 4.0  # how many windows the stated noise is worth, next to the observed one
 _DRIFT_S = 3600.0  # seconds after which as much is unknown as the calibration itself leaves
 SETTLING = WINDOW * (int(TRUSTED_WINDOWS) + 1)
 """Frames before which no change of the correction can be a rig that was found to have moved."""
@@ -214,13 +214,13 @@ Sandwich of an M-estimator (Huber 1981, ch. 6): E[w] E[w^2 s / d] / E[w - 2 w^2 
 Cauchy's weights w = 1 / (1 + s / c^2), s the squared residual of d = 2 * cameras coordinates.
 """
 _KNOCK_PROBABILITY = 1e-6  # of a window so far off, by chance; two in a row are a knock
-_DOUBTFUL = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
+_UNOBSERVED = 1e-3  # of the prior's information: less in a direction is no evidence of the noise
 
 
 class _Field(NamedTuple):
     """Modes of a field (:mod:`fgslam.core.correction`) as the same windows show them.
 
-    Eliminated from what is known, they would need their prior at once; so they are kept beside it,
+    Eliminated from what is known, they would need their prior at once; so they are kept next to it,
     and the prior may change with what is found. docs/derivations/cameras.md.
 
     Attributes:
@@ -315,7 +315,7 @@ class RigFilter:
         """
         size, axes = np.linalg.eigh(evidence.information)
         score = evidence.score + evidence.information @ (evidence.at - self.known.values)
-        telling = size > _DOUBTFUL * np.diagonal(axes.T @ self.prior @ axes)
+        telling = size > _UNOBSERVED * np.diagonal(axes.T @ self.prior @ axes)
         score = (axes.T @ score)[telling] / np.sqrt(size[telling])
         root = axes[:, telling] * np.sqrt(size[telling])
         known = root.T @ self.known.covariance @ root / self.noise_factor
@@ -466,7 +466,7 @@ def _free_terms(correction: RigCorrection) -> dict[str, BoolArray]:
 # Schur complements (Triggs et al. 2000, Bundle adjustment, 6.1).
 
 
-_KERNEL_WIDTH = 2.0  # standard deviations at which Cauchy's kernel bends, as the ego-motion's
+_KERNEL_WIDTH = 2.0  # of Cauchy's kernel, standard deviations, as the ego-motion's
 _GROSS = 50.0  # standard deviations: no error of a point seen once, but another point
 _ITERATIONS = 3  # more change the correction by a tenth of its sigma
 _TOLERANCE = 1e-4  # relative change of the cost at which a window has come to rest

@@ -37,7 +37,7 @@ _FEWEST = 12  # points: more than the unknowns
 _LEAST_SPREAD_PX = 0.1  # of points followed on sharp images
 _SIGNAL = 3.0
 """Spreads that the shift must amount to. Both sides err alike by the noise of the present image's
-patch, which at a standstill looks like half a frame; at three spreads it is 0.06 of one."""
+patch, which at a standstill seems half a frame; at three spreads it is 0.06 of one."""
 _UNKNOWN_LAG = 10.0  # frames, standard deviation of its prior: none to speak of
 
 
@@ -45,7 +45,7 @@ _UNKNOWN_LAG = 10.0  # frames, standard deviation of its prior: none to speak of
 class LineRows(Rows):
     """Points of one frame: offset (n,) across the lines, shift (n,) since, place (n, 2) in pixels.
 
-    The place is where the camera beside the reference shows the point, in the rig's own pixels.
+    The place is where the camera next to the reference shows the point, in the rig's own pixels.
     """
 
     offset: FloatArray
@@ -198,13 +198,13 @@ _LAG_OF_TURN = 0.5
 """Frames, deviation of the prior of the time between the cameras' images: at more than half a frame
 a camera is nearer to one frame late than to none, and its images are refused."""
 _REPORTED_SIGMAS = 3.0
-_REPORTED_DEG = 0.05  # about an axis beside the largest
+_REPORTED_DEG = 0.05  # about an axis next to the largest
 _FEW = 2  # knocks that are reported one by one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Turns:
-    """Evidence of how far each camera beside the reference is turned.
+    """Evidence of how far each camera next to the reference is turned.
 
     ``information`` (c, 3, 3) and ``score`` (c, 3), about the axes x, y and z, radians.
     """
@@ -233,7 +233,7 @@ def turns_of(rig: CameraRig, seen: Sequence[LineRows], spread_px: float) -> Turn
 
     Args:
         rig: as calibrated.
-        seen: for each camera beside the reference, the points of the frame.
+        seen: for each camera next to the reference, the points of the frame.
         spread_px: least deviation of an offset.
     """
     shown = [_turn_of(rig, camera, rows, spread_px) for camera, rows in enumerate(seen, 1)]

@@ -69,7 +69,7 @@ class StereoMatcher:
     def match_all(
         self, features: tuple[Features, ...], correction: RigCorrection | None = None
     ) -> StereoFeatures:
-        """The same, and after them what only two of three images show; ``complete`` tells them.
+        """The same, and after them what only two of three images show; ``complete`` marks them.
 
         The third image confirms what is new (Se et al. 2.2). A landmark is confirmed by the map
         that predicts it, and SIFT misses a fifth of all landmarks in each image, however small the
@@ -83,9 +83,9 @@ class StereoMatcher:
         whole = self._measure(features, straight, confirmed)
         n, k = self._match_along(1, straight[0], straight[2], self._vertical_to_horizontal)
         # What both images show, but not at one depth, is contradicted and not seen twice.
-        beside = np.isin(i, np.union1d(n, confirmed[0]), invert=True)
+        aside = np.isin(i, np.union1d(n, confirmed[0]), invert=True)
         above = np.isin(n, i, invert=True)
-        without_top = self._measure(features, straight, (i[beside], j[beside], None))
+        without_top = self._measure(features, straight, (i[aside], j[aside], None))
         without_left = self._measure(features, straight, (n[above], None, k[above]))
         every = whole.join(without_top).join(without_left)
         return dataclasses.replace(every, complete=np.arange(len(every)) < len(whole))
@@ -166,7 +166,7 @@ class StereoMatcher:
     def _match_along(
         self, axis: int, right: Features, other: Features, to_horizontal: float
     ) -> tuple[IntArray, IntArray]:
-        """Pairs (k,) with a camera beside the right one (``axis`` 0) or above it (1)."""
+        """Pairs (k,) with a camera next to the right one (``axis`` 0) or above it (1)."""
         s = self._settings
         i, j = pairs_within(right.xy[:, 1 - axis], s.epipolar_px, other.xy[:, 1 - axis])
         disparity = (other.xy[j, axis] - right.xy[i, axis]) * to_horizontal
@@ -330,7 +330,7 @@ class PatchStereo:
     def _prepared(self, image: Image) -> Image:
         """The image at half its size, mirrored, with margins.
 
-        OpenCV's reference is the left image: seen in a mirror, ours is. It says nothing of what
+        OpenCV's reference is the left image: seen in a mirror, ours is. It measures nothing of what
         lies nearer to the border than the largest disparity.
         """
         half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

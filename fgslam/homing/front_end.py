@@ -21,7 +21,7 @@ from fgslam.core.bearings import (
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.homing.tracking import BearingTracker, move_to_trackable
 from fgslam.frontend.homing.two_view import make_local_map, match_features, triangulable
-from fgslam.frontend.homing.vector import estimate_homing_vector, paired_anew
+from fgslam.frontend.homing.vector import estimate_homing_vector, re_paired
 from fgslam.homing.active import Sighting
 from fgslam.homing.features import best_all_around
 from fgslam.homing.settings import FrontEndSettings
@@ -206,7 +206,7 @@ def mixed_with_wrong(
         second.append(rows[other])
     if not first:
         return matches
-    wrong = paired_anew(matches, np.concatenate(first), np.concatenate(second))
+    wrong = re_paired(matches, np.concatenate(first), np.concatenate(second))
     return matches.join(wrong)
 
 

@@ -224,7 +224,7 @@ class SlamPipeline:
             tracked, stereo = self.key_frames.track(carried, prediction, landmarks, stereo)
         located, initialises = False, True
         if frame.i == 0 and self.located is not None:
-            again = self.tracker.track_anew(self.located, landmarks, stereo)
+            again = self.tracker.track_around(self.located, landmarks, stereo)
             located = again.ego_motion.status.measured
             tracked = again if located else tracked
         elif self.places is not None and frame.i > 0:  # where the prediction failed

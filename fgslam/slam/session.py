@@ -185,7 +185,7 @@ class Session:
                 if self.begins_anew(found, body):
                     # An extractor that fails does so before anything has changed.
                     now, body = self.describer.of_reference(replace(found, i=0)), None
-                    self._begin_anew(timestamp)
+                    self._begin_again(timestamp)
                 report = self.advance(now, timestamp, body)
                 if images is not None and not found.features:
                     self._seen.add(report.found, any_uint16(images))
@@ -258,7 +258,7 @@ class Session:
             return False
         return self.pipeline.can_initialise(found, least)
 
-    def _begin_anew(self, timestamp: float) -> None:
+    def _begin_again(self, timestamp: float) -> None:
         """Leaves out all frames so far: the next one is the first."""
         count = len(self)
         self._left_out = _LeftOut(self._left_out.count + count, timestamp)

@@ -28,7 +28,7 @@ def floor(dof: DegreesOfFreedom) -> Floor:
     return Floor.under(RIG, dof)
 
 
-def looks(rng: np.random.Generator, count: int) -> ByteArray:
+def random_descriptors(rng: np.random.Generator, count: int) -> ByteArray:
     """(count, 128) descriptors as SIFT's: sparse, of norm 512."""
     values = rng.gamma(0.5, 1.0, (count, 128))
     values *= 512.0 / np.linalg.norm(values, axis=1, keepdims=True)
@@ -83,7 +83,7 @@ def things(rng: np.random.Generator, low: FloatArray, high: FloatArray, count: i
     """Landmarks anywhere in a box."""
     return Place(
         rng.uniform(low, high, (count, 3)),
-        looks(rng, count),
+        random_descriptors(rng, count),
         rng.uniform(6.0, 20.0, count),
         rng.uniform(0.0, 2.0 * np.pi, count),
     )
@@ -120,7 +120,7 @@ def seen(
     scale = np.concatenate([own.size / points[rows[inside], 2], rng.uniform(1.5, 6.0, clutter)])
     turned = np.concatenate([own.orientation - roll, rng.uniform(0.0, 6.28, clutter)])
     exact = np.concatenate([measured, strange])
-    descriptors = np.concatenate([blurred(own.descriptors, rng), looks(rng, clutter)])
+    descriptors = np.concatenate([blurred(own.descriptors, rng), random_descriptors(rng, clutter)])
     order = rng.permutation(len(exact))
     return features(
         exact[order] + rng.normal(0.0, PIXEL_SIGMA, exact.shape),

@@ -56,7 +56,7 @@ def admit_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def relinearise_beyond(monkeypatch: pytest.MonkeyPatch, threshold: float) -> None:
-    """iSAM2 linearises anew what moves by more than a threshold."""
+    """iSAM2 relinearises what moves by more than a threshold."""
     monkeypatch.setattr(graphs, "RELINEARISED", threshold)
 
 

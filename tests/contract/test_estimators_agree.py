@@ -254,7 +254,7 @@ def test_without_measurements_all_are_dead_reckoning(name: str) -> None:
 
 
 SAMPLED = ("landmark_kalman", "landmark_kalman_graph")
-"""They report covariances of samples, beside their own ones."""
+"""They report covariances of samples, next to their own ones."""
 
 
 ONE_LANDMARK: dict[str, EstimatorSettings] = {
@@ -268,7 +268,7 @@ ONE_LANDMARK: dict[str, EstimatorSettings] = {
 def test_from_exactly_known_poses_landmarks_are_independent(name: str) -> None:
     """Then the paper's filter drops nothing, and is the smoother: to 1e-8 of a deviation.
 
-    The poses' covariance is zero, which graphs hold to a micrometre; beside a landmark's
+    The poses' covariance is zero, which graphs hold to a micrometre; next to a landmark's
     centimetres that is 1e-8 of its variance.
     """
     exact = np.zeros((6, 6))

@@ -162,7 +162,7 @@ def test_covariances_are_symmetric_and_positive(
 def test_features_without_elevations_are_estimated_by_their_bearings(
     case: Trial, settings: HomingEstimatorSettings
 ) -> None:
-    """A height that no view tells is no variable; the others keep theirs."""
+    """A height that no view shows is no variable; the others keep theirs."""
     matches = case.start.matches
     unknown = np.arange(len(matches)) % 2 == 0
     up = [np.where(unknown, np.nan, e) for e in (matches.elevation_a, matches.elevation_b)]

@@ -1,6 +1,6 @@
 """Full stochastic mapping: one Kalman filter over the pose and all landmarks.
 
-The costly alternative that Se, Lowe and Little (2001, 6) name and set aside; Smith, Self and
+The costly alternative that Se, Lowe and Little (2001, 6) name and do not use; Smith, Self and
 Cheeseman (1990). In the graph's terms a smoother that marginalises every past pose and never
 relinearises a measurement. With F the motion's Jacobian and Q its noise, H the measurements' and R
 theirs, a frame is
@@ -350,7 +350,7 @@ class FullEkf:
         except DivergedError as cause:
             raise EstimatorError(
                 f"frame {increment.index}: the ekf has diverged: {cause}; use isam2, which "
-                "linearises anew, or state the odometry's and the measurements' noise larger"
+                "relinearises, or state the odometry's and the measurements' noise larger"
             ) from None
 
     def _close(self, increment: Increment, loop: LoopClosure) -> bool:
@@ -499,7 +499,7 @@ class FullEkf:
         self._map = None
 
     def remake(self) -> None:
-        """The map is made anew of what was put back."""
+        """Rebuilds the map from what was put back."""
         self._map = None
 
 

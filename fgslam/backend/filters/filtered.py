@@ -51,7 +51,7 @@ class FilteredTrajectory:
         self.require_later(increment)
         if increment.odometry is None and self.timestamps:
             raise EstimatorError(
-                f"frame {increment.index}: neither odometry nor a stand-in says how the camera "
+                f"frame {increment.index}: neither odometry nor a stand-in states how the camera "
                 "moved; put the motion model's step into the increment"
             )
 

@@ -56,7 +56,7 @@ from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 _CONTRADICTED = 2.0
 """Sigmas of a measured disparity by which landmarks are off, rms, where a change of the rig's
-correction contradicts them: there the ego-motion's kernel bends."""
+correction contradicts them: the width of the ego-motion's kernel."""
 
 
 class LandmarkKalman:

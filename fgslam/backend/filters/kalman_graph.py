@@ -129,7 +129,7 @@ class FixedMapPose:
 def _exact_prior(prediction: Prediction) -> Any:
     """``Log(predicted^-1 wTc)`` with its whole Jacobian.
 
-    GTSAM's own prior leaves the logarithm's out, and so stops a little beside the minimum.
+    GTSAM's own prior leaves the logarithm's out, and so stops a little off the minimum.
     """
     predicted = gtsam.Pose3(prediction.wTc).inverse()
     covariance = 0.5 * (prediction.covariance + prediction.covariance.T)

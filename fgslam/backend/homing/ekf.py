@@ -56,7 +56,7 @@ class HomingEkf:
         """Takes in one image; see the protocol.
 
         Raises:
-            EstimatorError: as the protocol says, or the filter ran to infinity; it stays as it
+            EstimatorError: as in the protocol, or the filter ran to infinity; it stays as it
                 was before then.
         """
         step, taken = self._features.take(tracked)
@@ -170,7 +170,7 @@ def state_of(start: HomingStart, kept: BoolArray, covariance: FloatArray) -> Fil
 def _joint_covariance(start: HomingStart, kept: BoolArray) -> FloatArray:
     """(3 + 2n,) square, of target and features as what they are: functions of the two views.
 
-    All distances hang on the same direction and rotation of the target, and each on its own pair
+    All distances depend on the same direction and rotation of the target, and each on its own pair
     of bearings; the target's are thereby used, once.
     """
     vector, matches = start.vector, start.matches.select(kept)

@@ -99,7 +99,7 @@ class BearingAverage:
         """
         self._features = TrackedFeatures(start)
         if len(start.matches) == 0:
-            raise EstimatorError("homing start: no features to average; match anew")
+            raise EstimatorError("homing start: no features to average; match again")
         self._ids = start.local_map.ids
         self._target = start.matches.bearing_b
         self._turn, self._direction = 0.0, 0.0
@@ -110,7 +110,7 @@ class BearingAverage:
 
         Args:
             tracked: the image; without any feature left the last direction stays.
-            compass: heading of the target minus the present one, radians, where a compass tells.
+            compass: heading of the target minus the present one, radians, if a compass measures it.
         """
         _, taken = self._features.take(tracked)
         if taken.any():

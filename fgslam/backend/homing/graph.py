@@ -22,10 +22,10 @@ from fgslam.backend.homing.parts import (
     SIDEWAYS,
     TARGET,
     TURNING,
+    BearingSeen,
     Beginning,
     NewPart,
     Pair,
-    Sight,
     Solver,
     TrackedFeatures,
 )
@@ -134,7 +134,9 @@ class HomingProblem:
         entering = self._enter_seen(new, rows, tracked, taken & ~self._entered[rows], before)
         which = fits | entering
         seen = (rows, tracked.bearing, tracked.sigma_bearing)
-        new.bearings += map(Sight, repeat(image), *(values[which].tolist() for values in seen))
+        new.bearings += map(
+            BearingSeen, repeat(image), *(values[which].tolist() for values in seen)
+        )
         return new
 
     def _resected(
@@ -167,8 +169,8 @@ class HomingProblem:
         new.points[row] = (point, _PRIOR_DISTANCES * distance)
         from_start, _, from_target, _ = matches.sigma[row].tolist()
         new.bearings += [
-            Sight(0, row, float(matches.bearing_a[row]), from_start),
-            Sight(TARGET, row, float(matches.bearing_b[row]), from_target),
+            BearingSeen(0, row, float(matches.bearing_a[row]), from_start),
+            BearingSeen(TARGET, row, float(matches.bearing_b[row]), from_target),
         ]
         elevations = np.array([matches.elevation_a[row], matches.elevation_b[row]])
         if np.isfinite(elevations).all():

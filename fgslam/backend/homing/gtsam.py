@@ -61,10 +61,10 @@ def _parts(new: NewPart) -> tuple[Any, Any, set[int]]:
         graph.add(weak_landmark_prior(landmark_key(row), point, spread))
     robust = BearingFactors(KERNEL, KERNEL_WIDTH)
     keys = {pose, velocity}
-    for sight in new.bearings:
-        view = target_key() if sight.view == TARGET else pose_key(sight.view)
-        graph.add(robust.bearing(view, landmark_key(sight.row), sight.measured, sight.sigma))
-        keys.add(landmark_key(sight.row))
+    for seen in new.bearings:
+        view = target_key() if seen.view == TARGET else pose_key(seen.view)
+        graph.add(robust.bearing(view, landmark_key(seen.row), seen.measured, seen.sigma))
+        keys.add(landmark_key(seen.row))
     for pair in new.pairs:
         graph.add(robust.elevation_pair(target_key(), landmark_key(pair.row), *pair[1:]))
     return graph, values, keys
@@ -82,7 +82,7 @@ def _add_beginning(graph: Any, values: Any, beginning: Beginning) -> None:
 class GtsamSolver:
     """What GTSAM's solvers share: images become factors, values are looked up by key.
 
-    Where an update fails, the solver's own graph is solved as a batch, and the solver begins anew
+    Where an update fails, the solver's own graph is solved as a batch, and the solver is rebuilt
     from there: after an exception an ISAM2 object is corrupt.
     """
 
@@ -144,7 +144,7 @@ class GtsamSolver:
         raise NotImplementedError
 
     def _restart(self) -> None:
-        """Begins anew with the graph, at the values as they are."""
+        """Rebuilds the solver with the graph, at the values as they are."""
 
     def _joint(self, keys: list[int]) -> FloatArray:
         """Joint covariance of variables in the order given, in GTSAM's tangent spaces."""
@@ -244,4 +244,4 @@ def _pose(values: Any, key: int) -> FloatArray:
 
 def _failed(error: Exception) -> EstimatorError:
     cause = " ".join(str(error).split())[:200]
-    return EstimatorError(f"the homing graph cannot be solved ({cause}); start the homing anew")
+    return EstimatorError(f"the homing graph cannot be solved ({cause}); start the homing again")

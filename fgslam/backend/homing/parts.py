@@ -120,7 +120,7 @@ KERNEL_WIDTH = 2.0  # in deviations
 TARGET = -1
 
 
-class Sight(NamedTuple):
+class BearingSeen(NamedTuple):
     """A bearing of a landmark, and its deviation; radians."""
 
     view: int
@@ -172,7 +172,7 @@ class NewPart:
     times: tuple[float, float]
     beginning: Beginning | None = None
     points: dict[int, tuple[FloatArray, float]] = field(default_factory=dict)
-    bearings: list[Sight] = field(default_factory=list)
+    bearings: list[BearingSeen] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)
 
 

@@ -1,4 +1,4 @@
-"""The whole homing solved anew with every image, in plain arrays: exact, and the fastest.
+"""The whole homing solved again with every image, in plain arrays: exact, and the fastest.
 
 Gauss-Newton with reweighting from the last solution; steps that raise the cost are damped. Every
 few images the match that everything else contradicts most is put to the test.
@@ -20,9 +20,9 @@ from fgslam.backend.homing.parts import (
     KERNEL,
     KERNEL_WIDTH,
     MOTION_DENSITIES,
+    BearingSeen,
     NewPart,
     Pair,
-    Sight,
 )
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import EstimatorError
@@ -43,7 +43,7 @@ _ROWS, _COLUMNS = np.indices((STATE, STATE))
 _LOWER = np.tril_indices(STATE)
 _LEAST_DAMPING = 1e-3  # an image later the start is another, and covariances want none
 STILL = 0.3  # deviations, of all variables together: a shorter step ends the iteration
-_EVERY = 4  # images: a doubt costs half as much as an update
+_EVERY = 4  # images: re-weighing costs half as much as an update
 STEPS = 1
 """Gauss-Newton steps with an image, at most: what is left after one is gone with the next image."""
 
@@ -58,7 +58,7 @@ _FIRST_STEPS = 20  # with start and target alone, whose first guess is the initi
 class Factored:
     """Normal equations factored once: the step to the minimum, and covariances.
 
-    A is factored as a band, then the Schur complement C - B' A^-1 B. Everything is linearised anew
+    A is factored as a band, then the Schur complement C - B' A^-1 B. Everything is relinearised
     each time, and one covariance costs a few columns.
 
     Raises:
@@ -146,10 +146,10 @@ class SchurSolver:
         look = self._go_on(_FIRST_STEPS if new.image == 0 else STEPS)
         if not np.isfinite(look.cost):
             raise EstimatorError(
-                "the homing graph cannot be solved (its cost is no number); start the homing anew"
+                "the homing graph cannot be solved (its cost is no number); start the homing again"
             )
         if new.image % _EVERY == 0:
-            self._doubt(look)
+            self._weigh_down(look)
 
     def move(self, points: dict[int, FloatArray]) -> None:
         """See :class:`Solver`."""
@@ -189,7 +189,7 @@ class SchurSolver:
     def _numbers(self, rows: list[int]) -> IntArray:
         return np.array([self.model.landmarks[row] for row in rows], np.int64)
 
-    def _doubt(self, look: Look) -> None:
+    def _weigh_down(self, look: Look) -> None:
         """Goes on without the match that contradicts the solution most, if one does too much."""
         if self._factored is None or not self.model.landmarks:
             return
@@ -311,14 +311,14 @@ class Sights:
         """Empty."""
         self._table = np.zeros((2, 0, 0))
 
-    def put(self, sights: list[Sight], landmarks: dict[int, int]) -> None:
+    def put(self, seen: list[BearingSeen], landmarks: dict[int, int]) -> None:
         """Notes some, of landmarks whose numbers are those of their rows.
 
         Of the views the target is 0 here, the start 1.
         """
-        if not sights:
+        if not seen:
             return
-        views, rows, measured, sigmas = zip(*sights, strict=True)
+        views, rows, measured, sigmas = zip(*seen, strict=True)
         at = np.array(views) + 1, np.array([landmarks[row] for row in rows])
         self._reach(int(at[0].max()) + 1, int(at[1].max()) + 1)
         self._table[0][at], self._table[1][at] = measured, np.array(sigmas) ** -2.0
@@ -542,7 +542,7 @@ class SchurModel:
         e.border_gradient[:3] += by_target.T @ (weighed * residual)
 
     # ----------------------------------------------------------------------------------------
-    # Doubts
+    # Weights of what may be wrong
 
     def contradictions(self, look: Look, covariance: FloatArray) -> FloatArray:
         """How much each landmark's match contradicts everything else.
@@ -550,7 +550,7 @@ class SchurModel:
         Squared Mahalanobis distances (m,), chi-square of two degrees of freedom where the match
         is right, of the target's bearing and the elevation pair from what they would be without
         them: data snooping (Baarda 1968) of both together. A robust kernel sees the residual
-        *after* the fit alone, and a wrong match of a near point bends the fit to itself.
+        *after* the fit alone, and a wrong match of a near point pulls the fit to itself.
 
         Args:
             look: the solution.

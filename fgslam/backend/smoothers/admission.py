@@ -1,8 +1,8 @@
-"""Which landmarks enter the graph, wait outside, start anew or leave it.
+"""Which landmarks enter the graph, wait outside, start again or leave it.
 
 A landmark enters only once it is constrained: seen in enough frames, with enough parallax.
-Nothing is lost by waiting: its first observation has as many numbers as the landmark, so it says
-nothing about poses. One that is contradicted frame after frame has moved, and starts anew.
+Nothing is lost by waiting: its first observation has as many numbers as the landmark, and so
+measures nothing of poses. One that is contradicted frame after frame has moved, and starts again.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEAST_PARALLAX = 3.0
 CONTRADICTED_AFTER = 3
 """Rejected in so many frames in a row, which agree on another place, a landmark has moved."""
 _SAME_PLACE = 16.3  # 99.9 % quantile of chi-square with three degrees of freedom
-_ASTRAY_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
+_OUTLIER_PX = 12.0  # where nothing is left out: farther off, a match speaks against its landmark
 
 
 @dataclass(slots=True, eq=False)
@@ -67,7 +67,7 @@ class LandmarkAdmission:
 
     Attributes:
         tracks: by the landmark's identity.
-        remarks: which landmarks started anew, in words.
+        remarks: which landmarks started again, in words.
     """
 
     def __init__(self, sensor: CameraRig, settings: GraphSettings) -> None:
@@ -92,8 +92,8 @@ class LandmarkAdmission:
             Two masks (m,).
         """
         gate_px = self._settings.gate_px
-        astray = ~tracking.inliers & ~(tracking.residuals <= (gate_px or _ASTRAY_PX))
-        return (~astray if gate_px else np.ones(len(astray), np.bool_)), astray
+        outliers = ~tracking.inliers & ~(tracking.residuals <= (gate_px or _OUTLIER_PX))
+        return (~outliers if gate_px else np.ones(len(outliers), np.bool_)), outliers
 
     def confirmed(self, identities: IntArray) -> None:
         """Notes that landmarks were seen where they should be: nothing speaks against them."""
@@ -103,7 +103,7 @@ class LandmarkAdmission:
                 track.elsewhere.clear()
 
     def contradicted(self, rejected: Observations, wTc: FloatArray) -> Observations:
-        """Those rejected observations whose landmark must have moved: they start it anew.
+        """Those rejected observations whose landmark must have moved: they start it again.
 
         It has when it was rejected in several frames in a row, and they agree on where it is: wrong
         matches do not.
@@ -126,7 +126,7 @@ class LandmarkAdmission:
         return rejected.select(moved)
 
     def recalibrate(self, change: RigChange) -> None:
-        """Corrects anew what sightings measured; what spoke against a landmark may not any more."""
+        """Corrects again what sightings measured; what contradicted may not any more."""
         sightings = {id(s): s for t in self.tracks.values() for s in (t.last, *t.waiting)}
         if not sightings:
             return
@@ -176,13 +176,13 @@ class LandmarkAdmission:
         return identity in self._saved or not (seldom or parallax < track.least_parallax)
 
     def pruned(self, identities: IntArray) -> None:
-        """Drops landmarks as the front-end did: what they said stays in the graph, they do not."""
+        """Drops landmarks as the front-end did; what they measured stays in the graph."""
         for identity in identities.tolist():
             self.tracks.pop(identity, None)
             self.by_last_sighting.pop(identity, None)
             self._saved.pop(identity, None)
 
-    def start_anew(self, identities: Iterable[int], why: str) -> None:
+    def restart(self, identities: Iterable[int], why: str) -> None:
         """Closes the variables of landmarks; their next sighting begins new ones."""
         for identity in identities:
             self._saved.pop(identity, None)
@@ -251,7 +251,7 @@ class LandmarkAdmission:
 
 
 def _agree(places: list[tuple[FloatArray, FloatArray]]) -> bool:
-    """True if positions (3,) with covariances (3, 3) may be one place, each beside the last."""
+    """True if positions (3,) with covariances (3, 3) may be one place, each next to the last."""
     last, uncertainty = places[-1]
     for place, covariance in places[:-1]:
         offset = place - last

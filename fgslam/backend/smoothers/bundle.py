@@ -354,7 +354,7 @@ class OtherFactors:
         return dataclasses.replace(self, graph=graph)
 
     def without(self, gone: set[int]) -> OtherFactors:
-        """Without landmarks, by key, and what is said of them."""
+        """Without landmarks, by key, and what is measured of them."""
         graph = gtsam.NonlinearFactorGraph()
         for row in range(self.graph.size()):
             if gone.isdisjoint(self.graph.at(row).keys()):
@@ -396,7 +396,7 @@ class OtherFactors:
         jacobian, right = whole[:, :-1], whole[:, [-1]].toarray()[:, 0]
         information = (jacobian.T @ jacobian).tocsr()
         gradient = -(jacobian.T @ right)
-        own, links = _apart(information[: 3 * m, : 3 * m])
+        own, links = _diagonal_blocks(information[: 3 * m, : 3 * m])
         coupling = information[3 * m :, : 3 * m]
         return LinearSystem(
             np.array(self.pose_keys, np.int64),
@@ -410,15 +410,15 @@ class OtherFactors:
         )
 
 
-def _apart(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
-    """The (m, 3, 3) diagonal blocks of a sparse matrix (3m, 3m), and what is beside them."""
+def _diagonal_blocks(matrix: csr_matrix) -> tuple[FloatArray, csr_matrix]:
+    """The (m, 3, 3) diagonal blocks of a sparse matrix (3m, 3m), and what is off them."""
     entries = matrix.tocoo()
     own = np.zeros((matrix.shape[0] // 3, 3, 3))
     inside = entries.row // 3 == entries.col // 3
     row, column = entries.row[inside], entries.col[inside]
     own[row // 3, row % 3, column % 3] = entries.data[inside]
-    beside = entries.data[~inside], (entries.row[~inside], entries.col[~inside])
-    return own, csr_matrix(beside, matrix.shape)
+    off = entries.data[~inside], (entries.row[~inside], entries.col[~inside])
+    return own, csr_matrix(off, matrix.shape)
 
 
 PLAIN = KernelSettings("none")
@@ -543,7 +543,7 @@ class WholeGraph:
         new = np.asarray(weights, np.float64)
         return dataclasses.replace(self, weights=new, kernel=PLAIN)
 
-    def heeding(self, rows: BoolArray) -> WholeGraph:
+    def masked(self, rows: BoolArray) -> WholeGraph:
         """Without the other observations (k,), with its kernel."""
         return dataclasses.replace(self, weights=self.weights * rows)
 
@@ -703,7 +703,7 @@ class Descent:
     """Steps towards the minimum, Gauss and Newton's or damped.
 
     Near the minimum the poses' own system hardly changes from step to step: where it is kept, the
-    landmarks are eliminated anew, and its factor, which is most of the work, serves on.
+    landmarks are eliminated again, and its factor, which is most of the work, serves on.
     """
 
     def __init__(self, keeps: bool = True) -> None:

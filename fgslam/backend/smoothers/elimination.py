@@ -36,7 +36,7 @@ class Group:
 
     Attributes:
         start, stop: their places.
-        rows: (r,) ascending places of the later poses that they hang on.
+        rows: (r,) ascending places of the later poses that they depend on.
         parent: number of the group of the first of these; -1: there is none.
     """
 
@@ -54,7 +54,7 @@ class Group:
 class BlockCholesky:
     """Cholesky factor of a symmetric positive definite matrix, scaled to a unit diagonal.
 
-    Without the scaling, digits would be lost beside poses that are held stiffly.
+    Without the scaling, digits would be lost next to poses that are held stiffly.
     """
 
     def __init__(self, matrix: bsr_matrix) -> None:
@@ -162,7 +162,7 @@ class BlockCholesky:
                 whole[size:, size:], whole[size:, :size] = rest, -rest @ gain
                 whole[:size, size:] = whole[size:, :size].T
                 whole[:size, :size] -= gain.T @ whole[size:, :size]
-            if first.get(group.parent) == number:  # nobody asks for it any more
+            if first.get(group.parent) == number:  # no group needs it any more
                 known.pop(group.parent, None)
             if number in first:
                 known[number] = whole
@@ -194,7 +194,7 @@ def least_degree(links: csr_matrix) -> IntArray:
 
 
 def groups_of(links: csr_matrix, place: IntArray) -> list[Group]:
-    """Groups of poses by their places, each before the group that it hangs on."""
+    """Groups of poses by their places, each before the group that it depends on."""
     hang = _hanging(links, place)
     starts, held = [0], 0
     for j in range(1, len(hang)):
@@ -215,7 +215,7 @@ def groups_of(links: csr_matrix, place: IntArray) -> list[Group]:
 
 
 def _hanging(links: csr_matrix, place: IntArray) -> list[IntArray]:
-    """For each place the later ones that it hangs on when all before it are eliminated."""
+    """For each place the later ones that it depends on when all before it are eliminated."""
     n = len(place)
     row = place[np.repeat(np.arange(n), np.diff(links.indptr))]
     column = place[links.indices]
@@ -399,7 +399,7 @@ def scaled_cholesky(
 ) -> tuple[FloatArray, FloatArray]:
     """Lower Cholesky factor of a positive definite matrix scaled to a unit diagonal, and the scale.
 
-    Without the scaling, digits would be lost beside poses that are held stiffly. A large matrix is
+    Without the scaling, digits would be lost next to poses that are held stiffly. A large matrix is
     better overwritten.
     """
     size = np.sqrt(np.maximum(np.diagonal(information), 0.0))
@@ -601,16 +601,16 @@ def _backward(root: FloatArray, right: FloatArray) -> FloatArray:
 
 
 # ------------------------------------------------------------------------------------------
-# Stretches of a long chain of poses, each eliminated by a banded Cholesky decomposition
+# Segments of a long chain of poses, each eliminated by a banded Cholesky decomposition
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stretch:
-    """Neighbouring poses, eliminated together: they hang on what they see and on their ends.
+class ChainSegment:
+    """Neighbouring poses, eliminated together: they depend on what they see and on their ends.
 
     Attributes:
         rows: (6k,) of the system's poses.
-        columns: (c,) of what is kept that they hang on.
+        columns: (c,) of what is kept that they depend on.
         own: (k, 6, 6) their covariances if those are held.
         gain: (6k, c) how their mean follows those, negated.
         factor, size: of their information, scaled: Cholesky's band (12, 6k) and the scale (6k,).
@@ -624,11 +624,13 @@ class Stretch:
     size: FloatArray
 
     @staticmethod
-    def of(rows: IntArray, chain: csr_matrix, coupling: csr_matrix) -> tuple[Stretch, FloatArray]:
+    def of(
+        rows: IntArray, chain: csr_matrix, coupling: csr_matrix
+    ) -> tuple[ChainSegment, FloatArray]:
         """Of rows of the poses' block, and their coupling with all that is kept.
 
         Returns:
-            The stretch, and the information (c, c) that it takes from its columns.
+            The segment, and the information (c, c) that it takes from its columns.
 
         Raises:
             EstimatorError: the poses are not determined.
@@ -643,10 +645,10 @@ class Stretch:
         gain = cho_solve_banded((factor, True), scaled, check_finite=False)
         blocks = size.reshape(-1, 6)
         own = _inverse_blocks(factor) / (blocks[:, :, None] * blocks[:, None, :])
-        return Stretch(rows, columns, own, gain / size[:, None], factor, size), scaled.T @ gain
+        return ChainSegment(rows, columns, own, gain / size[:, None], factor, size), scaled.T @ gain
 
     def alone(self, gradients: FloatArray) -> FloatArray:
-        """(6k, c) their steps for gradients (6k, c) if what they hang on is held."""
+        """(6k, c) their steps for gradients (6k, c) if what they depend on is held."""
         scaled = gradients / self.size[:, None]
         found = cho_solve_banded((self.factor, True), scaled, check_finite=False)
         return np.asarray(-found / self.size[:, None])
@@ -670,11 +672,11 @@ def _inverse_blocks(factor: FloatArray) -> FloatArray:
     """(n, 6, 6) diagonal blocks of the inverse of a matrix with banded Cholesky factor (12, 6n)."""
     n = factor.shape[1] // 6
     row, column = np.tril_indices(6)
-    below, beside = np.indices((6, 6)).reshape(2, -1)
+    below, across = np.indices((6, 6)).reshape(2, -1)
     starts = 6 * np.arange(n)[:, None]
     own, next_to = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
     own[:, row, column] = factor[row - column, starts + column]
-    next_to[:, below, beside] = factor[6 + below - beside, starts + beside]
+    next_to[:, below, across] = factor[6 + below - across, starts + across]
     inverse = np.linalg.inv(own)
     carried = next_to @ inverse
     out = np.swapaxes(inverse, 1, 2) @ inverse
@@ -685,7 +687,7 @@ def _inverse_blocks(factor: FloatArray) -> FloatArray:
 
 _POSES_A_LANDMARK = 4
 """How many times more numbers landmarks have than the poses that cut a long chain: cuts make each
-stretch see little, and the system that is left larger."""
+segment see little, and the system that is left larger."""
 _PAIRS_AT_ONCE = 1 << 16
 """Of poses that see one landmark: a bound for memory."""
 
@@ -890,18 +892,18 @@ class ChainMarginals:
     Poses are tied to their neighbours by odometry, so their block is a band, and its Cholesky
     decomposition and the diagonal blocks of its inverse cost a constant a pose. The few poses to
     which a loop leads back are kept with the landmarks instead: without them the rest is a chain.
-    Some more are kept that cut it into stretches, each of which hangs on the landmarks seen from
+    Some more are kept that cut it into segments, each of which depends on the landmarks seen from
     there and on no others.
 
     Attributes:
         system: the graph.
-        stretches: poses that are eliminated.
+        segments: poses that are eliminated.
         kept: (3m + 6k,) rows in the system's information of all landmarks and the k poses kept.
         border: their information.
     """
 
     system: LinearSystem
-    stretches: list[Stretch]
+    segments: list[ChainSegment]
     kept: IntArray
     border: DenseFactor
 
@@ -921,15 +923,15 @@ class ChainMarginals:
         coupling = information[columns:][:, kept]
         border = information[kept][:, kept].toarray()
         left = np.delete(np.arange(n), apart)
-        stretches = []
+        segments = []
         for chosen in np.split(left, np.flatnonzero(np.diff(left) > 1) + 1):
             if not len(chosen):
                 continue
             own = rows[chosen].ravel()
-            stretch, taken = Stretch.of(own, among[own][:, own], coupling[own])
-            border[np.ix_(stretch.columns, stretch.columns)] -= taken
-            stretches.append(stretch)
-        return ChainMarginals(system, stretches, kept, DenseFactor(border))
+            segment, taken = ChainSegment.of(own, among[own][:, own], coupling[own])
+            border[np.ix_(segment.columns, segment.columns)] -= taken
+            segments.append(segment)
+        return ChainMarginals(system, segments, kept, DenseFactor(border))
 
     def step(self) -> FloatArray:
         """(3m + 6n,) from where the graph was linearised to its minimum, the border held."""
@@ -938,14 +940,14 @@ class ChainMarginals:
     def solve(self, gradients: FloatArray) -> FloatArray:
         """(3m + 6n, c) the steps for other gradients (3m + 6n, c), the border held."""
         of_poses, pull = gradients[self.system.columns :], gradients[self.kept]
-        for stretch in self.stretches:
-            pull[stretch.columns] -= stretch.gain.T @ of_poses[stretch.rows]
+        for segment in self.segments:
+            pull[segment.columns] -= segment.gain.T @ of_poses[segment.rows]
         moved = -self.border.solve(pull)
         out = np.empty_like(gradients)
         out[self.kept] = moved
-        for stretch in self.stretches:
-            alone = stretch.alone(of_poses[stretch.rows])
-            out[self.system.columns + stretch.rows] = alone - stretch.gain @ moved[stretch.columns]
+        for segment in self.segments:
+            alone = segment.alone(of_poses[segment.rows])
+            out[self.system.columns + segment.rows] = alone - segment.gain @ moved[segment.columns]
         return out
 
     def poses(self) -> FloatArray:
@@ -953,10 +955,10 @@ class ChainMarginals:
         columns, covariance = self.system.columns, self.border.inverse
         out = np.empty((len(self.system.pose_keys), 6, 6))
         out[(self.kept[columns::6] - columns) // 6] = _diagonal(covariance[columns:, columns:], 6)
-        for stretch in self.stretches:
-            gain = stretch.gain.reshape(len(stretch.own), 6, -1)
-            among = covariance[np.ix_(stretch.columns, stretch.columns)]
-            out[stretch.rows[::6] // 6] = stretch.own + gain @ among @ np.swapaxes(gain, 1, 2)
+        for segment in self.segments:
+            gain = segment.gain.reshape(len(segment.own), 6, -1)
+            among = covariance[np.ix_(segment.columns, segment.columns)]
+            out[segment.rows[::6] // 6] = segment.own + gain @ among @ np.swapaxes(gain, 1, 2)
         return out
 
     def landmarks(self) -> FloatArray:
@@ -974,12 +976,12 @@ class ChainMarginals:
         return np.block([[own, cross], [cross.T, covariance[np.ix_(columns, columns)]]])
 
     def _hangs(self, pose: int) -> tuple[IntArray, FloatArray, FloatArray]:
-        """What of the kept a pose hangs on, how (6, c), and its covariance if that is held."""
-        for stretch in self.stretches:
-            at = np.flatnonzero(stretch.rows == 6 * pose)
+        """What of the kept a pose depends on, how (6, c), and its covariance if that is held."""
+        for segment in self.segments:
+            at = np.flatnonzero(segment.rows == 6 * pose)
             if len(at):
                 first = int(at[0])
-                return stretch.columns, stretch.gain[first : first + 6], stretch.own[first // 6]
+                return segment.columns, segment.gain[first : first + 6], segment.own[first // 6]
         first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
         return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
 

@@ -56,11 +56,11 @@ from fgslam.core.types import Floor, GyroscopeBias, Prediction
 from fgslam.factors.graphs import number, poses_of_frame
 
 # ------------------------------------------------------------------------------------------
-# What the doubt about a rig's calibration adds to the covariances of a solved graph
+# What the uncertainty of a rig's calibration adds to the covariances of a solved graph
 
 
-def doubted(graph: WholeGraph, state: State, rig: RigCorrection) -> Bordered:
-    """Marginals at a solution, with the doubt about its rig.
+def with_uncertain_rig(graph: WholeGraph, state: State, rig: RigCorrection) -> Bordered:
+    """Marginals at a solution, with the uncertainty of its rig.
 
     Its border are the correction's terms, those that all cameras share, and the field's modes.
 
@@ -148,7 +148,7 @@ _BEYOND = (4.0 / 1.538) ** 2
 within which ego-motion takes them (1.538 is the median length of three normal numbers)."""
 _KEPT = 0.5  # weights end at 0 or 1
 _ROUNDS = 20  # trims until the observations that fit do not change any more
-_ROUGH = 1e-2  # of the cost: the minimum with the kernel only says roughly what fits
+_ROUGH = 1e-2  # of the cost: the minimum with the kernel only shows roughly what fits
 _CONTROL_GROWS, _CONTROL_ENDS = 1.4, 1e6  # Yang et al.; with the latter all weights are 0 or 1
 _NEAR_BEGINS, _NEAR_GROWS, _NEAR_ENDS = 0.3, 4.0, 20.0
 """From a robust solution the convex beginning is left out and the rest taken in larger steps: at
@@ -255,14 +255,14 @@ class Refined:
         graph: the factors that count.
         state: of all variables that are left.
         remarks: what was left out, in words.
-        doubted: what was applied last to a rig that calibrates itself; None for a known one.
+        uncertain_rig: what was applied last to a rig that calibrates itself; None for a known one.
         noise_ratio: variance of the measurements over what the builder takes it to be.
     """
 
     graph: WholeGraph
     state: State
     remarks: tuple[str, ...] = ()
-    doubted: RigCorrection | None = None
+    uncertain_rig: RigCorrection | None = None
     noise_ratio: float = 1.0
 
     @property
@@ -293,8 +293,8 @@ class Refined:
         Raises:
             EstimatorError: the measurements do not determine all variables.
         """
-        if self.doubted is not None and self.graph.seen is not None:
-            return doubted(self.graph, self.state, self.doubted)
+        if self.uncertain_rig is not None and self.graph.seen is not None:
+            return with_uncertain_rig(self.graph, self.state, self.uncertain_rig)
         return reduced(self.graph.linear(self.state))
 
     @property
@@ -310,7 +310,7 @@ def refine(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     """Solves; where poses were tracked by the fewer matches, weighs these by what they err now.
 
     Not where only key frames are variables, whose tracks were judged in all frames.
-    The observations alone are weighed anew: guessed steps and the translations of a gyroscope's
+    The observations alone are weighed again: guessed steps and the translations of a gyroscope's
     keep the noise of the way, and which landmarks lie behind a camera is not asked again.
     """
     found = _solved(builder, values, minimise)
@@ -328,7 +328,7 @@ def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
     remarks: list[str] = []
     for _ in range(_SOLUTIONS):
         state, kept = minimise(graph, state)
-        found = Refined(kept, state, tuple(remarks), builder.doubted)
+        found = Refined(kept, state, tuple(remarks), builder.uncertain_rig)
         lost = lost_landmarks(builder, found)
         if not lost:
             return found
@@ -336,7 +336,7 @@ def _solved(builder: GraphBuilder, values: Any, minimise: Minimise) -> Refined:
         rows = np.searchsorted(found.variables, sorted(lost)).astype(np.int64)
         graph, state = kept.without(rows, state)
     state, kept = minimise(graph, state)
-    return Refined(kept, state, tuple(remarks), builder.doubted)
+    return Refined(kept, state, tuple(remarks), builder.uncertain_rig)
 
 
 class WholeGraphSolver:

@@ -196,13 +196,13 @@ class GraphBuilder:
         return float(np.sqrt(self.noise.power / self.noise.spread))
 
     def recalibrate(self, change: RigChange) -> None:
-        """Corrects all observations so far anew."""
+        """Corrects all observations so far again."""
         self.observed["measurement"][:] = change.measured(self.observed["measurement"])
         self.corrections.recalibrate(change)
         self.admission.recalibrate(change)
 
     @property
-    def doubted(self) -> RigCorrection | None:
+    def uncertain_rig(self) -> RigCorrection | None:
         """A rig that calibrates itself, with the correction applied last; None for a known one."""
         applied = self.corrections.applied
         if not applied:
@@ -276,7 +276,7 @@ class GraphBuilder:
         return variable in self._rows
 
     def behind(self, poses: FloatArray, points: dict[int, FloatArray]) -> list[int]:
-        """Variables that lie behind a camera that saw them, where a stereo factor says nothing.
+        """Variables behind a camera that saw them, where a stereo factor constrains nothing.
 
         Args:
             poses: (n, 4, 4) ``wTc`` by frame, those of the graph at least.
@@ -559,7 +559,7 @@ def allowed_joint(floor: Floor, wTc: FloatArray, joint: FloatArray) -> FloatArra
 
 
 def suspect(error: Exception) -> int | None:
-    """Key of the variable near which GTSAM says that the system was indeterminate, if it does."""
+    """Key of the variable near which GTSAM reports an indeterminate system, if it does."""
     words = str(error).split("variable", 1)
     digits = "".join(c for c in words[-1].strip().split(" ")[0] if c.isdigit())
     return int(digits) if len(words) == 2 and digits else None
@@ -623,7 +623,7 @@ class GraphSolver(Protocol):
         ...
 
     def recalibrate(self, change: RigChange) -> None:
-        """The builder has corrected its observations anew."""
+        """The builder has corrected its observations again."""
         ...
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
@@ -727,7 +727,7 @@ class GraphLoops:
         refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
         competing = self._competing(closed.squared(solution))
         if refused and 0 < competing.sum() < known.matches:
-            graph, closed = graph.heeding(~competing), closed.heeding(~competing)
+            graph, closed = graph.masked(~competing), closed.masked(~competing)
             solution = solved(closed, solution)
             rise = 2.0 * (closed.cost(solution) - graph.cost(solved(graph, state)))
             refused = refusal(what, rise)
@@ -743,17 +743,17 @@ class GraphLoops:
     def _competing(self, squared: FloatArray) -> BoolArray:
         """(k,) observations that claim another return than the loop's, by their residuals with it.
 
-        A landmark that was long out of view was found again by its looks and by where the drifted
+        A landmark long out of view was found again by its appearance and by where the drifted
         camera expected it. That is a loop closure, too, of a few matches, and false where the
-        drift is large; so the larger number of matches says which of both is believed.
+        drift is large; so the larger number of matches decides between both.
         """
         gate = _OBSERVED / self.builder.noise_factor**2
         frames, variables, *_ = self.builder.kept_observed()
         return found_again(frames, variables) & (squared > gate)
 
     def accept(self, known: Constraint) -> None:
-        """Believed now, it is doubted when later ones contradict it."""
-        known = dataclasses.replace(known, doubted=True)
+        """Accepted now, it counts less when later ones contradict it."""
+        known = dataclasses.replace(known, uncertain=True)
         self.builder.graph.add(constraint_factor(known))
         self.accepted.append(known)
 

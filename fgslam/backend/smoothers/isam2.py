@@ -104,7 +104,7 @@ class Isam2Solver(WholeGraphSolver):
         return groups
 
     def _covariance(self, frame: int) -> FloatArray:
-        """Marginal of a pose; where the tree cannot tell it, it is built anew first."""
+        """Marginal of a pose; where the tree does not give it, it is rebuilt first."""
         try:
             covariance = np.asarray(self.tree.marginalCovariance(pose_key(frame)))
         except RuntimeError as error:
@@ -120,7 +120,7 @@ class Isam2Solver(WholeGraphSolver):
             raise self._failed(error) from None
 
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
-        """Updates the tree with the loop, or builds it anew where the loop moves the map."""
+        """Updates the tree with the loop, or rebuilds it where the loop moves the map."""
         self._updated = self.builder.frames[-1]
         self._flush()
         found = self._accepted(loop, drive, what, _without_loop)
@@ -148,7 +148,7 @@ class Isam2Solver(WholeGraphSolver):
         return refine(self.builder, values, self._minimise)
 
     def recalibrate(self, change: RigChange) -> None:
-        """Builds the tree anew, of the new measurements."""
+        """Rebuilds the tree, of the new measurements."""
         super().recalibrate(change)
         together = gtsam.Values(self.values)
         together.insert(self.new_values)
@@ -163,7 +163,7 @@ class Isam2Solver(WholeGraphSolver):
     # -- where the tree cannot be solved -------------------------------------------------------
 
     def _repair(self, values: Any, error: Exception) -> None:
-        """Builds the solver anew from the last good values, without the landmark that failed.
+        """Rebuilds the solver from the last good values, without the landmark that failed.
 
         After an exception iSAM2's own state is unusable; the builder's graph is not.
         """
@@ -180,7 +180,7 @@ class Isam2Solver(WholeGraphSolver):
             raise self._failed(last)
 
     def _tried(self, values: Any) -> RuntimeError | None:
-        """Builds the solver anew; what it fails on, or None."""
+        """Rebuilds the solver; what it fails on, or None."""
         try:
             self._rebuild(values)
         except RuntimeError as error:
@@ -206,7 +206,7 @@ class Isam2Solver(WholeGraphSolver):
             what = f"pose of frame {number(key)}" if is_pose(key) else "the map beyond a gap"
             self.remarks.append(
                 f"{what} known too unevenly for Cholesky at frame "
-                f"{self.builder.frames[-1]}: iSAM2 built anew, with QR from here on"
+                f"{self.builder.frames[-1]}: iSAM2 rebuilt, with QR from here on"
             )
             return True
         if is_pose(key) or not self.builder.in_graph(number(key)):
@@ -230,7 +230,7 @@ class Isam2Solver(WholeGraphSolver):
         if behind:
             self.remarks.append(
                 f"{len(behind)} landmarks came out behind a camera at frame "
-                f"{self.builder.frames[-1]}: put where they were seen last, iSAM2 built anew"
+                f"{self.builder.frames[-1]}: put where they were seen last, iSAM2 rebuilt"
             )
         return len(behind)
 
@@ -239,7 +239,7 @@ class Isam2Solver(WholeGraphSolver):
         values.erase(landmark_key(variable))
         self.remarks.append(
             f"{what} {why} at frame {self.builder.frames[-1]}: taken out of the graph, iSAM2 "
-            "built anew from the last estimate"
+            "rebuilt from the last estimate"
         )
 
     def new_tree(self) -> Any:

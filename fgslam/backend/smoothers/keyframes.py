@@ -163,7 +163,7 @@ class Segments:
         return self._entering(middle, fused, last - middle.frame)
 
     def recalibrate(self, change: RigChange) -> None:
-        """Corrects anew what frames between keyframes measured."""
+        """Corrects again what frames between keyframes measured."""
         self._block = [_corrected(frame, change) for frame in self._block]
         self.between = [_corrected(frame, change) for frame in self.between]
 
@@ -173,7 +173,7 @@ class Segments:
         return [_measured(frame, known.settle(rig, *_seen_in(frame))) for frame in self.between]
 
     def forget(self, identities: list[int]) -> None:
-        """Landmarks that start anew: what the open block saw of them is not the same landmark."""
+        """Landmarks that start again: what the open block saw of them is not the same landmark."""
         gone = np.array(identities, np.int64)
         if len(gone):
             self._block = [_without(frame, gone) for frame in self._block]
@@ -203,7 +203,7 @@ def _measured(frame: TrackedFrame, measured: FloatArray) -> TrackedFrame:
 
 
 def _is_placed(frame: TrackedFrame) -> bool:
-    """Whether a frame saw enough of the map for the tracker to place it beside the others."""
+    """Whether a frame saw enough of the map for the tracker to place it next to the others."""
     return len(frame.accepted) >= _LEAST_PLACED
 
 
@@ -272,7 +272,7 @@ def _carried(
 ) -> FloatArray:
     """What a frame's pose (6, 6) is uncertain by although its neighbours in the graph are held.
 
-    The frame hangs on both; that of the less certain one is the safe answer.
+    The frame depends on both; that of the less certain one is the safe answer.
     """
     carried = [
         congruence(adjoint(inverse(poses[frame]) @ poses[k]), covariances[k]) for k in neighbours

@@ -74,7 +74,7 @@ def fixed_lag_smoother(
 
 
 class FixedLagSolver:
-    """Solves a window of the last frames anew with each of them."""
+    """Solves a window of the last frames again with each of them."""
 
     kind: ClassVar[str] = "fixed_lag"
 
@@ -102,7 +102,7 @@ class FixedLagSolver:
         self._move_window(landmarks)
 
     def recalibrate(self, change: RigChange) -> None:
-        """Corrects the window's observations anew; what has left it is what it was."""
+        """Corrects the window's observations again; what has left it is what it was."""
         self.window.remeasure(change.measured)
 
     def solve_if_due(self, frame: int, closes_loop: bool) -> Smoothed | None:
@@ -119,7 +119,7 @@ class FixedLagSolver:
     def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
-        After that the window is solved anew from there. A loop within the lag is a factor more.
+        After that the window is solved again from there. A loop within the lag is a factor more.
         """
         inside = loop.before >= self._oldest  # both poses are variables
         if inside:
@@ -363,7 +363,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         super().recalibrate(change)
         self._let_go()
         self.window.remeasure(change.measured)
-        self._take_in()  # the builder has measured these anew already
+        self._take_in()  # the builder has corrected these already
         frames, variables, *_ = self.builder.kept_observed()
         if len(frames):
             last = np.zeros(len(self.held), np.int64)
@@ -436,7 +436,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         """Variables of landmarks of a place that are surely back; where many are, no other is."""
         seen = self._placed(rows)
         known = self.held.of(seen.variables)
-        there = seen.returned(known, self.window.poses[0], self._apart(place))
+        there = seen.returned(known, self.window.poses[0], self._drift_since(place))
         if there.sum() >= LEAST:
             self._begin_elsewhere(seen.select(~there))
         return np.asarray(seen.variables[there])
@@ -470,7 +470,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         rest = nearest_positive(drift - gain @ shared) + _STIFF**2 * np.eye(6)
         return Tie(follows, np.asarray(gain), np.asarray(np.linalg.inv(rest)))
 
-    def _apart(self, place: int) -> FloatArray:
+    def _drift_since(self, place: int) -> FloatArray:
         """(6, 6) covariance of the motion between a place and the window's first pose."""
         shared, drift, here = self._drifts(self.frame_of(place), self.window.frames[0])
         return nearest_positive(drift + here - 2.0 * shared) + _STIFF**2 * np.eye(6)
@@ -499,12 +499,12 @@ class SlidingWindowSolver(WholeGraphSolver):
         try:
             solved = self.window.repaired(self.window.take_out, self._failed)
         except EstimatorError:
-            self._begin_anew()
+            self._begin_again()
             solved = self.window.repaired(self.window.take_out, self._failed)
         for frame, pose in zip(self.window.frames, self.window.poses, strict=True):
             self.poses[frame] = pose.copy()  # a view would keep the whole window's array
         self.held.points[self.window.landmarks.variables] = self.window.landmarks.points
-        if self.window.places:  # the tracker's map is in doubt: some of it may have moved
+        if self.window.places:  # the tracker's map is uncertain: some of it may have moved
             self.builder.noise.smoothed(self.window.frames, self.window.poses)
         return solved
 
@@ -519,14 +519,14 @@ class SlidingWindowSolver(WholeGraphSolver):
             try:
                 self.held.left(self.window.let_go_before(first), home)
             except (UndeterminedError, np.linalg.LinAlgError):
-                self._begin_anew()
+                self._begin_again()
 
-    def _begin_anew(self) -> None:
+    def _begin_again(self) -> None:
         """What has left, known too unevenly to be solved, gives way to the first pose's place."""
         first = self.window.frames[0]
         self.window.carried_along(np.eye(4), pose_prior(pose_key(first), self._at(first)))
         self.remarks.append(
-            f"known too unevenly at frame {self.builder.frames[-1]}: the window begun anew"
+            f"known too unevenly at frame {self.builder.frames[-1]}: the window begun again"
         )
 
     def _measured(self, solved: Solved, row: int) -> Prediction:

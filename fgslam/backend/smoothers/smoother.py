@@ -87,8 +87,8 @@ class Smoother:
         self._answer: Solution | None = None
         self._takeovers = 0
         self._eras: list[int] = []
-        self._doubt = ConsiderCovariance(problem.sensor, problem.floor)
-        self._doubts: list[FloatArray] = []  # (6, 6) a frame: added to its pose when it came
+        self._considered = ConsiderCovariance(problem.sensor, problem.floor)
+        self._added: list[FloatArray] = []  # (6, 6) a frame: added to its pose when it came
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:
         """Tracks the frame, adds it to the graph, solves the graph if it is time to.
@@ -104,7 +104,7 @@ class Smoother:
         require_finite(increment, tracking)
         recalibrated(self, increment.rig_correction)
         before = self.tracker.predict(None).wTc
-        # The tracker's covariances are given the graph's, and so are not in doubt themselves.
+        # The tracker's covariances are given the graph's, and so are not uncertain themselves.
         plain = dataclasses.replace(increment, loops=(), rig_correction=None)
         stats = self.tracker.update(plain, tracking)
         self._record(increment, tracking)
@@ -117,9 +117,9 @@ class Smoother:
             self._solve(entering[-1], tracked, bool(increment.loops))
         closed = tuple(self._close(loop, increment.index) for loop in increment.loops)
         current = self._current(tracking)
-        self._doubt.observe(increment, current.wTc)
-        self._doubts.append(self._doubt.of_pose())
-        covariance = current.covariance + self._doubts[-1]
+        self._considered.observe(increment, current.wTc)
+        self._added.append(self._considered.of_pose())
+        covariance = current.covariance + self._added[-1]
         return dataclasses.replace(stats, wTc=current.wTc, covariance=covariance, closed=closed)
 
     # -- its steps -----------------------------------------------------------------------------
@@ -145,13 +145,13 @@ class Smoother:
         self._answer = None
 
     def _admitted(self, increment: Increment, tracking: EgoMotion) -> TrackedFrame:
-        """The frame with those observations that fit; landmarks that moved have started anew."""
+        """The frame with those observations that fit; landmarks that moved have started again."""
         admission, observed = self.builder.admission, increment.observations
         matched = observed.select(~observed.is_new)
-        used, astray = admission.judge(tracking)
+        used, outliers = admission.judge(tracking)
         admission.pruned(increment.pruned_ids)
-        admission.confirmed(matched.ids[~astray])
-        moved = admission.contradicted(self._held(matched.select(astray)), tracking.wTc)
+        admission.confirmed(matched.ids[~outliers])
+        moved = admission.contradicted(self._held(matched.select(outliers)), tracking.wTc)
         self._restart(moved)
         used &= ~np.isin(matched.ids, moved.ids)
         accepted = matched.select(used).join(observed.select(observed.is_new)).join(moved)
@@ -163,12 +163,12 @@ class Smoother:
         return observed.select(np.isin(observed.ids, self.tracker.landmarks().ids))
 
     def _restart(self, moved: Observations) -> None:
-        """Landmarks that were contradicted too often begin anew where they are seen now."""
+        """Landmarks that were contradicted too often begin again where they are seen now."""
         ids = moved.ids.tolist()
-        why = "was seen elsewhere in frame after frame: moved, started anew"
-        self.builder.admission.start_anew(ids, why)
+        why = "was seen elsewhere in frame after frame: moved, started again"
+        self.builder.admission.restart(ids, why)
         self.tracker.restart(moved)
-        self._doubt.forget(moved.ids)
+        self._considered.forget(moved.ids)
         if self._segments is not None:
             self._segments.forget(ids)
 
@@ -263,9 +263,9 @@ class Smoother:
             return self.tracker.estimate()
         answer = self._solved()
         covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
-        if self._doubt.present and not answer.considers_rig:
-            covariances = covariances + np.array(self._doubts)
-            landmarks = self._doubt.landmarks(landmarks)
+        if self._considered.present and not answer.considers_rig:
+            covariances = covariances + np.array(self._added)
+            landmarks = self._considered.landmarks(landmarks)
         return Estimate(
             Trajectory(np.array([one.increment.timestamp for one in self.inputs]), answer.poses),
             covariances,
@@ -307,8 +307,8 @@ class Smoother:
                 "its marginal instead"
             )
         joint = self._at_last_frame(self.solver.joint(variables))
-        if self._doubt.present and not self._solved().considers_rig:
-            joint = self._doubt.joint(ids, joint)
+        if self._considered.present and not self._solved().considers_rig:
+            joint = self._considered.joint(ids, joint)
         return joint
 
     def _at_last_frame(self, joint: FloatArray) -> FloatArray:
@@ -324,7 +324,7 @@ class Smoother:
         return joint
 
     def recalibrate(self, correction: FloatArray) -> None:
-        """Where the tracker's map moves, corrects all that was measured so far anew."""
+        """Where the tracker's map moves, corrects all that was measured so far again."""
         change = self.tracker.recalibrate(correction)
         if change is None:
             return
@@ -417,7 +417,7 @@ class Input(NamedTuple):
 
 
 # ------------------------------------------------------------------------------------------
-# The tracker's map beside the graph's: what it takes over from a solution, and what is reported
+# The tracker's map next to the graph's: what it takes over from a solution, and what is reported
 
 
 class TrackerMap:

@@ -292,7 +292,7 @@ class SeenAgain(Rows):
             self.points - known.points,
             self.covariances + inverse_spd3(known.information),
         )
-        alone = off.fit_beside(np.zeros(len(self), np.bool_), drift)
+        alone = off.fit_with(np.zeros(len(self), np.bool_), drift)
         surely = alone & off.outweigh(drift)
         together = off.agreeing(alone, drift)
         return np.asarray(surely | together)
@@ -329,20 +329,20 @@ class _Off(Rows):
     def agreeing(self, alone: BoolArray, drift: FloatArray) -> BoolArray:
         """(k,) those that agree on one motion; none where they are fewer than LEAST.
 
-        As many as fit beside one of them that fits ``alone``, then those that fit beside all.
+        As many as fit next to one of them that fits ``alone``, then those that fit next to all.
         """
         none = best = np.zeros(len(self), np.bool_)
         for row in np.flatnonzero(alone).tolist():
             of_one = np.arange(len(self)) == row
-            found = self.fit_beside(of_one, drift) | of_one
+            found = self.fit_with(of_one, drift) | of_one
             best = found if found.sum() > best.sum() else best
         for _ in range(_ROUNDS):
             if best.sum() < LEAST:
                 return none
-            best = self.fit_beside(best, drift)
+            best = self.fit_with(best, drift)
         return best if best.sum() >= LEAST else none
 
-    def fit_beside(self, chosen: BoolArray, drift: FloatArray) -> BoolArray:
+    def fit_with(self, chosen: BoolArray, drift: FloatArray) -> BoolArray:
         """(k,) which fit the motion as the chosen ones measure it (a Kalman update)."""
         k = int(chosen.sum())
         by = self.by_motion[chosen].reshape(3 * k, 6)
@@ -410,7 +410,7 @@ class WindowPrior:
         return int(self.coupling.shape[2])
 
     def with_pose(self) -> WindowPrior:
-        """The same with one pose more in the window, of which it says nothing."""
+        """The same with one pose more in the window, of which it measures nothing."""
         return self._with_corner(
             np.pad(self.corner, (0, 6)), np.pad(self.corner_gradient, (0, 6)), self.coupling
         )
@@ -468,7 +468,7 @@ class WindowPrior:
         return dataclasses.replace(found, kept=self.kept - 6)
 
     def with_rows(self, landmark: IntArray, columns: IntArray, rows: LinearRows) -> WindowPrior:
-        """With what observations (k,) said of landmarks, by row, and of hidden poses.
+        """With what observations (k,) measured of landmarks, by row, and of hidden poses.
 
         Args:
             landmark: (k,) rows of the landmarks.
@@ -487,7 +487,7 @@ class WindowPrior:
         )
 
     def with_landmarks(self, variables: IntArray, points: FloatArray) -> WindowPrior:
-        """Room for landmarks (k,) at points (k, 3), of which it says nothing yet."""
+        """Room for landmarks (k,) at points (k, 3), of which it measures nothing yet."""
         every = np.concatenate([self.variables, variables])
         order = np.argsort(every, kind="stable")
         more = len(variables)
@@ -568,7 +568,7 @@ class WindowPrior:
 
 
 _SHORT = 0.01
-"""Radians and metres of a pose, iSAM2's threshold of linearising anew: covariances are those of
+"""Radians and metres of a pose, iSAM2's threshold of relinearising: covariances are those of
 within it."""
 _NONE = np.empty(0, np.int64)
 _STEPS = 3  # with a frame: what is left after them is gone with the next frame
@@ -629,8 +629,8 @@ class Window:
 
     def remeasure(self, measured: Callable[[FloatArray], FloatArray]) -> None:
         """Replaces the numbers (k, 3) of all observations by a function of them."""
-        anew = measured(self.observed.measurement)
-        self.observed = dataclasses.replace(self.observed, measurement=anew)
+        again = measured(self.observed.measurement)
+        self.observed = dataclasses.replace(self.observed, measurement=again)
 
     # -- the solution ------------------------------------------------------------------------
 
@@ -807,10 +807,10 @@ class Window:
         return self._eliminate(~np.isin(self.landmarks.variables, self.observed.variable))
 
     def _into_prior(self, look: Look, factors: Any, leaving: int) -> None:
-        """Adds what the first poses said to the prior, and hides them there."""
-        said: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
-        pose, point = look.pose[said], look.point[said]
-        rows = look.rows.select(said)
+        """Adds what the first poses measured to the prior, and hides them there."""
+        counts: BoolArray = np.asarray(look.rows.by_point.any(axis=(1, 2)))
+        pose, point = look.pose[counts], look.point[counts]
+        rows = look.rows.select(counts)
         variables, points = self.landmarks.variables, self.landmarks.points
         new = np.setdiff1d(variables[point], self.prior.variables)
         prior = self.prior.with_landmarks(new, points[np.searchsorted(variables, new)])
@@ -838,7 +838,7 @@ class Window:
         self.poses, self._shift = self.poses[leaving:], self._shift[leaving:]
 
     def _eliminate(self, gone: BoolArray) -> Landmarks:
-        """Takes landmarks (by a mask of all) out of the window; what they said stays."""
+        """Takes landmarks (by a mask of all) out of the window; what they measured stays."""
         prior, weak = self.prior, self.landmarks
         tied = self._tied()
         known = weak.information.copy()

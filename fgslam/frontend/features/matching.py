@@ -145,7 +145,7 @@ def mutual_nearest(a: ByteArray, b: ByteArray, ratio: float = 0.8) -> tuple[IntA
     squared[i, j] = np.inf
     clear = best < ratio * ratio * squared.min(axis=1)
     squared[i, j] = best
-    # Columns are slow to search: only those that somebody clearly wants.
+    # Columns are slow to search: only those that a row clearly prefers.
     i, j = i[clear], j[clear]
     mutual = np.argmin(squared[:, j], axis=0) == i
     return i[mutual], j[mutual]

@@ -365,7 +365,7 @@ class ColumnSegmentFinder:
     ) -> None:
         """Takes the view's camera: vertical columns, rows proportional to tan(elevation).
 
-        ``seen`` (height, width) tells where the view has a picture; None for everywhere.
+        ``seen`` (height, width) marks where the view has a picture; None for everywhere.
         """
         self._width, self._height = view.width, view.height
         self._period = wrapping_period(view) or view.width
@@ -443,10 +443,10 @@ class ColumnSegmentFinder:
         at = np.full((self._period, self._height + 4), -1, np.int64)
         top = np.floor(raw.top + 0.5).astype(np.int64)
         at[raw.column, top + 2] = np.arange(n)
-        beside = (raw.column + 1) % self._period
+        next_column = (raw.column + 1) % self._period
         sources, targets = [], []
         for shift in (-2, -1, 0, 1, 2):
-            other = at[beside, np.clip(top + 2 + shift, 0, self._height + 3)]
+            other = at[next_column, np.clip(top + 2 + shift, 0, self._height + 3)]
             near = (
                 (other >= 0)
                 & (np.abs(raw.top[other] - raw.top) < _RUN_STEP_PX)
@@ -489,7 +489,7 @@ class ColumnSegmentFinder:
 
 
 class _ColumnSums:
-    """Sums down the columns: exact means over any stretch of a column, ends in between pixels."""
+    """Sums down the columns: exact means over any segment of a column, ends in between pixels."""
 
     def __init__(self, image: Image) -> None:
         parts = moment_images(image)
@@ -534,8 +534,8 @@ def _summed_down(parts: list[Float32Array]) -> FloatArray:
 
 def _summit(before: Float32Array, middle: Float32Array, after: Float32Array) -> FloatArray:
     """Offset in (-0.5, 0.5] of the top of the parabola through three values around a maximum."""
-    bend = before + after - 2.0 * middle
-    return np.asarray(0.5 * (before - after) / np.minimum(bend, -1e-9), np.float64)
+    curvature = before + after - 2.0 * middle
+    return np.asarray(0.5 * (before - after) / np.minimum(curvature, -1e-9), np.float64)
 
 
 def _axes(view: OmniCamera) -> tuple[FloatArray, tuple[float, float]]:

@@ -1,6 +1,6 @@
 """Tracked points held to what they looked like when their tracking began.
 
-Tracking from image to image adds up errors: under perspective a window stretches and shears, and
+Tracking from image to image adds up errors: under perspective a window is scaled and sheared, and
 what moves it is where its contrast happens to lie, not its centre. On the rendered house that is
 three to five percent of the way a point has moved. So every point keeps the patch it began with,
 and each track ends with one step that aligns this patch under an affine map (Shi and Tomasi 1994),

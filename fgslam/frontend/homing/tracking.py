@@ -1,7 +1,7 @@
 """Tracking of features from image to image: KLT on a stabilised view (Goedemé et al. IV-A).
 
 Eq. 2's matrix is summed over the window. A point is lost for good when it cannot be tracked
-back to where it came from, when it no longer looks as it did when its tracking began
+back to where it came from, when it no longer appears as it did when its tracking began
 (:mod:`fgslam.frontend.features.patches`), or when it leaves the view.
 """
 
@@ -38,7 +38,7 @@ is lost."""
 _PATCH_DEFORMATION = 0.05  # sigma of its stretching and shearing from image to image
 WINDOW_PX = 9  # side of the tracked window, in the view
 _MIN_CORRELATION = 0.7
-"""Of a point's patch with its first one, gain and offset taken out; a point that looks less like it
+"""Of a point's patch with its first one, gain and offset taken out; a point that resembles it less
 is lost."""
 
 _PATCH_NOISE_GREY = 4.0  # sigma of its grey values: noise, and what no affine map does

@@ -661,7 +661,7 @@ def plain_sift(camera: OmniCamera, image: Image) -> UprightFeatures:
 # Least-squares refinement of a homing vector on its inliers, with covariance
 #
 # The planar constraint supposes level cameras at one height. Real ones tilt by a fraction of a
-# degree ("estimate or inflate"), which bends elevations alike over whole sides of the view; so each
+# degree ("estimate or inflate"), which shifts elevations alike on whole sides of the view; so each
 # view's roll and pitch and the difference of heights are estimated along with theta and psi, held
 # by a prior. The residual is the epipolar one with general rotations, a weighted first-order
 # (Sampson) distance, minimised with its noise's own slope: held, the noise that residual and
@@ -781,7 +781,7 @@ class HomingRefinement:
         return float(self._prior @ solution.parameters**2)
 
     def refine(self, directions: FloatArray, rotations: FloatArray) -> list[Refined]:
-        """Gauss-Newton from hypotheses (c,), side by side; inliers are chosen anew each time."""
+        """Gauss-Newton from hypotheses (c,), side by side; inliers are chosen again each time."""
         parameters = np.zeros((len(directions), 7))
         parameters[:, 0], parameters[:, 1] = directions, rotations
         parameters = _SEARCH.minimise(parameters, self._normal)
@@ -807,7 +807,7 @@ class HomingRefinement:
         view = self._linearised(parameters)
         residuals = view.residuals
         inliers = self._inliers(parameters, residuals)
-        weights = _told(self._weights(parameters, residuals), residuals)
+        weights = _matched_weights(self._weights(parameters, residuals), residuals)
         scatter = np.array([_scatter(r[kept]) for r, kept in zip(residuals, inliers, strict=True)])
         variance = scatter[:, None, None] ** 2
         noise = self._noise_information(view, weights) * variance
@@ -868,7 +868,7 @@ def _information_of(prior: tuple[float, float]) -> FloatArray:
     return np.concatenate([np.zeros(2), 1.0 / held**2])
 
 
-def _told(weights: FloatArray, residuals: FloatArray) -> FloatArray:
+def _matched_weights(weights: FloatArray, residuals: FloatArray) -> FloatArray:
     """(c, n) information of matches over that of right ones, by how likely they are right.
 
     Less what is missing as that is not known (Louis 1982).

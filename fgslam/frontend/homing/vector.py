@@ -45,7 +45,7 @@ from fgslam.frontend.settings import HomingVectorSettings, OmniMatchingSettings
 LEAST_PARALLAX = np.deg2rad(3.0)  # of two rays; below, the signs of the distances are noise
 
 INLIER_SIGMAS = 3.0  # normalised epipolar residual; right matches exceed it in 0.3 %
-_BATCH = 50  # samples between two looks at the confidence
+_BATCH = 50  # samples between two tests of the confidence
 _MAX_LOG_RATIO_SIGMA = 0.7  # of ln rho: matches near the horizon support, but are not sampled
 _SHUFFLES = 10  # times the matches are paired wrongly to learn what chance supports
 _REFINED = 8  # different hypotheses that are refined, the best supported first
@@ -54,7 +54,7 @@ _SAME = np.deg2rad(0.2)  # refined solutions closer than this are one
 _TEMPER = 2.0  # residuals have common causes: so many of them count as one, see `covariance`
 _CELLS_AROUND = 180  # of 2 degrees: matches within one cell in both views count as one inlier
 _TURNED = 3.0  # times the median's limit: what is explained by the turn alone
-_SECTORS = 8  # of 45 degrees: what is seen in one has its errors in common, see `doubt`
+_SECTORS = 8  # of 45 degrees: what is seen in one has its errors in common, see `rival_probability`
 _LEAST_SPREAD = 0.25  # of directions; half a turn has 0.31, all around 0.71
 _LEVEL = float(chi2.ppf(0.95, 5))  # of the prior's strain: level cameras keep within
 _FREE = (np.deg2rad(5.0), 1.0)
@@ -131,7 +131,7 @@ class HomingSearch:
         floor = np.deg2rad([s.direction_floor_deg, s.rotation_floor_deg])
         return TwoViewVector(
             theta, psi, covariance + np.diag(floor**2), best.inliers, support,
-            self.doubt(best, competitors),
+            self.rival_probability(best, competitors),
         )  # fmt: skip
 
     # ----------------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ class HomingSearch:
         while len(chosen) < most and np.any(open_):
             k = int(np.argmax(open_))
             chosen.append(k)
-            open_ &= _angle_apart(ordered[:2], ordered[:2, k : k + 1]) > _ALIKE
+            open_ &= _angle_between(ordered[:2], ordered[:2, k : k + 1]) > _ALIKE
         return ordered[:2, chosen].T
 
     # ----------------------------------------------------------------------------------------
@@ -217,7 +217,7 @@ class HomingSearch:
         found.sort(key=lambda r: -self._score_of(r))
         out: list[Refined] = []
         for solution in found:
-            if all(_apart(solution, known) > _SAME for known in out):
+            if all(_direction_difference(solution, known) > _SAME for known in out):
                 out.append(solution)
         return out
 
@@ -247,7 +247,7 @@ class HomingSearch:
 
     def differ(self, one: Refined, other: Refined) -> bool:
         """Whether two solutions are not one and the same."""
-        return _apart(one, other) > float(np.deg2rad(self._settings.rival_angle_deg))
+        return _direction_difference(one, other) > float(np.deg2rad(self._settings.rival_angle_deg))
 
     def independent_inliers(self, which: BoolArray) -> int:
         """Number of inliers that are independent of each other."""
@@ -256,7 +256,7 @@ class HomingSearch:
     def turn_at_target(self, best: Refined) -> Refusal | None:
         """Both views from one place: there is a turn, but no direction.
 
-        That must be as well supported as any answer, and from enough sides: a single thing looks
+        That must be as well supported as any answer, and from enough sides: a single thing seems
         alike from anywhere, and like turned when it is another one of its kind.
         """
         return self._turn_of(best.inliers) if np.any(best.inliers) else None
@@ -291,7 +291,7 @@ class HomingSearch:
             psi,
         )
 
-    def doubt(self, best: Refined, competitors: list[Refined]) -> float:
+    def rival_probability(self, best: Refined, competitors: list[Refined]) -> float:
         """Largest probability that a different solution is the better one, at most 0.5.
 
         Vuong's test (1989) of two models that both are wrong a little: what the matches add to the
@@ -353,7 +353,7 @@ class HomingSearch:
         n, sigmas = len(self._matches), INLIER_SIGMAS
         shuffled = np.concatenate([self._rng.permutation(n) for _ in range(_SHUFFLES)])
         every = np.tile(np.arange(n), _SHUFFLES)
-        wrong = EpipolarTest.of(paired_anew(self._matches, every, shuffled), self._tilt)
+        wrong = EpipolarTest.of(re_paired(self._matches, every, shuffled), self._tilt)
         good, _ = wrong.inliers(best.parameters[:1], best.parameters[1:2], sigmas, LEAST_PARALLAX)
         chance = (np.count_nonzero(good) + 1.0) / (len(good) + 2.0)
         gains = np.where(best.inliers, gain(best.residuals, sigmas, chance), 0.0)
@@ -391,12 +391,12 @@ def _distinct_pairs(weights: FloatArray, count: int, rng: np.random.Generator) -
     return np.asarray(np.minimum(np.column_stack([first, second]), n - 1), dtype=np.int64)
 
 
-def _apart(one: Refined, other: Refined) -> float:
+def _direction_difference(one: Refined, other: Refined) -> float:
     """Larger of the differences in direction and rotation."""
-    return float(_angle_apart(one.parameters[:2, None], other.parameters[:2, None])[0])
+    return float(_angle_between(one.parameters[:2, None], other.parameters[:2, None])[0])
 
 
-def _angle_apart(one: FloatArray, other: FloatArray) -> FloatArray:
+def _angle_between(one: FloatArray, other: FloatArray) -> FloatArray:
     """(c,) larger of the differences in direction and rotation, of (2, c) hypotheses."""
     return np.asarray(np.max(np.abs(wrap(one - other)), axis=0))
 
@@ -432,7 +432,7 @@ def match_cells(matches: BearingMatches) -> IntArray:
     return np.asarray(cells.ravel(), dtype=np.int64)
 
 
-def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> BearingMatches:
+def re_paired(matches: BearingMatches, first: IntArray, second: IntArray) -> BearingMatches:
     """(m) features of the first view, of matches (m,), each with one of the second view."""
     a, b = matches.select(first), matches.select(second)
     return BearingMatches(
@@ -454,7 +454,7 @@ def paired_anew(matches: BearingMatches, first: IntArray, second: IntArray) -> B
 # nearer than the camera is high: no descriptor survives the change of view of a leg of that length,
 # and what does repeat there is the camera's own stand and shadow; * the ratio of sizes must be that
 # of the distances, d / e, that the homing vector implies; * one place in either view counts little
-# more than once: what hangs on one wall is wrong together.
+# more than once: what is on one wall is wrong together.
 
 
 _NEAREST = 5  # candidates of a feature, in either direction
@@ -476,7 +476,7 @@ at 0.65, 0.05 at 0.75.
 
 _SIZE_SIGMA = 0.35  # of ln of the ratio of sizes, of right candidates
 _SIZE_RANGE = 1.6  # that of wrong ones is even over so much: the planar gates admit a factor 2
-_NEAR_LEG = 0.05  # sine of the angle to the leg below which the distances' ratio says nothing
+_NEAR_LEG = 0.05  # sine of the angle to the leg below which the distances' ratio measures nothing
 _CELL_DEG = 2.0  # candidates within one cell in both views count as one
 _BLOCK_DEG, BLOCK_FULL = 7.0, 6.0
 """Evidence s within a block of so many degrees of a view counts f ln(1 + s / f)."""
@@ -801,7 +801,7 @@ class SecondLook:
     def _covariance(self, best: _Solution, others: list[_Solution]) -> FloatArray:
         """(2, 2) of the best solution, widened by those near it with nearly as much evidence.
 
-        What less than a block's evidence tells apart is undecided: its full evidence is the unit.
+        What less than a block's evidence separates is undecided: its full evidence is the unit.
         """
         near = [best, *(other for other in others if not self._differ(best, other))]
         scores = np.array([solution.score for solution in near])

@@ -110,7 +110,7 @@ class KnownMap:
     ) -> IntArray:
         """Rows of those and few others: by depth and the image's left and right, a hair wider.
 
-        Most landmarks of a large map are behind the camera, beside its view, or too far.
+        Most landmarks of a large map are behind the camera, next to its view, or too far.
         """
         right, _, forward = wTc[:3, :3].T
         depth = forward @ self.axes - forward @ wTc[:3, 3]
@@ -130,11 +130,11 @@ class KnownMap:
         near), and a predicted scale within ``scales`` (pixels), which the frame's features have.
         """
         rows, _ = self.in_view(rig, wTc, self.largest / scales[0] + _ROUNDING_M)
-        sight = self.landmarks.positions[rows] - wTc[:3, 3]
-        distance = np.maximum((sight @ wTc[:3, :3])[:, 2], _NEAREST_M)
-        sight = sight / np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
+        ray = self.landmarks.positions[rows] - wTc[:3, 3]
+        distance = np.maximum((ray @ wTc[:3, :3])[:, 2], _NEAREST_M)
+        ray = ray / np.maximum(np.linalg.norm(ray, axis=1), 1e-9)[:, None]
         views, at = self.views_of(rows)
-        cosine = np.einsum("vi,vi->v", self.views.direction[views], sight[at])
+        cosine = np.einsum("vi,vi->v", self.views.direction[views], ray[at])
         near = ~(cosine < np.cos(max_angle))  # so NaN is near
         scale = self.views.size[views] / distance[at]
         near &= (scale >= scales[0]) & (scale <= scales[1])
@@ -157,7 +157,7 @@ def _owners(ids: IntArray, viewed: IntArray) -> tuple[IntArray, IntArray]:
 
 MAX_DISTANCE = 400.0  # of descriptors, whose norm is 512
 _RATIO = 0.85  # a gap: the next place is farther than its predecessor by this ratio
-_MOST_PLACES = 3  # that may share a feature before it says nothing
+_MOST_PLACES = 3  # that may share a feature before it counts for nothing
 _SAME_PLACE_M = 0.3  # landmarks this near to one another are one place
 _SIZE_RATIO = 1.6  # of a feature's physical size to a landmark's, at most
 _ORIENTATION_DEG = 30.0  # on a level floor, largest difference
@@ -189,7 +189,7 @@ def gated(
     features: StereoFeatures,
     pairs: tuple[IntArray, IntArray],
     landmarks: LandmarkMap,
-    looks: tuple[LandmarkAppearances, IntArray],
+    appearances: tuple[LandmarkAppearances, IntArray],
     floor: Floor,
 ) -> BoolArray:
     """Which pairs (feature, view) agree in size and, on a level floor, in height and orientation.
@@ -198,10 +198,10 @@ def gated(
         features: of the frame.
         pairs: (k,) indices of features and (k,) rows of stored views.
         landmarks: the map.
-        looks: stored views and the map's row of each view's landmark.
+        appearances: stored views and the map's row of each view's landmark.
         floor: decides whether the camera is upright and at one height.
     """
-    (i, v), (views, owners) = pairs, looks
+    (i, v), (views, owners) = pairs, appearances
     depth = np.abs(features.position[i, 2])
     sigma = np.sqrt(features.position_covariance[i, 2, 2]) / np.maximum(depth, 1e-6)
     sizes = features.scale[i] * np.abs(features.position[i, 2])
@@ -237,8 +237,8 @@ def specific(
 ) -> Tentative:
     """Candidates of each feature, up to the first clear gap of distances between places.
 
-    A feature that looks like a few places keeps them all, as repeated texture must; one that looks
-    like many (no gap within three places) keeps none.
+    A feature that resembles a few places keeps them all, as repeated texture must; one that
+    resembles many (no gap within three places) keeps none.
 
     Args:
         neighbours: (q, k) nearest views of each feature.

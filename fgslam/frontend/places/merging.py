@@ -35,7 +35,7 @@ _MAX_DISTANCE = 250.0  # of descriptors, whose norm is 512
 _RATIO = 0.8  # nearest place's distance over the next one's, at most
 _SAME_PLACE_M = 0.3  # landmarks this near to one another are one place
 _SIZE_RATIO = 1.6  # of two landmarks' physical sizes, at most
-_SLACK_M = 0.03  # by how much maps bend, per axis: their covariances do not know it
+_SLACK_M = 0.03  # by how much maps are deformed, per axis: their covariances do not know it
 _GATE_SIGMAS = 3.4  # largest normalised distance of two observations of a landmark
 _SAMPLES = 60_000  # triples of matches drawn
 _MIN_PAIRS = 20  # fewer landmarks in common are no overlap
@@ -46,7 +46,7 @@ _OVERLAP_SHARE = 0.15  # of the landmarks among the other map's, least share tha
 # one poster in common does not make two places one
 _COMPETING = 8  # hypotheses elsewhere that are refined: the best ones
 _LEAST_SPREAD_M = 0.3  # smaller triangles turn the map by more than least squares corrects
-_ROUNDS = 8  # of least squares and choosing anew
+_ROUNDS = 8  # of least squares and choosing again
 AT_ONCE = 8192  # pairs of views compared together; their bytes stay in the cache
 _AMONG_M = 0.5  # a landmark this near to one of the other map's lies among them
 
@@ -212,7 +212,7 @@ def _hypotheses(problem: _Points, rng: np.random.Generator) -> FloatArray:
 
 
 def _refined(problem: _Points, aTb: FloatArray, gate: float) -> tuple[FloatArray, FloatArray]:
-    """Weighted least squares over what agrees, chosen anew until it stays; with covariance."""
+    """Weighted least squares over what agrees, chosen again until it stays; with covariance."""
     before = np.zeros(len(problem.a), np.bool_)
     information = np.eye(6)
     for _ in range(_ROUNDS):
@@ -232,15 +232,15 @@ def _refined(problem: _Points, aTb: FloatArray, gate: float) -> tuple[FloatArray
 def _second(problem: _Points, best: FloatArray, poses: FloatArray) -> int:
     """Matches that agree with the best alignment elsewhere; ``poses`` with the best ones first."""
     centre, most = problem.b.mean(axis=0), 0
-    for pose in poses[_apart(poses, best, centre)][:_COMPETING]:
+    for pose in poses[_differ(poses, best, centre)][:_COMPETING]:
         # What merely starts elsewhere comes to the best one itself.
         competing, _ = _refined(problem, pose, _GATE_SIGMAS)
-        if _apart(competing[None], best, centre)[0]:
+        if _differ(competing[None], best, centre)[0]:
             most = max(most, int(problem.within(competing, _GATE_SIGMAS).sum()))
     return most
 
 
-def _apart(poses: FloatArray, best: FloatArray, centre: FloatArray) -> BoolArray:
+def _differ(poses: FloatArray, best: FloatArray, centre: FloatArray) -> BoolArray:
     """Which alignments put the second map's centre, or its heading, elsewhere than the best."""
     here = transform_to_world(best, centre[None])[0]
     shift = poses[:, :3, :3] @ centre + poses[:, :3, 3] - here
@@ -473,7 +473,7 @@ def own_share(offset: FloatArray, covariance: FloatArray) -> float:
     """Share of two maps' covariances by which their landmarks differ, 0 to 1.
 
     What a drive drifted is in the covariances of all its landmarks, but moves neighbours alike: the
-    alignment takes it out of the differences, and a second visit says nothing about it. The share
+    alignment takes it out of the differences, and a second visit measures nothing of it. The share
     is the median normalised distance (k,) over its expectation, chi-square in three dimensions.
     """
     if not len(offset):

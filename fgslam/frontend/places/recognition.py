@@ -1,4 +1,4 @@
-"""Place recognition beside the loop: the return to a mapped place, and oneself when lost.
+"""Place recognition next to the loop: the return to a mapped place, and oneself when lost.
 
 Parts of the map between which nothing is measured are joined by it, too: a frame of one that is
 recognised in another is a closure between them.
@@ -121,7 +121,7 @@ class SightingMemory:
         """Those of the landmarks that the last ``frames`` frames did not see.
 
         Those that no frame saw are among them if they are of the map that the run began in, some
-        frame tells where in that map it was, and the last one was not placed by that map anyway:
+        frame shows where in that map it was, and the last one was not placed by that map anyway:
         what does not lie where it should then shows how the map is bent, not a drift.
         """
         known = ids[ids < len(self._last_seen)]
@@ -157,7 +157,7 @@ class SightingMemory:
     def best_view_of(self, ids: IntArray, landmarks: LandmarkMap) -> int:
         """The frame that saw most of the landmarks; the latest of several. -1 where none did.
 
-        What no frame saw of the given map counts as seen by the one that tells best where the run
+        What no frame saw of the given map counts as seen by the one that shows best where the run
         entered it: the earliest that saw enough landmarks of it that are still in ``landmarks``.
         """
         wanted = np.zeros(len(self._last_seen), np.bool_)
@@ -171,12 +171,12 @@ class SightingMemory:
         return len(counts) - 1 - int(np.argmax(counts[::-1]))
 
     def view(self, frame: int, ids: IntArray, landmarks: LandmarkMap) -> Observations:
-        """What a frame saw of the landmarks that are still in the map, to be located beside some.
+        """What a frame saw of landmarks still in the map, to be located relative to some.
 
         Args:
             frame: the earlier one.
-            ids: those beside which it is located. Where most of them are of the given map and no
-                frame saw them, only that map places the frame beside them.
+            ids: those relative to which it is located. Where most are of the given map and no
+                frame saw them, only that map places the frame relative to them.
             landmarks: the map.
         """
         seen = self.frames[frame].kept
@@ -310,7 +310,7 @@ class Confirmation:
         return self.count >= self._gates.confirm
 
     def forget(self) -> None:
-        """Begins anew: a look that found nothing, or a closure."""
+        """Begins again: a search that found nothing, or a closure."""
         self.count, self.offset = 0, np.eye(4)
 
     def _agrees(self, recognised: FloatArray, estimated: FloatArray) -> bool:
@@ -385,7 +385,7 @@ def close_loop(
 
 
 def is_sharp(closure: LoopClosure, gates: LoopGates) -> bool:
-    """Whether a closure rests on enough landmarks, and says where the frame is."""
+    """Whether a closure rests on enough landmarks, and determines where the frame is."""
     sigma = np.sqrt(np.diagonal(closure.covariance))
     return bool(
         len(closure.observations) >= gates.min_matches
@@ -402,7 +402,7 @@ def _relative_covariance(there: EgoMotion, here: EgoMotion) -> FloatArray:
 
 def duplicates(
     landmarks: LandmarkMap,
-    looks: LandmarkAppearances,
+    appearances: LandmarkAppearances,
     sides: tuple[IntArray, IntArray],
     appearance: AppearanceSettings,
 ) -> IntArray:
@@ -410,21 +410,23 @@ def duplicates(
 
     Args:
         landmarks: the map, corrected: what is one lies in one place.
-        looks: stored views of the landmarks on both sides.
+        appearances: stored views of the landmarks on both sides.
         sides: (a,) identities that may end, (b,) identities that may stay; none in both.
         appearance: how alike; each must be the other's closest, clearly.
     """
-    (new, new_at), (old, old_at) = (_one_view_each(looks, ids) for ids in sides)
+    (new, new_at), (old, old_at) = (_one_view_each(appearances, ids) for ids in sides)
     if not len(new) or not len(old):
         return np.empty((0, 2), np.int64)
     i, j = _near(_positions(landmarks, new), _positions(landmarks, old), _FUSED_M)
-    i, j = choose(i, j, (looks.descriptors[new_at], looks.descriptors[old_at]), appearance)
+    i, j = choose(
+        i, j, (appearances.descriptors[new_at], appearances.descriptors[old_at]), appearance
+    )
     return np.column_stack([new[i], old[j]]).astype(np.int64)
 
 
-def _one_view_each(looks: LandmarkAppearances, ids: IntArray) -> tuple[IntArray, IntArray]:
+def _one_view_each(appearances: LandmarkAppearances, ids: IntArray) -> tuple[IntArray, IntArray]:
     """Identities with a stored view, and the row of the first one of each."""
-    known, first = np.unique(looks.ids, return_index=True)
+    known, first = np.unique(appearances.ids, return_index=True)
     chosen = np.isin(known, ids)
     return known[chosen], first[chosen]
 
@@ -441,17 +443,17 @@ def _near(a: FloatArray, b: FloatArray, within_m: float) -> tuple[IntArray, IntA
     return np.repeat(np.arange(len(a)), counts), j
 
 
-_STREAM = 11  # of random numbers, beside those of the recording
+_STREAM = 11  # of random numbers, next to those of the recording
 _ONE_PLACE_M, _ONE_PLACE_DEG = 0.3, 5.0
 """What matching around a pose found in the whole map may change of it: several times what such a
 pose may be off (frontend.relocalisation.max_sigma_*)."""
 _WORDS_EVERY = 16
 """Frames after which the words of new and renewed views are found, half a millisecond's work: the
 first look after a long time would find them all at once."""
-_Looks: TypeAlias = tuple[int, IntArray, LandmarkAppearances | None]
+_Views: TypeAlias = tuple[int, IntArray, LandmarkAppearances | None]
 """State of the database's views, landmarks (n,), and their appearances then."""
 _JOINT = LoopGates()  # how sharp a closure between parts of the map must be
-_NOBODY: IntArray = np.empty(0, np.int64)
+_NO_IDS: IntArray = np.empty(0, np.int64)
 _NO_PAIRS: IntArray = np.empty((0, 2), np.int64)
 
 
@@ -479,7 +481,7 @@ class RecognitionParts:
 
 
 class PlaceRecognition:
-    """Remembers who saw what, looks for returns, and finds the camera when it is lost.
+    """Remembers who saw what, searches for returns, and finds the camera when it is lost.
 
     All of it happens at fixed frames and with random numbers of the frame's own: the same recording
     gives the same closures, interrupted or not.
@@ -504,7 +506,7 @@ class PlaceRecognition:
         self.merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
         self.fuse_since = -1  # a frame: landmarks made after it may be older ones' doubles
         self._pose = np.eye(4)
-        self._looks: _Looks = (-1, _NOBODY, None)
+        self._views: _Views = (-1, _NO_IDS, None)
         self._find_words()
 
     @property
@@ -558,7 +560,7 @@ class PlaceRecognition:
         # Without any landmark yet there is nothing to be lost in.
         located = tracked.ego_motion.status.measured or not len(landmarks)
         self._lost = 0 if located else self._lost + 1
-        if self._astray and self._confirmation is not None:
+        if self._untracked and self._confirmation is not None:
             self._confirmation.forget()  # its frames are to be in a row
         after = 1 if guessed and self._parts.joins else None
         if lost is not None:
@@ -569,11 +571,11 @@ class PlaceRecognition:
         if not found.found:
             return tracked, False
         around = Prediction(found.wTc, found.covariance)
-        anew = self._tracker.track_anew(around, landmarks, features)
-        if not anew.ego_motion.status.measured or not _one_place(found.wTc, anew.ego_motion.wTc):
+        again = self._tracker.track_around(around, landmarks, features)
+        if not again.ego_motion.status.measured or not _one_place(found.wTc, again.ego_motion.wTc):
             return tracked, False
         self._lost = 0
-        return anew, True
+        return again, True
 
     # -- loops -------------------------------------------------------------------------------
 
@@ -587,7 +589,7 @@ class PlaceRecognition:
         """Tracking of a frame; of two hypotheses with similar support, that of recent landmarks.
 
         Back at a place from which a drift has moved the estimate a little, old landmarks are
-        matched beside recent ones and contradict them. Until a closure has corrected the map the
+        matched next to recent ones and contradict them. Until a closure has corrected the map the
         frame is placed by the recent ones: between both it would fit neither, and the landmarks
         that it starts would be misplaced.
 
@@ -654,14 +656,14 @@ class PlaceRecognition:
         """
         since = self.fuse_since
         if since < 0:
-            return _NOBODY
+            return _NO_IDS
         ended = self._tracker.merge(self.merging)
         self.merging, self.fuse_since = _NO_PAIRS, -1
         left = landmarks.ids[~np.isin(landmarks.ids, ended)]
         new = self.memory.made_after(since, left)
-        looks = self._tracker.database.appearances()
+        appearances = self._tracker.database.appearances()
         sides = left[new], left[~new]
-        pairs = duplicates(landmarks, looks, sides, self._parts.appearance)
+        pairs = duplicates(landmarks, appearances, sides, self._parts.appearance)
         return np.union1d(ended, self._tracker.merge(pairs))
 
     # -- upkeep ------------------------------------------------------------------------------
@@ -708,7 +710,7 @@ class PlaceRecognition:
         """The closure between two parts of the map that a located frame sees; None without one.
 
         Looked for where the frame was found in another part than the last one, else at every few.
-        What places the frame in each is strict enough to be believed of a lost one; no drift could
+        What places the frame in each is strict enough for a lost one; no drift could
         tell whether the offset is plausible.
         """
         if not self._apart or not len(features):
@@ -739,10 +741,10 @@ class PlaceRecognition:
         return close_loop(self.memory, landmarks, features, found, partners, resection)
 
     @property
-    def _astray(self) -> bool:
+    def _untracked(self) -> bool:
         """Whether it is unknown where the frame is, so that no return would be believed.
 
-        Outside a map that is left as it is, nothing but the odometry ever tells; where nobody
+        Outside a map that is left as it is, nothing but the odometry ever shows it; where no pose
         searches the whole map for the lost, the return to it is a loop like any other.
         """
         outside = self._tracker.keeps_map and self._parts.lost is None
@@ -750,7 +752,7 @@ class PlaceRecognition:
 
     def _time_to_look(self, loops: LoopGates, confirmation: Confirmation) -> bool:
         frame = len(self.memory)
-        if self._astray or (self._offered >= 0 and frame - self._offered <= loops.rest):
+        if self._untracked or (self._offered >= 0 and frame - self._offered <= loops.rest):
             return False
         return confirmation.begun or frame % loops.every == 0
 
@@ -787,15 +789,19 @@ class PlaceRecognition:
         return self._parts.relocaliser.locate(features, rng)
 
     def _learn(self, landmarks: LandmarkMap, among: IntArray) -> None:
-        """Hands the map to the relocaliser; looks that it has seen keep their index."""
+        """Hands the map to the relocaliser; views that it has seen keep their index."""
         database = self._tracker.database
         named = np.isin(landmarks.ids, among)
         chosen = landmarks if named.all() else landmarks.select(np.flatnonzero(named))
-        changes, ids, looks = self._looks
-        if looks is None or changes != database.changes or not np.array_equal(ids, chosen.ids):
-            looks = database.appearances(chosen.ids, with_words=True)
-            self._looks = database.changes, chosen.ids, looks
-        self._parts.relocaliser.learn(chosen, looks)
+        changes, ids, appearances = self._views
+        if (
+            appearances is None
+            or changes != database.changes
+            or not np.array_equal(ids, chosen.ids)
+        ):
+            appearances = database.appearances(chosen.ids, with_words=True)
+            self._views = database.changes, chosen.ids, appearances
+        self._parts.relocaliser.learn(chosen, appearances)
 
 
 def _one_place(a: FloatArray, b: FloatArray) -> bool:

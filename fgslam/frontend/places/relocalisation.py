@@ -491,7 +491,7 @@ class Refined:
         rest = ~np.isin(own, other.features * count + other.landmarks)
         return independent_inliers(positions[self.landmarks[rest]], side)
 
-    def explains_beside(self, other: Refined) -> int:
+    def explains_more_than(self, other: Refined) -> int:
         """Features that have a landmark at this pose, and none at the other."""
         return int((~np.isin(self.features, other.features)).sum())
 
@@ -523,7 +523,7 @@ class _Search:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refiner:
-    """What refinement needs beside the pose."""
+    """What refinement needs besides the pose."""
 
     rig: CameraRig
     floor: Floor
@@ -577,8 +577,8 @@ class Refiner:
         distance = _distances(self.features.descriptors, self.known.views.descriptors[views])
         i, column = np.nonzero(distance <= MAX_DISTANCE)
         cost, v = distance[i, column], views[column]
-        looks = (self.known.views, self.known.owners)
-        keep = gated(self.features, (i, v), self.known.landmarks, looks, self.floor)
+        stored = (self.known.views, self.known.owners)
+        keep = gated(self.features, (i, v), self.known.landmarks, stored, self.floor)
         found = i[keep], self.known.owners[v[keep]], cost[keep]
         i, j, cost = (np.concatenate(both) for both in zip(found, proposed, strict=True))
         return i, j, cost
@@ -706,7 +706,7 @@ class Relocaliser:
     """Finds frames in a map that it has learnt."""
 
     def __init__(self, rig: CameraRig, floor: Floor, settings: RelocalisationSettings) -> None:
-        """Knows no map yet; ``floor`` says which camera motions the map's robot makes."""
+        """Knows no map yet; ``floor`` states which camera motions the map's robot makes."""
         self._rig = rig
         self._floor = floor
         self._settings = settings
@@ -733,7 +733,7 @@ class Relocaliser:
         self._known = KnownMap.of(landmarks, appearances, self._settings.map_sigma_m, index)
 
     def locate(self, features: StereoFeatures, rng: np.random.Generator) -> Relocalisation:
-        """The frame's pose, or why there is none to be believed.
+        """The frame's pose, or why none is accepted.
 
         Args:
             features: of one frame, or of a short submap in its last camera's frame; positions
@@ -754,12 +754,12 @@ class Relocaliser:
     def tentative(self, features: StereoFeatures) -> Tentative:
         """Matches of the features with landmarks anywhere in the map."""
         known = self._known
-        looks = (known.views, known.owners)
+        views = (known.views, known.owners)
         found = known.index.query(features.descriptors, _NEIGHBOURS)
         i, k = np.nonzero(found.rows >= 0)
         pairs = (i, found.rows[i, k])
         keep = np.zeros(found.rows.shape, np.bool_)
-        keep[i, k] = gated(features, pairs, known.landmarks, looks, self._floor)
+        keep[i, k] = gated(features, pairs, known.landmarks, views, self._floor)
         return specific(found, keep, known.owners, known.landmarks)
 
     def _refine(
@@ -854,7 +854,7 @@ def _status(
     n = len(best)
     sigma_m = float(np.sqrt(np.trace(best.covariance[3:, 3:])))
     sigma_deg = float(np.rad2deg(np.sqrt(np.trace(best.covariance[:3, :3]))))
-    said = (
+    found = (
         f"{n} matches agree ({best.proposed} of {matched} tentative), {best.independent} "
         f"independent inliers, elsewhere {competing}; {len(best.expected)} landmarks expected, "
         f"{best.covered:.0%} of their places seen; known in {best.explained:.0%} of the "
@@ -862,20 +862,20 @@ def _status(
     )
     if best.independent < LEAST_INLIERS:
         needed = f"{LEAST_INLIERS} independent inliers are needed"
-        return RelocalisationStatus.TOO_FEW_INLIERS, f"{said}; {needed}"
+        return RelocalisationStatus.TOO_FEW_INLIERS, f"{found}; {needed}"
     if competing >= _AMBIGUOUS_SHARE * best.independent:
         return (
             RelocalisationStatus.AMBIGUOUS,
-            f"{said}; another place explains the frame nearly as well",
+            f"{found}; another place explains the frame nearly as well",
         )
     if _contradicted(best, matched):
         return (
             RelocalisationStatus.CONTRADICTED,
-            f"{said}; too few for how they fit, or for what does not agree beside them",
+            f"{found}; too few for how they fit, or for what does not agree with them",
         )
     if sigma_m > settings.max_sigma_m or sigma_deg > settings.max_sigma_deg:
-        return RelocalisationStatus.INACCURATE, f"{said}; too uncertain"
-    return RelocalisationStatus.FOUND, said
+        return RelocalisationStatus.INACCURATE, f"{found}; too uncertain"
+    return RelocalisationStatus.FOUND, found
 
 
 def _contradicted(pose: Refined, matched: int) -> bool:
@@ -898,14 +898,14 @@ def _competes(other: Refined, best: Refined) -> bool:
     """True if another pose may be the right one.
 
     Not if landmarks expected there are not seen. Nor if it explains less than half of the best
-    one's features and hardly any other: the right pose would also explain what stands beside the
+    one's features and hardly any other: the right pose would also explain what stands next to the
     objects that both places have. (Under perceptual aliasing the other place explains more than
     half, even where a third of its landmarks are missing.)
     """
     refuted = other.misfit > MAX_MISFIT or other.covered < _LEAST_COVERED
     if refuted and other.independent < ENOUGH_INLIERS:
         return False
-    lost, own = best.explains_beside(other), other.explains_beside(best)
+    lost, own = best.explains_more_than(other), other.explains_more_than(best)
     return 2 * lost <= len(best) or own >= _AMBIGUOUS_OWN * lost
 
 

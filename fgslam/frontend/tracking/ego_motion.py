@@ -41,7 +41,7 @@ _STEP_TOLERANCE = 1e-9  # radians and metres; far below anything measurable
 _ROBUST_TOLERANCE = 1e-5  # the robust minimum only chooses the inliers for the exact one
 _REPEATS = 10  # minimisations with the remaining matches; two suffice on all recordings tried
 _EXACT_SIGMA = 1e-6  # radians and metres; stands for zero where a covariance is singular
-_KERNEL_WIDTH = 2.0  # standard deviations of a residual at which the robust kernel bends
+_KERNEL_WIDTH = 2.0  # of the robust kernel, standard deviations of a residual
 MAX_ITERATIONS = 15  # Newton steps of a minimisation, at most
 _CAP_SIGMAS = 6.0  # deviations of the prediction that a correction may amount to
 _MAX_DAMPING = 1e8
@@ -58,7 +58,7 @@ class EgoMotionSolver:
         self.floor = Floor.under(sensor, settings.dof)
         """Which poses are allowed."""
         self.noise = MatchNoise()
-        """Of the measurements; whoever drives has it learn each frame."""
+        """Of the measurements; the caller has it learn each frame."""
         self._judges = settings.outlier_sigmas > 0.0 and settings.weighting != "uniform"
         numbers = 3 if settings.residuals == "image_disparity" else 2
         self._median = float(chi_square_quantile(0.5, numbers))
@@ -424,8 +424,8 @@ class _Minimum:
 
 _FRAMES = 30  # latest ones that count: as many sightings as the longest track that is judged
 _STATED = 2  # frames that the stated noise counts for: three must contradict it
-_DOUBTED = 2.0
-"""Variance over the stated one from which on that is not believed: a gate of four deviations loses
+_LEAST_NOISE = 2.0
+"""Variance over the stated one from which on that is rejected: a gate of four deviations loses
 one right match in twenty."""
 
 
@@ -441,12 +441,12 @@ class MatchNoise:
     @property
     def variance(self) -> float:
         """Over the stated one; one where that may well be true, and never less."""
-        told = sorted([*(1.0,) * _STATED, *self._latest])
-        found = told[(len(told) - 1) // 2]  # of two in the middle the lower
-        return found if found > _DOUBTED else 1.0
+        latest = sorted([*(1.0,) * _STATED, *self._latest])
+        found = latest[(len(latest) - 1) // 2]  # of two in the middle the lower
+        return found if found > _LEAST_NOISE else 1.0
 
     def learn(self, tracking: EgoMotion) -> None:
-        """Takes in a frame; one that was not measured says nothing."""
+        """Takes in a frame; one that was not measured adds nothing."""
         if not math.isnan(tracking.misfit):
             self._latest.append(tracking.misfit)
 
@@ -456,8 +456,8 @@ class MatchNoise:
 
 _DRAWN = 4096  # at nine of ten matches wrong, no good triple among them once in 60
 _SAMPLES = 200  # of those that keep their shape
-_REFINED = 5  # of these; a few noisy depths make a poor pose, whose count says little
-_START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: says nothing
+_REFINED = 5  # of these; a few noisy depths make a poor pose, whose count means little
+_START_SIGMA_RAD = 0.5  # of the pose that starts the least squares: next to nothing
 _START_SIGMA_M = 5.0
 _NEAR = 3.0  # outlier bounds within which a match agrees with a pose from three others
 
@@ -466,7 +466,7 @@ class Resection:
     """Locates a frame by known landmarks."""
 
     def __init__(self, solver: EgoMotionSolver) -> None:
-        """The solver's floor says which poses are possible."""
+        """The solver's floor states which poses are possible."""
         self._solver = solver
 
     def solve(self, problem: PoseProblem) -> EgoMotion:
@@ -499,7 +499,7 @@ class Resection:
         return max(found, default=0)
 
     def _solved(self, start: FloatArray, problem: PoseProblem) -> EgoMotion:
-        """Least squares over all matches, from a pose that says nothing but where to start."""
+        """Least squares over all matches, from a pose that only states where to start."""
         sigma = np.repeat([_START_SIGMA_RAD, _START_SIGMA_M], 3)
         return self._solver.solve(Prediction(start, np.diag(sigma**2)), problem)
 

@@ -40,7 +40,7 @@ _LEAST_LANDMARKS = 40  # a pose by fewer is poor, whatever the key frame had
 _LEAST_COVERAGE = 0.6  # of the image's cells that the key frame's landmarks covered
 _MOST_REJECTED = 0.2
 """Of the carried landmarks: where more contradict the pose, something else moves, or patches went
-astray. On real roads nine frames of ten stay below 0.12."""
+lost. On real roads nine frames of ten stay below 0.12."""
 _CELLS = (4, 3)  # columns, rows
 _APART_PX = 5.0
 """Side of the squares of which each starts one landmark: a third of a patch. SIFT finds a sixth of
@@ -177,7 +177,7 @@ def _joined(
 
 
 def _described(carried: StereoFeatures, also: IntArray, sift: StereoFeatures) -> StereoFeatures:
-    """Carried features with the looks of the features of SIFT ``also`` (k,); -1 for none."""
+    """Carried features with the appearance of the features of SIFT ``also`` (k,); -1 for none."""
     known = also >= 0
     scale, orientation = carried.scale.copy(), carried.orientation.copy()
     descriptors = carried.descriptors.copy()
@@ -239,7 +239,7 @@ class CarriedFrame:
     def placed(self) -> bool:
         """Whether the pose can be relied on: enough landmarks agree on it, and most of them do.
 
-        Patches that went astray together agree on a wrong pose, too.
+        Patches that left their points together agree on a wrong pose, too.
         """
         pose = self.tracked.ego_motion
         enough = pose.inliers.sum() >= _LEAST_LANDMARKS
@@ -303,7 +303,7 @@ class LandmarkCarrier:
     def begin(self, image: Image, begun: Begun) -> None:
         """Landmarks seen in the reference image are carried from here, in place of older ones.
 
-        Their patches are worked on only when they are looked for: a frame that is given up before
+        Their patches are worked on only when they are looked for: a frame that fails before
         costs nothing.
         """
         self._keep(~np.isin(self._points.ids, begun.points.ids))
@@ -337,7 +337,7 @@ class LandmarkCarrier:
             self._patches = ReferencePatches.none(PATCH_PX)
             return None
         patches = self._anchored(last)
-        if not len(self._points):  # all that was to be carried looks different by now
+        if not len(self._points):  # all that was to be carried appears different by now
             return None
         rows = np.searchsorted(expected.ids, self._points.ids)
         predicted = expected.measurement[rows]
@@ -353,8 +353,8 @@ class LandmarkCarrier:
             )
             pixels.append(seen)
             good &= alike >= _MIN_CORRELATION
-        looks = (expected.scale[rows], expected.orientation[rows], expected.descriptors[rows])
-        found = tuple(Features(seen, *looks).select(good) for seen in pixels)
+        views = (expected.scale[rows], expected.orientation[rows], expected.descriptors[rows])
+        found = tuple(Features(seen, *views).select(good) for seen in pixels)
         features, consistent = self._stereo.measured(
             found, self._stereo.equally(NOISE_SHARE), correction
         )
@@ -388,7 +388,7 @@ class LandmarkCarrier:
         return self._patches
 
     def find_again(self, last: FineImage, fresh: Begun) -> tuple[ReferencePatches, Points]:
-        """Patches and places of landmarks begun in an image; what looks different by now is left.
+        """Patches and places of landmarks begun in an image; what appears different by now is left.
 
         Those known from before are placed by their own patch, not by SIFT.
         """
@@ -450,7 +450,7 @@ class Carried(Rows):
     Attributes:
         ids: (k,) ascending.
         rows: (k,) which of the expected landmarks they are, ascending.
-        features: as measured in all images, with the looks that were expected of them.
+        features: as measured in all images, with the appearance that was expected of them.
     """
 
     ids: IntArray

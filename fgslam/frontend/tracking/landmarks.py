@@ -51,7 +51,7 @@ MAX_VIEWS = 8  # of a landmark; a further one replaces that matched longest ago
 _VIEW_ANGLE_DEG = 20.0
 """A direction farther than this from every view becomes a view of its own: SIFT descriptors match
 up to about this angle (docs/concepts/maps.md)."""
-_LEAST_LOOKS = 4
+_LEAST_SEARCHES = 4
 """Of key frames, until what they miss is gone."""
 
 
@@ -121,7 +121,7 @@ class LandmarkDatabase:
         return wanted
 
     def _in_reach(self, rows: IntArray, points: FloatArray) -> BoolArray:
-        """Landmarks (k,) whose absence from a frame says something, at points of its camera.
+        """Landmarks (k,) whose absence from a frame is evidence, at points of its camera.
 
         From farther than a valid landmark was ever seen a nearer wall hides it, or it is too small:
         as when the drive first came that way. Pruning it would leave no loop to close there.
@@ -149,7 +149,7 @@ class LandmarkDatabase:
             ids: (k,) landmarks.
             features: the frame's.
             which: (k,) the features that they match.
-            directions: (k, 3) from the camera to each, unit, world; None where nobody asks.
+            directions: (k, 3) from the camera to each, unit, world; None where the caller has none.
         """
         rows = self._hit(ids)
         distances = np.linalg.norm(features.position[which], axis=1)
@@ -188,10 +188,10 @@ class LandmarkDatabase:
     def _stood_for(self, rows: IntArray, enough: int) -> IntArray:
         """(k,) frames that a miss in this one counts: this, and those before that did not look.
 
-        One where every frame looks for landmarks. Several looks must decide, whatever the gap
+        One where every frame searches for landmarks. Several searches must decide, whatever the gap
         between key frames: one adds at most a part of the frames that are ``enough``.
         """
-        most = -(-enough // _LEAST_LOOKS)
+        most = -(-enough // _LEAST_SEARCHES)
         return np.asarray(np.minimum(1 + self._columns["unlooked"][rows], most))
 
     def weigh(
@@ -204,7 +204,7 @@ class LandmarkDatabase:
         """Counts contradictions of permanent landmarks by a located frame; too many demote one.
 
         It contradicts those missing whose match was rejected as an outlier, and those whose place
-        it sees past (``permanence.seen_past``). What hides them says nothing.
+        it sees past (``permanence.seen_past``). What hides them is no evidence.
 
         Args:
             expected: landmarks expected in view.
@@ -284,8 +284,8 @@ class LandmarkDatabase:
         """A whole frame between key frames.
 
         Args:
-            ids: landmarks hit, whose looks nobody has described anew.
-            not_carried: those expected well in view that nobody looked for.
+            ids: landmarks hit, whose appearance was not described again.
+            not_carried: those expected well in view that were not searched for.
         """
         self._hit(ids)
         self._columns["unlooked"][self.rows(not_carried)] += 1
@@ -395,7 +395,7 @@ class LandmarkDatabase:
     ) -> LandmarkAppearances:
         """All views of all landmarks, or of those named (ascending); matched longest ago first.
 
-        ``with_words`` for whoever searches among them: each word is found once in a view's life.
+        ``with_words`` for a search among them: each word is found once in a view's life.
         """
         if ids is not None and len(ids) == len(self):
             ids = None  # to search for all of them would take as long as copying their views
@@ -427,7 +427,7 @@ class LandmarkDatabase:
         return owner, flat
 
     def described_lately(self, frames: int) -> IntArray:
-        """Identities (k,) whose looks are of the last frame that described any, or ``frames`` less.
+        """Identities (k,) described by the last frame that described any, or ``frames`` before.
 
         Those of a saved map that this run has not seen yet are older.
         """
@@ -507,7 +507,7 @@ class LandmarkDatabase:
         self._frame = 0
 
     def _clear(self, patch_pixels: int) -> None:
-        """No landmark; room for patches of so many pixels, at least, whoever began in them.
+        """No landmark; room for patches of so many pixels, at least, whatever began in them.
 
         A session that carries none keeps those of its map for the next one.
         """
@@ -558,8 +558,8 @@ def seen_past(places: FloatArray, seen: FloatArray) -> BoolArray:
     """Places (m,) that the cameras see past, so that what is missed there is not there.
 
     Near the place in the image something lies behind it, and nothing before it that might hide it.
-    That what surrounds a missed landmark is recognised says nothing: true landmarks are missed in
-    many frames in a row for their scale or direction, while others beside them are not
+    That what surrounds a missed landmark is recognised is no evidence: true landmarks are missed in
+    many frames in a row for their scale or direction, while others next to them are not
     (docs/concepts/maps.md has the numbers).
 
     Args:
@@ -586,7 +586,7 @@ Directions = npt.NDArray[np.float32]
 """(v, 3) unit vectors, camera to landmark, world; NaN where unknown."""
 _LEAST = 64
 _GROWTH = 1.5
-_UNKNOWN = -1  # word of a view for which nobody has asked
+_UNKNOWN = -1  # word of a view for which none was asked
 
 
 class ViewPool:
@@ -728,7 +728,7 @@ class ViewPool:
         self.release(ends)
 
     def remake(self) -> None:
-        """Words are found anew, of all views that were put back."""
+        """Words are found again, of all views that were put back."""
         self._words = np.full(len(self._size), _UNKNOWN, np.int16)
         self.changes += 1
 
@@ -809,10 +809,10 @@ class Views(Rows):
 
 
 # ------------------------------------------------------------------------------------------
-# Parts of a map between which nothing is measured: what is founded anew after a gap
+# Parts of a map between which nothing is measured: what is begun again after a gap
 
 _HOLD = 6
-"""Landmarks of a part that place a frame in it, beside those of another: by chance none agree."""
+"""Landmarks of a part that place a frame in it, next to those of another: by chance none agree."""
 _FIRST = 0
 
 
@@ -837,7 +837,7 @@ class MapParts:
         self._newest = _FIRST
 
     def __len__(self) -> int:
-        """Frames booked."""
+        """Frames recorded."""
         return len(self._frames)
 
     @property
@@ -862,7 +862,7 @@ class MapParts:
 
     @property
     def connected(self) -> BoolArray:
-        """(n,) frames that hang together with the first one by measurements."""
+        """(n,) frames that are connected with the first one by measurements."""
         return np.asarray(np.array(self._frames, np.int64) == _FIRST)
 
     def placed_by(self, ids: IntArray) -> int:

@@ -30,7 +30,7 @@ _SCALE_RATIO = 1.5
 """Largest ratio to the predicted scale: one level of the scale space (Se et al., IJRR 2002)."""
 WINDOW_PX = 5.0  # side of the search window in the image, as in Se et al. 3.1
 REFINE_SHIFT_PX = 0.25 * WINDOW_PX
-"""Landmarks that a first pose shifts by more, in the median, are matched anew around it. Measured:
+"""Landmarks that a first pose shifts by more, in the median, are matched again around it. Measured:
 on steps that the odometry foretells within it (roads) a second matching changes nothing."""
 _DISPARITY_PX = 2.0  # largest difference from the predicted disparity, likewise before widening
 MAX_WINDOW_PX = 80.0

@@ -47,7 +47,7 @@ from fgslam.frontend.tracking.map_matching import (
 )
 
 _FEW_MATCHED = 0.2
-"""Of a frame's features: landmarks in the pose's favour, below which it is looked for anew too."""
+"""Of a frame's features: landmarks in the pose's favour, below which it is sought again too."""
 
 
 class LandmarkTracker:
@@ -65,11 +65,11 @@ class LandmarkTracker:
         matcher: MapMatcher,
         ego_motion: EgoMotionSolver,
     ) -> None:
-        """The database is shared with whoever shows or saves it.
+        """The database is shared with callers that show or save it.
 
-        Which part of the map is which is booked in ``parts`` by whoever drives.
-        With ``keeps_map`` nothing is booked, started or pruned: the map is only localised in. With
-        ``expects_returns`` place recognition tells old landmarks from recent ones where they
+        Which part of the map is which is recorded in ``parts`` by the caller.
+        With ``keeps_map`` nothing is recorded, begun or pruned: the map is only localised in. With
+        ``expects_returns`` place recognition separates old landmarks from recent ones where they
         contradict each other; without, the prediction was wrong. It was in either case where few
         features agree with the pose.
         """
@@ -88,17 +88,17 @@ class LandmarkTracker:
     def track(
         self, prediction: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
-        """Matches expected landmarks and solves for the pose; wider or anew around it if set so."""
+        """Matches expected landmarks, solves for the pose; wider or again around it if set so."""
         around = Prediction(self._ego_motion.floor.constrain(prediction.wTc), prediction.covariance)
         tracked = self.match_and_solve(prediction, around, landmarks, features)
         if self._matcher.rescues and not tracked.ego_motion.status.measured:
             rescued = self.match_and_solve(prediction, around, landmarks, features, anywhere=True)
             # A failed rescue proves nothing about what is new: the first attempt stands.
             tracked = rescued if rescued.ego_motion.status.measured else tracked
-        if self._matcher.rescues and self._doubtful(tracked, features):
-            anew = self._regained(landmarks, features)
-            if anew is not None and _used(anew) >= 2 * _used(tracked):
-                return anew
+        if self._matcher.rescues and self._is_doubtful(tracked, features):
+            again = self._regained(landmarks, features)
+            if again is not None and _used(again) >= 2 * _used(tracked):
+                return again
         if self._matcher.refines and self._moved_far(tracked, landmarks):
             around = Prediction(tracked.ego_motion.wTc, tracked.ego_motion.covariance)
             refined = self.match_and_solve(prediction, around, landmarks, features)
@@ -157,7 +157,7 @@ class LandmarkTracker:
         problem = PoseProblem.of(landmarks, _matched(*matched))
         return Tracked(expected, matches, self._ego_motion.solve(prediction, problem))
 
-    def _doubtful(self, tracked: Tracked, features: StereoFeatures) -> bool:
+    def _is_doubtful(self, tracked: Tracked, features: StereoFeatures) -> bool:
         """Whether what was matched around the prediction contradicts the pose, or is little.
 
         In the wrong place a few dozen matches may agree: some right ones, of things far off or
@@ -173,10 +173,10 @@ class LandmarkTracker:
         found = self._regainer.find(landmarks, features)
         if found is None:
             return None
-        anew = self.track_anew(found, landmarks, features)
-        return anew if anew.ego_motion.status.measured else None
+        again = self.track_around(found, landmarks, features)
+        return again if again.ego_motion.status.measured else None
 
-    def track_anew(
+    def track_around(
         self, around: Prediction, landmarks: LandmarkMap, features: StereoFeatures
     ) -> Tracked:
         """Matches in the neighbourhood of a pose found without a prior, and solves without one."""
@@ -232,7 +232,7 @@ class LandmarkTracker:
         )
 
     def _missing(self, tracked: Tracked) -> IntArray:
-        """Landmarks expected well in view that the frame does not show, as far as it tells."""
+        """Landmarks expected well in view that the frame does not show, as far as is seen."""
         hit = np.zeros(len(tracked.expected), np.bool_)
         hit[tracked.matches.landmarks[tracked.ego_motion.inliers]] = True
         return self.database.missing(tracked.expected, hit)
@@ -371,7 +371,7 @@ class Regainer:
         self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
 
     def find(self, landmarks: LandmarkMap, features: StereoFeatures) -> Prediction | None:
-        """Pose and covariance; None where none is to be believed. The same input, the same bits."""
+        """Pose and covariance; None where none is accepted. The same input, the same bits."""
         for frames in (LATELY, _AT_LAST):
             found = self._found_by(frames, landmarks, features)
             if found is not None:
@@ -381,13 +381,13 @@ class Regainer:
     def _found_by(
         self, frames: int, landmarks: LandmarkMap, features: StereoFeatures
     ) -> EgoMotion | None:
-        """The frame by what the last frames described; None if it is not to be believed."""
+        """The frame by what the last frames described; None if it is rejected."""
         recent = np.intersect1d(self._database.described_lately(frames), landmarks.ids)
-        looks = self._database.appearances(recent)
-        latest = np.flatnonzero(np.diff(looks.ids, append=-1))
-        part = self._parts.of(looks.ids[latest])
+        appearances = self._database.appearances(recent)
+        latest = np.flatnonzero(np.diff(appearances.ids, append=-1))
+        part = self._parts.of(appearances.ids[latest])
         within = [
-            self._among(latest[part == one], looks, landmarks, features)
+            self._among(latest[part == one], appearances, landmarks, features)
             for one in np.unique(part).tolist()
         ]
         found = [one for one in within if one is not None]
@@ -396,14 +396,14 @@ class Regainer:
     def _among(
         self,
         rows: IntArray,
-        looks: LandmarkAppearances,
+        appearances: LandmarkAppearances,
         landmarks: LandmarkMap,
         features: StereoFeatures,
     ) -> EgoMotion | None:
-        """The frame by some landmarks, given by rows of their looks; None if not to be believed."""
+        """The frame by some landmarks, given by rows of their appearances; None if rejected."""
         seen = features.whole
-        i, j = mutual_nearest(seen.descriptors, looks.descriptors[rows])
-        observed = seen.observations(i, looks.ids[rows[j]], is_new=False)
+        i, j = mutual_nearest(seen.descriptors, appearances.descriptors[rows])
+        observed = seen.observations(i, appearances.ids[rows[j]], is_new=False)
         problem = PoseProblem.of(landmarks, observed)
         found = self._resection.solve(problem)
         if not found.status.measured or not self._certain(found, problem):
@@ -449,7 +449,7 @@ def _log_choose(n: int, k: int) -> float:
 
 
 # ------------------------------------------------------------------------------------------
-# Whether much of what a frame shows moves rigidly, but otherwise than its pose says
+# Whether much of what a frame shows moves rigidly, but otherwise than its pose
 
 _FEWEST = 15  # matches that move otherwise; chance is judged besides
 _SHARE = 0.1  # of those that the pose follows
@@ -494,7 +494,7 @@ class OtherMotion:
 
     _before: Kept[_Unexplained]
     _latest: Kept[deque[tuple[int, float]]]
-    _doubted: Kept[dict[int, float]]
+    _contradicting: Kept[dict[int, float]]
 
     def __init__(self, rig: CameraRig, solver: EgoMotionSolver) -> None:
         """Nothing seen yet."""
@@ -503,7 +503,7 @@ class OtherMotion:
         self._by_chance = math.pi * solver.farthest**2 / (rig.width * rig.height)
         self._before = _Unexplained.none()
         self._latest = deque(maxlen=_WINDOW)
-        self._doubted = {}
+        self._contradicting = {}
 
     def look(
         self,
@@ -521,7 +521,7 @@ class OtherMotion:
             known: (n,) the landmark that each is taken for, -1 for none, and the identities of
                 those among them that were known before.
             tracking: its pose, as it was tracked.
-            wTc: (4, 4) the same after the update, from which the next frame is told.
+            wTc: (4, 4) the same after the update, from which the next frame is predicted.
         """
         partners, old = known
         left = np.flatnonzero(~np.isin(partners, old))
@@ -530,7 +530,7 @@ class OtherMotion:
         self._latest.append((index, share))
         seen = [one for one in self._latest if one[1] > _SHARE]
         if len(seen) >= _FRAMES:
-            self._doubted.update(seen)
+            self._contradicting.update(seen)
         followed = tracking.status.measured or tracking.status is EgoMotionStatus.FIRST
         self._before = _Unexplained.none()
         if followed:
@@ -538,12 +538,12 @@ class OtherMotion:
 
     def remarks(self) -> tuple[Remark, ...]:
         """On the frames with two motions; none where there are none."""
-        if not self._doubted:
+        if not self._contradicting:
             return ()
-        most = max(self._doubted.values())
-        # The pose follows the fewer matches only where odometry, or the map, says so.
+        most = max(self._contradicting.values())
+        # The pose follows the fewer matches only where odometry, or the map, does.
         code = "other_motion" if most <= 1.0 else "other_motion_or_odometry"
-        return (Remark(code, tuple(sorted(self._doubted)), {"percent": 100.0 * most}),)
+        return (Remark(code, tuple(sorted(self._contradicting)), {"percent": 100.0 * most}),)
 
     def _share(
         self, features: StereoFeatures, left: IntArray, old: IntArray, tracking: EgoMotion

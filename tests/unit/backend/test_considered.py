@@ -35,7 +35,7 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
 )
 from fgslam.backend.smoothers.elimination import Bordered
-from fgslam.backend.smoothers.final import Refined, doubted, shifts
+from fgslam.backend.smoothers.final import Refined, shifts, with_uncertain_rig
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray
 from fgslam.core.correction import (
@@ -204,9 +204,9 @@ def test_a_column_is_what_the_filter_makes_of_an_error(
     def known(
         self: SampledErrors, wTc: FloatArray, seen: PoseProblem
     ) -> considered.ObservedColumns:
-        sights = original(self, wTc, seen)
-        sights.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
-        return sights
+        seen_shifts = original(self, wTc, seen)
+        seen_shifts.shift[:, :, -SAMPLES:] = pattern(seen.measurement)[:, :, None]
+        return seen_shifts
 
     monkeypatch.setattr(SampledErrors, "linearised", known)
     monkeypatch.setattr(considered, "symmetric_root", lambda covariance: np.zeros((6, 6)))
@@ -254,9 +254,9 @@ def test_a_frame_that_nothing_places_is_as_uncertain_as_its_odometry() -> None:
         for each in increments[8:]
     ]
     estimator = played(increments[:8] + blind)
-    said = estimator.estimate().covariances
-    known = said[7]
-    for each, covariance in zip(blind, said[8:], strict=True):
+    reported = estimator.estimate().covariances
+    known = reported[7]
+    for each, covariance in zip(blind, reported[8:], strict=True):
         assert each.odometry is not None
         known = g.compose_covariance(each.odometry.motion, known, each.odometry.covariance)
         ratio = np.diagonal(covariance) / np.diagonal(known)
@@ -330,7 +330,7 @@ def seeing(increment: Increment, matches: int) -> Increment:
 
 
 # ------------------------------------------------------------------------------------------
-# What the doubt about a rig adds to a graph's covariances, against a graph that estimates it
+# What the uncertainty of a rig adds to a graph's covariances, against a graph that estimates it
 
 
 EXACT = RigCorrection.none(dataclasses.replace(RIG, exact=True))
@@ -369,7 +369,7 @@ def displaced(increment: Any, by: FloatArray) -> Any:
 
 def test_covariances_are_those_of_a_graph_with_the_correction_as_a_variable() -> None:
     refined = solved()
-    found = doubted(refined.graph, refined.state, EXACT)
+    found = with_uncertain_rig(refined.graph, refined.state, EXACT)
     system = refined.graph.linear(refined.state)
     information = system.information.toarray()
     p = len(EXACT.values)
@@ -397,7 +397,7 @@ def test_poses_move_with_a_wrong_rig_as_their_gains_say(term: str) -> None:
     """By some tenths of a pixel; to first order."""
     by = (0.3 if "mode" in term else 0.1 / RIG.fx) * (np.array(ALL) == term)
     refined, moved = solved(), solved(3, tuple(by))
-    found = doubted(refined.graph, refined.state, UNEVEN)
+    found = with_uncertain_rig(refined.graph, refined.state, UNEVEN)
     before, after = refined.state.poses, moved.state.poses
     steps = np.array([g.se3_log(step) for step in g.inverse(before) @ after])
     gain = (found.gain[found.held.system.columns :] @ by).reshape(-1, 6)
@@ -414,7 +414,7 @@ def test_images_far_off_against_each_other_are_taken_to_be_off_as_far() -> None:
     def of(left_px: float) -> FloatArray:
         """Covariance of what is shared, the left image so far to the right."""
         moved = dataclasses.replace(CALIBRATED, values=left_px / RIG.fx * column)
-        found = doubted(refined.graph, refined.state, moved)
+        found = with_uncertain_rig(refined.graph, refined.state, moved)
         return found.covariance[shared, shared]
 
     np.testing.assert_allclose(of(0.3), of(0.0))
@@ -460,11 +460,11 @@ def test_rigs_that_are_off_as_assumed_leave_consistent_poses(
     for k in range(drives):
         seed = k % 12
         exact, truth = solved(seed), drawn(seed, frames=12).poses[1:]
-        assumed = doubted(exact.graph, exact.state, rig).covariance
+        assumed = with_uncertain_rig(exact.graph, exact.state, rig).covariance
         by = rng.multivariate_normal(np.zeros(len(assumed)), assumed)
         refined = solved(seed, tuple(np.pad(by, (0, len(ALL) - len(by)))))
         poses = refined.poses()[1:]
-        both = doubted(refined.graph, refined.state, rig)
+        both = with_uncertain_rig(refined.graph, refined.state, rig)
         found.append(pose_nees_per_dof(poses, both.poses()[1:], truth))
         held.append(pose_nees_per_dof(poses, both.held.poses()[1:], truth))
     assert np.mean(held) > 2.0
@@ -509,7 +509,7 @@ def test_a_landmark_seen_once_lies_where_a_wrong_rig_has_it(term: str) -> None:
 
 def whole(rig: RigCorrection = CALIBRATED) -> Bordered:
     refined = solved()
-    return doubted(refined.graph, refined.state, rig)
+    return with_uncertain_rig(refined.graph, refined.state, rig)
 
 
 @pytest.mark.parametrize("rig", [CALIBRATED, UNEVEN], ids=["terms", "field"])
@@ -564,7 +564,7 @@ def test_filters_report_landmarks_as_uncertain_as_their_rig_leaves_them(kind: st
     more = reported.covariances - matched.covariances
     assert np.linalg.eigvalsh(more).min() > -1e-12
     assert np.median(np.trace(more, axis1=1, axis2=2)) > 1e-6
-    # Matching needs what a landmark's place is beside the camera, which shares the rig's error.
+    # Matching needs a landmark's place relative to the camera, which shares the rig's error.
     np.testing.assert_array_equal(calibrated.landmarks().covariances, exact.landmarks().covariances)
     added = calibrated.estimate().covariances - exact.estimate().covariances
     assert np.trace(added[-1]) > 0.2 * np.trace(exact.estimate().covariances[-1])
@@ -601,10 +601,13 @@ def test_reported_sigmas_of_rigs_a_pixel_off_hold_errors_of_poses_and_landmarks(
             for each in drive.increments
         ]
         estimator = make_estimator(CALIBRATED.rig, ONLINE[kind], FREE)
-        said = play(estimator, increments, FREE, CALIBRATED.rig)[1:]
+        stats = play(estimator, increments, FREE, CALIBRATED.rig)[1:]
         found = estimator.estimate()
         truth, places = drive.poses[1:], drive.points_by_id[found.landmarks.ids]
-        poses = np.array([each.wTc for each in said]), np.array([each.covariance for each in said])
+        poses = (
+            np.array([each.wTc for each in stats]),
+            np.array([each.covariance for each in stats]),
+        )
         online.append(within(pose_errors(poses[0], truth), poses[1]))
         last = found.trajectory.poses[1:], found.covariances[1:]
         final.append(within(pose_errors(last[0], truth), last[1]))

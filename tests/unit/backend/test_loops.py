@@ -220,14 +220,14 @@ def test_many_motions_are_those_of_single_ones(rng: np.random.Generator) -> None
     np.testing.assert_allclose(rigid_motions(twists), expected, rtol=0, atol=1e-13)
 
 
-def test_a_doubted_loop_is_overruled_by_loops_that_agree(rng: np.random.Generator) -> None:
+def test_an_uncertain_loop_is_overruled_by_loops_that_agree(rng: np.random.Generator) -> None:
     poses, steps = chained([STEP] * (COUNT - 1)), uncertain()
     wrong = g.inverse(poses[2]) @ poses[30] @ g.se3_exp(np.array([0, 0.3, 0, 0.5, 0, 0.5]))
     sure = 1e-6 * np.eye(6)
     others = [Constraint(a, b, g.inverse(poses[a]) @ poses[b], sure) for a, b in ((0, 28), (3, 33))]
     believed, _ = corrected(poses, steps, [*others, Constraint(2, 30, wrong, sure)])
-    doubted, _ = corrected(poses, steps, [*others, Constraint(2, 30, wrong, sure, doubted=True)])
-    assert apart(doubted, poses) < 0.05 * apart(believed, poses)
+    weighed, _ = corrected(poses, steps, [*others, Constraint(2, 30, wrong, sure, uncertain=True)])
+    assert apart(weighed, poses) < 0.05 * apart(believed, poses)
 
 
 # ------------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ def driven(
     """Learned on a drive whose errors are ``scale`` of those stated, ``kept`` from frame to frame.
 
     Each landmark is seen for 12 frames; ``wrong`` of the sightings are of something else. Every
-    tenth step is said to be ``lost``. Where the path is ``smoothed`` every fifth frame, it is true.
+    tenth step is marked ``lost``. Where the path is ``smoothed`` every fifth frame, it is true.
     At the frame ``resumed`` another continues from the state.
     """
     rng = np.random.default_rng(5)
@@ -106,7 +106,7 @@ def test_tracks_end_where_no_landmark_has_measured_the_step() -> None:
 
 
 def test_steps_that_a_map_in_doubt_has_leaned_are_put_right_by_the_smoothed_path() -> None:
-    """Else a track across such a step takes the doubt for noise."""
+    """Else a track across such a step takes the uncertainty for noise."""
     aside = STEP @ g.se3_exp(np.array([0.0, 0.02, 0.0, 0.02, 0.0, 0.0]))
     assert driven(1.0, frames=60, lost=aside).power > 4.0
     found = driven(1.0, frames=60, lost=aside, smoothed=True)

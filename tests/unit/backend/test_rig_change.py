@@ -81,9 +81,9 @@ def test_measurements_follow_as_if_their_pixels_had_been_corrected_anew(places: 
     before = raw - (displacements(RIG, raw) @ known).reshape(pixels.shape)
     rig = dataclasses.replace(RIG, places=places)
     measured = before.reshape(-1, 6) @ rig_map(rig).T
-    anew = RigChange(rig, wrong - known).measured(measured)
+    again = RigChange(rig, wrong - known).measured(measured)
     assert np.abs(measured - exact).max() > 0.25
-    np.testing.assert_allclose(anew, exact, rtol=0.0, atol=0.01)
+    np.testing.assert_allclose(again, exact, rtol=0.0, atol=0.01)
 
 
 def test_a_landmark_moves_along_its_ray_to_where_it_is() -> None:

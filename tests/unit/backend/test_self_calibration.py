@@ -54,15 +54,15 @@ TERMS, MODES = len(prior_information(PAIR)), field_modes(PAIR)
 
 
 def window(rng: np.random.Generator) -> tuple[RigEvidence, FloatArray, FloatArray]:
-    """What it says, as half a Hessian of terms and modes, and where it would go."""
+    """Its evidence, as half a Hessian of terms and modes, and where it would go."""
     root = rng.standard_normal((TERMS + MODES, TERMS + MODES))
     root[:, :TERMS] *= 3.0 * np.sqrt(np.diagonal(prior_information(PAIR)))
     hessian, best = root.T @ root, rng.standard_normal(TERMS + MODES)
     at = np.concatenate([1e-3 * rng.standard_normal(TERMS), np.zeros(MODES)])
     score, t = hessian @ (best - at), slice(TERMS)
     m = slice(TERMS, None)
-    said = RigEvidence(hessian[t, t], score[t], at[t], 50, hessian[t, m], hessian[m, m], score[m])
-    return said, hessian, hessian @ best
+    made = RigEvidence(hessian[t, t], score[t], at[t], 50, hessian[t, m], hessian[m, m], score[m])
+    return made, hessian, hessian @ best
 
 
 def test_windows_and_drift_are_those_of_terms_and_modes_estimated_together() -> None:
@@ -73,8 +73,8 @@ def test_windows_and_drift_are_those_of_terms_and_modes_estimated_together() -> 
     drift = block_diag(share * np.linalg.inv(prior_information(PAIR)), np.zeros((MODES, MODES)))
     values, covariance = np.zeros(len(prior)), np.linalg.inv(prior)
     for _ in range(4):
-        said, hessian, score = window(rng)
-        filtered = filtered.grown(share).after(said)
+        made, hessian, score = window(rng)
+        filtered = filtered.grown(share).after(made)
         information = np.linalg.inv(covariance + drift)
         pull = information @ values + score / factor
         covariance = np.linalg.inv(information + hessian / factor)
@@ -490,7 +490,7 @@ def test_corrections_undo_the_displacement_of_raw_pixels() -> None:
         )
     )
     assert np.abs(measured.measurement - exact.measurement).max() > 0.3
-    # The displacement is taken where the pixel is seen, a pixel beside where it belongs.
+    # The displacement is taken where the pixel is seen, a pixel from where it belongs.
     for k, found in enumerate(straight):
         np.testing.assert_allclose(found.xy, exact.pixels[:, k], rtol=0.0, atol=5e-3)
 

@@ -95,29 +95,29 @@ def darker(camera: int) -> Fault:
 def watched(
     rig: CameraRig, frames: list[Images], fault: Fault, until: int | None = None
 ) -> tuple[list[str], CameraWatch]:
-    """What is said of each frame; the fault lasts from ``BEGINS`` on, ``until`` the frame."""
+    """What is reported of each frame; the fault lasts from ``BEGINS`` on, ``until`` the frame."""
     watch = CameraWatch(rig)
     end = len(frames) if until is None else until
-    said = [
+    reported = [
         watch.look(fault(frames, k) if BEGINS <= k < end else frames[k]) for k in range(len(frames))
     ]
-    return said, watch
+    return reported, watch
 
 
-def assert_found(said: list[str], name: str) -> None:
+def assert_found(reported: list[str], name: str) -> None:
     """Silence before the fault, the camera by name within ten frames, and to the end."""
-    assert not any(said[:BEGINS])
-    first = next(k for k, words in enumerate(said) if words)
+    assert not any(reported[:BEGINS])
+    first = next(k for k, words in enumerate(reported) if words)
     assert first < BEGINS + SOON
-    assert all(f"the {name} camera" in words for words in said[first + 1 :])
+    assert all(f"the {name} camera" in words for words in reported[first + 1 :])
 
 
 @pytest.mark.parametrize(("fault", "camera"), [(late, 0), (late, 2), (frozen, 1), (stuck, 2)])
 def test_an_old_image_is_found_in_the_lab(
     lab: tuple[CameraRig, list[Images]], fault: Callable[[int], Fault], camera: int
 ) -> None:
-    said, _ = watched(*lab, fault(camera))
-    assert_found(said, CAMERA_NAMES[camera])
+    reported, _ = watched(*lab, fault(camera))
+    assert_found(reported, CAMERA_NAMES[camera])
 
 
 @pytest.mark.data
@@ -125,22 +125,22 @@ def test_an_old_image_is_found_in_the_lab(
 def test_an_old_image_is_found_on_a_real_road(
     road: tuple[CameraRig, list[Images]], fault: Callable[[int], Fault], camera: int
 ) -> None:
-    said, _ = watched(*road, fault(camera))
-    assert_found(said, CAMERA_NAMES[camera])
+    reported, _ = watched(*road, fault(camera))
+    assert_found(reported, CAMERA_NAMES[camera])
 
 
 def test_swapped_cameras_are_found_in_the_lab(lab: tuple[CameraRig, list[Images]]) -> None:
-    said, _ = watched(*lab, swapped)
-    assert not any(said[:BEGINS])
-    assert all("right and the left camera are swapped" in words for words in said[BEGINS + 1 :])
+    reported, _ = watched(*lab, swapped)
+    assert not any(reported[:BEGINS])
+    assert all("right and the left camera are swapped" in words for words in reported[BEGINS + 1 :])
 
 
 @pytest.mark.parametrize("camera", [0, 1])
 def test_a_darker_camera_is_said_and_its_frames_are_used(
     lab: tuple[CameraRig, list[Images]], camera: int
 ) -> None:
-    said, watch = watched(*lab, darker(camera))
-    assert not any(said)
+    reported, watch = watched(*lab, darker(camera))
+    assert not any(reported)
     remarks = watch.remarks()
     assert len(remarks) == (2 if camera == 0 else 1)  # a dark reference differs from both others
     assert remarks[0].code == "unequal_exposure"
@@ -148,15 +148,15 @@ def test_a_darker_camera_is_said_and_its_frames_are_used(
 
 
 def test_one_repeated_image_costs_one_frame(lab: tuple[CameraRig, list[Images]]) -> None:
-    said, _ = watched(*lab, stuck(1), until=BEGINS + 1)
-    assert [k for k, words in enumerate(said) if words] == [BEGINS]
-    assert said[BEGINS] == "the left camera delivers the image of the frame before once more"
+    reported, _ = watched(*lab, stuck(1), until=BEGINS + 1)
+    assert [k for k, words in enumerate(reported) if words] == [BEGINS]
+    assert reported[BEGINS] == "the left camera delivers the image of the frame before once more"
 
 
 def test_a_camera_that_has_recovered_is_used_again(lab: tuple[CameraRig, list[Images]]) -> None:
-    said, _ = watched(*lab, late(2), until=BEGINS + 5)
-    assert any(said)
-    assert not any(said[-3:])
+    reported, _ = watched(*lab, late(2), until=BEGINS + 5)
+    assert any(reported)
+    assert not any(reported[-3:])
 
 
 def test_watching_goes_on_where_it_stopped(lab: tuple[CameraRig, list[Images]]) -> None:
@@ -166,9 +166,9 @@ def test_watching_goes_on_where_it_stopped(lab: tuple[CameraRig, list[Images]]) 
     for stop in (BEGINS, BEGINS + 3):
         first, then = CameraWatch(rig), CameraWatch(rig)
         given = [fault(frames, k) if k >= BEGINS else frames[k] for k in range(len(frames))]
-        said = [first.look(images) for images in given[:stop]]
+        reported = [first.look(images) for images in given[:stop]]
         restore(then, state_of(first))
-        assert said + [then.look(images) for images in given[stop:]] == whole
+        assert reported + [then.look(images) for images in given[stop:]] == whole
         np.testing.assert_equal(state_of(first), state_of(first))
 
 
@@ -194,8 +194,8 @@ SOUND = (
 def test_no_sound_recording_gives_an_alarm(shared_data: Path, name: str) -> None:
     recording = fg.open_recording(shared_data / name)
     watch = CameraWatch(recording.rig)
-    said = [watch.look(images) for images in frames_of(recording, len(recording))]
-    assert not any(said)
+    reported = [watch.look(images) for images in frames_of(recording, len(recording))]
+    assert not any(reported)
     assert watch.remarks() == ()
 
 

@@ -1,4 +1,4 @@
-"""Frames that nothing measured lie between the located ones, as uncertain as the drive tells."""
+"""Frames that nothing measured lie between the located ones, as uncertain as the drive shows."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Parts(MapParts):
 
 
 def estimated(poses: FloatArray, parts: Parts, guess: FloatArray | None = None) -> Estimate:
-    """Poses as they truly are, but for those beside the first part: a guess, or 5 m off it."""
+    """Poses as they truly are, but for those next to the first part: a guess, or 5 m off it."""
     lost = np.flatnonzero(~parts.connected)
     found, covariances = poses.copy(), np.tile(KNOWN, (len(poses), 1, 1))
     found[lost] = g.se3_exp(np.array([0.3, 0.0, 0.0, 5.0, 0.0, 0.0])) @ found[lost]

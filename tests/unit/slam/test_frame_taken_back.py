@@ -1,4 +1,4 @@
-"""A frame without features right after a closure: what that ended stays ended in all books."""
+"""A frame without features right after a closure: what that ended stays ended in all records."""
 
 from __future__ import annotations
 

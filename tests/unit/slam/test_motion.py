@@ -143,7 +143,7 @@ def test_blind_frames_lose_certainty_and_the_velocity_with_it() -> None:
     motion.observe(0.0, at(np.eye(4)), measured=True)
     motion.observe(0.5, at(g.se3_exp(0.5 * TWIST)), measured=True)
     fresh = motion.between(1.0)
-    motion.observe(1.0, at(np.eye(4)), measured=False)  # a pose that nobody measured
+    motion.observe(1.0, at(np.eye(4)), measured=False)  # an unmeasured pose
     motion.observe(1.5, at(np.eye(4)), measured=False)
     blind = motion.between(2.0)
     assert fresh is not None

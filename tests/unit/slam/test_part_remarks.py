@@ -1,4 +1,4 @@
-"""Frames that a guess alone places beside the first map are told, with their share."""
+"""Frames that a guess alone places next to the first map are reported, with their share."""
 
 from __future__ import annotations
 

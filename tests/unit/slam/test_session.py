@@ -216,7 +216,7 @@ def test_a_frame_without_images_is_placed_by_odometry(views: Views) -> None:
 
 
 def test_a_camera_loop_may_fill_the_same_images_again(views: Views) -> None:
-    """Tracking looks back at the last images: they are not those that were given."""
+    """Tracking compares with the last images: they are not those that were given."""
     buffers = views.images(0)
     taken = checked_images(buffers, RIG)
     before = [image.copy() for image in taken]
@@ -226,14 +226,14 @@ def test_a_camera_loop_may_fill_the_same_images_again(views: Views) -> None:
         np.testing.assert_array_equal(image, then)
 
 
-@pytest.mark.parametrize("anew", [False, True])
+@pytest.mark.parametrize("relocalised", [False, True])
 def test_the_pose_that_is_used_says_whether_it_was_found_anew(
-    views: Views, monkeypatch: pytest.MonkeyPatch, anew: bool
+    views: Views, monkeypatch: pytest.MonkeyPatch, relocalised: bool
 ) -> None:
     """Recent landmarks may place a frame again: with them the prediction, or without it."""
     slam = session(views, frontend={"tracking": "sift", "loops": True})
     push(slam, views, range(3))
-    status = EgoMotionStatus.RELOCALISED if anew else EgoMotionStatus.OK
+    status = EgoMotionStatus.RELOCALISED if relocalised else EgoMotionStatus.OK
 
     def by_recent(self: object, tracked: Tracked, *_: object) -> Tracked:
         found = dataclasses.replace(tracked.ego_motion, status=status)
@@ -241,7 +241,7 @@ def test_the_pose_that_is_used_says_whether_it_was_found_anew(
 
     monkeypatch.setattr(type(slam.pipeline.places), "placed_by_recent", by_recent)
     slam.track(1.5, views.images(3), views.odometry(3))
-    assert slam.log.increments[-1].relocalised is anew
+    assert slam.log.increments[-1].relocalised is relocalised
 
 
 def test_the_log_counts_frames_as_their_recording_does(views: Views) -> None:
@@ -279,7 +279,7 @@ WRONG: dict[str, tuple[type[FgslamError], str, dict[str, Any]]] = {
     "odometry is NaN": (OdometryError, "not finite", {"odometry": np.full((4, 4), np.nan)}),
     "odometry is flat": (OdometryError, r"shape \(3,\)", {"odometry": np.zeros(3)}),
     "odometry is text": (OdometryError, "no array", {"odometry": "fast"}),
-    "odometry stretches": (OdometryError, "rigid", {"odometry": turned(np.eye(4))}),
+    "odometry is scaled": (OdometryError, "rigid", {"odometry": turned(np.eye(4))}),
     "covariance is negative": (
         OdometryError,
         "symmetric and positive",

@@ -64,7 +64,7 @@ def step(estimator: FullEkf, increment: Increment) -> UpdateStats:
 class LinearGraph:
     """The whole run's factors, each linearised by GTSAM where the filter linearised it.
 
-    A pose's variable is its tangent at the prediction, a landmark's its offset from first sight;
+    A pose's variable is its tangent at the prediction, a landmark's its offset as first observed;
     a factor linearised elsewhere has that offset moved to its right-hand side.
     """
 

@@ -372,7 +372,7 @@ def test_estimate_is_the_history_of_updates(simulation: Simulation) -> None:
 
 @pytest.mark.parametrize("measured", [False, True], ids=["guessed", "odometry"])
 def test_landmarks_take_no_guess_over(measured: bool, rng: np.random.Generator) -> None:
-    """A guessed pose is nobody's knowledge of single landmarks; odometry's uncertainty is."""
+    """A guessed pose is no knowledge of single landmarks; odometry's uncertainty is."""
     points = points_in_view(RIG, 5, (1.5, 6.0), rng)
     estimator, z = make(), noisy(points, np.eye(4), rng)
     vague = Prediction(np.eye(4), np.diag([0.5] * 3 + [20.0] * 3) ** 2)

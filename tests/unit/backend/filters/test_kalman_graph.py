@@ -77,7 +77,7 @@ def assert_equal(found: LandmarkMap, expected: LandmarkMap, tolerance: float) ->
 
 
 def updated(pair: Pair, depths: FloatArray, covariance: FloatArray, seed: int) -> float:
-    """Gives both the same first sight and the same second one from a pose nearby.
+    """Gives both the same first observation and the same second one from a pose nearby.
 
     Returns the worst condition number of a landmark's covariance in between.
     """
@@ -152,10 +152,10 @@ def test_a_run_is_the_closed_form(case: str) -> None:
     own, others = closed.landmarks().covariances, graph.landmarks().covariances
     scale = np.abs(own).max(axis=(1, 2), keepdims=True)
     np.testing.assert_allclose(others / scale, own / scale, rtol=0, atol=1e-9)
-    said, others = a.landmarks.covariances, b.landmarks.covariances
-    scale = np.abs(said).max(axis=(1, 2), keepdims=True)
+    reported, others = a.landmarks.covariances, b.landmarks.covariances
+    scale = np.abs(reported).max(axis=(1, 2), keepdims=True)
     # Samples are kept in single precision.
-    np.testing.assert_allclose(others / scale, said / scale, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(others / scale, reported / scale, rtol=0, atol=1e-5)
     assert [s.nis_dof for s in found] == [s.nis_dof for s in expected]
     assert sum(s.nis_dof for s in found) > 300
 

@@ -1,4 +1,4 @@
-"""The homing graph in plain arrays beside the same graph in GTSAM's factors."""
+"""The homing graph in plain arrays next to the same graph in GTSAM's factors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ EXACT = HomingGraphSettings()
 
 @pytest.fixture(autouse=True)
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every image is solved to convergence, and no match is doubted."""
+    """Every image is solved to convergence, and no match weighs less."""
     monkeypatch.setattr("fgslam.backend.homing.schur.STEPS", 30)
     monkeypatch.setattr("fgslam.backend.homing.schur.MATCH_LIMIT", np.inf)
 
@@ -112,7 +112,7 @@ def test_the_factored_system_is_solved() -> None:
 def test_wrong_matches_are_found_by_what_contradicts_them(
     exact: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A wrong match that RANSAC let pass, and that no kernel tells from the others."""
+    """A wrong match that RANSAC let pass, and that no kernel separates from the others."""
     settings = SimulatedBearingsSettings(images_per_s=5.0, part=0.6)
     given = trial(3, settings, HomingOutliers(wrong_matches=0.3))
     wrong = np.flatnonzero(~given.correct)

@@ -67,7 +67,7 @@ def problem(name: Any, seed: int = 0, wrong: float = 0.05) -> tuple[Any, Any, Gr
         motion = inverse(poses_of_frame(values, before)) @ poses_of_frame(values, after)
         motion = motion @ se3_exp(0.01 * rng.standard_normal(6))
         known = Constraint(before, after, motion, random_covariance(rng, 6, 0.01))
-        builder.graph.add(constraint_factor(dataclasses.replace(known, doubted=True)))
+        builder.graph.add(constraint_factor(dataclasses.replace(known, uncertain=True)))
     return builder.kept_factors(), values, builder
 
 
@@ -96,7 +96,7 @@ def test_minimum_is_that_of_gtsam_on_drives_with_loops(name: str) -> None:
     whole, state = builder.whole_graph(values)
     found = whole.minimum(state, ITERATIONS, TOLERANCE)
     assert whole.cost(found) <= graph.error(expected) * (1.0 + 1e-6)
-    if name == "cauchy":  # the others have minima beside each other
+    if name == "cauchy":  # the others have minima next to each other
         np.testing.assert_allclose(found.poses, State.of(expected).poses, rtol=0, atol=1e-4)
 
 
@@ -320,7 +320,7 @@ def test_a_bias_has_nodes_where_its_walk_comes_out_of_the_noise() -> None:
 
 
 def noise_of(turns: Turns) -> FloatArray:
-    """(k, 6, 6) of the steps, beside the bias."""
+    """(k, 6, 6) of the steps, next to the bias."""
     return np.asarray(np.linalg.inv(np.swapaxes(turns.roots, 1, 2) @ turns.roots))
 
 
@@ -406,8 +406,8 @@ def test_step_and_covariances_are_those_of_the_whole_system(
     system = whole.graph.linear(state)
     border, columns = system.border, system.columns
     assert border is not None
-    beside = np.concatenate([np.zeros((columns, border.own.shape[0])), border.by_pose])
-    dense = np.block([[system.information.toarray(), beside], [beside.T, border.own]])
+    coupling = np.concatenate([np.zeros((columns, border.own.shape[0])), border.by_pose])
+    dense = np.block([[system.information.toarray(), coupling], [coupling.T, border.own]])
     size = 1.0 / np.sqrt(np.diagonal(dense))
     covariance = size[:, None] * np.linalg.inv(size[:, None] * dense * size) * size
     found = with_border(kind.of(system))
@@ -494,7 +494,7 @@ def test_a_log_on_disk_and_a_restored_smoother_find_the_same(tmp_path: Path) -> 
 
 
 def with_loop(one: Driven, off_m: float) -> MeasurementLog:
-    """The last frame recognises frame 5, so far beside where it is (to 1 cm and 0.06 degrees)."""
+    """The last frame recognises frame 5, so far from where it is (to 1 cm and 0.06 degrees)."""
     frames, poses = list(one.log), one.simulation.poses
     true = g.inverse(poses[5]) @ poses[len(frames) - 1]
     oTc = true @ g.pose(np.eye(3), np.array([off_m, 0.0, 0.0]))

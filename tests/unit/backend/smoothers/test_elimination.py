@@ -239,7 +239,7 @@ def problems() -> dict[str, Callable[[np.random.Generator], Problem]]:
     return {
         "few poses": lambda rng: Problem(rng, 3, 12),
         "many poses": lambda rng: Problem(rng, 15, 3),
-        "poses cut into stretches": lambda rng: Problem(rng, 12, 24),
+        "poses cut into segments": lambda rng: Problem(rng, 12, 24),
         "one pose": lambda rng: Problem(rng, 1, 4),
         "no landmarks": lambda rng: Problem(rng, 5, 0),
         "robust": lambda rng: Problem(rng, 4, 7, Whitening("cauchy", 0.5)),

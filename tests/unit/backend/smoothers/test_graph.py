@@ -44,7 +44,7 @@ from fgslam.worlds.settings import (
 )
 
 # ------------------------------------------------------------------------------------------
-# Admission of landmarks to the graph: which wait, enter, start anew, and are reported
+# Admission of landmarks to the graph: which wait, enter, start again, and are reported
 
 
 ORIGIN = Prediction(np.eye(4), np.zeros((6, 6)))
@@ -253,7 +253,7 @@ def test_a_landmark_that_moved_starts_anew(name: str, drive: Simulation) -> None
     found = estimator.estimate()
     reported = [r for r in found.remarks if r.startswith(f"landmark {OFTEN} (seen ")]
     assert len(reported) == 1
-    assert "moved, started anew" in reported[0]
+    assert "moved, started again" in reported[0]
     offset = found.landmarks.positions[row_of(found, OFTEN)] - place
     covariance = found.landmarks.covariances[row_of(found, OFTEN)]
     assert offset @ np.linalg.solve(covariance, offset) < 16.3
@@ -294,7 +294,7 @@ def test_contradictions_count_in_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
             gone = made.admission.contradicted(here.accepted, here.wTc)
             found.append(len(gone) == 1)
             if len(gone):
-                made.admission.start_anew([1], "moved")
+                made.admission.restart([1], "moved")
                 made.add(frame(k, points, True), known(points))
             elif k == 4:
                 made.admission.confirmed(np.array([1]))
@@ -447,7 +447,7 @@ def test_landmarks_behind_a_camera_are_removed(
 
 
 # ------------------------------------------------------------------------------------------
-# Drives without odometry that start, stop and bend harder than a moment before
+# Drives without odometry that start, stop and turn harder than a moment before
 
 
 HARD = SimulatedMeasurementsSettings(

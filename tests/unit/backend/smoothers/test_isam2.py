@@ -67,7 +67,7 @@ def test_failure_at_a_landmark_is_repaired_with_a_remark(settings: Isam2Settings
     (remark,) = found.remarks
     assert remark.startswith("landmark 5 (seen ")
     assert "left the system indeterminate at frame " in remark
-    assert remark.endswith("taken out of the graph, iSAM2 built anew from the last estimate")
+    assert remark.endswith("taken out of the graph, iSAM2 rebuilt from the last estimate")
     assert int(remark.split("seen ")[1].split()[0]) >= sightings
     assert "\n" not in remark
     assert ate(found, simulation) < 0.01
@@ -255,5 +255,5 @@ def test_a_covariance_that_the_tree_cannot_tell_is_asked_of_a_new_one() -> None:
     play(estimator, simulation.increments[13:], FREE)
     found = estimator.estimate()
     assert_finite(found)
-    assert found.remarks[0].endswith("iSAM2 built anew, with QR from here on")
+    assert found.remarks[0].endswith("iSAM2 rebuilt, with QR from here on")
     assert ate(found, simulation) < 0.01

@@ -372,7 +372,7 @@ def test_a_landmark_that_moves_within_a_block(since: int) -> None:
     row = found.landmarks.rows(np.array([28]))[0]
     offset = found.landmarks.positions[row] - place
     assert offset @ np.linalg.solve(found.landmarks.covariances[row], offset) < 16.3
-    assert sum("moved, started anew" in remark for remark in found.remarks) == 1
+    assert sum("moved, started again" in remark for remark in found.remarks) == 1
     assert ate(found, drive) < 0.01
 
 

@@ -348,10 +348,10 @@ def last_pose(window: Window) -> FloatArray:
 def test_a_place_is_off_as_far_as_its_frame_had_drifted(returned: SlidingWindowSolver) -> None:
     """Given another that shares a part of it, and the rest."""
     tie, here = returned.tie_of(0), g.inverse(returned.window.poses[0])
-    beside = returned.window.frames[0]
+    near = returned.window.frames[0]
     if tie.follows is not None:
-        beside = returned.frame_of(tie.follows)
-    frames = beside, returned.frame_of(0)
+        near = returned.frame_of(tie.follows)
+    frames = near, returned.frame_of(0)
     other, own = (g.congruence(g.adjoint(here), returned.drift[frame]) for frame in frames)
     whole = g.congruence(tie.gain, other) + np.linalg.inv(tie.information)
     found, expected = np.sqrt(np.diagonal(whole)), np.sqrt(np.diagonal(own))
@@ -388,7 +388,7 @@ def test_what_is_known_too_unevenly_is_begun_anew_with_a_remark(
     off = [np.linalg.norm(s.wTc[:3, 3] - x[:3, 3]) for s, x in zip(stats, drive.poses, strict=True)]
     assert len(failed) == 1
     assert max(off) < 0.03
-    assert sum("begun anew" in remark for remark in estimator.estimate().remarks) == 1
+    assert sum("begun again" in remark for remark in estimator.estimate().remarks) == 1
 
 
 def test_a_change_of_the_rig_is_taken_once_also_by_frames_that_wait() -> None:
@@ -424,9 +424,9 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
     inside = ours[window.landmarks.variables]
     assert all(mask.sum() > 3 for mask in (ours & outside, inside, ~ours & outside, ~inside))
     points, mean = held.points.copy(), window.landmarks.mean.copy()
-    beside = g.se3_exp(np.array([0.0, 0.3, 0.0, 0.5, 0.0, 0.0])) @ window.poses[-1]
-    there = Prediction(beside, 1e-6 * np.eye(6))
-    loop = Constraint(2, window.frames[-1], g.inverse(solver.poses[2]) @ beside, 1e-6 * np.eye(6))
+    near = g.se3_exp(np.array([0.0, 0.3, 0.0, 0.5, 0.0, 0.0])) @ window.poses[-1]
+    there = Prediction(near, 1e-6 * np.eye(6))
+    loop = Constraint(2, window.frames[-1], g.inverse(solver.poses[2]) @ near, 1e-6 * np.eye(6))
     solver.loops.accept(loop)
     solver.move_by_loop(there, loop, Drive(estimator.tracker.chain, window.poses[-1]))
     np.testing.assert_array_equal(held.points[ours & outside], points[ours & outside])

@@ -18,7 +18,7 @@ from fgslam.core import geometry as g
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray
 
 # ------------------------------------------------------------------------------------------
-# The fixed lag's window: what has left says the same, once and where it was first linearised
+# The fixed lag's window: what has left counts the same, once and where it was first linearised
 
 
 FRAMES, FIRST = 14, 8
@@ -97,7 +97,7 @@ def test_an_observation_is_weighed_and_linearised_where_the_prior_was(window: Wi
 
 
 # ------------------------------------------------------------------------------------------
-# Landmarks seen again after a drift: one says nothing, several that agree say where it is
+# Landmarks seen again after a drift: one counts for nothing, several that agree place it
 
 
 WTF = g.se3_exp(np.array([0.1, 0.8, 0.0, 3.0, 0.0, -2.0]))
@@ -148,7 +148,7 @@ FAR_PX = np.array([0.3, 0.3, 0.2])
 
 
 def far_away(turn: float) -> tuple[SeenAgain, Landmarks]:
-    """Eight landmarks whose depth no single observation tells, by a camera that has turned."""
+    """Eight landmarks whose depth no single observation fixes, by a camera that has turned."""
     rng = np.random.default_rng(5)
     local = rng.uniform([-25.0, -18.0, 60.0], [25.0, 18.0, 90.0], (8, 3))
     points = g.transform_to_world(WTF, local)
@@ -162,7 +162,7 @@ def far_away(turn: float) -> tuple[SeenAgain, Landmarks]:
 
 
 def test_landmarks_too_far_to_be_placed_agree_by_where_they_are_seen() -> None:
-    """Waiting for a depth that none of them tells, all of them would be lost to the window."""
+    """Waiting for a depth that none of them fixes, all of them would be lost to the window."""
     turned, known = far_away(0.04)
     assert turned.variables.tolist() == list(range(8))
     assert not turned.near.any()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from known_places import blurred, looks
+from known_places import blurred, random_descriptors
 
 from fgslam.core.arrays import ByteArray
 from fgslam.frontend.features import matching as descriptor_index
@@ -23,7 +23,7 @@ def _assert_equal(a: Neighbours, b: Neighbours) -> None:
 
 
 def test_small_contents_are_answered_exactly(rng: np.random.Generator) -> None:
-    held, asked = looks(rng, 300), looks(rng, 20)
+    held, asked = random_descriptors(rng, 300), random_descriptors(rng, 20)
     found = AppearanceIndex(held).query(asked, 5)
     exact = _truth(asked, held)
     order = np.argsort(exact, axis=1)[:, :5]
@@ -35,7 +35,7 @@ def test_large_contents_are_answered_nearly(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(descriptor_index, "EXACT", 100)
-    held = looks(rng, 4000)
+    held = random_descriptors(rng, 4000)
     asked = blurred(held[:200], rng)
     found = AppearanceIndex(held).query(asked, 3)
     assert np.mean(found.rows[:, 0] == np.arange(200)) > 0.9
@@ -48,7 +48,7 @@ def test_large_contents_are_answered_nearly(
 def test_every_cell_searched_finds_what_a_full_search_does(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, chunk: int
 ) -> None:
-    held, asked = looks(rng, 900), looks(rng, 40)
+    held, asked = random_descriptors(rng, 900), random_descriptors(rng, 40)
     held[450:600] = held[300:450]  # ties, at the last of the asked neighbours as well
     monkeypatch.setattr(descriptor_index, "CHUNK", chunk)
     in_full = AppearanceIndex(held).query(asked, 7)
@@ -64,7 +64,7 @@ def test_words_at_hand_change_nothing(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
     monkeypatch.setattr(descriptor_index, "EXACT", exact)
-    held, asked = looks(rng, 500), looks(rng, 30)
+    held, asked = random_descriptors(rng, 500), random_descriptors(rng, 30)
     found = AppearanceIndex(held).query(asked, 8)
     given = AppearanceIndex(held, descriptor_index.words_of(held)).query(asked, 8)
     _assert_equal(found, given)
@@ -75,8 +75,8 @@ def test_ties_come_in_the_order_of_their_rows_and_none_too_many(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
     monkeypatch.setattr(descriptor_index, "EXACT", exact)
-    look = looks(rng, 1)
-    held = np.concatenate([looks(rng, 5), np.repeat(look, 6, axis=0)])
+    look = random_descriptors(rng, 1)
+    held = np.concatenate([random_descriptors(rng, 5), np.repeat(look, 6, axis=0)])
     found = AppearanceIndex(held).query(look, 3)
     assert found.rows.tolist() == [[5, 6, 7]]
     assert found.distances.tolist() == [[0.0, 0.0, 0.0]]
@@ -87,15 +87,15 @@ def test_what_is_not_held_is_marked(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, exact: int
 ) -> None:
     monkeypatch.setattr(descriptor_index, "EXACT", exact)
-    made = AppearanceIndex(looks(rng, 2))
-    found = made.query(looks(rng, 4), 6)
+    made = AppearanceIndex(random_descriptors(rng, 2))
+    found = made.query(random_descriptors(rng, 4), 6)
     missing = found.rows == -1
     assert (missing == np.isinf(found.distances)).all()
     assert missing[:, 2:].all()
-    assert made.query(looks(rng, 0), 2).rows.shape == (0, 2)
-    nothing = AppearanceIndex(looks(rng, 0))
+    assert made.query(random_descriptors(rng, 0), 2).rows.shape == (0, 2)
+    nothing = AppearanceIndex(random_descriptors(rng, 0))
     assert len(nothing) == 0
-    assert (nothing.query(looks(rng, 4), 2).rows == -1).all()
+    assert (nothing.query(random_descriptors(rng, 4), 2).rows == -1).all()
 
 
 def _views(descriptors: ByteArray) -> Views:
@@ -106,7 +106,7 @@ def _views(descriptors: ByteArray) -> Views:
 
 
 def test_words_are_the_nearest_centres(rng: np.random.Generator) -> None:
-    descriptors = looks(rng, 5000)  # more than are compared at once
+    descriptors = random_descriptors(rng, 5000)  # more than are compared at once
     extreme = np.array([[255] * 128, [0] * 128], np.uint8)
     descriptors = np.concatenate([descriptors, extreme, descriptor_index.vocabulary()])
     centres = descriptor_index.vocabulary().astype(np.int64)
@@ -128,16 +128,16 @@ def test_a_view_is_quantised_to_words_once(
 
     monkeypatch.setattr(views_module, "words_of", counted)
     pool = ViewPool(max_views=1, angle=0.0)
-    first, later = looks(rng, 100), looks(rng, 3)
+    first, later = random_descriptors(rng, 100), random_descriptors(rng, 3)
     places = pool.start(_views(first))
     assert np.array_equal(pool.words(places[:40, 0]), descriptor_index.words_of(first[:40]))
     assert np.array_equal(pool.words(places[:, 0]), descriptor_index.words_of(first))
     pool.refresh(places[10:13], _views(later))
     pool.release(places[50:52])
-    anew = pool.start(_views(later[:2]))  # in the places just released
+    again = pool.start(_views(later[:2]))  # in the places just released
     first[10:13] = later
     assert np.array_equal(pool.words(places[:50, 0]), descriptor_index.words_of(first[:50]))
-    assert np.array_equal(pool.words(anew[:, 0]), descriptor_index.words_of(later[:2]))
+    assert np.array_equal(pool.words(again[:, 0]), descriptor_index.words_of(later[:2]))
     more = pool.start(_views(first))  # the pool grows; what is known stays known
     assert np.array_equal(pool.words(places[:50, 0]), descriptor_index.words_of(first[:50]))
     assert asked == [40, 60, 3, 2, 0]

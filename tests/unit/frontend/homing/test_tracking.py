@@ -207,9 +207,9 @@ def test_a_blank_image_loses_all_and_new_points_get_new_names() -> None:
     first = follower.take(image, 0.0)
     blank = follower.take(np.zeros_like(image), 0.1)
     assert len(blank.tracked) == blank.survivors == 0
-    anew = follower.take(image, 0.2)
-    assert len(anew.tracked) == 60
-    assert anew.tracked.ids.min() > first.tracked.ids.max()
+    again = follower.take(image, 0.2)
+    assert len(again.tracked) == 60
+    assert again.tracked.ids.min() > first.tracked.ids.max()
 
 
 def test_new_points_keep_away_from_those_there_are() -> None:
@@ -251,7 +251,7 @@ def features_at(seen: FloatArray, scale: FloatArray) -> OmniFeatures:
 
 
 def wall_points(count: int, seed: int) -> FloatArray:
-    """(n, 3) on all walls, in sight of both poses."""
+    """(n, 3) on all walls, seen from both poses."""
     rng = np.random.default_rng(seed)
     bearing = rng.uniform(-np.pi, np.pi, count)
     rays = np.column_stack([np.cos(bearing), np.sin(bearing), rng.uniform(-0.5, 0.5, count)])

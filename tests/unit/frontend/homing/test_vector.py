@@ -122,10 +122,10 @@ def test_a_lead_in_one_sector_leaves_doubt_and_the_same_lead_all_around_does_not
 
     best = solution([])
     everywhere, at_one_side = solution([*range(0, 64, 8)]), solution([*range(8)])
-    assert search.doubt(best, [everywhere]) == pytest.approx(norm.sf(np.sqrt(8.0)))
-    assert search.doubt(best, [everywhere, at_one_side]) == pytest.approx(norm.sf(1.0))
-    assert search.doubt(best, [solution([])]) == 0.5
-    assert search.doubt(best, []) == 0.0
+    assert search.rival_probability(best, [everywhere]) == pytest.approx(norm.sf(np.sqrt(8.0)))
+    assert search.rival_probability(best, [everywhere, at_one_side]) == pytest.approx(norm.sf(1.0))
+    assert search.rival_probability(best, [solution([])]) == 0.5
+    assert search.rival_probability(best, []) == 0.0
 
 
 def test_random_matches_are_refused() -> None:
@@ -156,7 +156,7 @@ def test_both_views_from_one_place() -> None:
 
 
 def test_one_thing_of_the_same_kind_elsewhere_is_no_arrival() -> None:
-    """A poster that hangs in another room, too, among wrong matches: that looks like a turn."""
+    """A poster that hangs in another room, too, among wrong matches: that resembles a turn."""
     reasons = []
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -359,10 +359,10 @@ def crowded_views(seed: int, shared: int, blur: float) -> tuple[OmniFeatures, Om
     turn = np.array(
         [[np.cos(psi), -np.sin(psi), 0.0], [np.sin(psi), np.cos(psi), 0.0], [0.0, 0.0, 1.0]]
     )
-    looks = rng.gamma(0.6, 40.0, (len(points), 128))
+    drawn = rng.gamma(0.6, 40.0, (len(points), 128))
 
     def again() -> FloatArray:
-        return np.asarray(looks + rng.normal(0.0, blur, looks.shape))
+        return np.asarray(drawn + rng.normal(0.0, blur, drawn.shape))
 
     def others(count: int) -> tuple[FloatArray, FloatArray]:
         around, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(0.7, 5.0, count)
@@ -478,13 +478,13 @@ def test_things_in_one_place_say_less_than_things_all_around(width: float) -> No
     points = np.column_stack(
         [2.0 * np.cos(around), 2.0 * np.sin(around), rng.uniform(0.2, 0.3, 30)]
     )
-    looks = rng.gamma(0.6, 40.0, (30, 128))
+    drawn = rng.gamma(0.6, 40.0, (30, 128))
     theta, psi = TRUE
     leg = np.array([np.cos(theta), np.sin(theta), 0.0])
     turn = np.array(
         [[np.cos(psi), -np.sin(psi), 0.0], [np.sin(psi), np.cos(psi), 0.0], [0.0, 0.0, 1.0]]
     )
-    a, b = view(points, looks, rng), view((points - leg) @ turn, looks, rng)
+    a, b = view(points, drawn, rng), view((points - leg) @ turn, drawn, rng)
     candidates = candidates_of(a, b)
     good, residuals = EpipolarTest.of(candidates.matches).inliers(TRUE[:1], TRUE[1:], 3.0, 0.05)
     score, rows = GuidedScore(candidates).of(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from known_places import RIG, looks, planar
+from known_places import RIG, planar, random_descriptors
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import project, transform_to_camera
@@ -23,7 +23,9 @@ def _views(ids: IntArray, rng: np.random.Generator) -> LandmarkAppearances:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     direction[rng.random(len(ids)) < 0.2] = np.nan
     size = rng.uniform(1.0, 30.0, len(ids))
-    return LandmarkAppearances(ids, looks(rng, len(ids)), size, np.zeros(len(ids)), direction)
+    return LandmarkAppearances(
+        ids, random_descriptors(rng, len(ids)), size, np.zeros(len(ids)), direction
+    )
 
 
 @pytest.fixture
@@ -92,9 +94,9 @@ def test_recognisable_is_what_has_a_view_of_like_direction_and_scale(known: Know
     rows, points = known.in_view(RIG, wTc)
     wanted = []
     for row, distance in zip(rows.tolist(), points[:, 2], strict=True):
-        sight = known.landmarks.positions[row] - wTc[:3, 3]
+        ray = known.landmarks.positions[row] - wTc[:3, 3]
         for view in np.flatnonzero(known.owners == row):
-            cosine = sight @ known.views.direction[view] / np.linalg.norm(sight)
+            cosine = ray @ known.views.direction[view] / np.linalg.norm(ray)
             alike = np.isnan(cosine) or cosine >= np.cos(angle)
             if alike and scales[0] <= known.views.size[view] / distance <= scales[1]:
                 wanted.append(row)

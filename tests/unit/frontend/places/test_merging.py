@@ -49,8 +49,8 @@ class World:
     def __init__(self, rng: np.random.Generator, count: int = 400) -> None:
         self.rng = rng
         self.points = rng.uniform([-5, -1, -5], [5, 1, 5], (count, 3))
-        looks = rng.exponential(1.0, (count, 128))
-        self.looks = 512.0 * looks / np.linalg.norm(looks, axis=1, keepdims=True)
+        signatures = rng.exponential(1.0, (count, 128))
+        self.signatures = 512.0 * signatures / np.linalg.norm(signatures, axis=1, keepdims=True)
         self.size = rng.uniform(2.0, 8.0, count)
 
     def seen(self, which: IntArray, wTm: FloatArray, stamp: float = 0.0) -> SavedMap:
@@ -60,12 +60,12 @@ class World:
         positions = g.transform_to_camera(wTm, self.points[which]) + noise
         covariances = np.broadcast_to(SIGMA_M**2 * np.eye(3), (n, 3, 3)).copy()
         ids = 3 * np.arange(n) + 1
-        looks = self.looks[which] + 8.0 * rng.standard_normal((n, 128))
+        signatures = self.signatures[which] + 8.0 * rng.standard_normal((n, 128))
         size = self.size[which] * rng.uniform(0.9, 1.1, n)
         return SavedMap(
             rig=LEVEL_RIG,
             landmarks=LandmarkMap(ids, positions, covariances),
-            appearances=appearances(ids, np.clip(looks, 0, 255).astype(np.uint8), size),
+            appearances=appearances(ids, np.clip(signatures, 0, 255).astype(np.uint8), size),
             hits=rng.integers(3, 40, n),
             misses=rng.integers(0, 10, n),
             farthest=np.linspace(1.0, 2.0, n),
@@ -131,7 +131,7 @@ def test_one_poster_in_common_is_no_overlap(world: World, rng: np.random.Generat
     other = World(rng, 400)
     poster = np.arange(40)
     world.points[poster] = rng.uniform([-1, -1, 3.0], [1, 1, 3.02], (40, 3))
-    for name in ("points", "looks", "size"):
+    for name in ("points", "signatures", "size"):
         getattr(other, name)[poster] = getattr(world, name)[poster]
     near = np.array([5.0, 1.0, 5.0]) * 0.3
     world.points[40:] *= 0.3
@@ -147,7 +147,7 @@ def test_a_place_that_repeats_is_ambiguous(world: World, rng: np.random.Generato
     """Two identical rooms in the first map, one of them in the second."""
     room = np.arange(100)
     world.points[100:200] = world.points[room] + np.array([0.0, 0.0, 12.0])
-    world.looks[100:200], world.size[100:200] = world.looks[room], world.size[room]
+    world.signatures[100:200], world.size[100:200] = world.signatures[room], world.size[room]
     a = world.seen(np.arange(400), np.eye(4))
     b = world.seen(room, BTA)
     with pytest.raises(MapError, match=r"ambiguous|look alike"):
@@ -286,11 +286,11 @@ def test_landmarks_are_as_alike_as_the_nearest_of_their_views(
 def with_strange_views(saved: SavedMap, count: int, rng: np.random.Generator) -> SavedMap:
     """Every landmark seen ``count`` more times, each time looking like nothing else."""
     own = saved.appearances
-    looks = rng.exponential(1.0, (count * len(own), 128))
-    looks = 512.0 * looks / np.linalg.norm(looks, axis=1, keepdims=True)
+    signatures = rng.exponential(1.0, (count * len(own), 128))
+    signatures = 512.0 * signatures / np.linalg.norm(signatures, axis=1, keepdims=True)
     ids = np.concatenate([own.ids, np.tile(own.ids, count)])
     order = np.argsort(ids, kind="stable")
-    descriptors = np.concatenate([own.descriptors, np.clip(looks, 0, 255).astype(np.uint8)])
+    descriptors = np.concatenate([own.descriptors, np.clip(signatures, 0, 255).astype(np.uint8)])
     size = np.tile(own.size, count + 1)
     return replace(saved, appearances=appearances(ids[order], descriptors[order], size[order]))
 
@@ -306,7 +306,7 @@ HALF_BAND = (
 
 
 class Place:
-    """Points with looks, along a drive that is made again and again."""
+    """Points with descriptors, along a drive that is made again and again."""
 
     def __init__(self, seed: int, frames: int = 12) -> None:
         self.rng = np.random.default_rng(seed)
@@ -316,28 +316,28 @@ class Place:
         for _ in range(frames - 1):
             self.poses.append(g.reorthonormalise(self.poses[-1] @ step))
         self.points = points_in_views(self.drive, self.poses, self.rng)
-        looks = self.rng.exponential(1.0, (POINTS, 128))
-        self.looks = 512.0 * looks / np.linalg.norm(looks, axis=1, keepdims=True)
+        signatures = self.rng.exponential(1.0, (POINTS, 128))
+        self.signatures = 512.0 * signatures / np.linalg.norm(signatures, axis=1, keepdims=True)
         self.size = self.rng.uniform(2.0, 8.0, POINTS)
 
     def visit(self, pTw: FloatArray, noise: float = 1.0) -> tuple[SavedMap, IntArray]:
         """A map of a drive that begins at a pose, and the point of each landmark."""
         drive = replace(self.drive, noise=noise)
-        book = Identities(drive, g.transform_to_camera(pTw, self.points))
+        kept = Identities(drive, g.transform_to_camera(pTw, self.points))
         step = g.se3_exp(np.array(TURN_AND_GO))
-        seen = [book.increment(k, wTc, step, self.rng) for k, wTc in enumerate(self.poses)]
+        seen = [kept.increment(k, wTc, step, self.rng) for k, wTc in enumerate(self.poses)]
         simulation = Simulation(drive, np.array(self.poses), self.points, seen)
         estimate = answer(BatchSettings(), simulation.increments)
-        which = book.book.point_of_id[estimate.landmarks.ids]
+        which = kept.book.point_of_id[estimate.landmarks.ids]
         every = np.concatenate([i.observations.ids for i in seen])
         n, ids = len(which), estimate.landmarks.ids
-        looks = self.looks[which] + 8.0 * self.rng.standard_normal((n, 128))
+        signatures = self.signatures[which] + 8.0 * self.rng.standard_normal((n, 128))
         return SavedMap(
             rig=RIG,
             landmarks=estimate.landmarks,
             appearances=LandmarkAppearances(
                 ids,
-                np.clip(looks, 0, 255).astype(np.uint8),
+                np.clip(signatures, 0, 255).astype(np.uint8),
                 self.size[which],
                 np.zeros(n),
                 np.tile([0.0, 0.0, 1.0], (n, 1)),

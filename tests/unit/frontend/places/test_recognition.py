@@ -101,7 +101,7 @@ def states_of(pipeline: SlamPipeline) -> State:
 
 @lru_cache(maxsize=2)
 def ring_and_states(refusing: bool) -> tuple[SlamPipeline, list[FrameReport], list[State]]:
-    """Once round and past the start, a stretch of it in the dark; the state before each frame."""
+    """Once round and past the start, a part of it in the dark; the state before each frame."""
     pipeline, reports, states = round_the_ring(), list[FrameReport](), list[State]()
     with pytest.MonkeyPatch.context() as patch:
         if refusing:
@@ -372,7 +372,7 @@ def turned(yaw_deg: float, x: float = 0.0, z: float = 0.0) -> FloatArray:
     return g.pose(g.so3_exp(np.deg2rad(yaw_deg) * DOWN), np.array([x, 0.0, z]))
 
 
-def sight(
+def seen_from(
     wTc: FloatArray, points: FloatArray, ids: IntArray, rng: np.random.Generator | None = None
 ) -> Observations:
     """What a camera measures of points; with a fifth of a pixel of noise where ``rng`` is given."""
@@ -407,7 +407,7 @@ def remembered(frames: list[list[int]], given: int = -1) -> SightingMemory:
     for k, ids in enumerate(frames):
         known = np.array(ids, np.int64)
         points = np.tile([0.0, 0.0, 3.0], (len(ids), 1))
-        memory.add(frame(k, sight(np.eye(4), points, known)), forward)
+        memory.add(frame(k, seen_from(np.eye(4), points, known)), forward)
     return memory
 
 
@@ -473,8 +473,8 @@ def test_unseen_landmarks_of_the_map_count_as_seen_where_the_run_entered_it() ->
 def test_a_frame_is_placed_in_the_map_by_the_map_alone() -> None:
     memory = remembered([[*HERE, 60, 61]], given=59)
     held = _map(np.arange(1, 70), np.zeros((69, 3)))
-    beside = memory.view(0, np.array([40]), held)
-    np.testing.assert_array_equal(beside.ids, HERE[1:])
+    located = memory.view(0, np.array([40]), held)
+    np.testing.assert_array_equal(located.ids, HERE[1:])
     again = memory.view(0, np.array([3, 60, 40]), held)
     np.testing.assert_array_equal(again.ids, [*HERE[1:], 60, 61])
 
@@ -515,9 +515,9 @@ def test_a_return_in_between_bounds_the_drift() -> None:
 
 def closing(k: int, to: int, again: IntArray) -> Increment:
     """A frame that sees nothing but the landmarks of an earlier one, by a closure."""
-    old = sight(np.eye(4), np.tile([0.0, 0.0, 3.0], (len(again), 1)), again)
+    old = seen_from(np.eye(4), np.tile([0.0, 0.0, 3.0], (len(again), 1)), again)
     loop = LoopClosure(to, np.eye(4), np.eye(6), old, np.empty((0, 2), np.int64))
-    nothing = sight(np.eye(4), np.empty((0, 3)), NOBODY)
+    nothing = seen_from(np.eye(4), np.empty((0, 3)), NOBODY)
     return dataclasses.replace(frame(k, nothing), loops=(loop,))
 
 
@@ -533,7 +533,7 @@ def test_a_closure_bounds_the_drift_only_if_the_estimator_took_it(taken: bool, w
     restored, log = SightingMemory(), MeasurementLog(RIG, {})
     for k, ids in enumerate(places):
         points = np.tile([0.0, 0.0, 3.0], (len(ids), 1))
-        log.append(frame(k, sight(np.eye(4), points, np.array(ids))))
+        log.append(frame(k, seen_from(np.eye(4), points, np.array(ids))))
     log.append(last)
     restore(restored, state_of(memory))
     restored.frames[:] = log
@@ -553,7 +553,7 @@ def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
     unseen = np.arange(32, 60)
     for one in (memory, again):
         new = np.arange(600, 620)
-        one.add(frame(47, sight(np.eye(4), np.tile([0.0, 0.0, 3.0], (20, 1)), new)), np.eye(4))
+        one.add(frame(47, seen_from(np.eye(4), np.tile([0.0, 0.0, 3.0], (20, 1)), new)), np.eye(4))
         np.testing.assert_array_equal(one.unseen_for(30, MAP), [*HERE, *unseen])
         assert one.best_view_of(unseen, held) == 1
         assert one.last_seen(unseen) == 4
@@ -621,7 +621,7 @@ def test_resection_finds_the_pose_among_wrong_matches(dof: int) -> None:
     rng = np.random.default_rng(5)
     points = cloud(60, rng)
     true = turned(-9.0, x=0.3, z=0.4)
-    seen = sight(true, points, np.arange(60), rng)
+    seen = seen_from(true, points, np.arange(60), rng)
     wrong = rng.choice(60, 24, False)
     seen.measurement[wrong] += rng.uniform(8.0, 60.0, (24, 3))
     resection = Resection(EgoMotionSolver(RIG, EgoMotionSettings(dof=dof)))
@@ -640,7 +640,7 @@ def test_resection_finds_the_pose_among_wrong_matches(dof: int) -> None:
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
 def test_resection_of_too_few_matches_says_so(count: int) -> None:
     points = cloud(count, np.random.default_rng(0))
-    seen = sight(np.eye(4), points, np.arange(count))
+    seen = seen_from(np.eye(4), points, np.arange(count))
     resection = Resection(EgoMotionSolver(RIG, EgoMotionSettings()))
     found = resection.solve(PoseProblem.of(_map(np.arange(count), points), seen))
     assert found.status is EgoMotionStatus.TOO_FEW_MATCHES
@@ -670,12 +670,12 @@ def test_closure_measures_the_relative_pose_whatever_the_drift() -> None:
     rng = np.random.default_rng(6)
     points, ids = cloud(50, rng), np.arange(50)
     memory = SightingMemory()
-    memory.add(frame(0, sight(turned(0.0), points, ids, rng)), np.eye(4))
+    memory.add(frame(0, seen_from(turned(0.0), points, ids, rng)), np.eye(4))
     for k in range(1, 4):
-        nothing = sight(np.eye(4), np.empty((0, 3)), np.empty(0, np.int64))
+        nothing = seen_from(np.eye(4), np.empty((0, 3)), np.empty(0, np.int64))
         memory.add(frame(k, nothing), turned(0.0, z=1.0))
     true = turned(6.0, x=0.2, z=0.3)
-    features = features_of(sight(true, points, ids, rng))
+    features = features_of(seen_from(true, points, ids, rng))
     partners = np.where(ids < 20, ids + 100, -1)
     found = Relocalisation(
         RelocalisationStatus.FOUND, true, np.eye(6), ids, ids, 50, 50, 0.3, 0, "for the test"
@@ -702,18 +702,18 @@ def test_closure_measures_the_relative_pose_whatever_the_drift() -> None:
 
 def test_duplicates_are_near_and_look_alike() -> None:
     rng = np.random.default_rng(7)
-    looks = rng.integers(0, 90, (4, 128)).astype(np.uint8)
+    signatures = rng.integers(0, 90, (4, 128)).astype(np.uint8)
     old = rng.uniform(-5.0, 5.0, (4, 3))
     new = old + np.array([[0.02, 0.0, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 0.03], [0.01, 0.0, 0.0]])
     other = rng.integers(0, 255, 128).astype(np.uint8)
-    descriptors = np.concatenate([looks, looks[:3], other[None]])
+    descriptors = np.concatenate([signatures, signatures[:3], other[None]])
     ids = np.arange(8)
     appearances = LandmarkAppearances(
         ids, descriptors, np.ones(8), np.zeros(8), np.full((8, 3), np.nan)
     )
     landmarks = _map(ids, np.concatenate([old, new]))
     pairs = duplicates(landmarks, appearances, (ids[4:], ids[:4]), AppearanceSettings())
-    # the second is too far away, the fourth looks different
+    # the second is too far away, the fourth appears different
     np.testing.assert_array_equal(pairs, [[4, 0], [6, 2]])
     none = duplicates(landmarks, appearances, (ids[:0], ids[:4]), AppearanceSettings())
     assert none.shape == (0, 2)
@@ -795,7 +795,7 @@ def test_an_aliased_place_with_missing_landmarks_still_makes_it_ambiguous(missin
 
 
 def test_a_place_that_explains_less_than_half_does_not_compete() -> None:
-    """Were it the right one, what stands beside the objects that both have would be explained."""
+    """Were it the right one, what stands next to the objects that both have would be explained."""
     best = _pose(np.arange(24))
     assert _status(30, best, _pose(np.arange(12, 24), place=1)) is RelocalisationStatus.AMBIGUOUS
     best = _pose(np.arange(25))
@@ -805,7 +805,7 @@ def test_a_place_that_explains_less_than_half_does_not_compete() -> None:
 
 
 def test_an_object_carried_off_is_refused() -> None:
-    """All that looks like a landmark agrees; but it hung on a wall that is not there."""
+    """All that resembles a landmark agrees; but it hung on a wall that is not there."""
     carried = replace(_pose(np.arange(20), covered=0.3), explained=0.3)
     assert _status(21, carried) is RelocalisationStatus.CONTRADICTED
     assert _status(21, replace(carried, explained=0.6)) is RelocalisationStatus.FOUND
@@ -813,7 +813,7 @@ def test_an_object_carried_off_is_refused() -> None:
 
 
 def test_hypotheses_that_share_their_inliers_do_not_compete() -> None:
-    """Two poses by the same landmarks are one, known badly; the covariance says how."""
+    """Two poses by the same landmarks are one, known badly; the covariance shows how."""
     assert _status(24, _pose(np.arange(20)), _pose(np.arange(2, 20))) is RelocalisationStatus.FOUND
 
 

@@ -362,7 +362,7 @@ def _carried(view: StereoFeatures, lTc: FloatArray) -> StereoFeatures:
 
 
 # ------------------------------------------------------------------------------------------
-# After a gap that nothing bridges the map is founded anew; recognised, its parts become one
+# After a gap that nothing bridges the map is begun again; recognised, its parts become one
 
 
 GAP = 8

@@ -51,7 +51,7 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def tilted_rig(pitch_deg: float) -> CameraRig:
-    """The camera looks down by an angle, half a metre ahead of the robot's centre."""
+    """The camera points down by an angle, half a metre ahead of the robot's centre."""
     bTc = g.BODY_FORWARD_LEFT_UP_FROM_CAMERA @ g.se3_exp(
         np.array([-np.deg2rad(pitch_deg), 0.0, 0.0, 0.0, 0.0, 0.0])
     )
@@ -377,7 +377,7 @@ def test_the_cap_shortens_the_correction_along_itself(dof: int) -> None:
 
 
 def test_the_cap_is_as_wide_as_the_prediction_is_uncertain() -> None:
-    """A jump of 0.6 m: beyond a cap of 0.3 m, unless the prediction says that it knows little."""
+    """A jump of 0.6 m: beyond a cap of 0.3 m, unless the prediction is uncertain."""
     rng = np.random.default_rng(33)
     problem = scene(FORWARD, rng)
     slipped = FORWARD @ g.se3_exp(np.array([0.0, 0.0, 0.0, 0.6, 0.0, 0.0]))
@@ -589,7 +589,7 @@ def noisy_drive(frames: int) -> MeasurementLog:
     return open_measurements(world, 1, ConstantVelocitySettings()).log
 
 
-def told(noise: MatchNoise, *misfits: float) -> float:
+def learnt_variance(noise: MatchNoise, *misfits: float) -> float:
     nothing = np.empty(0)
     for misfit in misfits:
         status = EgoMotionStatus.OK
@@ -599,13 +599,13 @@ def told(noise: MatchNoise, *misfits: float) -> float:
 
 
 def test_three_frames_contradict_the_stated_noise_and_a_stretch_of_wrong_matches_does_not() -> None:
-    assert told(MatchNoise(), 16.0, 17.0) == 1.0
-    assert told(MatchNoise(), 16.0, 17.0, 18.0) == 16.0
-    assert told(MatchNoise(), *[0.1] * 9) == 1.0
-    assert told(MatchNoise(), *[1.9] * 9) == 1.0  # the stated noise may well be true
-    assert told(MatchNoise(), *[1.0] * 20, *[50.0] * 14) == 1.0
-    assert told(MatchNoise(), *[9.0] * 40, *[50.0] * 14) == 9.0
-    assert told(MatchNoise(), np.nan, np.nan, np.nan, np.nan) == 1.0
+    assert learnt_variance(MatchNoise(), 16.0, 17.0) == 1.0
+    assert learnt_variance(MatchNoise(), 16.0, 17.0, 18.0) == 16.0
+    assert learnt_variance(MatchNoise(), *[0.1] * 9) == 1.0
+    assert learnt_variance(MatchNoise(), *[1.9] * 9) == 1.0  # the stated noise may well be true
+    assert learnt_variance(MatchNoise(), *[1.0] * 20, *[50.0] * 14) == 1.0
+    assert learnt_variance(MatchNoise(), *[9.0] * 40, *[50.0] * 14) == 9.0
+    assert learnt_variance(MatchNoise(), np.nan, np.nan, np.nan, np.nan) == 1.0
 
 
 def test_a_frame_whose_pose_is_only_predicted_says_nothing_of_the_noise() -> None:

@@ -146,7 +146,7 @@ def test_a_landmark_found_again_is_placed_by_its_own_patch(nearer: float, least:
 
 
 def test_what_looks_different_by_now_is_not_found_again() -> None:
-    """Every second one is taken for what lies ten pixels beside it."""
+    """Every second one is taken for what lies ten pixels next to it."""
     off = np.where(np.arange(len(GRID))[:, None] % 2, [9.0, -7.0], 0.0)
     _, at = found_again(np.array([0.02, 0.0, 0.0]), off)
     same = np.isin(at.ids - 10, np.flatnonzero(off[:, 0] == 0.0))

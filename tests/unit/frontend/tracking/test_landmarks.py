@@ -187,7 +187,7 @@ def test_landmark_ids_may_differ_from_row_numbers() -> None:
 
 
 def test_a_confirmed_landmark_is_not_missed_from_farther_than_it_was_ever_seen() -> None:
-    """What hid it when the drive came hides it again; a single sighting tells no such distance."""
+    """What hid it when the drive came hides it again; a single sighting gives no such distance."""
     points = np.array([[0.0, 0.0, 3.0], [0.2, 0.0, 3.0]])
     database = database_of(points)
     for z in (2.0, 1.5):
@@ -223,15 +223,15 @@ def test_a_miss_on_a_key_frame_counts_the_frames_in_view_that_did_not_look() -> 
 def test_several_key_frames_decide_whatever_the_gap_between_them() -> None:
     database = LandmarkDatabase(RIG, DatabaseSettings(prune_after_misses=10), 40.0)
     database.add(stereo_features(at_pixels([(80, 60, 8)])), np.arange(1), np.zeros(1, np.uint8))
-    ids, none, looks = np.array([0]), np.empty(0, np.int64), 0
+    ids, none, searches = np.array([0]), np.empty(0, np.int64), 0
     database.prune()
     while len(database):
         for _ in range(30):
             database.record_carried(none, ids)
         database.record_misses(ids)
         database.prune()
-        looks += 1
-    assert looks == 4
+        searches += 1
+    assert searches == 4
 
 
 def test_own_patches_stay_with_their_landmarks() -> None:
@@ -397,7 +397,7 @@ def test_merging_adds_counts_and_keeps_the_later_look() -> None:
     for _ in range(2):
         hit(database, 2)
     end_frame(database, 3)
-    looks = {i: database.appearances(np.array([i])).descriptors[0] for i in (0, 2, 3)}
+    views = {i: database.appearances(np.array([i])).descriptors[0] for i in (0, 2, 3)}
     seen = state_of(database)["columns/seen"][[0, 2, 3]].copy()
     assert seen.tolist() == [1, 2, 0]
     database.merge(np.array([[2, 0], [3, 1]]))
@@ -407,7 +407,7 @@ def test_merging_adds_counts_and_keeps_the_later_look() -> None:
     assert database.missed.tolist() == [0, 0]
     assert state_of(database)["columns/seen"].tolist() == [2, 0]
     assert database.permanent.tolist() == [True, False]
-    np.testing.assert_array_equal(database.appearances(np.array([0])).descriptors[0], looks[2])
+    np.testing.assert_array_equal(database.appearances(np.array([0])).descriptors[0], views[2])
     # What ends is never named again.
     assert database.next_id == 4
 
@@ -562,7 +562,7 @@ def test_a_map_with_a_landmark_that_has_no_view_is_refused() -> None:
 
 
 def test_memory_a_landmark_is_as_documented() -> None:
-    """docs/concepts/maps.md tells it."""
+    """docs/concepts/maps.md describes it."""
     assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0)) == 78 + 164
     assert kept_bytes(LandmarkDatabase(RIG, DatabaseSettings(), 40.0, CUT_PIXELS)) == 242 + 289
     assert kept_bytes(LandmarkDatabase(RIG, VIEWS, 40.0)) == 242 + 2 * 4
@@ -744,7 +744,7 @@ def test_loading_keeps_the_last_views_of_a_landmark_that_has_too_many() -> None:
 
 
 # ------------------------------------------------------------------------------------------
-# Landmarks and frames hang together by measurements, or lie beside each other by a guess
+# Landmarks and frames are connected by measurements, or lie next to each other by a guess
 
 
 GUESS = Odometry(np.eye(4), np.eye(6), measured=False)
@@ -772,7 +772,7 @@ def frame(
     )
 
 
-def booked(*frames: Increment) -> MapParts:
+def parts_of(*frames: Increment) -> MapParts:
     parts = MapParts()
     for one in frames:
         parts.record(one, (True,) * len(one.loops))
@@ -786,42 +786,42 @@ GAP = frame(new=range(30, 50))
 @pytest.mark.parametrize("odometry", [GUESS, None], ids=["live", "in a log"])
 def test_a_frame_that_nothing_places_founds_a_part(odometry: Odometry | None) -> None:
     gap = frame(new=range(30, 50), odometry=odometry)
-    parts = booked(*BEFORE, gap, frame(range(30, 45), range(50, 55), odometry))
+    parts = parts_of(*BEFORE, gap, frame(range(30, 45), range(50, 55), odometry))
     assert parts.connected.tolist() == [True, True, False, False]
     assert parts.of(np.array([5, 25, 31, 52])).tolist() == [0, 0, 1, 1]
     assert parts.placed_by(np.array([1, 30, 31])) == 1
 
 
 def test_what_was_rejected_places_nothing() -> None:
-    parts = booked(*BEFORE, frame(range(20), range(30, 50), rejected=range(20)))
+    parts = parts_of(*BEFORE, frame(range(20), range(30, 50), rejected=range(20)))
     assert parts.connected.tolist() == [True, True, False]
 
 
 def test_odometry_bridges_a_gap() -> None:
-    assert booked(*BEFORE, frame(new=range(30, 50), odometry=WHEELS)).connected.all()
+    assert parts_of(*BEFORE, frame(new=range(30, 50), odometry=WHEELS)).connected.all()
 
 
 def test_a_frame_that_sees_two_parts_makes_them_one() -> None:
-    parts = booked(*BEFORE, GAP, frame(range(24, 36)))
+    parts = parts_of(*BEFORE, GAP, frame(range(24, 36)))
     assert parts.connected.all()
     assert not parts.several
 
 
 def test_a_few_agreeing_landmarks_do_not_join_parts() -> None:
-    parts = booked(*BEFORE, GAP, frame(range(28, 48)))
+    parts = parts_of(*BEFORE, GAP, frame(range(28, 48)))
     assert parts.connected.tolist() == [True, True, False, False]
 
 
 @pytest.mark.parametrize("taken", [True, False])
 def test_a_closure_joins_where_it_is_taken(taken: bool) -> None:
     loop = LoopClosure(0, np.eye(4), np.eye(6), observed(range(5), range(0)), np.empty((0, 2)))
-    parts = booked(*BEFORE, GAP)
+    parts = parts_of(*BEFORE, GAP)
     parts.record(frame(range(30, 50), loops=(loop,)), (taken,))
     assert bool(parts.connected.all()) is taken
 
 
 def test_continued_from_its_state_it_is_the_same() -> None:
-    parts, again = booked(*BEFORE, GAP), MapParts()
+    parts, again = parts_of(*BEFORE, GAP), MapParts()
     restore(again, state_of(parts))
     for one in (parts, again):
         one.record(frame(new=range(50, 60)), ())
@@ -831,7 +831,7 @@ def test_continued_from_its_state_it_is_the_same() -> None:
 
 
 def test_landmarks_of_a_given_map_are_of_the_first_part() -> None:
-    parts = booked(frame(range(100, 120), odometry=None), frame(range(100, 110)))
+    parts = parts_of(frame(range(100, 120), odometry=None), frame(range(100, 110)))
     assert parts.connected.all()
 
 
@@ -870,7 +870,7 @@ def test_a_view_in_which_nearly_nothing_is_matched_is_blocked(below, hits, blind
     expected = expected_landmarks([True] * 20 + [False] * 30)
     hit = np.zeros(50, np.bool_)
     hit[:hits] = True
-    hit[20:40] = True  # what is at the border says nothing about the view
+    hit[20:40] = True  # what is at the border is no evidence about the view
     assert is_blind(expected, hit, PermanenceSettings(blind_below=below)) is blind
 
 
@@ -880,7 +880,7 @@ SEEN = {
     "nothing": ([], False),
     "the wall behind": ([(105, 85, 5)], True),
     "something before it": ([(105, 85, 15)], False),
-    "the wall behind, beside what may hide it": ([(95, 80, 5), (105, 85, 15)], False),
+    "the wall behind, next to what may hide it": ([(95, 80, 5), (105, 85, 15)], False),
     "something at its own depth": ([(105, 85, 10.5)], False),
     "hardly behind": ([(105, 85, 8.01)], False),
     "just behind": ([(105, 85, 7.99)], True),

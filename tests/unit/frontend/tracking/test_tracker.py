@@ -321,7 +321,7 @@ def box(rng: np.random.Generator, count: int, half: float, depth: float) -> Floa
 
 
 class Things:
-    """A tracker that looks at points around the middle; its map is the truth."""
+    """A tracker that observes points around the middle; its map is the truth."""
 
     def __init__(self, points: FloatArray, frontend: FrontendSettings) -> None:
         self.world = FeatureWorld(points, np.random.default_rng(5))
@@ -395,7 +395,7 @@ def test_the_four_branches(branch: str) -> None:
     assert (landmark in association.observations.ids) is matched
     assert (landmark in association.missed_ids) is (misses == 1)
     after = things.database.appearances(np.array([landmark]))
-    # What it looked like is forgotten only where it was seen anew from the same direction.
+    # What it looked like is forgotten only where it was seen again from the same direction.
     assert (before.size[0] in after.size) is (views == 2 or not matched)
     np.testing.assert_allclose(np.linalg.norm(after.direction, axis=1), 1.0, atol=1e-6)
     np.testing.assert_allclose(after.direction[0], before.direction[0], atol=1e-6)
@@ -533,7 +533,7 @@ def test_a_hit_in_between_clears_a_landmark() -> None:
 
 
 def test_a_landmark_rejected_again_and_again_is_demoted() -> None:
-    """It has been moved a little: what looks like it is found beside its place."""
+    """It has been moved a little: what resembles it is found next to its place."""
     things = beside_a_wall(LASTING)
     landmark = things.id_of(20)
     row = int(things.map.rows(np.array([landmark]))[0])
@@ -553,7 +553,7 @@ RESCUING = dataclasses.replace(
     SETTINGS, matching=dataclasses.replace(SETTINGS.matching, rescue=True)
 )
 TURNED = g.se3_exp(np.array([0.05, 0.2, -0.1, 0.2, 0.05, 0.1]))  # 13 degrees, half the image
-ABSURD = g.se3_exp(np.array([0.0, 2.5, 0.0, -4.0, 0.0, 1.0]))  # looks away from all landmarks
+ABSURD = g.se3_exp(np.array([0.0, 2.5, 0.0, -4.0, 0.0, 1.0]))  # turned away from all landmarks
 
 
 def tracked_at(scene: Scene, predicted: FloatArray, wTc: FloatArray = TURNED) -> Tracked:
@@ -744,12 +744,12 @@ def drive(board_m: float, step_m: float) -> Session:
 
 def test_something_large_that_passes_is_told() -> None:
     with drive(1.2, 0.1) as session:
-        told = [note for note in session.result().notes if note.code.startswith("other_motion")]
-        assert len(told) == 1, session.result().notes
+        reported = [note for note in session.result().notes if note.code.startswith("other_motion")]
+        assert len(reported) == 1, session.result().notes
         watch = session.pipeline.tracker.other_motion
         other = OtherMotion(PASSING_RIG, EgoMotionSolver(PASSING_RIG, EgoMotionSettings()))
         restore(other, state_of(watch))
-        assert other.remarks() == watch.remarks() == (told[0],)
+        assert other.remarks() == watch.remarks() == (reported[0],)
         for name, array in state_of(watch).items():
             np.testing.assert_array_equal(state_of(other)[name], array)
 
