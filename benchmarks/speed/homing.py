@@ -25,7 +25,7 @@ from fgslam.core.threads import one_blas_thread
 from fgslam.frontend.features.omni import OmniFeatureExtractor
 from fgslam.frontend.settings import OmniFeatureSettings
 from fgslam.homing.controller import HomingController
-from fgslam.homing.front_end import HomingFrontEnd, ImageFrontEnd
+from fgslam.homing.front_end import ImageFrontEnd
 from fgslam.homing.settings import FrontEndSettings
 from fgslam.worlds.house import OmniWorld
 from fgslam.worlds.settings import HousePathSettings, OmniHouseSettings
@@ -118,7 +118,7 @@ def update_ratios(leg: Leg, settings: HomingEstimatorSettings) -> list[tuple[flo
     """Each update's time over that of raw KLT from its image before; and the points' number."""
 
     def begin(noted: NotedFrontEnd, target: OmniFeatures) -> Step:
-        front_end: HomingFrontEnd = noted  # type: ignore[assignment]
+        front_end: ImageFrontEnd = noted  # type: ignore[assignment]
         controller = HomingController(
             front_end, target, lambda start: make_homing_estimator(start, settings)
         )

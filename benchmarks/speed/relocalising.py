@@ -33,7 +33,7 @@ from fgslam.core.types import (
     Trajectory,
 )
 from fgslam.frontend.features.sift import SiftExtractor
-from fgslam.frontend.places.recognition import LostRules, PlaceRecognition, RecognitionParts
+from fgslam.frontend.places.recognition import LostRules, PlaceRecognition
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.tracker import LandmarkTracker
 from fgslam.runs.config import load_config
@@ -90,15 +90,10 @@ class Lost:
         """In a saved map; every frame that is not located by tracking is sought at once."""
         tracker = make_tracker(known.rig, settings)
         tracker.database.load(known)
-        parts = RecognitionParts(
-            joins=False,
-            loops=None,
-            lost=LostRules(after=1),
-            appearance=settings.appearance,
-            relocaliser=make_relocaliser(known.rig, settings),
-            seed=0,
-        )
-        return Lost(known.landmarks, tracker, PlaceRecognition(parts, tracker))
+        relocaliser = make_relocaliser(known.rig, settings)
+        lost = LostRules(after=1)
+        places = PlaceRecognition(tracker, relocaliser, settings.appearance, 0, lost=lost)
+        return Lost(known.landmarks, tracker, places)
 
     def look(self, features: StereoFeatures, wTc: FloatArray) -> None:
         """One frame, timed; tracked from far away, it is not located before."""

@@ -9,7 +9,6 @@ or backwards as a drift of the camera would. docs/derivations/measurements.md.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -39,35 +38,6 @@ STATED = np.array([30.0, 0.3])
 _BOUNDS = (0.05, 400.0)  # of variances over the stated ones
 _FITS = 3.2
 """Medians of an image residual within which 99.9 % lie that are normal in column and row."""
-
-
-class MeasurementNoise(Protocol):
-    """How much larger than stated the errors of measurements are, as known so far."""
-
-    @property
-    def spread(self) -> float:
-        """Variance of a single measurement over the stated one: what a wrong match is judged by."""
-        ...
-
-    @property
-    def power(self) -> float:
-        """Variance over the stated one by which a graph of independent measurements weighs them."""
-        ...
-
-    def expect(self, variance: float) -> None:
-        """Takes in what a frame's pose took measurements to have, over the stated variance."""
-        ...
-
-    def learn(self, frame: int, step: FloatArray | None, accepted: Observations) -> None:
-        """Takes in a frame's observations that fit.
-
-        ``step`` (4, 4) leads there from the frame before; None: no landmark has measured it.
-        """
-        ...
-
-    def smoothed(self, frames: list[int], poses: FloatArray) -> None:
-        """Takes in how the latest frames lie to each other: poses (n, 4, 4) of a solution."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +87,18 @@ class Persistence:
 
     @property
     def spread(self) -> float:
-        """From the residuals of tracks that have ended."""
+        """Variance of a single measurement over the stated one, by which a wrong match is judged.
+
+        From the residuals of tracks that have ended.
+        """
         return self._ratio(0)
 
     @property
     def power(self) -> float:
-        """What independent measurements would need to lean those tracks as much as they do."""
+        """Variance over the stated one by which a graph of independent measurements weighs them.
+
+        What independent measurements would need to lean those tracks as much as they do.
+        """
         return self._ratio(1)
 
     def expect(self, variance: float) -> None:
@@ -134,6 +110,8 @@ class Persistence:
 
         Poses are chained by steps: a smoother's correction of the whole path leans no track. An
         unmeasured step would: all tracks end before it.
+
+        ``step`` (4, 4) leads there from the frame before; None: no landmark has measured it.
         """
         if step is None:
             self._judge(frame, *self._tracks.take_all())
@@ -173,7 +151,7 @@ class Persistence:
 
 
 def learn_from(
-    noise: MeasurementNoise,
+    noise: Persistence | StatedNoise,
     frame: int,
     increment: Increment,
     tracking: EgoMotion,

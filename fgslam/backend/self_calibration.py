@@ -861,12 +861,12 @@ class FieldSize:
         # Modes count by how they show, each as far as it stands out of the noise.
         shrunk = np.linalg.inv(whole + np.eye(len(whole)))
         weighed = shrunk @ whole @ shrunk
-        found = _Pairs(pull @ weighed @ pull.T)
+        found, found_without = _sums_over_pairs(pull @ weighed @ pull.T)
         by_group = weighed @ information
-        unit = _Pairs(np.einsum("gij,hji->gh", by_group, information))
-        without = found.without() / unit.without()
+        unit, unit_without = _sums_over_pairs(np.einsum("gij,hji->gh", by_group, information))
+        without = found_without / unit_without
         spread = ((without - without.mean()) ** 2).sum() * (len(normal) - 1) / len(normal)
-        return found.all() / unit.all(), float(np.sqrt(spread))
+        return found / unit, float(np.sqrt(spread))
 
     def _of_field(self, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
         """By group, information (g, m, m) and gradient (g, m) of the modes, terms eliminated."""
@@ -876,18 +876,11 @@ class FieldSize:
         return left[:, :-1, :-1], left[:, :-1, -1]
 
 
-class _Pairs:
-    """Products (g, g) of groups, added up over different ones."""
-
-    def __init__(self, products: FloatArray) -> None:
-        self._off = products - np.diag(np.diagonal(products))
-
-    def all(self) -> float:
-        return float(self._off.sum())
-
-    def without(self) -> FloatArray:
-        """(g,) without each group in turn."""
-        return np.asarray(self._off.sum() - self._off.sum(axis=0) - self._off.sum(axis=1))
+def _sums_over_pairs(products: FloatArray) -> tuple[float, FloatArray]:
+    """Products (g, g) summed over different groups; (g,) the same without each group in turn."""
+    off = products - np.diag(np.diagonal(products))
+    whole = float(off.sum())
+    return whole, np.asarray(whole - off.sum(axis=0) - off.sum(axis=1))
 
 
 # --------------------------------------------------------------------------------------------

@@ -62,13 +62,6 @@ class PerLandmarkSettings(NamedSettings):
     pose_covariance: bool = Field(
         default=True, description="add the pose's covariance to the observation's"
     )
-
-
-@dataclass(frozen=True, config=STRICT)
-class LandmarkKalmanSettings(PerLandmarkSettings):
-    """The paper's estimator: least-squares pose, one 3x3 filter per landmark (6.4)."""
-
-    kind: Literal["landmark_kalman"] = "landmark_kalman"
     update: Literal["pixel", "world", "running_mean", "half"] = Field(
         default="pixel",
         description="`pixel` Kalman on (c, r, d); `world` on positions (6.4); averages of 4.1",
@@ -76,14 +69,17 @@ class LandmarkKalmanSettings(PerLandmarkSettings):
 
 
 @dataclass(frozen=True, config=STRICT)
+class LandmarkKalmanSettings(PerLandmarkSettings):
+    """The paper's estimator: least-squares pose, one 3x3 filter per landmark (6.4)."""
+
+    kind: Literal["landmark_kalman"] = "landmark_kalman"
+
+
+@dataclass(frozen=True, config=STRICT)
 class LandmarkKalmanGraphSettings(PerLandmarkSettings):
     """The same estimator as factor graphs: equal to ``landmark_kalman`` up to rounding."""
 
     kind: Literal["landmark_kalman_graph"] = "landmark_kalman_graph"
-    update: Literal["pixel", "world", "running_mean", "half"] = Field(
-        default="pixel",
-        description="as landmark_kalman's; the averaging of 4.1 by factors of equal weight",
-    )
 
 
 @dataclass(frozen=True, config=STRICT)

@@ -27,7 +27,7 @@ from fgslam.homing.active import (
     Sighting,
     surely_left,
 )
-from fgslam.homing.front_end import HomingFrontEnd
+from fgslam.homing.front_end import ImageFrontEnd
 from fgslam.homing.steering import Command, HomingState
 
 SWITCH_FRACTION = 0.07  # of the leg left when the target counts as reached
@@ -65,7 +65,7 @@ class HomingController:
 
     def __init__(
         self,
-        front_end: HomingFrontEnd,
+        front_end: ImageFrontEnd,
         target: OmniFeatures,
         make_estimator: EstimatorMaker,
     ) -> None:
@@ -424,7 +424,7 @@ class HomingChain:
 
     def __init__(
         self,
-        front_end: HomingFrontEnd,
+        front_end: ImageFrontEnd,
         path: Sequence[OmniFeatures],
         make_estimator: EstimatorMaker,
     ) -> None:

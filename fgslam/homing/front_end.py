@@ -1,9 +1,8 @@
-"""The front-end of homing: what a homing needs of it, and that of one omnidirectional camera."""
+"""The front-end of homing for one omnidirectional camera: features, homing vector, tracking."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -26,41 +25,6 @@ from fgslam.homing.active import Sighting
 from fgslam.homing.features import best_all_around
 from fgslam.homing.settings import FrontEndSettings
 
-
-class HomingFrontEnd(Protocol):
-    """Features, matches and tracks of a stream of images (h, w, 3).
-
-    ``begin`` and ``track`` are called with times that never decrease. One image may be given to
-    ``track`` and then, at the same time, to ``begin``: so a homing starts where another one ends.
-    """
-
-    def describe(self, image: ByteArray) -> OmniFeatures:
-        """Features of a path image; changes nothing."""
-        ...
-
-    def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
-        """Matches the image with a target and, unless refused, tracks these features from now on.
-
-        A refusal leaves the tracks that there are alone.
-        """
-        ...
-
-    def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
-        """Matches the image with a target, and leaves all tracks alone."""
-        ...
-
-    def track(self, image: ByteArray, time: float) -> TrackedBearings:
-        """The features of the last ``begin`` in a new image; features once lost stay away.
-
-        An image without any of them gives no rows; that is not an error.
-        """
-        ...
-
-
-# --------------------------------------------------------------------------------------------
-# For one omnidirectional camera: features, homing vector, tracking
-
-
 _MAX_POINTS = 50
 """Tracked in one homing, the surest of all directions alike: the paper finds 30 to 50 (IV-A), and
 an image's cost grows with them."""
@@ -72,7 +36,11 @@ _MAX_RELATIVE_SIGMA = 1.0  # of a distance; features known less well wait for pa
 
 
 class ImageFrontEnd:
-    """Homing's front-end for one camera; see :class:`HomingFrontEnd`."""
+    """Features, matches and tracks of a stream of images (h, w, 3) of one camera.
+
+    ``begin`` and ``track`` are called with times that never decrease. One image may be given to
+    ``track`` and then, at the same time, to ``begin``: so a homing starts where another one ends.
+    """
 
     def __init__(
         self, camera: OmniCamera, settings: FrontEndSettings, rng: np.random.Generator
@@ -84,11 +52,17 @@ class ImageFrontEnd:
         self._tracker = BearingTracker(camera)
 
     def describe(self, image: ByteArray) -> OmniFeatures:
-        """Features of a path image. Raises FrameError where the image is not the camera's."""
+        """Features of a path image; changes nothing.
+
+        Raises FrameError where the image is not the camera's.
+        """
         return self._extractor.extract(image)
 
     def begin(self, image: ByteArray, target: OmniFeatures, time: float) -> HomingStart | Refusal:
-        """The initialisation step (section III); unless refused, its features are tracked now."""
+        """The initialisation step (section III); unless refused, its features are tracked now.
+
+        A refusal leaves the tracks that there are alone.
+        """
         answer = self._matched(image, target)
         if isinstance(answer, Refusal):
             return answer
@@ -96,7 +70,7 @@ class ImageFrontEnd:
         return self._started(image, time, vector, matches, (present, target))
 
     def look(self, image: ByteArray, target: OmniFeatures) -> Sighting | Refusal:
-        """The homing vector and its inliers alone."""
+        """The homing vector and its inliers; leaves all tracks alone."""
         answer = self._matched(image, target)
         if isinstance(answer, Refusal):
             return answer
@@ -104,7 +78,11 @@ class ImageFrontEnd:
         return Sighting(vector, matches.select(vector.inliers))
 
     def track(self, image: ByteArray, time: float) -> TrackedBearings:
-        """The features in the next image. Raises as :meth:`BearingTracker.track`."""
+        """The features of the last ``begin`` in a new image; features once lost stay away.
+
+        An image without any of them gives no rows; that is not an error. Raises as
+        :meth:`BearingTracker.track`.
+        """
         return self._tracker.track(image, time)
 
     def unwrapped(self, image: ByteArray) -> ByteArray:

@@ -245,22 +245,17 @@ def make_places(
     """
     if not (settings.loops or settings.lost or joins):
         return None
-    from fgslam.frontend.places.recognition import (
-        LoopGates,
-        LostRules,
-        PlaceRecognition,
-        RecognitionParts,
-    )
+    from fgslam.frontend.places.recognition import LoopGates, LostRules, PlaceRecognition
 
-    parts = RecognitionParts(
-        joins=joins,
+    return PlaceRecognition(
+        tracker,
+        make_relocaliser(rig, settings),
+        settings.appearance,
+        seed,
         loops=LoopGates() if settings.loops else None,
         lost=LostRules() if settings.lost else None,
-        appearance=settings.appearance,
-        relocaliser=make_relocaliser(rig, settings),
-        seed=seed,
+        joins=joins,
     )
-    return PlaceRecognition(parts, tracker)
 
 
 def make_relocaliser(rig: CameraRig, settings: FrontendSettings) -> Relocaliser:

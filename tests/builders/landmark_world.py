@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from fgslam.frontend.settings import HomingVectorSettings
 from fgslam.homing.active import Sighting
 from fgslam.homing.closed_loop import DriveRecord, follow
 from fgslam.homing.controller import HomingChain
+from fgslam.homing.front_end import ImageFrontEnd
 from fgslam.homing.settings import HomingBehaviourSettings
 from fgslam.homing.steering import CorridorAvoidance, Steering
 from fgslam.runs.tasks.homing_replay import start_from_matches
@@ -278,11 +280,8 @@ def make_follower(
 ) -> HomingChain:
     """Over the whole path."""
     kind = HomingEkfSettings() if estimator is None else estimator
-    return HomingChain(
-        setting.front_end,
-        setting.path(),
-        lambda start: make_homing_estimator(start, kind),
-    )
+    front_end = cast("ImageFrontEnd", setting.front_end)  # it has all that a chain calls
+    return HomingChain(front_end, setting.path(), lambda start: make_homing_estimator(start, kind))
 
 
 def drive_path(

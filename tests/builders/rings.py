@@ -18,7 +18,6 @@ from fgslam.frontend.places.recognition import (
     LoopGates,
     LostRules,
     PlaceRecognition,
-    RecognitionParts,
     difference,
 )
 from fgslam.frontend.settings import EgoMotionSettings, FrontendSettings
@@ -129,15 +128,8 @@ def places_of(
     """Place recognition by these rules; None where neither is given."""
     if loops is None and lost is None:
         return None
-    parts = RecognitionParts(
-        joins=False,
-        loops=loops,
-        lost=lost,
-        appearance=settings.appearance,
-        relocaliser=make_relocaliser(RIG, settings),
-        seed=0,
-    )
-    return PlaceRecognition(parts, tracker)
+    relocaliser = make_relocaliser(RIG, settings)
+    return PlaceRecognition(tracker, relocaliser, settings.appearance, 0, loops, lost)
 
 
 def seen(

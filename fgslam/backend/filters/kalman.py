@@ -38,7 +38,7 @@ from fgslam.backend.loops import (
 )
 from fgslam.backend.protocol import recalibrated
 from fgslam.backend.self_calibration import SETTLING, RigChange
-from fgslam.backend.settings import LandmarkKalmanSettings
+from fgslam.backend.settings import PerLandmarkSettings
 from fgslam.core.arrays import FloatArray, GrowingColumns, IntArray
 from fgslam.core.geometry import inverse, inverse_spd3
 from fgslam.core.sensors import (
@@ -76,7 +76,7 @@ class LandmarkKalman:
     def __init__(
         self,
         rig: CameraRig,
-        settings: LandmarkKalmanSettings,
+        settings: PerLandmarkSettings,
         prior: Prediction,
         ego_motion: EgoMotionSettings | None = None,
     ) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from fgslam.backend.filters.kalman import LandmarkKalman
 from fgslam.backend.filters.landmark_update import FrameUpdate, Landmarks, UpdateKind
-from fgslam.backend.settings import LandmarkKalmanGraphSettings, LandmarkKalmanSettings
+from fgslam.backend.settings import LandmarkKalmanGraphSettings
 from fgslam.core.arrays import BoolArray, FloatArray
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
@@ -366,11 +366,7 @@ class LandmarkKalmanGraph(LandmarkKalman):
             prior: pose of the first frame and its covariance.
             ego_motion: the front-end's, whose cost the pose's graph repeats.
         """
-        closed_form = LandmarkKalmanSettings(
-            update=settings.update,
-            pose_covariance=settings.pose_covariance,
-        )
-        super().__init__(rig, closed_form, prior, ego_motion)
+        super().__init__(rig, settings, prior, ego_motion)
         self._pose_graph = FixedMapPose(rig, ego_motion)
 
     def update(self, increment: Increment, tracking: EgoMotion) -> UpdateStats:

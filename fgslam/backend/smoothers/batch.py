@@ -17,7 +17,6 @@ from fgslam.backend.smoothers.final import (
     trimmed,
 )
 from fgslam.backend.smoothers.graph import (
-    ClosedLoop,
     Drive,
     NewFactors,
     Smoothed,
@@ -61,14 +60,12 @@ class BatchSolver(WholeGraphSolver):
         """Never: the minimum is found at loops, and for the answer."""
         return None
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
-        found = self._accepted(loop, drive, what, solved)
-        if found is None:
-            return None
-        if found.values is None:
-            return ClosedLoop()
-        self.values = found.values
+        accepted, values = self._judge(loop, drive, what, solved)
+        if values is None:
+            return accepted
+        self.values = values
         graph, state = self.builder.whole_graph(self.values)
         covariance = reduced(graph.linear(state)).poses()[-1]
         here = reorthonormalise(state.poses[-1])

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from fgslam.backend.considered import fused, pixels_of, shared_covariance
-from fgslam.backend.loops import Constraint
+from fgslam.backend.loops import Constraint, constraint_factor, refusal
 from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, Tracks, tracks_of
 from fgslam.backend.persistence import STATED, Fitted
 from fgslam.backend.self_calibration import RigChange
@@ -27,16 +27,16 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.bundle import Descent, State, WholeGraph
 from fgslam.backend.smoothers.elimination import Bordered, SolvedSystem, reduced
 from fgslam.backend.smoothers.graph import (
-    Acceptance,
-    ClosedLoop,
     Drive,
     GraphBuilder,
-    GraphLoops,
-    Minimum,
     Smoothed,
     Solution,
     allowed_joint,
     allowed_parts,
+    first_guess,
+    found_again,
+    misfit,
+    solved,
     solver_failed,
 )
 from fgslam.core.arrays import BoolArray, FloatArray, IntArray, chi_square_quantile
@@ -143,6 +143,7 @@ def _in_tracks(points: IntArray, frames: IntArray, counts: BoolArray) -> tuple[I
 
 
 _GATE = float(chi_square_quantile(0.999, 3))  # 16.3, of a landmark observation's three numbers
+_AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
 _BEYOND = (4.0 / 1.538) ** 2
 """Variance over the stated one from which on most matches lie beyond the four stated deviations
 within which ego-motion takes them (1.538 is the median length of three normal numbers)."""
@@ -159,6 +160,7 @@ _SOLUTIONS = 5  # solutions until no landmark lies behind a camera any more
 _BEHIND = "came out behind a camera"
 _UNSEEN = "has no observation that fits the others"
 
+Minimum: TypeAlias = Callable[[WholeGraph, State], State]
 Minimise: TypeAlias = Callable[[WholeGraph, State], tuple[State, WholeGraph]]
 """From a graph and initial values to those at the minimum and the factors that count there."""
 
@@ -352,7 +354,8 @@ class WholeGraphSolver:
     ) -> None:
         """Nothing to solve yet; loops are judged with the builder's kernel or with another."""
         self.builder, self._floor = builder, floor
-        self.loops = GraphLoops(builder, kernel)
+        self._kernel = kernel
+        self.accepted: list[Constraint] = []
         self.values = gtsam.Values()
         self._answer: Refined | None = None
         self.remarks: list[str] = []
@@ -399,21 +402,73 @@ class WholeGraphSolver:
         return trimmed(graph, state, self.builder.noise_factor)
 
     @one_blas_thread()
-    def _accepted(
-        self, loop: Constraint, drive: Drive, what: str, minimum: Minimum
-    ) -> Acceptance | None:
-        """The loop in the graph; None, and a remark, if it is refused. See GraphLoops.judge."""
-        found = self.loops.judge(loop, drive, self.values, minimum, what)
-        self.remarks.append(found.remark)
-        if not found.closed:
-            return None
-        self._answer = None  # it may have been solved in this very frame, without the loop
-        return found
+    def _judge(
+        self, known: Constraint, drive: Drive, what: str, minimum: Minimum
+    ) -> tuple[bool, Any | None]:
+        """Whether the measurements allow a loop closure, which is then a factor of the graph.
 
-    def _after_loop(self, covariance: FloatArray) -> ClosedLoop:
+        One that the graph meets anyway is a factor more. Otherwise the graph is solved with it, and
+        it is refused where that raises the cost by more than measurement noise explains: a true
+        loop's rise is chi-square with six degrees of freedom, whatever the drift.
+
+        Args:
+            known: the loop, between two frames of the graph.
+            drive: as tracked, without it.
+            what: begins the remark.
+            minimum: gives the graph's minimum without the loop, from the values of now.
+
+        Returns:
+            True if it was accepted; all variables with the loop closed, None where nothing moved.
+        """
+        if misfit(constraint_factor(known), self.values) <= _AGREES:
+            self.accept(known)
+            self.remarks.append(f"{what}: as expected, nothing moved")
+            return True, None
+        graph, state = self.builder.whole_graph(self.values, self._kernel)
+        state = minimum(graph, state)
+        loops = [*self.accepted, known]
+        guess = first_guess(self.builder, graph.values(state), drive.chain, loops)
+        closed = graph.plus(constraint_factor(known))
+        solution = solved(closed, dataclasses.replace(State.of(guess), bias=state.bias))
+        refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
+        competing = self._competing(closed.squared(solution))
+        if refused and 0 < competing.sum() < known.matches:
+            graph, closed = graph.masked(~competing), closed.masked(~competing)
+            solution = solved(closed, solution)
+            rise = 2.0 * (closed.cost(solution) - graph.cost(solved(graph, state)))
+            refused = refusal(what, rise)
+        if refused:
+            self.remarks.append(refused)
+            return False, None
+        self.accept(known)
+        found = closed.values(solution)
+        here = poses_of_frame(found, known.after)[:3, 3]
+        shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
+        self.remarks.append(f"{what}: the camera moved by {shift:.2f} m, the graph with it")
+        return True, found
+
+    def _competing(self, squared: FloatArray) -> BoolArray:
+        """(k,) observations that claim another return than the loop's, by their residuals with it.
+
+        A landmark long out of view was found again by its appearance and by where the drifted
+        camera expected it. That is a loop closure, too, of a few matches, and false where the
+        drift is large; so the larger number of matches decides between both.
+        """
+        gate = _GATE / self.builder.noise_factor**2
+        frames, variables, *_ = self.builder.kept_observed()
+        return found_again(frames, variables) & (squared > gate)
+
+    def accept(self, known: Constraint) -> None:
+        """Adds a loop to the graph; accepted now, it counts less when later ones contradict it."""
+        known = dataclasses.replace(known, uncertain=True)
+        self.builder.graph.add(constraint_factor(known))
+        self.accepted.append(known)
+        self._answer = None  # it may have been solved in this very frame, without the loop
+
+    def _after_loop(self, covariance: FloatArray) -> Smoothed:
         """The values that a loop has moved, and the covariance (6, 6) of their last pose."""
         here = reorthonormalise(poses_of_frame(self.values, self.builder.frames[-1]))
-        return ClosedLoop(Smoothed(self.values, Prediction(here, covariance), by_loop=True))
+        return Smoothed(self.values, Prediction(here, covariance), by_loop=True)
 
     def _failed(self, error: Exception, when: str = "at") -> Exception:
         return solver_failed(self.kind, error, self.builder.frames[-1], when)

@@ -13,7 +13,7 @@ import dataclasses
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -22,17 +22,16 @@ from fgslam.backend.loops import (
     Chain,
     Constraint,
     changes,
-    constraint_factor,
     corrected,
     nearest_positive,
     refusal,
 )
-from fgslam.backend.persistence import MeasurementNoise, Persistence, StatedNoise
+from fgslam.backend.persistence import Persistence, StatedNoise
 from fgslam.backend.self_calibration import KnownCorrections, RigChange
 from fgslam.backend.settings import GraphSettings, KernelSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting, Track
 from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, WholeGraph
-from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray, chi_square_quantile
+from fgslam.core.arrays import BoolArray, FloatArray, GrowingColumns, IntArray
 from fgslam.core.correction import RigCorrection
 from fgslam.core.errors import EstimatorError
 from fgslam.core.geometry import (
@@ -166,7 +165,7 @@ class GraphBuilder:
         self._floor = floor
         self._prior = prior
         given = settings.noise_factor
-        self.noise: MeasurementNoise = Persistence(sensor) if given is None else StatedNoise(given)
+        self.noise = Persistence(sensor) if given is None else StatedNoise(given)
         self.corrections = KnownCorrections()
         self._variance_of: dict[int, float] = {}
         self._turned: dict[int, TurnedStep] = {}
@@ -583,13 +582,6 @@ class Smoothed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ClosedLoop:
-    """A loop closure that was accepted; ``smoothed`` where the tracker is to go on from it."""
-
-    smoothed: Smoothed | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Drive:
     """The drive as it was tracked: its chain of steps, and the present pose ``wTc`` (4, 4)."""
 
@@ -633,8 +625,10 @@ class GraphSolver(Protocol):
         """
         ...
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
-        """Takes in a loop closure of the frame added last; None, and a remark, if it is refused.
+    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
+        """Takes in a loop closure of the frame added last; False, and a remark, if it is refused.
+
+        The solution that the tracker is to go on from; True where it goes on as it is.
 
         Args:
             loop: between two frames of the graph.
@@ -660,102 +654,11 @@ def solver_failed(kind: str, error: Exception, frame: int, when: str = "at") -> 
     )
 
 
-_AGREES = chi_square_quantile(0.99, 6)  # 16.8: a loop that the graph meets as it is
-_OBSERVED = float(chi_square_quantile(0.999, 3))  # of an observation that fits
 LONG_UNSEEN = 60  # frames, as the front-end's LoopGates.forgotten_after
 _ITERATIONS = 20
 _ENOUGH = 2.0  # the last iteration's gain, half squared deviations: far below the gate's square
 _TOLERANCE = 1e-6  # of the cost, where that is small
 _EXACT = 1e-4  # radians and metres: a pose that is given
-
-Minimum: TypeAlias = Callable[[WholeGraph, State], State]
-
-
-@dataclasses.dataclass(frozen=True, slots=True, eq=False)
-class Acceptance:
-    """What became of a loop closure in a graph that keeps every pose.
-
-    Attributes:
-        closed: it was accepted, and its factor is in the builder's graph.
-        values: of all variables with the loop closed; None where nothing had to move.
-        remark: in words.
-    """
-
-    closed: bool
-    values: Any | None
-    remark: str
-
-
-class GraphLoops:
-    """The loops of a graph that keeps every pose: which were accepted, and at what cost."""
-
-    def __init__(self, builder: GraphBuilder, kernel: KernelSettings | None = None) -> None:
-        """No loop yet; the kernel is that of the observations where the graph is solved."""
-        self.builder, self._kernel = builder, kernel
-        self.accepted: list[Constraint] = []
-
-    def judge(
-        self,
-        known: Constraint,
-        drive: Drive,
-        values: Any,
-        minimum: Minimum,
-        what: str,
-    ) -> Acceptance:
-        """Whether the measurements allow a loop closure, which is then a factor of the graph.
-
-        One that the graph meets anyway is a factor more. Otherwise the graph is solved with it, and
-        it is refused where that raises the cost by more than measurement noise explains: a true
-        loop's rise is chi-square with six degrees of freedom, whatever the drift.
-
-        Args:
-            known: the loop, between two frames of the graph.
-            drive: as tracked, without it.
-            values: of all variables, as they are now.
-            minimum: gives the graph's minimum without the loop, from these values.
-            what: begins the remark.
-        """
-        if misfit(constraint_factor(known), values) <= _AGREES:
-            self.accept(known)
-            return Acceptance(True, None, f"{what}: as expected, nothing moved")
-        graph, state = self.builder.whole_graph(values, self._kernel)
-        state = minimum(graph, state)
-        loops = [*self.accepted, known]
-        guess = first_guess(self.builder, graph.values(state), drive.chain, loops)
-        closed = graph.plus(constraint_factor(known))
-        solution = solved(closed, dataclasses.replace(State.of(guess), bias=state.bias))
-        refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
-        competing = self._competing(closed.squared(solution))
-        if refused and 0 < competing.sum() < known.matches:
-            graph, closed = graph.masked(~competing), closed.masked(~competing)
-            solution = solved(closed, solution)
-            rise = 2.0 * (closed.cost(solution) - graph.cost(solved(graph, state)))
-            refused = refusal(what, rise)
-        if refused:
-            return Acceptance(False, None, refused)
-        self.accept(known)
-        found = closed.values(solution)
-        here = poses_of_frame(found, known.after)[:3, 3]
-        shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
-        remark = f"{what}: the camera moved by {shift:.2f} m, the graph with it"
-        return Acceptance(True, found, remark)
-
-    def _competing(self, squared: FloatArray) -> BoolArray:
-        """(k,) observations that claim another return than the loop's, by their residuals with it.
-
-        A landmark long out of view was found again by its appearance and by where the drifted
-        camera expected it. That is a loop closure, too, of a few matches, and false where the
-        drift is large; so the larger number of matches decides between both.
-        """
-        gate = _OBSERVED / self.builder.noise_factor**2
-        frames, variables, *_ = self.builder.kept_observed()
-        return found_again(frames, variables) & (squared > gate)
-
-    def accept(self, known: Constraint) -> None:
-        """Accepted now, it counts less when later ones contradict it."""
-        known = dataclasses.replace(known, uncertain=True)
-        self.builder.graph.add(constraint_factor(known))
-        self.accepted.append(known)
 
 
 def found_again(frames: IntArray, variables: IntArray) -> BoolArray:

@@ -13,7 +13,6 @@ from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.final import Refined, WholeGraphSolver, refine
 from fgslam.backend.smoothers.graph import (
-    ClosedLoop,
     Drive,
     NewFactors,
     Smoothed,
@@ -119,21 +118,21 @@ class Isam2Solver(WholeGraphSolver):
         except RuntimeError as error:
             raise self._failed(error) from None
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
         """Updates the tree with the loop, or rebuilds it where the loop moves the map."""
         self._updated = self.builder.frames[-1]
         self._flush()
-        found = self._accepted(loop, drive, what, _without_loop)
-        if found is None:
-            return None
-        self._join(found.values)
+        accepted, values = self._judge(loop, drive, what, _without_loop)
+        if not accepted:
+            return False
+        self._join(values)
         return self._after_loop(self._covariance(self.builder.frames[-1]))
 
     def _join(self, found: Any | None) -> None:
         """Goes on with the graph that has the loop; from these values where they are given."""
         if found is None:
             graph = gtsam.NonlinearFactorGraph()
-            graph.add(constraint_factor(self.loops.accepted[-1]))
+            graph.add(constraint_factor(self.accepted[-1]))
             self._update(graph, gtsam.Values())
             return
         try:

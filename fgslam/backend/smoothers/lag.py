@@ -23,7 +23,6 @@ from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.elimination import UndeterminedError
 from fgslam.backend.smoothers.final import WholeGraphSolver
 from fgslam.backend.smoothers.graph import (
-    ClosedLoop,
     Drive,
     NewFactors,
     Smoothed,
@@ -116,7 +115,7 @@ class FixedLagSolver:
             self._covariances[frame] = self._covariance(frame)
         return Smoothed(self.window.values(), Prediction(self.poses[last], self._covariances[last]))
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
         After that the window is solved again from there. A loop within the lag is a factor more.
@@ -131,7 +130,7 @@ class FixedLagSolver:
         found, remark = drift_undone(self._floor, earlier, last, loop, what)
         if found is None:
             self.remarks.append(remark)
-            return None
+            return False
         if inside:
             self.window.factors.add(constraint_factor(loop))
             self._solve()
@@ -139,7 +138,7 @@ class FixedLagSolver:
         else:
             self.remarks.append(f"{remark}, and what lies within the lag")
             self._move_all(found)
-        return ClosedLoop(self._smoothed({loop.after}))
+        return self._smoothed({loop.after})
 
     def _move_all(self, last: Prediction) -> None:
         """Takes the window along with its last pose, as it is, and starts from there."""
@@ -543,7 +542,7 @@ class SlidingWindowSolver(WholeGraphSolver):
 
     # -- loops -------------------------------------------------------------------------------
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> ClosedLoop | None:
+    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
         """Moves the drive and all that it saw to where the loop has it, the window in one piece.
 
         A loop within the window is a factor more.
@@ -556,9 +555,8 @@ class SlidingWindowSolver(WholeGraphSolver):
         found, remark = drift_undone(self._floor, before, last, loop, what)
         self.remarks.append(remark + ("" if found is None else ", the drive with it"))
         if found is None:
-            return None
-        self.loops.accept(loop)
-        self._answer = None
+            return False
+        self.accept(loop)
         if inside:
             return self._closed_inside(loop)
         self.move_by_loop(found, loop, drive)
@@ -567,13 +565,13 @@ class SlidingWindowSolver(WholeGraphSolver):
             dict(zip(map(pose_key, range(len(self.poses))), self.poses, strict=True)),
             dict(zip(map(landmark_key, every), self.held.points, strict=True)),
         )
-        return ClosedLoop(Smoothed(values, found, by_loop=True))
+        return Smoothed(values, found, by_loop=True)
 
-    def _closed_inside(self, loop: Constraint) -> ClosedLoop:
+    def _closed_inside(self, loop: Constraint) -> Smoothed:
         self.window.factors.add(constraint_factor(loop))
         self._leaving = solved = self._solve()
         last = self._measured(solved, len(solved.frames) - 1)
-        return ClosedLoop(Smoothed(self.window.values(), last, self.window.frames[0]))
+        return Smoothed(self.window.values(), last, self.window.frames[0])
 
     def _at(self, frame: int) -> Prediction:
         """A pose as it is now, as uncertain as when it left."""
@@ -583,7 +581,7 @@ class SlidingWindowSolver(WholeGraphSolver):
     def move_by_loop(self, last: Prediction, loop: Constraint, drive: Drive) -> None:
         """Spreads the last pose's change over the drive, and takes all landmarks along."""
         window, poses = self.window, np.array(self.poses)
-        moved = closed_chain(poses, drive.chain, self.loops.accepted, last.wTc)
+        moved = closed_chain(poses, drive.chain, self.accepted, last.wTc)
         by = changes(poses, moved)
         self.poses = list(moved)
         held = self.held

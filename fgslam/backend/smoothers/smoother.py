@@ -202,9 +202,9 @@ class Smoother:
         drive = Drive(self.tracker.chain, self.tracker.predict(None).wTc)
         what = f"frame {index}: loop closure to frame {loop.frame} of the log"
         closed = self.solver.close(known, drive, what)
-        if closed is not None and closed.smoothed is not None:
-            self._take_over(closed.smoothed, closed.smoothed.last)
-        return closed is not None
+        if isinstance(closed, Smoothed):
+            self._take_over(closed, closed.last)
+        return closed is not False
 
     def _between(self, loop: LoopClosure) -> Constraint:
         """A loop between poses of the graph, the last of which is the present frame's.

@@ -465,21 +465,6 @@ class LostRules:
     give_up_after: int = 10
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RecognitionParts:
-    """What place recognition works with; loops or lost None where it is not wanted.
-
-    ``joins``: whether the estimator takes closures, so that parts of the map may be joined.
-    """
-
-    joins: bool
-    loops: LoopGates | None
-    lost: LostRules | None
-    appearance: AppearanceSettings
-    relocaliser: Relocaliser
-    seed: int
-
-
 class PlaceRecognition:
     """Remembers who saw what, searches for returns, and finds the camera when it is lost.
 
@@ -495,12 +480,26 @@ class PlaceRecognition:
     fuse_since: Kept[int]
     _pose: Kept[FloatArray]
 
-    def __init__(self, parts: RecognitionParts, tracker: LandmarkTracker) -> None:
-        """Nothing is remembered yet; the tracker is the run's own, with the map it begins in."""
-        self._parts = parts
-        self._tracker = tracker
+    def __init__(
+        self,
+        tracker: LandmarkTracker,
+        relocaliser: Relocaliser,
+        appearance: AppearanceSettings,
+        seed: int,
+        loops: LoopGates | None = None,
+        lost: LostRules | None = None,
+        joins: bool = False,
+    ) -> None:
+        """Nothing is remembered yet; the tracker is the run's own, with the map it begins in.
+
+        ``loops`` or ``lost`` None: not wanted. ``joins``: the estimator takes closures, so that
+        parts of the map may be joined.
+        """
+        self._tracker, self._relocaliser = tracker, relocaliser
+        self._appearance, self._seed = appearance, seed
+        self._loops, self._lost_rules, self._joins = loops, lost, joins
         self.memory = SightingMemory(int(tracker.database.ids.max(initial=-1)))
-        self._confirmation = None if parts.loops is None else Confirmation(parts.loops)
+        self._confirmation = None if loops is None else Confirmation(loops)
         self._lost = 0
         self._offered = -1  # frame of the last closure, taken or not
         self.merging = _NO_PAIRS  # landmarks that are one, by the closure just taken
@@ -515,7 +514,7 @@ class PlaceRecognition:
 
         From the first frame on: with landmarks of its own a robot carried off would not know it.
         """
-        lost = self._parts.lost
+        lost = self._lost_rules
         return lost is None or not 0 < self._lost < lost.give_up_after
 
     @property
@@ -531,7 +530,7 @@ class PlaceRecognition:
     @property
     def wants_features(self) -> bool:
         """Whether the next frame is looked at, so that its features must be found."""
-        loops, confirmation = self._parts.loops, self._confirmation
+        loops, confirmation = self._loops, self._confirmation
         if self._lost > 0 or self._apart:
             return True
         return (
@@ -556,13 +555,13 @@ class PlaceRecognition:
         Returns:
             The result, and whether it was found without a prior.
         """
-        lost = self._parts.lost
+        lost = self._lost_rules
         # Without any landmark yet there is nothing to be lost in.
         located = tracked.ego_motion.status.measured or not len(landmarks)
         self._lost = 0 if located else self._lost + 1
         if self._untracked and self._confirmation is not None:
             self._confirmation.forget()  # its frames are to be in a row
-        after = 1 if guessed and self._parts.joins else None
+        after = 1 if guessed and self._joins else None
         if lost is not None:
             after = lost.after
         if after is None or self._lost < after or not len(features):
@@ -599,7 +598,7 @@ class PlaceRecognition:
             landmarks: the map.
             features: the frame's.
         """
-        loops = self._parts.loops
+        loops = self._loops
         if loops is None or tracked.ego_motion.coherent:
             return tracked
         old = self.memory.unseen_for(loops.forgotten_after, landmarks.ids)
@@ -628,7 +627,7 @@ class PlaceRecognition:
         joint = self.find_join(landmarks, features, association)
         if joint is not None:
             return (joint,)
-        loops, confirmation = self._parts.loops, self._confirmation
+        loops, confirmation = self._loops, self._confirmation
         if loops is None or confirmation is None or not self._time_to_look(loops, confirmation):
             return ()
         found = self._old_place(loops, landmarks, features)
@@ -663,7 +662,7 @@ class PlaceRecognition:
         new = self.memory.made_after(since, left)
         appearances = self._tracker.database.appearances()
         sides = left[new], left[~new]
-        pairs = duplicates(landmarks, appearances, sides, self._parts.appearance)
+        pairs = duplicates(landmarks, appearances, sides, self._appearance)
         return np.union1d(ended, self._tracker.merge(pairs))
 
     # -- upkeep ------------------------------------------------------------------------------
@@ -694,12 +693,12 @@ class PlaceRecognition:
     # ----------------------------------------------------------------------------------------
 
     def _find_words(self) -> None:
-        if self._parts.loops is not None or self._parts.lost is not None or self._apart:
+        if self._loops is not None or self._lost_rules is not None or self._apart:
             self._tracker.database.find_words()
 
     @property
     def _apart(self) -> bool:
-        return self._parts.joins and self._tracker.parts.several
+        return self._joins and self._tracker.parts.several
 
     def find_join(
         self,
@@ -747,7 +746,7 @@ class PlaceRecognition:
         Outside a map that is left as it is, nothing but the odometry ever shows it; where no pose
         searches the whole map for the lost, the return to it is a loop like any other.
         """
-        outside = self._tracker.keeps_map and self._parts.lost is None
+        outside = self._tracker.keeps_map and self._lost_rules is None
         return self._lost > 0 and not outside
 
     def _time_to_look(self, loops: LoopGates, confirmation: Confirmation) -> bool:
@@ -784,9 +783,9 @@ class PlaceRecognition:
     def _locate(
         self, landmarks: LandmarkMap, among: IntArray, features: StereoFeatures
     ) -> Relocalisation:
-        rng = np.random.default_rng([self._parts.seed, _STREAM, len(self.memory)])
+        rng = np.random.default_rng([self._seed, _STREAM, len(self.memory)])
         self._learn(landmarks, among)
-        return self._parts.relocaliser.locate(features, rng)
+        return self._relocaliser.locate(features, rng)
 
     def _learn(self, landmarks: LandmarkMap, among: IntArray) -> None:
         """Hands the map to the relocaliser; views that it has seen keep their index."""
@@ -801,7 +800,7 @@ class PlaceRecognition:
         ):
             appearances = database.appearances(chosen.ids, with_words=True)
             self._views = database.changes, chosen.ids, appearances
-        self._parts.relocaliser.learn(chosen, appearances)
+        self._relocaliser.learn(chosen, appearances)
 
 
 def _one_place(a: FloatArray, b: FloatArray) -> bool:

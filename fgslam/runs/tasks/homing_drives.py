@@ -44,7 +44,7 @@ from fgslam.homing.closed_loop import (
     truly_arrived,
 )
 from fgslam.homing.controller import HomingChain
-from fgslam.homing.front_end import HomingFrontEnd, make_front_end
+from fgslam.homing.front_end import ImageFrontEnd, make_front_end
 from fgslam.homing.route import PathMemory
 from fgslam.homing.settings import FrontEndSettings
 from fgslam.homing.steering import Command, CorridorAvoidance, HomingState, Steering
@@ -108,7 +108,7 @@ class Opened:
     """
 
     world: PathWorld
-    front_end: HomingFrontEnd
+    front_end: ImageFrontEnd
     memory: PathMemory
     poses: FloatArray
 
@@ -190,7 +190,7 @@ def open_crossroads_drive(config: CrossroadsConfig, seed: int) -> Opened:
     return Opened(world, front_end, PathMemory(way.images, way.names), every[at])
 
 
-def _open_house(config: DrivingConfig, seed: int) -> tuple[OmniWorld, HomingFrontEnd]:
+def _open_house(config: DrivingConfig, seed: int) -> tuple[OmniWorld, ImageFrontEnd]:
     world = open_house(config.dataset, seed)
     settings = FrontEndSettings(config.features, config.homing_vector, config.wrong_matches)
     return world, make_front_end(world.calibration, settings, seed)

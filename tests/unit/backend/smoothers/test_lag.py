@@ -427,7 +427,7 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
     near = g.se3_exp(np.array([0.0, 0.3, 0.0, 0.5, 0.0, 0.0])) @ window.poses[-1]
     there = Prediction(near, 1e-6 * np.eye(6))
     loop = Constraint(2, window.frames[-1], g.inverse(solver.poses[2]) @ near, 1e-6 * np.eye(6))
-    solver.loops.accept(loop)
+    solver.accept(loop)
     solver.move_by_loop(there, loop, Drive(estimator.tracker.chain, window.poses[-1]))
     np.testing.assert_array_equal(held.points[ours & outside], points[ours & outside])
     np.testing.assert_array_equal(window.landmarks.mean[inside], mean[inside])
