@@ -71,9 +71,6 @@ class OmniMatchingSettings:
         default=True,
         description="compare square roots of descriptors (Arandjelovic, Zisserman 2012)",
     )
-    max_colour_distance: Positive = Field(
-        default=0.2, description="Euclidean, of (C_RB, C_RG, C_GB); larger ones are discarded"
-    )
     planar_gates: bool = Field(
         default=True, description="leave out candidates that no planar motion explains"
     )

@@ -339,6 +339,7 @@ def triangulable(local_map: LocalMap, max_relative_sigma: float) -> BoolArray:
 
 
 _MAX_COLUMN_DISTANCE = 4.4  # Mahalanobis, of 11 elements; 4.4 is exceeded by 5 % if normal
+_MAX_COLOUR_DISTANCE = 0.2  # Euclidean, of (C_RB, C_RG, C_GB), of matched SIFT features
 _COLUMN_RATIO = 0.7  # column segments: nearest over second nearest distance below this
 _MAX_SCALE_RATIO = 2.0  # factor between the ratio of scales and that of the sines of the elevations
 _HORIZON_MARGIN_DEG = 3.0  # elevations nearer to the horizon may have either sign
@@ -384,7 +385,7 @@ def match_sift(
         return sift_matches(a, b, np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     i, j, ratio = _mutual_nearest(planar_distances(a, b, settings) if squared is None else squared)
     colour = np.linalg.norm(a.colour[i] - b.colour[j], axis=1)
-    keep = (ratio < settings.ratio) & (colour < settings.max_colour_distance)
+    keep = (ratio < settings.ratio) & (colour < _MAX_COLOUR_DISTANCE)
     return sift_matches(a, b, i[keep], j[keep], 1.0 - ratio[keep])
 
 
@@ -622,9 +623,7 @@ def log_likelihood_ratio(gains: FloatArray, probability: FloatArray) -> float:
 # The baseline of all comparisons: SIFT as OpenCV has it
 
 
-PLAIN_MATCHING = OmniMatchingSettings(
-    ratio=0.8, root=False, max_colour_distance=1e9, planar_gates=False
-)
+PLAIN_MATCHING = OmniMatchingSettings(ratio=0.8, root=False, planar_gates=False)
 """Lowe's ratio test alone, for :func:`plain_sift`."""
 
 
