@@ -366,7 +366,7 @@ class RigFilter:
 
 
 # --------------------------------------------------------------------------------------------
-# How much of the estimate is believed: models of what is wrong with a rig, weighed.
+# How much of the estimate is accepted: models of what is wrong with a rig, weighed.
 #
 # A correction of many values always fits a little better than none. Each model frees some terms and
 # holds the others at zero; its evidence charges it for what it frees (MacKay 2003, ch. 28). All are

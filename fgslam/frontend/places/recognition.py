@@ -741,7 +741,7 @@ class PlaceRecognition:
 
     @property
     def _untracked(self) -> bool:
-        """Whether it is unknown where the frame is, so that no return would be believed.
+        """Whether it is unknown where the frame is, so that no return would be accepted.
 
         Outside a map that is left as it is, nothing but the odometry ever shows it; where no pose
         searches the whole map for the lost, the return to it is a loop like any other.

@@ -524,7 +524,7 @@ def test_the_newest_pose_is_as_uncertain_as_the_whole_graph_has_it(rig: RigCorre
     assert (ratio < 2.0).all(), ratio
 
 
-def test_a_hard_floor_keeps_the_doubt_within_what_it_allows() -> None:
+def test_a_hard_floor_keeps_the_uncertainty_within_what_it_allows() -> None:
     floor = Floor.under(RIG, 3)
     last, added = drawn(3, frames=12).poses[-1], driven(12, floor).of_pose()
     assert np.linalg.matrix_rank(added, tol=1e-9 * np.trace(added)) == 3
@@ -576,7 +576,7 @@ def test_filters_report_landmarks_as_uncertain_as_their_rig_leaves_them(kind: st
 
 
 @pytest.mark.parametrize("kind", ["landmark_kalman", "ekf"])
-def test_a_restored_filter_of_a_rig_in_doubt_continues_to_the_same_bits(kind: str) -> None:
+def test_a_restored_filter_of_an_uncertain_rig_continues_to_the_same_bits(kind: str) -> None:
     increments = increments_of(12, field_px=0.3)
     through, first, second = (make_estimator(CALIBRATED.rig, ONLINE[kind], FREE) for _ in range(3))
     play(through, increments, FREE)

@@ -72,7 +72,7 @@ STEP = g.se3_exp(np.array([0.0, 2.0 * np.pi / 40, 0.0, 0.0, 0.0, 0.3]))
 """Forty of them are a round."""
 SIGMA = np.array([1e-3, 4e-3, 1e-3, 5e-3, 5e-3, 1e-2])
 TIGHT = 1e-8 * np.eye(6)
-NOBODY = observations(np.empty(0, np.int64), np.empty((0, 3)), np.ones(3), np.empty(0, np.bool_))
+NO_IDS = observations(np.empty(0, np.int64), np.empty((0, 3)), np.ones(3), np.empty(0, np.bool_))
 
 
 def chained(steps: list[FloatArray]) -> FloatArray:
@@ -143,7 +143,7 @@ def test_frames_take_the_share_of_a_closure_that_the_whole_solution_gives(
     found, _ = corrected(poses, steps, [loop], every=1)
     moved = np.array([g.se3_log(each) for each in changes(poses, found)])
     whole = g.se3_log(poses[7] @ motion @ g.inverse(poses[-1]))
-    closed = LoopClosure(7, motion, covariance, NOBODY, np.empty((0, 2), np.int64))
+    closed = LoopClosure(7, motion, covariance, NO_IDS, np.empty((0, 2), np.int64))
     taken = shares(chain, closed)
     np.testing.assert_allclose(taken @ whole, moved, rtol=0.0, atol=1e-2 * np.abs(moved).max())
     assert np.abs(moved[:8]).max() < 1e-9 < np.abs(moved[8:]).max()
@@ -533,7 +533,7 @@ def found_again_where_expected(estimator: Any, count: int) -> None:
 
 
 @pytest.mark.parametrize("more", [False, True])
-def test_the_larger_number_of_matches_says_which_return_is_believed(more: bool) -> None:
+def test_the_larger_number_of_matches_decides_between_two_returns(more: bool) -> None:
     """A few landmarks found again by chance do not keep a loop from closing; many do."""
     before, closing = returned().increments[:CLOSED], returned().increments[CLOSED]
     (loop,) = closing.loops

@@ -105,7 +105,7 @@ def test_tracks_end_where_no_landmark_has_measured_the_step() -> None:
     assert ended.power == pytest.approx(1.0, rel=0.3)
 
 
-def test_steps_that_a_map_in_doubt_has_leaned_are_put_right_by_the_smoothed_path() -> None:
+def test_steps_that_a_moved_map_has_leaned_are_put_right_by_the_smoothed_path() -> None:
     """Else a track across such a step takes the uncertainty for noise."""
     aside = STEP @ g.se3_exp(np.array([0.0, 0.02, 0.0, 0.02, 0.0, 0.0]))
     assert driven(1.0, frames=60, lost=aside).power > 4.0
@@ -164,7 +164,7 @@ class Known:
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_graph_is_weighed_anew_by_what_is_known_at_its_end(measured: bool) -> None:
+def test_a_graph_is_weighed_again_by_what_is_known_at_its_end(measured: bool) -> None:
     """Observations by their power; a step that only goes on as before by what persists of it."""
     origin = Prediction(np.eye(4), 1e-8 * np.eye(6))
     builder = GraphBuilder(RIG, GraphSettings(), Floor.under(RIG, 6), origin)

@@ -72,7 +72,7 @@ def last_steps(increments: list[Increment], kind: str, truth: FloatArray) -> flo
 
 
 @pytest.mark.parametrize("places", get_args(RigPlaces))
-def test_measurements_follow_as_if_their_pixels_had_been_corrected_anew(places: RigPlaces) -> None:
+def test_measurements_follow_as_if_their_pixels_had_been_corrected_again(places: RigPlaces) -> None:
     rng = np.random.default_rng(1)
     exact = np.column_stack([rng.uniform(20.0, 300.0, (50, 2)), rng.uniform(5.0, 20.0, 50)])
     pixels = (exact @ pixel_model(3, 1.0).T).reshape(-1, 3, 2)
@@ -139,7 +139,7 @@ def places(increments: list[Increment], kind: str) -> FloatArray:
     return estimator.estimate().trajectory.poses[:, :3, 3]
 
 
-def test_a_landmark_started_anew_moves_with_the_others(drive: Simulation) -> None:
+def test_a_landmark_started_again_moves_with_the_others(drive: Simulation) -> None:
     increments = known_from(WINDOW, 2.0, drive)[:WINDOW]
     estimator = make_estimator(RIG, LandmarkKalmanSettings())
     play(estimator, increments)

@@ -172,7 +172,7 @@ def test_little_is_no_evidence_and_a_state_continues_to_the_same_bits() -> None:
     assert_same_bits(state_of(second), state_of(whole))
 
 
-def test_what_not_all_images_show_says_nothing() -> None:
+def test_what_not_all_images_show_is_no_evidence() -> None:
     seen = frames(THREE, 0.4, 1)
     blocked = [each.pixels.copy() for each in seen]
     for pixels in blocked:
@@ -270,7 +270,7 @@ def errors(rig: CameraRig = RIG, camera: str = "left", **terms: float) -> FloatA
     return out
 
 
-def test_a_correction_larger_than_calibrations_leave_is_told_with_a_doubt() -> None:
+def test_a_correction_larger_than_calibrations_leave_is_reported_as_uncertain() -> None:
     plausible, large = (
         calibration_note(calibrated(Road(frames=18), errors(yaw=yaw), 0)) for yaw in (0.002, 0.012)
     )
@@ -338,7 +338,7 @@ def test_errors_together_are_found_by_the_other_kinds_of_rig(rig: CameraRig) -> 
         for name, rig in RIGS.items()
     ],
 )
-def test_the_error_of_the_correction_is_what_its_covariance_says(
+def test_the_error_of_the_correction_matches_its_covariance(
     rig: CameraRig, seeds: int, low: float, high: float
 ) -> None:
     nees = []
@@ -561,7 +561,7 @@ def test_changes_are_the_turn_of_a_camera_in_degrees(rig: CameraRig) -> None:
     assert ("top_yaw_deg" in found) == (rig.cameras == 3)
 
 
-def test_a_shifted_principal_point_is_told_as_a_turn() -> None:
+def test_a_shifted_principal_point_is_reported_as_a_turn() -> None:
     """Over the image, both move the pixels alike."""
     shifted = RigCorrection(RIG, errors(column=0.001), np.eye(len(errors())) * 1e-12).changes()
     # x^2 of the yaw's 1 + x^2 is 0.25 in the mean over this image.
@@ -571,7 +571,7 @@ def test_a_shifted_principal_point_is_told_as_a_turn() -> None:
 # -- what two of three images show -----------------------------------------------------------
 
 
-def test_what_one_image_does_not_show_says_nothing_of_the_rig() -> None:
+def test_what_one_image_does_not_show_is_no_evidence_of_the_rig() -> None:
     """Observations that lack an image are left out, the others count as before."""
     road = Road(frames=WINDOW, rig=THREE, points=1500)
     wrong = np.zeros(len(term_names(THREE)))

@@ -136,7 +136,7 @@ def test_swapped_cameras_are_found_in_the_lab(lab: tuple[CameraRig, list[Images]
 
 
 @pytest.mark.parametrize("camera", [0, 1])
-def test_a_darker_camera_is_said_and_its_frames_are_used(
+def test_a_darker_camera_is_reported_and_its_frames_are_used(
     lab: tuple[CameraRig, list[Images]], camera: int
 ) -> None:
     reported, watch = watched(*lab, darker(camera))
@@ -220,7 +220,7 @@ def points(rng: np.random.Generator, lag: float, sigma: float, n: int = 80) -> L
     return LineRows(lag * shift + sigma * rng.standard_normal(n), shift, place)
 
 
-def test_the_lag_is_as_uncertain_as_it_says(rng: np.random.Generator) -> None:
+def test_the_lag_is_as_uncertain_as_stated(rng: np.random.Generator) -> None:
     model = LagModel(RIG, 1)
     found = [model.lag(points(rng, lag, 0.3), 0.1) for lag in 50 * [0.0, 0.4, 1.0]]
     error = np.array([one.frames for one in found]) - np.array(50 * [0.0, 0.4, 1.0])
@@ -242,7 +242,7 @@ def test_a_turned_camera_is_no_late_one(rng: np.random.Generator) -> None:
     assert LagModel(RIG, 1).lag(drawn, 0.1).late < -5.0
 
 
-def test_what_stands_still_tells_no_lag(rng: np.random.Generator) -> None:
+def test_lag_is_unknown_without_motion(rng: np.random.Generator) -> None:
     """The patch's own noise is in offset and shift alike, as if the image were half a frame old."""
     place = rng.uniform([5, 5], [315, 235], (80, 2))
     common = 0.1 * rng.standard_normal(80)
@@ -346,7 +346,9 @@ def test_frames_are_named_by_their_own_numbers(turned_lab: tuple[CameraRig, list
     assert watch.knocked
 
 
-def said_of(rig: CameraRig, frames: list[Images], camera: int, turn_deg: FloatArray) -> list[str]:
+def reported_of(
+    rig: CameraRig, frames: list[Images], camera: int, turn_deg: FloatArray
+) -> list[str]:
     """Remarks on a drive in whose middle a camera is turned."""
     watch = CameraWatch(rig)
     for k, images in enumerate(frames):
@@ -365,7 +367,7 @@ def about(axis: int) -> FloatArray:
 def test_the_knocked_one_of_three_cameras_is_named_with_its_turn(
     turned_lab: tuple[CameraRig, list[Images]], camera: int, axis: int
 ) -> None:
-    (line,) = said_of(*turned_lab, camera, about(axis))
+    (line,) = reported_of(*turned_lab, camera, about(axis))
     assert line.startswith(f"the {CAMERA_NAMES[camera]} camera was turned by ")
     size, words = line.removeprefix(f"the {CAMERA_NAMES[camera]} camera was turned by ").split(
         " degrees in ", 1
@@ -376,19 +378,19 @@ def test_the_knocked_one_of_three_cameras_is_named_with_its_turn(
     assert line.count("degrees in") == 1  # no other axis
 
 
-def test_of_a_pair_the_turn_of_one_against_the_other_is_said(
+def test_of_a_pair_the_turn_of_one_against_the_other_is_reported(
     turned_lab: tuple[CameraRig, list[Images]],
 ) -> None:
     (rig, frames), axis = turned_lab, 0
     pair = dataclasses.replace(rig, vertical_baseline=None)
-    (line,) = said_of(pair, frames, 1, about(axis))
+    (line,) = reported_of(pair, frames, 1, about(axis))
     assert "the left camera was turned by" in line
     assert f"degrees in {AXES[axis]}" in line
     assert "against the right one (or that one by the opposite)" in line
 
 
-def test_nothing_is_said_of_a_sound_drive(turned_lab: tuple[CameraRig, list[Images]]) -> None:
-    assert said_of(*turned_lab, 1, np.zeros(3)) == []
+def test_nothing_is_reported_of_a_sound_drive(turned_lab: tuple[CameraRig, list[Images]]) -> None:
+    assert reported_of(*turned_lab, 1, np.zeros(3)) == []
 
 
 # --------------------------------------------------------------------------------------------
@@ -503,7 +505,7 @@ def test_noise_is_no_knock_in_a_long_drive(rng: np.random.Generator) -> None:
     assert watch.knocks == []
 
 
-def test_two_knocks_are_told_apart(rng: np.random.Generator) -> None:
+def test_two_knocks_are_separated(rng: np.random.Generator) -> None:
     watch = TurnWatch(PAIR, 0.1)
     for frame in range(15 * WINDOW):
         show(watch, frame, rng, (0.0, 0.4, -0.2)[frame // (5 * WINDOW)])

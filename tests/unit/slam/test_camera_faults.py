@@ -39,7 +39,7 @@ def driven(recording: fg.Recording, frontend: dict[str, object]) -> fg.Slam:
 
 
 @pytest.mark.slow
-def test_frames_of_a_late_camera_are_not_used_and_the_covariance_says_so(
+def test_frames_of_a_late_camera_are_not_used_and_the_covariance_shows_it(
     recording: fg.Recording,
 ) -> None:
     slam = driven(recording, {})

@@ -47,7 +47,7 @@ def test_bits_that_are_given_and_lost_are_remarked(recording: fg.Recording) -> N
     assert re.search(r"reach 1[0-5] of 255: shift 12-bit values to 16 bits", remark), remark
 
 
-def test_swapped_images_are_said_to_be_swapped(recording: fg.Recording) -> None:
+def test_swapped_images_are_reported_as_swapped(recording: fg.Recording) -> None:
     remark, *_ = remarks(recording, lambda images: (images[1], images[0], *images[2:]))
     assert remark.startswith("the images of the right and the left camera are swapped: 4 of 4")
     assert "(swap their images; " in remark
@@ -73,7 +73,9 @@ def test_images_without_stereo_matches_give_one_line(
     assert re.search(words, remark), remark
 
 
-def test_a_covered_camera_of_two_is_told_from_swapped_ones(recording: fg.Recording) -> None:
+def test_a_covered_camera_of_two_is_not_taken_for_swapped(
+    recording: fg.Recording,
+) -> None:
     rng = np.random.default_rng(0)
 
     def covered(images: Images) -> Images:

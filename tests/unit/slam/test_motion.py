@@ -183,7 +183,7 @@ def test_a_step_that_nothing_measured_is_at_most_free() -> None:
     np.testing.assert_allclose(np.sqrt(np.diag(step.covariance)), [3.0] * 3 + [30.0] * 3)
 
 
-def test_a_sudden_turn_found_anew_is_the_velocity_from_there() -> None:
+def test_a_sudden_turn_found_again_is_the_velocity_from_there() -> None:
     motion = ConstantVelocityMotion()
     motion.observe(0.0, at(np.eye(4)), measured=True)
     motion.observe(0.5, at(np.eye(4)), measured=True)
@@ -205,7 +205,7 @@ def test_nothing_is_known_of_the_velocity_after_a_gap() -> None:
     assert step.covariance[3, 3] == pytest.approx((0.5 * START_VELOCITY_SIGMA[3]) ** 2)
 
 
-def test_a_motion_that_nobody_saw_is_no_part_of_the_velocity() -> None:
+def test_a_motion_that_no_frame_saw_is_no_part_of_the_velocity() -> None:
     """Frame 0 was blind, frame 1 founded the map where the camera had got to unseen."""
     motion = ConstantVelocityMotion()
     motion.observe(0.0, at(np.eye(4)), measured=False)

@@ -19,7 +19,7 @@ def odometry(sigma: float) -> fg.Odometry:
     return fg.Odometry(STEP, sigma**2 * np.eye(6))
 
 
-def test_a_frame_that_nobody_took_is_replaced_and_counted() -> None:
+def test_a_frame_that_no_caller_took_is_replaced_and_counted() -> None:
     frames = fg.NewestFrame()
     for t in (1.0, 2.0, 3.0):
         frames.put(t, IMAGES)

@@ -36,19 +36,19 @@ def recorded(statuses: list[str], step: Odometry | None = None) -> RunRecorder:
 STATUSES = ["first", "ok", "too_few_matches", "relocalised", "ok"]
 
 
-def test_nothing_is_said_of_one_map() -> None:
+def test_nothing_is_reported_of_one_map() -> None:
     assert part_remarks(recorded(STATUSES), Apart([True] * 5)) == ()
     assert in_first_map(recorded(STATUSES), Apart([True] * 5)) == 4
 
 
-def test_frames_that_are_interpolated_are_told() -> None:
+def test_frames_that_are_interpolated_are_reported() -> None:
     parts = Apart([True, True, False, True, True])
     (remark,) = part_remarks(recorded(STATUSES), parts)
     assert (remark.code, remark.frames) == ("bridged", (20,))
     assert in_first_map(recorded(STATUSES), parts) == 4
 
 
-def test_frames_beyond_a_gap_are_told() -> None:
+def test_frames_beyond_a_gap_are_reported() -> None:
     parts = Apart([True, True, False, False, False])
     (remark,) = part_remarks(recorded(STATUSES), parts)
     assert (remark.code, remark.frames) == ("unconnected", (30, 40))
@@ -60,7 +60,7 @@ def test_a_frame_that_failed_is_not_counted() -> None:
     assert in_first_map(recorded(STATUSES), parts) == 4
 
 
-def test_odometry_against_which_most_frames_are_located_is_told() -> None:
+def test_odometry_against_which_most_frames_are_located_is_reported() -> None:
     statuses = ["first", "relocalised", "ok", "relocalised", "relocalised"]
     connected = Apart([True] * 5)
     step = Odometry(np.eye(4), np.eye(6))

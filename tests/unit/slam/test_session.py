@@ -142,7 +142,7 @@ def assert_same_result(first: Session, second: Session) -> None:
 # Frames and results
 
 
-def test_a_step_says_what_was_matched(views: Views) -> None:
+def test_a_step_reports_what_was_matched(views: Views) -> None:
     slam = session(views)
     first = slam.track(0.0, views.images(0))
     second = slam.track(0.5, views.images(1), views.odometry(1))
@@ -227,7 +227,7 @@ def test_a_camera_loop_may_fill_the_same_images_again(views: Views) -> None:
 
 
 @pytest.mark.parametrize("relocalised", [False, True])
-def test_the_pose_that_is_used_says_whether_it_was_found_anew(
+def test_the_pose_that_is_used_shows_whether_it_was_found_again(
     views: Views, monkeypatch: pytest.MonkeyPatch, relocalised: bool
 ) -> None:
     """Recent landmarks may place a frame again: with them the prediction, or without it."""

@@ -215,7 +215,7 @@ def standing_still(frames: int) -> tuple[float, float]:
     return float(np.sqrt(claimed[2, 2])), float(np.sqrt(marginal[2, 2]))
 
 
-def test_the_same_pose_error_is_counted_anew_in_every_frame() -> None:
+def test_the_same_pose_error_is_counted_again_in_every_frame() -> None:
     claimed_once, true_once = standing_still(1)
     assert claimed_once == pytest.approx(true_once, rel=1e-9)
     claimed, honest = standing_still(100)

@@ -157,7 +157,7 @@ def test_a_compass_takes_the_rotation_over(
 
 
 @pytest.mark.parametrize("broken", ["covariance", "solve"])
-def test_a_filter_that_breaks_down_says_so_and_stays(
+def test_a_filter_that_breaks_down_is_refused_and_stays(
     broken: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A covariance that is no number is no estimate, and a failed solution no traceback."""

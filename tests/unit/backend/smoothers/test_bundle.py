@@ -334,7 +334,7 @@ def test_extremes_of_the_stated_noise_leave_a_bias(walk: float, density: float, 
     assert np.isfinite(bias).all()
 
 
-def test_a_bias_that_nothing_determines_is_told() -> None:
+def test_a_bias_that_nothing_determines_is_reported() -> None:
     turns = turns_of(0.0)
     open_to_all = dataclasses.replace(
         turns, jacobians=0.0 * turns.jacobians, known=np.zeros((3, 3))

@@ -246,7 +246,7 @@ def row_of(estimate, identity: int) -> int:
 
 
 @GRAPHS
-def test_a_landmark_that_moved_starts_anew(name: str, drive: Simulation) -> None:
+def test_a_landmark_that_moved_starts_again(name: str, drive: Simulation) -> None:
     place = drive.points_by_id[OFTEN] + [0.3, 0.1, 0.3]
     increments = moved(drive, OFTEN, 8, place, np.random.default_rng(1))
     estimator, _ = run(SMOOTHERS[name], increments)
@@ -264,7 +264,7 @@ def test_a_landmark_that_moved_starts_anew(name: str, drive: Simulation) -> None
     assert variables.count(OFTEN) == 2
 
 
-def test_wrong_matches_do_not_start_a_landmark_anew(drive: Simulation) -> None:
+def test_wrong_matches_do_not_start_a_landmark_again(drive: Simulation) -> None:
     """Rejected frame after frame, each time elsewhere."""
     rng = np.random.default_rng(2)
     increments = list(drive.increments)

@@ -254,7 +254,7 @@ def test_a_frame_located_without_a_prior_is_as_sure_as_the_map_around_it() -> No
     assert (sigmas[1] < 3.0 * sigmas[0]).all(), "not 3 rad and 30 m"
 
 
-def test_a_frame_located_by_landmarks_of_the_lag_tells_nothing_twice() -> None:
+def test_a_frame_located_by_landmarks_of_the_lag_counts_nothing_twice() -> None:
     """Its factors hold it there; a prior from the same matches would be the same evidence."""
     increments = drawn(3, frames=14).increments
     marked = [dataclasses.replace(each, relocalised=each.index % 3 == 2) for each in increments]
@@ -303,7 +303,7 @@ def test_drift_goes_where_the_drive_returns_though_no_loop_is_announced() -> Non
 
 
 @pytest.mark.slow
-def test_pose_of_every_frame_is_as_uncertain_as_it_says_before_and_after_a_return() -> None:
+def test_pose_of_every_frame_is_as_uncertain_as_stated_before_and_after_a_return() -> None:
     squared = np.array([live(100 + seed)[1] for seed in range(20)]) / 6.0
     assert 0.4 < squared[:, : ROUND - 1].mean() < 1.25
     assert 0.4 < squared[:, ROUND - 1 :].mean() < 1.25
@@ -329,7 +329,7 @@ def returned() -> SlidingWindowSolver:
     return solver_of(estimator)
 
 
-def test_a_place_that_is_like_any_pose_that_left_says_the_same(
+def test_a_place_that_is_like_any_pose_that_left_counts_the_same(
     returned: SlidingWindowSolver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     window = returned.window
@@ -371,7 +371,7 @@ def test_answer_is_that_of_batch() -> None:
     np.testing.assert_allclose(sigma, expected, rtol=0.02)
 
 
-def test_what_is_known_too_unevenly_is_begun_anew_with_a_remark(
+def test_what_is_known_too_unevenly_is_begun_again_with_a_remark(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     drive, estimator, solve = drawn(8, frames=16), build(SHORT), Window.solve

@@ -173,7 +173,7 @@ def test_landmarks_too_far_to_be_placed_agree_by_where_they_are_seen() -> None:
     assert not turned.returned(elsewhere, WTF, DRIFT).any()
 
 
-def test_of_what_is_near_the_observation_alone_says_where_it_is() -> None:
+def test_of_what_is_near_the_observation_alone_places_it() -> None:
     points = np.array([[0.0, 0.0, 3.0], [0.5, 0.2, 400.0], [0.0, 0.0, -3.0]])
     ahead = np.where(points[:, 2:] > 0.0, points, 4.0)
     known = Landmarks(np.array([5, 7, 8]), *2 * [g.transform_to_world(WTF, points)], *[np.eye(3)])

@@ -291,7 +291,7 @@ def test_points_of_planar_patches_are_mapped_within_half_a_degree() -> None:
     assert np.mean(np.abs(off) < 3.0 * sigma) > 0.9
 
 
-def test_a_window_tells_corners_from_edges() -> None:
+def test_a_window_separates_corners_from_edges() -> None:
     """Eq. 2 of a single pixel has rank 1 everywhere; summed over a window only on edges."""
     grey = np.full((CAMERA.height, CAMERA.width - 1), 60, np.uint8)
     grey[:90, 300:] = 200  # one corner at (300, 90); edges up, and to the right

@@ -94,7 +94,7 @@ def test_tilted_cameras_are_estimated() -> None:
     assert np.median(free) < 0.3 * np.median(level)
 
 
-def test_a_camera_that_is_lifted_on_the_way_is_told_from_the_plane() -> None:
+def test_a_camera_that_is_lifted_on_the_way_is_distinguished_from_the_plane() -> None:
     """As far up or down as on, tilted by a degree: held to the plane 2 of 20 had an answer."""
     errors = []
     for seed in range(20):
@@ -111,7 +111,7 @@ def test_a_camera_that_is_lifted_on_the_way_is_told_from_the_plane() -> None:
     assert np.rad2deg(np.median(errors)) < 2.0
 
 
-def test_a_lead_in_one_sector_leaves_doubt_and_the_same_lead_all_around_does_not() -> None:
+def test_a_lead_in_one_sector_leaves_uncertainty_and_the_same_lead_all_around_does_not() -> None:
     """Eight equal matches fewer for the other solution: 8 of 1 sigma each, or one of 8."""
     bearing = np.repeat(np.deg2rad(22.5 + 45.0 * np.arange(8)), 8)
     angles = np.column_stack([bearing, np.full(64, 0.2)] * 2)

@@ -363,7 +363,7 @@ def test_a_correction_is_no_motion() -> None:
 
 RETURN_LOOPS = LoopGates()
 DOWN = np.array([0.0, 1.0, 0.0])
-NOBODY = np.empty(0, np.int64)
+NO_IDS = np.empty(0, np.int64)
 NOISE = 0.2**2 * np.eye(3)
 
 
@@ -411,7 +411,7 @@ def remembered(frames: list[list[int]], given: int = -1) -> SightingMemory:
     return memory
 
 
-def test_memory_tells_what_was_not_seen_for_long_and_where_it_was_seen_best() -> None:
+def test_memory_holds_what_was_not_seen_for_long_and_where_it_was_seen_best() -> None:
     memory = remembered([[0, 1, 2], [0, 1, 2, 3], [3, 4], [4, 5], [5, 6], [2, 6]])
     asked = np.arange(9)
     np.testing.assert_array_equal(memory.unseen_for(3, asked), [0, 1, 3])
@@ -517,7 +517,7 @@ def closing(k: int, to: int, again: IntArray) -> Increment:
     """A frame that sees nothing but the landmarks of an earlier one, by a closure."""
     old = seen_from(np.eye(4), np.tile([0.0, 0.0, 3.0], (len(again), 1)), again)
     loop = LoopClosure(to, np.eye(4), np.eye(6), old, np.empty((0, 2), np.int64))
-    nothing = seen_from(np.eye(4), np.empty((0, 3)), NOBODY)
+    nothing = seen_from(np.eye(4), np.empty((0, 3)), NO_IDS)
     return dataclasses.replace(frame(k, nothing), loops=(loop,))
 
 
@@ -546,7 +546,7 @@ def test_memory_of_a_map_restored_from_log_goes_on_the_same() -> None:
     memory, again, log = left_and_back(), SightingMemory(), MeasurementLog(RIG, {})
     held = _map(np.arange(600), np.zeros((600, 3)))
     for k in range(len(memory)):
-        log.append(frame(k, memory.view(k, NOBODY, held)))
+        log.append(frame(k, memory.view(k, NO_IDS, held)))
     restore(again, state_of(memory))
     again.frames[:] = log
     assert_same_bits(state_of(again), state_of(memory))
@@ -638,7 +638,7 @@ def test_resection_finds_the_pose_among_wrong_matches(dof: int) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])
-def test_resection_of_too_few_matches_says_so(count: int) -> None:
+def test_resection_of_too_few_matches_is_refused(count: int) -> None:
     points = cloud(count, np.random.default_rng(0))
     seen = seen_from(np.eye(4), points, np.arange(count))
     resection = Resection(EgoMotionSolver(RIG, EgoMotionSettings()))

@@ -133,7 +133,7 @@ def test_degenerate_pairs_have_an_infinite_covariance(rng: np.random.Generator) 
     assert np.array_equal(poses[0], start)
 
 
-def test_covariance_tells_the_scatter_of_poses() -> None:
+def test_covariance_is_the_scatter_of_poses() -> None:
     """NEES over many noisy frames lies in its band (three degrees of freedom)."""
     rng = np.random.default_rng(3)
     place, truth, level = room(rng, 250), planar(0.2, 0.1, 0.5), floor(3)

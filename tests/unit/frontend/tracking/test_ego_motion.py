@@ -598,7 +598,7 @@ def learnt_variance(noise: MatchNoise, *misfits: float) -> float:
     return noise.variance
 
 
-def test_three_frames_contradict_the_stated_noise_and_a_stretch_of_wrong_matches_does_not() -> None:
+def test_three_frames_contradict_the_stated_noise_and_a_run_of_wrong_matches_does_not() -> None:
     assert learnt_variance(MatchNoise(), 16.0, 17.0) == 1.0
     assert learnt_variance(MatchNoise(), 16.0, 17.0, 18.0) == 16.0
     assert learnt_variance(MatchNoise(), *[0.1] * 9) == 1.0
@@ -608,7 +608,7 @@ def test_three_frames_contradict_the_stated_noise_and_a_stretch_of_wrong_matches
     assert learnt_variance(MatchNoise(), np.nan, np.nan, np.nan, np.nan) == 1.0
 
 
-def test_a_frame_whose_pose_is_only_predicted_says_nothing_of_the_noise() -> None:
+def test_a_frame_whose_pose_is_only_predicted_is_no_evidence_of_the_noise() -> None:
     """Nor does it have a graph weigh its matches by the stated noise again."""
     log = noisy_drive(7)
     noise = Persistence(log.rig)

@@ -145,7 +145,7 @@ def test_a_landmark_found_again_is_placed_by_its_own_patch(nearer: float, least:
     np.testing.assert_allclose(np.median(sizes), WALL_M / (WALL_M - nearer), rtol=0.02)
 
 
-def test_what_looks_different_by_now_is_not_found_again() -> None:
+def test_what_appears_different_by_now_is_not_found_again() -> None:
     """Every second one is taken for what lies ten pixels next to it."""
     off = np.where(np.arange(len(GRID))[:, None] % 2, [9.0, -7.0], 0.0)
     _, at = found_again(np.array([0.02, 0.0, 0.0]), off)
@@ -206,7 +206,7 @@ def test_a_large_motion_is_left_to_features() -> None:
     assert carrier.follow(pictures(place), expected(place)) is None
 
 
-def test_looks_are_those_expected_and_noise_is_stated() -> None:
+def test_appearances_are_those_expected_and_noise_is_stated() -> None:
     found = followed(begun(pictures(HERE), HERE), HERE)
     features = found.features
     np.testing.assert_allclose(features.scale, 2.0, rtol=0, atol=1e-12)
@@ -261,7 +261,7 @@ def test_enough_landmarks_that_mostly_agree_place_a_frame(
     assert found.suffices is placed
 
 
-def test_few_that_are_left_ask_for_a_key_frame_beside_which_they_are_used() -> None:
+def test_few_that_are_left_ask_for_a_key_frame_next_to_which_they_are_used() -> None:
     found = replace(frame(100, 0), lasting=False)
     assert found.placed
     assert not found.suffices

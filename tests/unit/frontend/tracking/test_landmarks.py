@@ -784,7 +784,7 @@ GAP = frame(new=range(30, 50))
 
 
 @pytest.mark.parametrize("odometry", [GUESS, None], ids=["live", "in a log"])
-def test_a_frame_that_nothing_places_founds_a_part(odometry: Odometry | None) -> None:
+def test_a_frame_that_nothing_places_begins_a_part(odometry: Odometry | None) -> None:
     gap = frame(new=range(30, 50), odometry=odometry)
     parts = parts_of(*BEFORE, gap, frame(range(30, 45), range(50, 55), odometry))
     assert parts.connected.tolist() == [True, True, False, False]

@@ -478,7 +478,7 @@ def test_a_blocked_camera_takes_nothing_from_a_lasting_map(blind_below: float) -
     np.testing.assert_array_equal(association.observations.ids, ids)
 
 
-def beside_a_wall(permanence: PermanenceSettings) -> Things:
+def next_to_a_wall(permanence: PermanenceSettings) -> Things:
     """A thing of eight points before a wall of many, and what hides it: a thing nearer yet."""
     rng = np.random.default_rng(9)
     thing = box(rng, 8, 0.15, 2.5)
@@ -498,7 +498,7 @@ THING, PERSON = np.arange(8), np.arange(68, 80)
 @pytest.mark.parametrize("after", [3, 6, None])
 def test_a_thing_that_is_gone_is_demoted_and_goes(after: int | None) -> None:
     """Item 5.5: where it was, the wall behind is seen."""
-    things = beside_a_wall(dataclasses.replace(LASTING, contradicted_after=after))
+    things = next_to_a_wall(dataclasses.replace(LASTING, contradicted_after=after))
     ids = np.array([things.id_of(k) for k in THING])
     assert things.database.permanent[things.database.rows(ids)].all()
     gone_at: dict[int, int] = {}
@@ -512,7 +512,7 @@ def test_a_thing_that_is_gone_is_demoted_and_goes(after: int | None) -> None:
 
 
 def test_a_thing_behind_a_person_stays() -> None:
-    things = beside_a_wall(LASTING)
+    things = next_to_a_wall(LASTING)
     ids = np.array([things.id_of(k) for k in THING])
     for _ in range(40):
         association = things.step(from_angle(HERE), THING)
@@ -524,7 +524,7 @@ def test_a_thing_behind_a_person_stays() -> None:
 
 
 def test_a_hit_in_between_clears_a_landmark() -> None:
-    things = beside_a_wall(LASTING)
+    things = next_to_a_wall(LASTING)
     ids = np.array([things.id_of(k) for k in THING])
     for k in range(30):
         there = k % 6 == 5
@@ -534,7 +534,7 @@ def test_a_hit_in_between_clears_a_landmark() -> None:
 
 def test_a_landmark_rejected_again_and_again_is_demoted() -> None:
     """It has been moved a little: what resembles it is found next to its place."""
-    things = beside_a_wall(LASTING)
+    things = next_to_a_wall(LASTING)
     landmark = things.id_of(20)
     row = int(things.map.rows(np.array([landmark]))[0])
     things.map.positions[row, 0] += 2.4 * things.map.positions[row, 2] / RIG.fx
@@ -576,7 +576,7 @@ def test_a_frame_is_found_whatever_was_predicted(scene: Scene, predicted: FloatA
     np.testing.assert_allclose(g.se3_log(g.inverse(TURNED) @ found.wTc), 0.0, atol=4e-3)
 
 
-def test_nobody_looks_for_a_frame_that_was_foreseen(
+def test_no_search_is_made_for_a_frame_that_was_foreseen(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(regaining.Regainer, "find", lambda *_: pytest.fail("looked for"))
@@ -642,7 +642,7 @@ def test_new_ground_is_no_reason_to_look(
 
 
 @pytest.mark.parametrize("returns", [False, True])
-def test_few_matches_are_a_reason_whoever_else_looks(scene: Scene, returns: bool) -> None:
+def test_few_matches_are_a_reason_whatever_else_searches(scene: Scene, returns: bool) -> None:
     scene.tracker.expects_returns = returns
     few = scene.world.points[:, 0] < np.quantile(scene.world.points[:, 0], 0.1)
     scene.world.points[few] = g.transform_to_world(TURNED, scene.world.points[few])
@@ -742,7 +742,7 @@ def drive(board_m: float, step_m: float) -> Session:
     return session
 
 
-def test_something_large_that_passes_is_told() -> None:
+def test_something_large_that_passes_is_reported() -> None:
     with drive(1.2, 0.1) as session:
         reported = [note for note in session.result().notes if note.code.startswith("other_motion")]
         assert len(reported) == 1, session.result().notes
