@@ -8,7 +8,6 @@ import numpy as np
 
 from fgslam.core.arrays import BoolArray, GrowingColumns, IntArray, StateArrays
 from fgslam.core.sensors import Observations
-from fgslam.core.store import Kept
 
 LEAST_SIGHTINGS = 4  # of a track that is judged: a place and a slope take two
 LONGEST = 30  # sightings of a track, at which it is judged although it goes on
@@ -43,22 +42,21 @@ def tracks_of(counts: IntArray) -> Tracks:
     return Tracks(ends - counts, int(counts.sum()))
 
 
-class OpenTracks:
+class OpenTracks(GrowingColumns):
     """Sightings of tracks that go on, in order of time."""
 
-    _rows: Kept[GrowingColumns]
+    ids: IntArray
+    frame: IntArray
 
     def __init__(self) -> None:
         """None yet."""
         number = np.empty(0, np.int64)
         measurement, covariance = np.empty((0, 3)), np.empty((0, 3, 3))
-        self._rows = GrowingColumns(
-            ids=number, frame=number, measurement=measurement, covariance=covariance
-        )
+        super().__init__(ids=number, frame=number, measurement=measurement, covariance=covariance)
 
     def add(self, frame: int, seen: Observations) -> None:
         """Takes in a frame's observations."""
-        self._rows.append(
+        self.append(
             {
                 "ids": seen.ids,
                 "frame": np.full(len(seen), frame, np.int64),
@@ -69,7 +67,7 @@ class OpenTracks:
 
     def first_frame(self, default: int) -> int:
         """The first one that any track was seen in."""
-        return int(self._rows["frame"].min(initial=default))
+        return int(self.frame.min(initial=default))
 
     def take_ended(self, frame: int) -> tuple[StateArrays, IntArray]:
         """Takes out the tracks that have ended before a frame; those of a length to be judged.
@@ -80,7 +78,7 @@ class OpenTracks:
         """
         track, counts = self._numbered()
         last = np.zeros(len(counts), np.int64)
-        np.maximum.at(last, track, self._rows["frame"])
+        np.maximum.at(last, track, self.frame)
         return self._take((counts >= LONGEST) | (frame - last > ENDED_AFTER), track, counts)
 
     def take_all(self) -> tuple[StateArrays, IntArray]:
@@ -88,13 +86,10 @@ class OpenTracks:
         track, counts = self._numbered()
         return self._take(np.ones(len(counts), np.bool_), track, counts)
 
-    def _columns(self) -> StateArrays:
-        return self._rows.columns()
-
     def _numbered(self) -> tuple[IntArray, IntArray]:
         """(n,) which track each sighting is of, in order of the tracks' first ones; counts (m,)."""
         _, first, track, counts = np.unique(
-            self._rows["ids"], return_index=True, return_inverse=True, return_counts=True
+            self.ids, return_index=True, return_inverse=True, return_counts=True
         )
         order = np.argsort(first)
         number = np.empty(len(order), np.int64)
@@ -107,6 +102,6 @@ class OpenTracks:
         judged = ended & (counts >= LEAST_SIGHTINGS)
         rows = np.flatnonzero(judged[track])
         rows = rows[np.argsort(track[rows], kind="stable")]
-        out = {name: of[rows] for name, of in self._columns().items()}
-        self._rows.drop(ended[track])
+        out = {name: of[rows] for name, of in self.columns().items()}
+        self.drop(ended[track])
         return out, counts[judged]

@@ -121,7 +121,8 @@ class GrowingColumns:
 
     Appending costs what is appended (the buffers grow by a factor), dropping what lies behind the
     first row dropped. ``columns[name]`` is a view of the present rows: it may be written to, and
-    is good until the next change of length.
+    is good until the next change of length. A child that annotates its columns has them as
+    attributes, too.
     """
 
     def __init__(self, **like: npt.NDArray[Any]) -> None:
@@ -136,6 +137,11 @@ class GrowingColumns:
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         return self._buffers[name][: self._length]
+
+    def __getattr__(self, name: str) -> npt.NDArray[Any]:
+        if name not in self.__dict__.get("_buffers", ()):
+            raise AttributeError(f"{type(self).__name__} has no column {name}")
+        return self[name]
 
     def columns(self) -> StateArrays:
         """All columns as views, by name."""
@@ -173,9 +179,10 @@ class GrowingColumns:
         return self.columns()
 
     @classmethod
-    def unpacked(cls, packed: StateArrays) -> GrowingColumns:
+    def unpacked(cls, packed: StateArrays) -> Self:
         """Back from :meth:`packed`."""
-        out = cls(**packed)
+        out = cls.__new__(cls)
+        GrowingColumns.__init__(out, **packed)
         out.append(packed)
         return out
 

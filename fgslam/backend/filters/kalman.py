@@ -308,60 +308,40 @@ def moved_share(
     return np.asarray(np.eye(3) - (after + extra) @ inverse_spd3(before + extra))
 
 
-class LandmarkRows:
+class LandmarkRows(GrowingColumns):
     """Identities ascending, with position, covariance, sightings, home frame and last frame.
 
     An update costs what it touches: new landmarks are appended in place, and those that go are
     mostly young, so that only what lies behind the first of them moves.
-    The arrays are views of the room in use: writing to rows of them changes the landmarks.
+
+    Attributes:
+        ids: (n,) ascending.
+        positions: (n, 3) world, metres.
+        covariances: (n, 3, 3) metres squared.
+        counts: (n,) frames in which each was seen.
+        homes: (n,) frame with which each moves when a loop is closed; -1 for one that stays.
+        lasts: (n,) frame that saw each last; -1 for one that none saw yet.
     """
 
-    _columns: Kept[GrowingColumns]
+    ids: IntArray
+    positions: FloatArray
+    covariances: FloatArray
+    counts: IntArray
+    homes: IntArray
+    lasts: IntArray
 
     def __init__(self) -> None:
         """No landmark."""
         number = np.empty(0, np.int64)
-        self._columns = GrowingColumns(
+        positions, covariances = np.empty((0, 3)), np.empty((0, 3, 3))
+        super().__init__(
             ids=number,
-            positions=np.empty((0, 3)),
-            covariances=np.empty((0, 3, 3)),
+            positions=positions,
+            covariances=covariances,
             counts=number,
             homes=number,
             lasts=number,
         )
-
-    def __len__(self) -> int:
-        return len(self._columns)
-
-    @property
-    def ids(self) -> IntArray:
-        """(n,) ascending."""
-        return self._columns["ids"]
-
-    @property
-    def positions(self) -> FloatArray:
-        """(n, 3) world, metres."""
-        return self._columns["positions"]
-
-    @property
-    def covariances(self) -> FloatArray:
-        """(n, 3, 3) metres squared."""
-        return self._columns["covariances"]
-
-    @property
-    def counts(self) -> IntArray:
-        """(n,) frames in which each was seen."""
-        return self._columns["counts"]
-
-    @property
-    def homes(self) -> IntArray:
-        """(n,) frame with which each moves when a loop is closed; -1 for one that stays."""
-        return self._columns["homes"]
-
-    @property
-    def lasts(self) -> IntArray:
-        """(n,) frame that saw each last; -1 for one that none saw yet."""
-        return self._columns["lasts"]
 
     def map(self) -> LandmarkMap:
         """As a map; only until the next landmark comes or goes."""
@@ -381,7 +361,7 @@ class LandmarkRows:
     ) -> None:
         """Adds landmarks (k,) that are known already; none of them may be there."""
         before = len(self)
-        self._columns.append(
+        self.append(
             {
                 "ids": landmarks.ids,
                 "positions": landmarks.positions,
@@ -391,7 +371,7 @@ class LandmarkRows:
                 "lasts": lasts,
             }
         )
-        self._columns.keep_ascending("ids", before)
+        self.keep_ascending("ids", before)
 
     def remove(self, ids: IntArray) -> None:
         """Drops landmarks. Raises KeyError when one is absent."""
@@ -399,11 +379,11 @@ class LandmarkRows:
             return
         gone = np.zeros(len(self), np.bool_)
         gone[self.rows(ids)] = True
-        self._columns.drop(gone)
+        self.drop(gone)
 
     def load(
         self, landmarks: LandmarkMap, counts: IntArray, homes: IntArray, lasts: IntArray
     ) -> None:
         """Replaces everything; the arrays are copied."""
-        self._columns.take(0, np.empty(0, np.int64))
+        self.take(0, np.empty(0, np.int64))
         self.bring(landmarks, counts, homes, lasts)

@@ -23,7 +23,7 @@ from fgslam.backend.settings import (
     LandmarkKalmanSettings,
     SlidingWindowSettings,
 )
-from fgslam.backend.smoothers import graph as loop_closing
+from fgslam.backend.smoothers import final as loop_closing
 from fgslam.backend.smoothers.bundle import State, Turn, TurnedStep, Turns, WholeGraph
 from fgslam.backend.smoothers.elimination import (
     Bordered,
