@@ -6,7 +6,7 @@ import numpy as np
 
 from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, OpenTracks
 from fgslam.core.sensors import Observations
-from fgslam.core.store import restore, state_of
+from fgslam.core.store import state_of, unpack
 
 
 def test_tracks_end_as_lists_of_their_sightings_would(rng: np.random.Generator) -> None:
@@ -22,9 +22,9 @@ def test_tracks_end_as_lists_of_their_sightings_would(rng: np.random.Generator) 
         for identity in ids.tolist():
             lists.setdefault(identity, []).append(frame)
         if frame % 7 == 0:
-            state, tracks = state_of(tracks), OpenTracks()
-            restore(tracks, state)
-            assert list(dict.fromkeys(state["rows/ids"].tolist())) == list(lists)
+            state = state_of(tracks)
+            tracks = unpack(state, OpenTracks)
+            assert list(dict.fromkeys(state["ids"].tolist())) == list(lists)
         assert tracks.first_frame(frame) == min((one[0] for one in lists.values()), default=frame)
         if frame % 5:
             continue
