@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from fgslam.backend.loops import Constraint
+from fgslam.backend.loops import Chain, Constraint
 from fgslam.backend.settings import BatchSettings, KernelSettings
 from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.elimination import reduced
@@ -17,13 +17,13 @@ from fgslam.backend.smoothers.final import (
     trimmed,
 )
 from fgslam.backend.smoothers.graph import (
-    Drive,
     NewFactors,
     Smoothed,
     allowed_parts,
     solved,
 )
 from fgslam.backend.smoothers.smoother import GraphProblem, MapSmoother
+from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import reorthonormalise
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Floor, LandmarkMap, Prediction
@@ -60,9 +60,9 @@ class BatchSolver(WholeGraphSolver):
         """Never: the minimum is found at loops, and for the answer."""
         return None
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
+    def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Tracks on from the solution; where nothing moves, the next one takes the loop in."""
-        accepted, values = self._judge(loop, drive, what, solved)
+        accepted, values = self._judge(loop, chain, wTc, what, solved)
         if values is None:
             return accepted
         self.values = values

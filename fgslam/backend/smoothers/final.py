@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from fgslam.backend.considered import fused, pixels_of, shared_covariance
-from fgslam.backend.loops import Constraint, constraint_factor, refusal
+from fgslam.backend.loops import Chain, Constraint, constraint_factor, refusal
 from fgslam.backend.open_tracks import ENDED_AFTER, LEAST_SIGHTINGS, LONGEST, Tracks, tracks_of
 from fgslam.backend.persistence import STATED, Fitted
 from fgslam.backend.self_calibration import RigChange
@@ -27,7 +27,6 @@ from fgslam.backend.settings import KernelSettings
 from fgslam.backend.smoothers.bundle import Descent, State, WholeGraph
 from fgslam.backend.smoothers.elimination import Bordered, SolvedSystem, reduced
 from fgslam.backend.smoothers.graph import (
-    Drive,
     GraphBuilder,
     Smoothed,
     Solution,
@@ -403,7 +402,7 @@ class WholeGraphSolver:
 
     @one_blas_thread()
     def _judge(
-        self, known: Constraint, drive: Drive, what: str, minimum: Minimum
+        self, known: Constraint, chain: Chain, wTc: FloatArray, what: str, minimum: Minimum
     ) -> tuple[bool, Any | None]:
         """Whether the measurements allow a loop closure, which is then a factor of the graph.
 
@@ -413,7 +412,8 @@ class WholeGraphSolver:
 
         Args:
             known: the loop, between two frames of the graph.
-            drive: as tracked, without it.
+            chain: the drive's steps as tracked, without it.
+            wTc: (4, 4) the present pose as tracked.
             what: begins the remark.
             minimum: gives the graph's minimum without the loop, from the values of now.
 
@@ -427,7 +427,7 @@ class WholeGraphSolver:
         graph, state = self.builder.whole_graph(self.values, self._kernel)
         state = minimum(graph, state)
         loops = [*self.accepted, known]
-        guess = first_guess(self.builder, graph.values(state), drive.chain, loops)
+        guess = first_guess(self.builder, graph.values(state), chain, loops)
         closed = graph.plus(constraint_factor(known))
         solution = solved(closed, dataclasses.replace(State.of(guess), bias=state.bias))
         refused = refusal(what, 2.0 * (closed.cost(solution) - graph.cost(state)))
@@ -443,7 +443,7 @@ class WholeGraphSolver:
         self.accept(known)
         found = closed.values(solution)
         here = poses_of_frame(found, known.after)[:3, 3]
-        shift = float(np.linalg.norm(here - drive.wTc[:3, 3]))
+        shift = float(np.linalg.norm(here - wTc[:3, 3]))
         self.remarks.append(f"{what}: the camera moved by {shift:.2f} m, the graph with it")
         return True, found
 

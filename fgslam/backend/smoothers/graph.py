@@ -581,14 +581,6 @@ class Smoothed:
     by_loop: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Drive:
-    """The drive as it was tracked: its chain of steps, and the present pose ``wTc`` (4, 4)."""
-
-    chain: Chain
-    wTc: FloatArray
-
-
 class GraphSolver(Protocol):
     """Solves the growing graph of a :class:`~fgslam.backend.smoothers.smoother.Smoother`.
 
@@ -625,14 +617,15 @@ class GraphSolver(Protocol):
         """
         ...
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
+    def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Takes in a loop closure of the frame added last; False, and a remark, if it is refused.
 
         The solution that the tracker is to go on from; True where it goes on as it is.
 
         Args:
             loop: between two frames of the graph.
-            drive: as tracked, without the loop.
+            chain: the drive's steps as tracked, without the loop.
+            wTc: (4, 4) the present pose as tracked.
             what: begins the remark.
         """
         ...

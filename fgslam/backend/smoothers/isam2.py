@@ -7,13 +7,12 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.loops import Constraint, constraint_factor
+from fgslam.backend.loops import Chain, Constraint, constraint_factor
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import Isam2Settings
 from fgslam.backend.smoothers.bundle import State, WholeGraph
 from fgslam.backend.smoothers.final import Refined, WholeGraphSolver, refine
 from fgslam.backend.smoothers.graph import (
-    Drive,
     NewFactors,
     Smoothed,
     allowed_parts,
@@ -118,11 +117,11 @@ class Isam2Solver(WholeGraphSolver):
         except RuntimeError as error:
             raise self._failed(error) from None
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
+    def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Updates the tree with the loop, or rebuilds it where the loop moves the map."""
         self._updated = self.builder.frames[-1]
         self._flush()
-        accepted, values = self._judge(loop, drive, what, _without_loop)
+        accepted, values = self._judge(loop, chain, wTc, what, _without_loop)
         if not accepted:
             return False
         self._join(values)

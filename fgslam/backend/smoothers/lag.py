@@ -16,14 +16,13 @@ from typing import Any, ClassVar
 import gtsam
 import numpy as np
 
-from fgslam.backend.loops import Constraint, changes, constraint_factor, nearest_positive
+from fgslam.backend.loops import Chain, Constraint, changes, constraint_factor, nearest_positive
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import FixedLagSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.admission import Track
 from fgslam.backend.smoothers.elimination import UndeterminedError
 from fgslam.backend.smoothers.final import WholeGraphSolver
 from fgslam.backend.smoothers.graph import (
-    Drive,
     NewFactors,
     Smoothed,
     Solution,
@@ -115,7 +114,7 @@ class FixedLagSolver:
             self._covariances[frame] = self._covariance(frame)
         return Smoothed(self.window.values(), Prediction(self.poses[last], self._covariances[last]))
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
+    def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Moves the window as a whole to where the loop has the last pose; the past stays.
 
         After that the window is solved again from there. A loop within the lag is a factor more.
@@ -542,7 +541,7 @@ class SlidingWindowSolver(WholeGraphSolver):
 
     # -- loops -------------------------------------------------------------------------------
 
-    def close(self, loop: Constraint, drive: Drive, what: str) -> Smoothed | bool:
+    def close(self, loop: Constraint, chain: Chain, wTc: FloatArray, what: str) -> Smoothed | bool:
         """Moves the drive and all that it saw to where the loop has it, the window in one piece.
 
         A loop within the window is a factor more.
@@ -559,7 +558,7 @@ class SlidingWindowSolver(WholeGraphSolver):
         self.accept(loop)
         if inside:
             return self._closed_inside(loop)
-        self.move_by_loop(found, loop, drive)
+        self.move_by_loop(found, loop, chain)
         every = range(len(self.held))
         values = WindowValues(
             dict(zip(map(pose_key, range(len(self.poses))), self.poses, strict=True)),
@@ -578,10 +577,10 @@ class SlidingWindowSolver(WholeGraphSolver):
         pose = self.poses[frame]
         return Prediction(pose, congruence(adjoint(inverse(pose)), self.drift[frame]))
 
-    def move_by_loop(self, last: Prediction, loop: Constraint, drive: Drive) -> None:
+    def move_by_loop(self, last: Prediction, loop: Constraint, chain: Chain) -> None:
         """Spreads the last pose's change over the drive, and takes all landmarks along."""
         window, poses = self.window, np.array(self.poses)
-        moved = closed_chain(poses, drive.chain, self.accepted, last.wTc)
+        moved = closed_chain(poses, chain, self.accepted, last.wTc)
         by = changes(poses, moved)
         self.poses = list(moved)
         held = self.held

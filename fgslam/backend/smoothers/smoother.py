@@ -28,7 +28,6 @@ from fgslam.backend.settings import GraphSettings, LandmarkKalmanSettings
 from fgslam.backend.smoothers.admission import LandmarkAdmission, Sighting
 from fgslam.backend.smoothers.bundle import Turn
 from fgslam.backend.smoothers.graph import (
-    Drive,
     GraphBuilder,
     GraphSolver,
     Smoothed,
@@ -199,9 +198,9 @@ class Smoother:
     def _close(self, loop: LoopClosure, index: int) -> bool:
         """Closes a loop of the frame just taken in, or refuses it."""
         known = self._between(loop)
-        drive = Drive(self.tracker.chain, self.tracker.predict(None).wTc)
         what = f"frame {index}: loop closure to frame {loop.frame} of the log"
-        closed = self.solver.close(known, drive, what)
+        wTc = self.tracker.predict(None).wTc
+        closed = self.solver.close(known, self.tracker.chain, wTc, what)
         if isinstance(closed, Smoothed):
             self._take_over(closed, closed.last)
         return closed is not False

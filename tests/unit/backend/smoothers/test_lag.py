@@ -27,7 +27,6 @@ from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import BatchSettings, FixedLagSettings, SlidingWindowSettings
 from fgslam.backend.smoothers.elimination import Eliminated, UndeterminedError
-from fgslam.backend.smoothers.graph import Drive
 from fgslam.backend.smoothers.lag import FixedLagSolver, SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother, Smoother
 from fgslam.backend.smoothers.window import HeldLandmarks, LandmarkUndeterminedError, Solved, Window
@@ -428,7 +427,7 @@ def test_a_loop_moves_no_landmark_of_a_saved_map() -> None:
     there = Prediction(near, 1e-6 * np.eye(6))
     loop = Constraint(2, window.frames[-1], g.inverse(solver.poses[2]) @ near, 1e-6 * np.eye(6))
     solver.accept(loop)
-    solver.move_by_loop(there, loop, Drive(estimator.tracker.chain, window.poses[-1]))
+    solver.move_by_loop(there, loop, estimator.tracker.chain)
     np.testing.assert_array_equal(held.points[ours & outside], points[ours & outside])
     np.testing.assert_array_equal(window.landmarks.mean[inside], mean[inside])
     went = np.linalg.norm(held.points - points, axis=1)[~ours & outside & (held.homes > 10)]
