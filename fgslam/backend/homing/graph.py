@@ -23,7 +23,6 @@ from fgslam.backend.homing.parts import (
     TARGET,
     TURNING,
     BearingSeen,
-    Beginning,
     NewPart,
     Pair,
     Solver,
@@ -107,7 +106,7 @@ class HomingProblem:
         covariance = 0.5 * _WIDER**2 * (vector.covariance + vector.covariance.T)
         covariance = covariance + _LEAST_SIGMA**2 * np.eye(2)
         target = np.append(unit(np.array(vector.direction)), vector.rotation)
-        beginning = Beginning(target, vector, covariance)
+        beginning = target, vector, covariance
         new = NewPart(0, np.zeros(3), np.zeros(3), (start.time, start.time), beginning)
         chart = start.local_map
         spread = np.sqrt(chart.covariance[:, 0, 0])

@@ -16,7 +16,6 @@ from fgslam.backend.homing.parts import (
     KERNEL_WIDTH,
     MOTION_DENSITIES,
     TARGET,
-    Beginning,
     NewPart,
 )
 from fgslam.core.arrays import FloatArray
@@ -52,7 +51,12 @@ def _parts(new: NewPart) -> tuple[Any, Any, set[int]]:
     values.insert(pose, gtsam.Pose2(*new.pose))
     values.insert(velocity, new.velocity)
     if new.beginning is not None:
-        _add_beginning(graph, values, new.beginning)
+        target, vector, covariance = new.beginning
+        values.insert(target_key(), gtsam.Pose2(*target))
+        graph.add(start_prior(pose_key(0)))
+        graph.add(velocity_prior(velocity_key(0), np.zeros(3), FIRST_SPEEDS))
+        graph.add(leg_factor(pose_key(0), target_key()))
+        graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
     else:
         earlier = (pose_key(new.image - 1), velocity_key(new.image - 1), new.times[0])
         graph.add(motion_factor(earlier, (pose, velocity, new.times[1]), MOTION_DENSITIES))
@@ -68,15 +72,6 @@ def _parts(new: NewPart) -> tuple[Any, Any, set[int]]:
     for pair in new.pairs:
         graph.add(robust.elevation_pair(target_key(), landmark_key(pair.row), *pair[1:]))
     return graph, values, keys
-
-
-def _add_beginning(graph: Any, values: Any, beginning: Beginning) -> None:
-    target, vector, covariance = beginning
-    values.insert(target_key(), gtsam.Pose2(*target))
-    graph.add(start_prior(pose_key(0)))
-    graph.add(velocity_prior(velocity_key(0), np.zeros(3), FIRST_SPEEDS))
-    graph.add(leg_factor(pose_key(0), target_key()))
-    graph.add(vector_factor(target_key(), vector.direction, vector.rotation, covariance))
 
 
 class GtsamSolver:

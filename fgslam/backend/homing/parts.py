@@ -141,18 +141,6 @@ class Pair(NamedTuple):
     first: FloatArray
 
 
-class Beginning(NamedTuple):
-    """Start and target.
-
-    First guess (3,) of the target, the initialisation's vector, and its covariance (2, 2) as the
-    graph takes it.
-    """
-
-    target: FloatArray
-    vector: TwoViewVector
-    covariance: FloatArray
-
-
 @dataclass
 class NewPart:
     """What one image adds: its state, how it came there, and what it sees.
@@ -161,7 +149,8 @@ class NewPart:
         image: its number; 0 for start and target together.
         pose, velocity: (3,) first guesses.
         times: of the image before and of this one, seconds.
-        beginning: with the start alone.
+        beginning: with the start alone: first guess (3,) of the target, the initialisation's
+            vector, and its covariance (2, 2) as the graph takes it.
         points: first guess and deviation of the weak prior, of landmarks that enter.
         bearings, pairs: what is measured.
     """
@@ -170,7 +159,7 @@ class NewPart:
     pose: FloatArray
     velocity: FloatArray
     times: tuple[float, float]
-    beginning: Beginning | None = None
+    beginning: tuple[FloatArray, TwoViewVector, FloatArray] | None = None
     points: dict[int, tuple[FloatArray, float]] = field(default_factory=dict)
     bearings: list[BearingSeen] = field(default_factory=list)
     pairs: list[Pair] = field(default_factory=list)

@@ -125,15 +125,6 @@ class Tie:
     information: FloatArray
 
 
-class LandmarkUndeterminedError(UndeterminedError):
-    """``variable`` is not determined by its observations."""
-
-    def __init__(self, variable: int, message: str) -> None:
-        """The landmark's variable, and why."""
-        super().__init__(variable, message)
-        self.variable = variable
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class WindowValues:
     """What is asked of GTSAM's values between two frames, by key: poses (4, 4) and points (3,)."""
@@ -631,11 +622,11 @@ class Window:
         """Gauss-Newton steps until one is short, and the equations that the last was taken by.
 
         Raises:
-            LandmarkUndeterminedError: a landmark is not determined by its observations.
+            UndeterminedLandmarkError: a landmark is not determined by its observations.
             UndeterminedError: a pose is not.
         """
         for _ in range(_STEPS):
-            eliminated = self._eliminated(self.equations())
+            eliminated = Eliminated(self.equations())
             self._move(eliminated)
             if np.abs(eliminated.corner[eliminated.hidden :]).max() < _SHORT:
                 break
@@ -653,8 +644,8 @@ class Window:
         for _ in range(_REPAIRS):
             try:
                 return self.solve()
-            except LandmarkUndeterminedError as error:
-                take_out(error.variable)
+            except UndeterminedLandmarkError as error:
+                take_out(int(self.landmarks.variables[error.row]))
             except (UndeterminedError, np.linalg.LinAlgError) as error:
                 raise failed(error) from None
         raise failed(EstimatorError("too many landmarks left it indeterminate"))
@@ -666,13 +657,6 @@ class Window:
             dict(zip(map(pose_key, self.frames), self.poses, strict=True)),
             dict(zip(map(landmark_key, known.variables.tolist()), known.points, strict=True)),
         )
-
-    def _eliminated(self, equations: Equations) -> Eliminated:
-        try:
-            return Eliminated(equations)
-        except UndeterminedLandmarkError as error:
-            variable = int(self.landmarks.variables[error.row])
-            raise LandmarkUndeterminedError(variable, str(error)) from None
 
     def _move(self, step: Eliminated) -> None:
         by = step.corner[step.hidden :].reshape(-1, 6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,10 +27,14 @@ from fgslam.backend.loops import Constraint
 from fgslam.backend.protocol import Estimator
 from fgslam.backend.self_calibration import RigChange
 from fgslam.backend.settings import BatchSettings, FixedLagSettings, SlidingWindowSettings
-from fgslam.backend.smoothers.elimination import Eliminated, UndeterminedError
+from fgslam.backend.smoothers.elimination import (
+    Eliminated,
+    UndeterminedError,
+    UndeterminedLandmarkError,
+)
 from fgslam.backend.smoothers.lag import FixedLagSolver, SlidingWindowSolver
 from fgslam.backend.smoothers.smoother import MapSmoother, Smoother
-from fgslam.backend.smoothers.window import HeldLandmarks, LandmarkUndeterminedError, Solved, Window
+from fgslam.backend.smoothers.window import HeldLandmarks, Solved, Window
 from fgslam.core import geometry as g
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.correction import term_names
@@ -45,21 +50,26 @@ from fgslam.evaluation.statistics import pose_nees
 LAG = FixedLagSettings(lag_frames=5)
 
 
-def spoil(estimator: Any, error: Exception) -> None:
-    """The window's next solution fails with this error, those after it are found."""
+def spoil(estimator: Any, error: Any) -> None:
+    """The window's next solution fails with this error, or one made of it; later ones do not."""
     window = estimator.solver.window
     solve, errors = window.solve, [error]
 
     def failing(*arguments: Any) -> Any:
         if errors:
-            raise errors.pop()
+            error = errors.pop()
+            raise error(window) if callable(error) else error
         return solve(*arguments)
 
     window.solve = failing
 
 
-def undetermined(variable: int) -> LandmarkUndeterminedError:
-    return LandmarkUndeterminedError(variable, "its observations do not determine it")
+def undetermined(variable: int) -> Callable[[Window], UndeterminedLandmarkError]:
+    def error(window: Window) -> UndeterminedLandmarkError:
+        row = int(np.searchsorted(window.landmarks.variables, variable))
+        return UndeterminedLandmarkError(row, "its observations do not determine it")
+
+    return error
 
 
 def smoother(settings: FixedLagSettings = LAG) -> Smoother:
