@@ -16,7 +16,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import between, wrap
 from fgslam.homing.closed_loop import DriveRecord, HomingLog, pass_distances, truly_arrived
 from fgslam.runs.config import DrivingConfig, as_task, load_experiment
-from fgslam.runs.tasks.homing_drives import DriveTask, open_house_drive, perform_drive
+from fgslam.runs.tasks.homing_drives import perform_drive
 
 ERRORS = (
     (0.0, 0.0),
@@ -84,7 +84,7 @@ def _drive(mirror: float, centre: float, seed: int) -> DriveRecord:
     short = ("dataset.path.legs=1", "output.pictures=0")
     path = EXPERIMENTS / "homing_lab.yaml"
     config = as_task(DrivingConfig, load_experiment(path, (*off, *short)), str(path))
-    return perform_drive(DriveTask(config, seed, open_house_drive)).record
+    return perform_drive(config, seed).record
 
 
 def _starts(drives: Sequence[DriveRecord]) -> _Judged:

@@ -185,6 +185,6 @@ def over_images(frames: int) -> dict[str, float]:
         )
     config = load_config(EXPERIMENTS / "lab_laps.yaml", [f"dataset.stop={frames}"])
     with progress_bar() as tell:
-        sequence = open_sequence(config, lambda done, total: tell("rendering", done, total))
+        sequence = open_sequence(config, tell)
         found = run_blocks(config, sequence, lambda done: tell("timing", done, len(sequence)))
     return found.ratios()

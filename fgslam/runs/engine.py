@@ -10,8 +10,9 @@ from __future__ import annotations
 import dataclasses
 import os
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
 
@@ -33,17 +34,8 @@ from fgslam.runs.folder import (
     versions,
     write_config,
 )
-from fgslam.runs.units import (
-    Argument,
-    Done,
-    Progress,
-    Result,
-    Stage,
-    Stopped,
-    UnitStore,
-    holds_units,
-)
-from fgslam.runs.workers import Executor, Failed, Pool
+from fgslam.runs.units import Done, Progress, Stopped, UnitStore, holds_units
+from fgslam.runs.workers import Argument, Executor, Failed, Pool, Result
 
 _GROUND = ("log", "trials", "first_seed")
 """What a resumed run must find as it was, of its provenance, next to the data set's identity."""
@@ -126,29 +118,60 @@ class Context:
     stopped: Stopped
     executor: Executor
 
-    def perform(self, stage: Stage[Argument, Result]) -> Done[Result]:
-        """Does what is missing of a stage; what is done until a stop is kept.
+    def perform(
+        self,
+        names: tuple[str, str],
+        function: Callable[[Argument], Result],
+        arguments: Sequence[Argument],
+        kind: Any,
+        block: int = 1,
+        fresh: bool = False,
+    ) -> Done[Result]:
+        """Does what is missing of the units of one sort; what is done until a stop is kept.
+
+        Args:
+            names: unique in the run, of the files; and of the progress.
+            function: of a module's top level; makes the result of one unit.
+            arguments: one a unit; the units are numbered from 0.
+            kind: type of one unit's result.
+            block: units that are handed out, and kept, together.
+            fresh: each block in a process that has done nothing before: its memory is measured.
 
         Raises:
             FgslamError: what a unit raised, or a unit's file cannot be written or read.
         """
-        found: dict[int, Result] = self.store.load(stage.name, stage.kind)
-        missing = [k for k in range(stage.count) if k not in found]
-        blocks = [tuple(missing[k : k + stage.block]) for k in range(0, len(missing), stage.block)]
+        (name, label), count = names, len(arguments)
+        found: dict[int, Result] = self.store.load(name, kind)
+        missing = [k for k in range(count) if k not in found]
+        blocks = [tuple(missing[k : k + block]) for k in range(0, len(missing), block)]
         ended: list[tuple[tuple[int, ...], str]] = []
-        arguments = [stage.argument(block) for block in blocks]
+        work = partial(_call_each, function)
+        handed = [[arguments[k] for k in units] for units in blocks]
         done = len(found)
-        self.progress(stage.label, done, stage.count)
-        for index, result in self.executor.run(stage.work, arguments, self.stopped, stage.fresh):
-            block = blocks[index]
+        self.progress(label, done, count)
+        for index, result in self.executor.run(work, handed, self.stopped, fresh):
+            units = blocks[index]
             if isinstance(result, Failed):
-                ended.append((block, result.why))
+                ended.append((units, result.why))
             else:
-                results = dict(zip(block, result, strict=True))
-                found |= self.store.add(stage.name, results, stage.kind)
-            done += len(block)
-            self.progress(stage.label, done, stage.count)
+                found |= self.store.add(name, dict(zip(units, result, strict=True)), kind)
+            done += len(units)
+            self.progress(label, done, count)
         return Done({k: found[k] for k in sorted(found)}, sorted(ended))
+
+    def steps(self, label: str, numbers: range) -> Iterator[int]:
+        """The numbers until a stop, with the progress after each."""
+        for number in numbers:
+            if self.stopped():
+                return
+            yield number
+            self.progress(label, number + 1, numbers.stop)
+
+
+def _call_each(
+    function: Callable[[Argument], Result], arguments: Sequence[Argument]
+) -> list[Result]:
+    return [function(argument) for argument in arguments]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -66,7 +66,7 @@ def inspect_recording(
         FgslamError: the recording cannot be opened at all, or the configuration is wrong.
     """
     config = _configure(dataset, overrides, camera)
-    sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
+    sequence = open_sequence(config, progress)
     read = max(frames, _READ_AT_LEAST)
     general = check_sequence(sequence, read, lambda done, total: progress("reading", done, total))
     matched = match_frames(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.log import ImageSequence
@@ -16,23 +16,22 @@ from fgslam.datasets.settings import (
     SyntheticOdometrySettings,
 )
 from fgslam.runs.config import ExperimentConfig
+from fgslam.runs.units import Progress
 
 
-def open_sequence(
-    config: ExperimentConfig, progress: Callable[[int, int], None] | None = None
-) -> ImageSequence:
+def open_sequence(config: ExperimentConfig, progress: Progress | None = None) -> ImageSequence:
     """Opens the recording, rendered or read, with the odometry that the configuration wants.
 
-    ``progress`` is called with how many frames of a rendered recording are done, and of how many.
+    ``progress`` is called after each frame that is rendered.
     """
     dataset = config.dataset
     if isinstance(dataset, RenderedLabSettings):
         from fgslam.datasets.rendered import RenderedLabSequence  # the world and its textures
 
         _require_own_noise(config.odometry)
-        return RenderedLabSequence(
-            dataset, config.seed, dataset.start, dataset.stop, dataset.stride, progress
-        )
+        rendered = None if progress is None else partial(progress, "rendering")
+        selected = dataset.start, dataset.stop, dataset.stride
+        return RenderedLabSequence(dataset, config.seed, *selected, rendered)
     if isinstance(dataset, MeasurementDatasetSettings):
         raise ConfigError(
             f"dataset.kind {dataset.kind} holds measurements, no images; choose a recording of "

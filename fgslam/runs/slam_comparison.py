@@ -6,7 +6,7 @@ The run itself compares the estimators of its configuration so, and `fgslam comp
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementLog, read_landmark_t
 from fgslam.core.types import Trajectory
 from fgslam.evaluation.judging import Truth, judge_replay, seen_often
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue
-from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.report.content import read_metrics, write_metrics
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import ExperimentConfig, load_config
@@ -34,21 +33,9 @@ from fgslam.runs.tables import (
     write_replay,
 )
 from fgslam.runs.tasks.slam_map_entry import arrival_of
-from fgslam.runs.units import each_apart
 from fgslam.slam.replay import replay
 
 GROUND_TRUTH_FILE = "ground_truth.tum"
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayTask:
-    """What one process is to do: replay the log of ``run``, write into ``out/<title>/``."""
-
-    run: Path
-    out: Path
-    settings: EstimatorSettings
-    ego_motion: EgoMotionSettings
-    remark: str = ""
 
 
 def open_slam_comparison(
@@ -114,29 +101,28 @@ def replay_apart(
 
     With one job the times do not disturb each other.
     """
-    ego_motion, remark = config.frontend.ego_motion, config.remark
-    tasks = [ReplayTask(run, context.folder, s, ego_motion, remark) for s in estimators]
-    stage = each_apart(("replays", "replaying"), perform, tasks, EstimatorMetrics, fresh=True)
-    found = context.perform(stage).all(
+    names, work = ("replays", "replaying"), partial(perform, config, run, context.folder)
+    found = context.perform(names, work, estimators, EstimatorMetrics, fresh=True).all(
         lambda k, why: EstimatorMetrics(more={"kind": estimators[k].kind, "failure": why})
     )
     return {settings.title: one for settings, one in zip(estimators, found, strict=True)}
 
 
-def perform(task: ReplayTask) -> EstimatorMetrics:
-    """One estimator, start to end: replay, files, judgement.
+def perform(
+    config: ExperimentConfig, run: Path, out: Path, settings: EstimatorSettings
+) -> EstimatorMetrics:
+    """One estimator, start to end: replays the log of ``run``, writes ``out/<title>/``, judges.
 
     Raises:
         FgslamError: the log or the truth cannot be read, or a file cannot be written.
     """
-    log = MeasurementLog.load(task.run / LOG_FILE)
-    result = replay(log, task.settings, task.ego_motion, arrival=arrival_of(task.run))
+    log = MeasurementLog.load(run / LOG_FILE)
+    result = replay(log, settings, config.frontend.ego_motion, arrival=arrival_of(run))
     # The colours that the live front-end saw, where the run had images.
-    steered = load_config(task.run / RUN_MARKER).estimator.title
-    colours = task.run / steered / "map.ply"
+    colours = run / load_config(run / RUN_MARKER).estimator.title / "map.ply"
     look = read_ply(colours) if colours.is_file() else None
-    write_replay(task.out, result, log, task.remark, look)
-    return judge_replay(result, load_truth(task.run, log)).metrics
+    write_replay(out, result, log, config.remark, look)
+    return judge_replay(result, load_truth(run, log)).metrics
 
 
 def write_comparison(

@@ -61,7 +61,7 @@ from fgslam.runs.run import opener_of
 from fgslam.runs.session import override_texts
 from fgslam.runs.slam_comparison import judged_apart
 from fgslam.runs.tables import RESULT_COLUMNS, TIME_COLUMNS, measured_marks, with_marks
-from fgslam.runs.trials import TrialTask, perform_trial
+from fgslam.runs.trials import perform_trial
 from fgslam.runs.units import Progress, Stopped
 from fgslam.runs.workers import NOT_BEGUN, Executor, Failed
 
@@ -395,7 +395,7 @@ def perform_case(case: Case) -> CaseResult | Failed:
 
 def _rows_of_case(config: Experiment, estimators: tuple[Any, ...]) -> Iterator[Row]:
     if isinstance(config, ExperimentConfig):
-        trial = perform_trial(TrialTask(config, config.seed, estimators))
+        trial = perform_trial(config, estimators, config.seed)
         for title, metrics in trial.metrics.items():
             values = {**plain(metrics.as_json()), "odometry": config.odometry.kind}
             numbers = {name: value_at(values, path) for name, path in RESULT_COLUMNS}

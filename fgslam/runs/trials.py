@@ -47,7 +47,7 @@ from fgslam.runs.tasks.homing_replay import open_trials
 from fgslam.runs.tasks.slam import open_slam
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 from fgslam.runs.tasks.slam_measurements import open_measured, write_log_and_truth
-from fgslam.runs.units import Progress, Stopped, each_apart
+from fgslam.runs.units import Progress, Stopped
 from fgslam.slam.replay import replay
 
 DEFAULT_FOLDER = "trials"
@@ -56,15 +56,6 @@ DEFAULT_FOLDER = "trials"
 # One trial: an experiment in one world of noise, through estimators
 
 _OUTPUT = OutputSettings(pictures=False, report=False, checkpoint_seconds=1e9)
-
-
-@dataclass(frozen=True, slots=True)
-class TrialTask:
-    """One world of noise for one process."""
-
-    config: ExperimentConfig
-    seed: int
-    estimators: tuple[EstimatorSettings, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,13 +68,15 @@ class Trial:
 
 
 @one_blas_thread()
-def perform_trial(task: TrialTask) -> Trial:
-    """One trial, start to end, in a folder that is gone afterwards."""
+def perform_trial(
+    experiment: ExperimentConfig, estimators: Sequence[EstimatorSettings], seed: int
+) -> Trial:
+    """One world of noise, start to end, in a folder that is gone afterwards."""
     with tempfile.TemporaryDirectory(prefix="fgslam-trial-") as scratch:
         run = Path(scratch) / "run"
-        maps = dataclasses.replace(task.config.map, save=None)
-        config = task.config.model_copy(
-            update={"seed": task.seed, "compare": (), "map": maps, "output": _OUTPUT}
+        maps = dataclasses.replace(experiment.map, save=None)
+        config = experiment.model_copy(
+            update={"seed": seed, "compare": (), "map": maps, "output": _OUTPUT}
         )
         if config.on_measurements:
             run.mkdir()
@@ -94,13 +87,13 @@ def perform_trial(task: TrialTask) -> Trial:
         truth = load_truth(run, log)
         arrival = None if config.on_measurements else arrival_of(run)  # these begin in no map
     metrics, nees = {}, {}
-    for settings in task.estimators:
+    for settings in estimators:
         answer = replay(log, settings, config.frontend.ego_motion, arrival=arrival)
         judged = judge_replay(answer, truth)
         # A process of several estimators has no memory of each.
         metrics[settings.title] = dataclasses.replace(judged.metrics, peak_memory_mb=None)
         nees[settings.title] = judged.nees
-    return Trial(task.seed, metrics, nees)
+    return Trial(seed, metrics, nees)
 
 
 # --------------------------------------------------------------------------------------------
@@ -154,28 +147,33 @@ def run_trials(
     chosen = with_estimators(config, estimators)
     opener: Opener[RunResult] = open_trials
     if isinstance(config, ExperimentConfig):
-        opener = partial(_open, config, [TrialTask(config, seed, estimators) for seed in seeds])
+        opener = partial(_open, config, seeds, estimators)
     else:
         chosen = chosen.model_copy(update={"trials": len(seeds), "seed": seeds.start})
     return run_task(opener, chosen, folder, existing, progress, stopped, jobs)
 
 
 def _open(
-    config: ExperimentConfig, tasks: Sequence[TrialTask], chosen: Experiment, opening: Opening
+    config: ExperimentConfig,
+    seeds: range,
+    estimators: Sequence[EstimatorSettings],
+    chosen: Experiment,
+    opening: Opening,
 ) -> Task[RunResult]:
     """Trials of SLAM; what they share is rendered once, before several processes would do so."""
     if not config.on_measurements:
-        open_sequence(config, lambda done, total: opening.progress("rendering", done, total))
+        open_sequence(config, opening.progress)
 
     def run(context: Context) -> RunResult:
-        done = context.perform(each_apart(("trials", "trials"), perform_trial, tasks, Trial))
-        failures = sorted(f"trial with seed {tasks[k].seed}: {why}" for (k,), why in done.ended)
+        work = partial(perform_trial, config, estimators)
+        done = context.perform(("trials", "trials"), work, seeds, Trial)
+        failures = sorted(f"trial with seed {seeds[k]}: {why}" for (k,), why in done.ended)
         status: Status = "interrupted" if context.stopped() else "finished"
-        kinds = {settings.title: settings.kind for settings in tasks[0].estimators}
+        kinds = {settings.title: settings.kind for settings in estimators}
         trials = list(done.results.values())
         return write_trials(config, context.folder, status, trials, kinds, failures)
 
-    return Task({"trials": len(tasks), "first_seed": tasks[0].seed}, run)
+    return Task({"trials": len(seeds), "first_seed": seeds.start}, run)
 
 
 def write_trials(

@@ -9,9 +9,8 @@ from there: so a resumed run goes on with the same values to the bit.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, TypeAlias, TypeVar
 
@@ -19,7 +18,6 @@ from fgslam.core.errors import MeasurementLogError, OutputError
 from fgslam.core.files import clear_output_errors, is_unfinished_file, make_subfolder
 from fgslam.core.store import UNFIT, load_arrays, pack, unpack, write_arrays
 
-Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 Progress: TypeAlias = Callable[[str, int, int], None]
 """Called with what is under way, how much is done, and of how much."""
@@ -28,31 +26,6 @@ Stopped: TypeAlias = Callable[[], bool]
 
 UNITS_FOLDER = "units"
 _UNIT_FILE = re.compile(r"\w+_\d{6,}\.npz")
-
-
-@dataclass(frozen=True, slots=True)
-class Stage(Generic[Argument, Result]):
-    """Units of one sort.
-
-    Attributes:
-        name: unique in the run; of the files.
-        label: of their progress.
-        count: units, numbered from 0.
-        work: of a module's top level; the results of a block's units, in their order.
-        argument: what a process is given for a block of units.
-        kind: type of one unit's result.
-        block: units that are handed out, and kept, together.
-        fresh: each block in a process that has done nothing before: its memory is measured.
-    """
-
-    name: str
-    label: str
-    count: int
-    work: Callable[[Argument], Sequence[Result]]
-    argument: Callable[[tuple[int, ...]], Argument]
-    kind: Any
-    block: int = 1
-    fresh: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,38 +45,6 @@ class Done(Generic[Result]):
         lost = {k: ended(k, why) for block, why in self.ended for k in block}
         found = self.results | lost
         return [found[k] for k in sorted(found)]
-
-
-def _call_each(
-    function: Callable[[Argument], Result], arguments: Sequence[Argument]
-) -> list[Result]:
-    return [function(argument) for argument in arguments]
-
-
-def each_apart(
-    names: tuple[str, str],
-    function: Callable[[Argument], Result],
-    arguments: Sequence[Argument],
-    kind: Any,
-    block: int = 1,
-    fresh: bool = False,
-) -> Stage[list[Argument], Result]:
-    """A stage with a unit for each argument.
-
-    Args:
-        names: of the stage, and of its progress.
-        function: of a module's top level; makes the result of one unit.
-        arguments: one a unit.
-        kind: type of one unit's result.
-        block: units that are handed out, and kept, together.
-        fresh: each block in a process that has done nothing before: its memory is measured.
-    """
-    name, label = names
-    work = partial(_call_each, function)
-    return Stage(
-        name, label, len(arguments), work, lambda units: [arguments[k] for k in units],
-        kind, block, fresh,
-    )  # fmt: skip
 
 
 class UnitStore:

@@ -7,19 +7,19 @@ path_memory.npz, views of the legs, metrics.json, the page.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from fgslam.backend.homing.estimators import make_homing_estimator
 from fgslam.core.arrays import ByteArray, FloatArray, StateArrays
-from fgslam.core.bearings import BearingLog, HomingTruth, TrackedBearings
+from fgslam.core.bearings import BearingLog, HomingTruth
 from fgslam.core.errors import OutputError, StoredMapError
 from fgslam.core.geometry import between, wrap
 from fgslam.core.store import restore, state_of
@@ -34,7 +34,6 @@ from fgslam.homing.closed_loop import (
     STAGES,
     DriveRecord,
     HomingLog,
-    World,
     corners,
     cross_track,
     end_distance,
@@ -63,7 +62,6 @@ from fgslam.runs.config import CrossroadsConfig, DrivingConfig, OmniVideoConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, provenance_of
 from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table
 from fgslam.runs.tasks.homing_replay import replay_homing, save_bearing_logs
-from fgslam.runs.units import each_apart
 
 if TYPE_CHECKING:
     from fgslam.datasets.opening import OmniWorld
@@ -79,38 +77,8 @@ _TRAIL = 15  # images
 # One drive
 
 
-class PathWorld(World, Protocol):
-    """A world to put a robot into, with walls to draw."""
-
-    @property
-    def outlines(self) -> Sequence[FloatArray]:
-        """Polylines (k, 2) of walls and furniture, metres."""
-        ...
-
-    def put(self, pose: FloatArray) -> None:
-        """Puts the robot elsewhere (3,)."""
-        ...
-
-    def clearance(self, points: FloatArray) -> FloatArray:
-        """(n,) metres from places (n, 2) to the nearest obstacle."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Opened:
-    """What a drive begins with.
-
-    Attributes:
-        world: with the robot where it starts.
-        front_end: for its camera.
-        memory: the path.
-        poses: (m, 3) where its images were taken.
-    """
-
-    world: PathWorld
-    front_end: ImageFrontEnd
-    memory: PathMemory
-    poses: FloatArray
+Opened: TypeAlias = "tuple[OmniWorld, ImageFrontEnd, PathMemory, FloatArray]"
+"""World, its robot at the start; front-end; path; (m, 3) poses where its images were taken."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,21 +119,12 @@ class DrivenSeed:
     views: tuple[LegView, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class DriveTask:
-    """One seed for one process; ``opener`` is of a module's top level."""
-
-    config: DrivingConfig
-    seed: int
-    opener: Callable[[Any, int], Opened]
-
-
 def open_house_drive(config: DrivingConfig, seed: int) -> Opened:
     """World and front-end of one seed. Raises FgslamError where the house cannot be built."""
     world, front_end = _open_house(config, seed)
     taught = teach(world.targets, world.calibration, features=config.features)
     memory = PathMemory.of(taught.images)  # the front-end has the camera
-    return Opened(world, front_end, memory, world.target_poses)
+    return world, front_end, memory, world.target_poses
 
 
 def open_crossroads_drive(config: CrossroadsConfig, seed: int) -> Opened:
@@ -187,7 +146,7 @@ def open_crossroads_drive(config: CrossroadsConfig, seed: int) -> Opened:
         with suppress(StoredMapError):  # no way
             way = joined.way(place, end)
     at = [joined.names.index(name) for name in way.names]
-    return Opened(world, front_end, PathMemory(way.images, way.names), every[at])
+    return world, front_end, PathMemory(way.images, way.names), every[at]
 
 
 def _open_house(config: DrivingConfig, seed: int) -> tuple[OmniWorld, ImageFrontEnd]:
@@ -196,13 +155,13 @@ def _open_house(config: DrivingConfig, seed: int) -> tuple[OmniWorld, ImageFront
     return world, make_front_end(world.calibration, settings, seed)
 
 
-def perform_drive(task: DriveTask) -> DrivenSeed:
+def perform_drive(config: DrivingConfig, seed: int) -> DrivenSeed:
     """One drive from start to end."""
-    config, behaviour = task.config, task.config.behaviour
-    opened = task.opener(config, task.seed)
-    world, front_end, memory = opened.world, opened.front_end, opened.memory
+    opener = open_crossroads_drive if isinstance(config, CrossroadsConfig) else open_house_drive
+    world, front_end, memory, poses = opener(config, seed)  # type: ignore[arg-type]
+    behaviour = config.behaviour
     if config.start_offset_m > 0.0:
-        rng = np.random.default_rng((task.seed, 7))
+        rng = np.random.default_rng((seed, 7))
         world.put(displaced_start(world, config.start_offset_m, rng))
     follower = HomingChain(
         front_end,
@@ -212,17 +171,15 @@ def perform_drive(task: DriveTask) -> DrivenSeed:
     steering = Steering(behaviour.steering)
     avoider = CorridorAvoidance(behaviour.steering.max_turn_deg_s)
     start = np.array(world.true_pose)
-    shown = config.output.pictures if task.seed == config.seed else 0
-    watcher = (
-        DriveWatcher(front_end, follower) if shown and isinstance(front_end, Unwrapping) else None
-    )
-    record = follow(world, follower, steering, avoider, behaviour.loop, opened.poses, watcher)
-    leg = float(np.hypot(*(opened.poses[0, :2] - start[:2])))
+    shown = config.output.pictures if seed == config.seed else 0
+    watcher = DriveWatcher(front_end, follower) if shown else None
+    record = follow(world, follower, steering, avoider, behaviour.loop, poses, watcher)
+    leg = float(np.hypot(*(poses[0, :2] - start[:2])))
     views = () if watcher is None else watcher.views(shown)
-    return DrivenSeed(task.seed, record, memory, tuple(world.outlines), leg, views)
+    return DrivenSeed(seed, record, memory, tuple(world.outlines), leg, views)
 
 
-def displaced_start(world: PathWorld, radius: float, rng: np.random.Generator) -> FloatArray:
+def displaced_start(world: OmniWorld, radius: float, rng: np.random.Generator) -> FloatArray:
     """The start, moved and turned at random to a place that is free; itself where none is found."""
     pose = np.array(world.true_pose, np.float64)
     room = float(world.clearance(pose[None, :2])[0])
@@ -234,23 +191,10 @@ def displaced_start(world: PathWorld, radius: float, rng: np.random.Generator) -
     return pose
 
 
-@runtime_checkable
-class Unwrapping(Protocol):
-    """A front-end that can show its view; those of landmark worlds cannot."""
-
-    def unwrapped(self, image: ByteArray) -> ByteArray:
-        """(h, w) grey view of an image."""
-        ...
-
-    def places(self, tracked: TrackedBearings) -> FloatArray:
-        """(m, 2) column and row of tracked points in that view."""
-        ...
-
-
 class DriveWatcher:
     """Keeps each leg's last view; see :data:`fgslam.homing.closed_loop.Watcher`."""
 
-    def __init__(self, front_end: Unwrapping, follower: HomingChain) -> None:
+    def __init__(self, front_end: ImageFrontEnd, follower: HomingChain) -> None:
         self._front_end, self._follower = front_end, follower
         self._homing: ActiveHoming | None = None
         self._trails: dict[int, FloatArray] = {}
@@ -300,19 +244,16 @@ def trails_after(
 
 def open_drives(config: DrivingConfig, opening: Opening) -> Task[RunResult]:
     """Drives in the rendered house, which each process builds for itself."""
-    opener = open_crossroads_drive if isinstance(config, CrossroadsConfig) else open_house_drive
-    provenance = {"dataset": {"name": config.dataset.kind}}
-    return Task(provenance, lambda context: _run(config, opener, context))
+    return Task({"dataset": {"name": config.dataset.kind}}, partial(_run, config))
 
 
-def _run(
-    config: DrivingConfig, opener: Callable[[Any, int], Opened], context: Context
-) -> RunResult:
+def _run(config: DrivingConfig, context: Context) -> RunResult:
     """Stopped early, the drives that are done count."""
-    tasks = [DriveTask(config, config.seed + k, opener) for k in range(config.trials)]
-    done = context.perform(each_apart(("drives", "drives"), perform_drive, tasks, DrivenSeed))
+    seeds = range(config.seed, config.seed + config.trials)
+    work = partial(perform_drive, config)
+    done = context.perform(("drives", "drives"), work, seeds, DrivenSeed)
     driven = list(done.results.values())
-    failures = sorted(f"seed {config.seed + k}: {why}" for (k,), why in done.ended)
+    failures = sorted(f"seed {seeds[k]}: {why}" for (k,), why in done.ended)
     if not driven and not context.stopped():
         raise OutputError(f"no drive was finished; {failures[0]}")
     return finish_drives(config, context.folder, driven, failures)
@@ -606,7 +547,10 @@ _POINTS = (110, 160)
 
 @dataclass(slots=True, eq=False)
 class _Tracks:
-    """What is recorded, frame by frame (rows of frames.csv) and point by point."""
+    """What is recorded, frame by frame (rows of frames.csv) and point by point; kept in units.
+
+    ``tracker`` is the tracker's state after the last frame, to go on from.
+    """
 
     frames: list[tuple[str, float, int, int, int]] = field(default_factory=list)
     first: dict[int, int] = field(default_factory=dict)
@@ -615,14 +559,7 @@ class _Tracks:
     read_ms: list[float] = field(default_factory=list)
     trails: dict[int, FloatArray] = field(default_factory=dict)
     pictures: list[Picture] = field(default_factory=list)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Progress:
-    """What the run goes on from: the tracks so far, and the tracker after the last frame."""
-
-    tracks: _Tracks
-    tracker: StateArrays
+    tracker: StateArrays = field(default_factory=dict)
 
 
 def open_video(config: OmniVideoConfig, opening: Opening) -> Task[RunResult]:
@@ -639,22 +576,25 @@ def _run_video(config: OmniVideoConfig, recording: OmniRecording, context: Conte
     folder = context.folder
     tracker = ReplenishedTracker(recording.camera, *_POINTS)
     tracks = _Tracks()
-    if saved := context.store.load(_STATE, _Progress).get(0):
-        tracks = saved.tracks
+    if saved := context.store.load(_STATE, _Tracks).get(0):
+        tracks = saved
         restore(tracker, saved.tracker)
+
+    def save() -> None:
+        tracks.tracker = state_of(tracker)
+        context.store.add(_STATE, {0: tracks}, _Tracks)
+
     shown = np.linspace(0, len(recording), config.output.pictures + 1).astype(int)[1:] - 1
     last_saved = perf_counter()
-    for i in range(len(tracks.frames), len(recording)):
-        stopped = context.stopped()
-        if stopped or perf_counter() - last_saved >= SAVE_EVERY_S:
-            context.store.add(_STATE, {0: _Progress(tracks, state_of(tracker))}, _Progress)
+    for i in context.steps("tracking", range(len(tracks.frames), len(recording))):
+        if perf_counter() - last_saved >= SAVE_EVERY_S:
+            save()
             last_saved = perf_counter()
-        if stopped:
-            break
         _take(tracks, tracker, recording, i)
         if i in shown:
             tracks.pictures.append(_draw(tracks, tracker, recording, folder))
-        context.progress("tracking", i + 1, len(recording))
+    if len(tracks.frames) < len(recording):
+        save()
     write_csv(folder / "frames.csv", ("frame", "time", "points", "added", "lost"), tracks.frames)
     rows = [(i, first, tracks.last[i]) for i, first in sorted(tracks.first.items())]
     write_csv(folder / "tracks.csv", ("id", "first_frame", "last_frame"), rows)

@@ -11,6 +11,7 @@ import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -42,7 +43,6 @@ from fgslam.runs.config import HomingExperiment, HomingTrialsConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task
 from fgslam.runs.folder import COMPARISON_FILE, TIMING_FILE, TRIALS_FILE, digest_of
 from fgslam.runs.results import finish, number_text
-from fgslam.runs.units import each_apart
 
 LOG_FOLDER = "logs"
 ESTIMATES_FILE = "estimates.csv"
@@ -211,9 +211,6 @@ def _cell(value: Any, spec: str) -> str:
 # ------------------------------------------------------------------------------------------
 # Task `homing_trials`: simulated homings of bearings, many estimators on the same ones
 
-Unit: TypeAlias = tuple[HomingTrialsConfig, int, int]
-"""Configuration, number of the share of outliers, and of the trial."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomingTrial:
@@ -239,24 +236,23 @@ class HomingTrial:
 
 def open_trials(config: HomingTrialsConfig, opening: Opening) -> Task[RunResult]:
     """Simulated homings need no data."""
-    provenance = {"dataset": {"name": "simulated bearings"}}
-    return Task(provenance, lambda context: _run_trials(config, context))
+    return Task({"dataset": {"name": "simulated bearings"}}, partial(_run_trials, config))
 
 
 def _run_trials(config: HomingTrialsConfig, context: Context) -> RunResult:
     """Runs all trials; stopped early, those finished count."""
     folder, titles = context.folder, [settings.title for settings in config.estimators]
     units = [  # those of one block are of one share, and the shares take turns
-        (config, share, trial)
+        (share, trial)
         for first in range(0, config.trials, TRIALS_A_BLOCK)
         for share in range(len(config.outliers))
         for trial in range(first, min(first + TRIALS_A_BLOCK, config.trials))
     ]
-    stage = each_apart(("trials", "trials"), perform_trial, units, HomingTrial, TRIALS_A_BLOCK)
-    done = context.perform(stage)
+    work = partial(perform_trial, config)
+    done = context.perform(("trials", "trials"), work, units, HomingTrial, TRIALS_A_BLOCK)
     trials = sorted(done.results.values(), key=lambda trial: (trial.share, trial.trial))
     failures = sorted(
-        f"{len(block)} trials, from trial {units[block[0]][2]} of share {units[block[0]][1]} on: "
+        f"{len(block)} trials, from trial {units[block[0]][1]} of share {units[block[0]][0]} on: "
         f"{why}"
         for block, why in done.ended
     )
@@ -321,9 +317,9 @@ def _run_trials(config: HomingTrialsConfig, context: Context) -> RunResult:
     )
 
 
-def perform_trial(unit: Unit) -> HomingTrial:
+def perform_trial(config: HomingTrialsConfig, unit: tuple[int, int]) -> HomingTrial:
     """One trial; its noise depends on the seed, the share's number and its own number alone."""
-    config, share, trial = unit
+    share, trial = unit
     rng = np.random.default_rng((config.seed, share, trial))
     part = config.outliers[share]
     simulated = open_simulated_homing(config.dataset, part, rng)
@@ -472,9 +468,8 @@ def _compare(
     context: Context,
 ) -> RunResult:
     folder = context.folder
-    tasks = [(logs, settings) for settings in estimators]
-    stage = each_apart(("replays", "replaying"), perform_replay, tasks, dict[str, ReplayedHoming])
-    found = context.perform(stage).all(
+    names, kind = ("replays", "replaying"), dict[str, ReplayedHoming]
+    found = context.perform(names, partial(perform_replay, logs), estimators, kind).all(
         lambda k, why: dict.fromkeys(logs, ReplayedHoming((), np.empty(0), why))
     )
     replays = {settings.title: one for settings, one in zip(estimators, found, strict=True)}
@@ -519,10 +514,9 @@ def _compare(
 
 
 def perform_replay(
-    task: tuple[dict[str, BearingLog], HomingEstimatorSettings],
+    logs: dict[str, BearingLog], settings: HomingEstimatorSettings
 ) -> dict[str, ReplayedHoming]:
     """One estimator on each log, by the log's name."""
-    logs, settings = task
     shown = next(iter(logs), None)  # the local map that is drawn is the first log's
     return {
         name: replay_homing(log.start, log.images, settings, landmarks=name == shown)

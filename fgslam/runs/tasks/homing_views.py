@@ -52,7 +52,6 @@ from fgslam.report.homing_figures import (
 from fgslam.runs.config import HomingPairsConfig, TopologicalMapConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table, write_table
-from fgslam.runs.units import Stage, each_apart
 
 VIEWS_A_BLOCK = 4
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
@@ -304,15 +303,13 @@ def _localise(
     localiser = Localiser(moves, VisualWords(nodes, rng), linker, config.localisation)
     located: list[Localised] = []
     context.progress("localising", 0, len(out))
-    for done, view in enumerate(out):
-        if context.stopped():
-            break
+    for k in context.steps("localising", range(len(out))):
+        view = out[k]
         localiser.update(features[view])
         node, probability = localiser.best()
         low, high = sorted((view, kept[node]))
         neighbour = not any(low < k < high for k in kept if k != kept[node])
         located.append(Localised(names[view], names[kept[node]], probability, neighbour))
-        context.progress("localising", done + 1, len(out))
     return located
 
 
@@ -446,17 +443,17 @@ def extract_features(
         OutputError: a process ended by itself, perhaps for lack of memory.
     """
     what = "features" if settings is not None else "plain SIFT"
-    units = [(dataset, settings, i) for i in range(len(views))]
-    names = (what.replace(" ", "_"), what)
-    done = context.perform(each_apart(names, _extract, units, OmniFeatures, VIEWS_A_BLOCK))
+    names, work = (what.replace(" ", "_"), what), partial(_extract, dataset, settings)
+    done = context.perform(names, work, range(len(views)), OmniFeatures, VIEWS_A_BLOCK)
     if done.ended and not context.stopped():
         raise OutputError(f"features of {views.name}: {done.ended[0][1]}")
     gap = next((k for k in range(len(views)) if k not in done.results), len(views))
     return [done.results[k] for k in range(gap)]
 
 
-def _extract(unit: tuple[OmniDatasetSettings, OmniFeatureSettings | None, int]) -> OmniFeatures:
-    dataset, settings, i = unit
+def _extract(
+    dataset: OmniDatasetSettings, settings: OmniFeatureSettings | None, i: int
+) -> OmniFeatures:
     recording = open_omni(dataset)
     if settings is None:
         return OmniFeatures(plain_sift(recording.camera, recording.image(i)), empty_segments())
@@ -524,27 +521,18 @@ def answer_pairs(
     search: PairSearch, context: Context, what: str = "pairs"
 ) -> tuple[list[PairAnswer], list[str]]:
     """All pairs in their order (stopped early, those that are done), and what went wrong."""
-    stage = Stage(
-        # Their numbers depend on how many views there are: fewer where a run was stopped.
-        name=f"{what.replace(' ', '_')}_of_{len(search.features)}_views",
-        label=what,
-        count=len(search.pairs),
-        work=_answer,
-        argument=lambda units: replace(search, pairs=tuple(search.pairs[k] for k in units)),
-        kind=PairAnswer,
-        block=max(1, -(-len(search.pairs) // (_BLOCKS_A_JOB * context.jobs))),
-    )
-    done = context.perform(stage)
+    # Their numbers depend on how many views there are: fewer where a run was stopped.
+    names = f"{what.replace(' ', '_')}_of_{len(search.features)}_views", what
+    block = max(1, -(-len(search.pairs) // (_BLOCKS_A_JOB * context.jobs)))
+    work = partial(_answer, replace(search, pairs=()))
+    done = context.perform(names, work, search.pairs, PairAnswer, block)
     failures = [f"{len(units)} pairs: {why}" for units, why in done.ended]
     return list(done.results.values()), failures
 
 
-def _answer(search: PairSearch) -> list[PairAnswer]:
-    answers = []
-    for a, b in search.pairs:
-        found, matches = search.answer(a, b)
-        answers.append(PairAnswer(a, b, found, len(matches), sift_inliers(found, matches)))
-    return answers
+def _answer(search: PairSearch, pair: tuple[int, int]) -> PairAnswer:
+    found, matches = search.answer(*pair)
+    return PairAnswer(*pair, found, len(matches), sift_inliers(found, matches))
 
 
 # --------------------------------------------------------------------------------------------

@@ -344,7 +344,7 @@ class LocalisationResult(RunResult):
 def open_localisation(config: LocalisationConfig, opening: Opening) -> Task[LocalisationResult]:
     """Opens the recording, and the map where it is there already. Raises FgslamError."""
     given = None if config.map.load is None else open_map(Path(config.map.load))
-    sequence = _open_queries(config, opening.progress)
+    sequence = open_sequence(config.as_experiment(), opening.progress)
     if given is not None:
         require_rig(given.saved, sequence.rig, str(given.path))
     provenance = _provenance(given, sequence)
@@ -369,12 +369,6 @@ def _run(
     subtitle = f"{sequence.name}, in a map of {len(asked.landmarks)} landmarks"
     write_results(result, given, subtitle)
     return result
-
-
-def _open_queries(config: LocalisationConfig, progress: Progress) -> ImageSequence:
-    return open_sequence(
-        config.as_experiment(), lambda done, total: progress("rendering", done, total)
-    )
 
 
 def _provenance(given: GivenMap | None, sequence: ImageSequence) -> dict[str, Any]:
@@ -793,9 +787,9 @@ def _config_of(wanted: Wanted, made_with: Mapping[str, Any]) -> LocalisationConf
 def _open_wanted(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> ImageSequence:
     frame = wanted.frame
     if frame is None:
-        return _open_queries(config, progress)
+        return open_sequence(config.as_experiment(), progress)
     try:
-        sequence = _open_queries(config, progress)
+        sequence = open_sequence(config.as_experiment(), progress)
     except FgslamError as error:
         raise type(error)(f"--frame {frame}: {error}") from None
     if len(sequence) < wanted.frames:

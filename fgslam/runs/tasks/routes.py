@@ -76,17 +76,15 @@ def _run_teaching(
     """Stopped early, the route ends where the recording was read to."""
     folder = context.folder
     teacher = Teacher(recording.camera, DRIVING, config.seed)
-    whole = True
-    for i in range(len(recording)):
-        if context.stopped():
-            whole = False
-            break
+    done = 0
+    for i in context.steps("teaching", range(len(recording))):
+        done = i + 1
         if i >= teacher.next or i == len(recording) - 1:
             try:
                 teacher.take(i, recording.names[i], recording.image(i))
             except FrameError as error:
                 teacher.leave_out(i, str(error))
-        context.progress("teaching", i + 1, len(recording))
+    whole = done == len(recording)
     if not whole and not teacher.begun:
         return _nothing_yet(config, folder, "There is no route yet.")
     taught = teacher.finish()
@@ -294,9 +292,7 @@ def _run_following(
     with PathFollower(
         recording.camera, path, behaviour=behaviour, seed=config.seed, by="looks"
     ) as follower:
-        for i in range(count):
-            if context.stopped():
-                break
+        for i in context.steps("following", range(count)):
             stamp = float(recording.timestamps[i])
             time = stamp if np.isfinite(stamp) else i / _RATE_HZ
             # An epoch's time has more digits than a table's numbers.
@@ -316,7 +312,6 @@ def _run_following(
                 left_out[i] = str(error)
                 cells = dict(zip(_FOLLOW_COLUMNS, row, strict=False), refusal=str(error))
                 rows.append([cells.get(name) for name in _FOLLOW_COLUMNS])
-            context.progress("following", i + 1, count)
     write_csv(folder / FOLLOW_FILE, _FOLLOW_COLUMNS, rows)
     numbers = _follow_numbers(list(commands.values()), count)
     names = {

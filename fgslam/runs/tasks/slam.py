@@ -355,7 +355,7 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
     """
     folder, progress = opening.folder, opening.progress
     given = None if config.map.load is None else open_map(Path(config.map.load))
-    sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
+    sequence = open_sequence(config, progress)
     steps = range(1, len(sequence)) if config.odometry.kind == "recorded" else ()
     # Refused before the start, not at frame 1.
     if steps and all(sequence.odometry(i) is None for i in steps):
@@ -394,7 +394,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
         start = config.dataset.start + before * config.dataset.stride
         later = dataclasses.replace(config.dataset, start=start)
         config = config.model_copy(update={"dataset": later})
-        sequence = open_sequence(config, lambda done, total: progress("rendering", done, total))
+        sequence = open_sequence(config, progress)
     arrival = None
     notes: tuple[str, ...] = ()
     if run.frames_before:

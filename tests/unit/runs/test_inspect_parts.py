@@ -17,7 +17,7 @@ from fgslam.datasets.layouts import kitti_drives, recognise_layout
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import ImageFolderSettings, RecordedOdometrySettings
 from fgslam.frontend.features.matching import mutual_nearest
-from fgslam.runs.findings import Finding, Level
+from fgslam.runs.findings import Finding, Level, finding
 from fgslam.runs.inspect import check_clock, inspect_recording, render_report
 from fgslam.runs.inspect_matches import LEFT_RIGHT, Matches, check_disparity_gates, check_pair
 
@@ -240,10 +240,10 @@ def test_sound_clock_and_straight_drive_give_no_finding(tmp_path: Path) -> None:
 
 def test_report_puts_facts_above_and_findings_below() -> None:
     findings = (
-        Finding("odometry_malformed", {"text": "bad. " * 30}),
-        Finding("note", {"text": "gap"}),
-        Finding("odometry_covers", {"share": "all"}),
-        Finding("disparities", {"count": 9, "median": 1.0, "percent": 60.0}),
+        finding("odometry_malformed", text="bad. " * 30),
+        finding("note", text="gap"),
+        finding("odometry_covers", share="all"),
+        finding("disparities", count=9, median=1.0, percent=60.0),
     )
     blocks = render_report((("frames", "9"),), (("SIFT features", "many"),), findings).split("\n\n")
     assert blocks[0] == "frames         9"
