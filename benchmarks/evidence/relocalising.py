@@ -123,7 +123,7 @@ def _queries(
 ) -> Iterator[tuple[Query, CameraRig]]:
     experiment = config.as_experiment()
     sequence = open_sequence(experiment)
-    truth = truth_in_map(given.saved, sequence, experiment).poses
+    truth = truth_in_map(given.saved, sequence, experiment)[0]
     stereo = make_stereo(sequence.rig, config.frontend)
     longest = max(FRAMES)
     held: list[FeatureFrame] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -67,54 +68,14 @@ class LocalisationErrors:
     dof: IntArray
 
 
-@dataclass(frozen=True, slots=True)
-class Spread:
-    """Median, 95th percentile and largest of some errors; None where there are none."""
-
-    median: float | None
-    p95: float | None
-    largest: float | None
-
-    @staticmethod
-    def of(values: FloatArray) -> Spread:
-        """Of the values that are known."""
-        known = values[np.isfinite(values)]
-        if not len(known):
-            return Spread(None, None, None)
-        return Spread(*(float(np.percentile(known, q)) for q in (50.0, 95.0, 100.0)))
-
-
-@dataclass(frozen=True, slots=True)
-class LocalisationScore:
-    """Counts over some queries.
-
-    Attributes:
-        queries: how many.
-        accepted: poses that were believed.
-        known: how many of the queries have a truth; the rest of the counts is over these.
-        right: accepted and within the bounds.
-        inexact: accepted, neither right nor false.
-        false: accepted, and somewhere else.
-        metres, degrees: errors of those accepted.
-        nees_per_dof: mean of them; None where unknown.
-        held: share of the true poses inside the 95 % region of the covariance; None where unknown.
-    """
-
-    queries: int
-    accepted: int
-    known: int
-    right: int
-    inexact: int
-    false: int
-    metres: Spread
-    degrees: Spread
-    nees_per_dof: float | None
-    held: float | None
-
-    @property
-    def share_right(self) -> float | None:
-        """Right ones of all with a truth; None where no truth is known."""
-        return self.right / self.known if self.known else None
+def spread(values: FloatArray) -> dict[str, float | None]:
+    """``median``, 95th percentile ``p95`` and ``max`` of what is known; None where nothing is."""
+    known = values[np.isfinite(values)]
+    quantiles = {"median": 50.0, "p95": 95.0, "max": 100.0}
+    return {
+        name: float(np.percentile(known, q)) if len(known) else None
+        for name, q in quantiles.items()
+    }
 
 
 def localisation_errors(answers: Answers) -> LocalisationErrors:
@@ -132,26 +93,36 @@ def localisation_errors(answers: Answers) -> LocalisationErrors:
     return LocalisationErrors(metres, radians, nees, dof)
 
 
-def score(answers: Answers, bounds: Bounds) -> LocalisationScore:
-    """Counts the answers."""
+def score(answers: Answers, bounds: Bounds) -> dict[str, Any]:
+    """Counts over some queries, and their errors, as metrics.json has them.
+
+    Returns:
+        Queries ``asked``; ``accepted``, poses that were trusted; ``with_truth``, how many have a
+        truth: the rest is over these. Of the accepted ``right``, within the bounds, ``false``,
+        somewhere else, and ``inexact``, neither; ``share_right``. :func:`spread` of ``error_m`` and
+        ``error_deg`` of those accepted; the mean ``nees_per_dof``, and ``share_in_95_percent`` of
+        the true poses in that region of the covariance. None where unknown.
+    """
     errors = localisation_errors(answers)
     judged = np.isfinite(errors.metres)
     right = judged & (errors.metres <= bounds.within_m) & (errors.radians <= bounds.within_rad)
     false = judged & ((errors.metres > bounds.wrong_m) | (errors.radians > bounds.wrong_rad))
     sure = judged & (errors.dof > 0)
     held = errors.nees[sure] <= chi_square_quantile(_HELD, errors.dof[sure])
-    return LocalisationScore(
-        queries=len(answers),
-        accepted=int(answers.accepted.sum()),
-        known=int(np.isfinite(answers.truth).all(axis=(1, 2)).sum()),
-        right=int(right.sum()),
-        inexact=int((judged & ~right & ~false).sum()),
-        false=int(false.sum()),
-        metres=Spread.of(errors.metres),
-        degrees=Spread.of(np.rad2deg(errors.radians)),
-        nees_per_dof=errors.nees[sure].sum() / errors.dof[sure].sum() if sure.any() else None,
-        held=float(np.mean(held)) if sure.any() else None,
-    )
+    known = int(np.isfinite(answers.truth).all(axis=(1, 2)).sum())
+    return {
+        "asked": len(answers),
+        "accepted": int(answers.accepted.sum()),
+        "with_truth": known,
+        "right": int(right.sum()),
+        "inexact": int((judged & ~right & ~false).sum()),
+        "false": int(false.sum()),
+        "share_right": int(right.sum()) / known if known else None,
+        "error_m": spread(errors.metres),
+        "error_deg": spread(np.rad2deg(errors.radians)),
+        "nees_per_dof": errors.nees[sure].sum() / errors.dof[sure].sum() if sure.any() else None,
+        "share_in_95_percent": float(np.mean(held)) if sure.any() else None,
+    }
 
 
 def enough(in_view: IntArray, bounds: Bounds) -> BoolArray:

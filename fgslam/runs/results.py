@@ -122,7 +122,7 @@ def number_text(value: JsonValue, spec: str = ".2f") -> str:
     """A number as text, decimal ones by ``spec``; a dash where it is not known."""
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return UNKNOWN
-    return format(value, spec) if isinstance(value, float) else str(value)
+    return format(value, spec).replace("%", " %") if isinstance(value, float) else str(value)
 
 
 def median(values: Sequence[float] | np.ndarray) -> float | None:

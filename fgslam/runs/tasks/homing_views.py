@@ -51,7 +51,14 @@ from fgslam.report.homing_figures import (
 )
 from fgslam.runs.config import HomingPairsConfig, TopologicalMapConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
-from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table, write_table
+from fgslam.runs.results import (
+    draw_picture,
+    finish,
+    median,
+    number_text,
+    numbers_table,
+    write_table,
+)
 
 VIEWS_A_BLOCK = 4
 _BLOCKS_A_JOB = 4  # so that progress moves, and no process waits long for the last one
@@ -647,10 +654,7 @@ def error_tables(numbers: Mapping[str, Any] | None) -> tuple[TextTable, ...]:
     rows = tuple(
         (
             name,
-            tuple(
-                format(group[key], spec).replace("%", " %") if key in group else UNKNOWN
-                for _, key, _, spec in _ERROR_COLUMNS
-            ),
+            tuple(number_text(group.get(key), spec) for _, key, _, spec in _ERROR_COLUMNS),
         )
         for name, group in groups.items()
     )

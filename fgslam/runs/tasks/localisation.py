@@ -11,7 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +39,10 @@ from fgslam.evaluation.localisation import (
     Answers,
     Bounds,
     LocalisationErrors,
-    LocalisationScore,
-    Spread,
     enough,
     localisation_errors,
     score,
+    spread,
 )
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.frontend.settings import FrontendSettings
@@ -71,7 +70,7 @@ from fgslam.runs.opening import open_sequence
 from fgslam.runs.results import PICTURES, UNKNOWN, number_text, write_page
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
-from fgslam.runs.tasks.slam_results import Sighted, TrueSights, truth_in_map
+from fgslam.runs.tasks.slam_results import true_sights, truth_in_map
 from fgslam.runs.units import Progress, UnitStore
 from fgslam.runs.workers import Executor
 from fgslam.slam.build import make_pipeline, make_relocaliser, make_stereo, make_stream, trusted
@@ -103,7 +102,8 @@ class Attempt:
         found: the answer; of a frame that could not be read None.
         problem: why it could not; empty where it could.
         truth: (4, 4) true pose in the map's world; NaN where unknown.
-        sighted: landmarks truly in view of it.
+        visible, familiar: landmarks truly in view of it, and of these, seen before from about
+            there; -1 where unknown.
         milliseconds: for the answer, without features.
         frontend_ms: for the frame's features in all images, and for matching them.
     """
@@ -115,7 +115,8 @@ class Attempt:
     found: Relocalisation | None
     problem: str
     truth: FloatArray
-    sighted: Sighted
+    visible: int
+    familiar: int
     milliseconds: float
     frontend_ms: float
 
@@ -178,46 +179,30 @@ def ask_all(
     relocaliser = make_relocaliser(sequence.rig, frontend)
     relocaliser.learn(landmarks, appearances)
     floor = Floor.under(sequence.rig, frontend.ego_motion.dof)
-    truth = truth_in_map(given.saved, sequence, config.as_experiment())
-    in_view = TrueSights(given.saved, landmarks, sequence, frontend)
+    truth, alignment = truth_in_map(given.saved, sequence, config.as_experiment())
+    in_view = true_sights(given.saved, landmarks, sequence, frontend)
 
-    def ask(found: list[FeatureFrame], sighted: Sighted) -> Attempt:
+    def ask(found: list[FeatureFrame], sighted: tuple[int, int]) -> Attempt:
         """One query: consecutive frames, the last of which is to be located."""
-        last, count = found[-1], len(found)
+        last, count, asked, answer = found[-1], len(found), 0, None
         frame = config.dataset.start + last.i * config.dataset.stride
-        attempt = Attempt(
-            i=last.i,
-            frame=frame,
-            frames=count,
-            features=0,
-            found=None,
-            problem=last.problem,
-            truth=truth.poses[last.i],
-            sighted=sighted,
-            milliseconds=float("nan"),
-            frontend_ms=last.sift_ms,
-        )
-        if last.frame is None:
-            return attempt
-        rng = np.random.default_rng([config.seed, _STREAM, frame, count])
-        start = time.perf_counter()
-        if count == 1:
-            features, spread = stereo.match(last.frame, last.features).whole, None
-        else:
-            features, spread = submap_features(sequence, found, frontend, config.odometry)
-        matched = time.perf_counter()
-        answer = relocaliser.locate(features, rng)
-        done = time.perf_counter()
-        if spread is not None and np.isfinite(answer.covariance).all():
-            own = floor.allowed_part(answer.wTc, spread)
-            answer = dataclasses.replace(answer, covariance=answer.covariance + own)
-        return dataclasses.replace(
-            attempt,
-            features=len(features),
-            found=answer,
-            milliseconds=1e3 * (done - matched),
-            frontend_ms=last.sift_ms + 1e3 * (matched - start),
-        )
+        milliseconds, frontend_ms = float("nan"), last.sift_ms
+        if last.frame is not None:
+            rng = np.random.default_rng([config.seed, _STREAM, frame, count])
+            start = time.perf_counter()
+            if count == 1:
+                features, spread = stereo.match(last.frame, last.features).whole, None
+            else:
+                features, spread = submap_features(sequence, found, frontend, config.odometry)
+            matched = time.perf_counter()
+            asked, answer = len(features), relocaliser.locate(features, rng)
+            milliseconds = 1e3 * (time.perf_counter() - matched)
+            frontend_ms += 1e3 * (matched - start)
+            if spread is not None and np.isfinite(answer.covariance).all():
+                own = floor.allowed_part(answer.wTc, spread)
+                answer = dataclasses.replace(answer, covariance=answer.covariance + own)
+        about = (last.i, frame, count, asked, answer, last.problem, truth[last.i], *sighted)
+        return Attempt(*about, milliseconds, frontend_ms)
 
     # Answers by number of the query, kept in the run folder now and then.
     queries = len(range(longest - 1, len(sequence), wanted.every))
@@ -228,7 +213,7 @@ def ask_all(
     context.progress("localising", len(done), queries)
     saved = time.perf_counter()
     for k, found in _queries(config, sequence, first):
-        sighted = in_view.of(found[-1].i, truth.poses[found[-1].i])
+        sighted = in_view(found[-1].i, truth[found[-1].i])
         fresh[k] = tuple(ask(found[len(found) - n :], sighted) for n in wanted.frames)
         context.progress("localising", len(done) + len(fresh), queries)
         stopped = context.stopped()
@@ -239,7 +224,7 @@ def ask_all(
             break
     attempts = [attempt for answers in done.values() for attempt in answers]
     attempts.sort(key=lambda one: (wanted.frames.index(one.frames), one.i))
-    return Asked(tuple(attempts), landmarks, truth.alignment, whole=len(done) == queries)
+    return Asked(tuple(attempts), landmarks, alignment, whole=len(done) == queries)
 
 
 def _queries(
@@ -365,10 +350,8 @@ def _run(
         given = open_map(folder / FIRST_FOLDER / MAP_FILE)
         write_config(folder, config, _provenance(given, sequence))
     asked = ask_all(config, given, sequence, context)
-    result = result_of(config, folder, asked, sequence.notes)
     subtitle = f"{sequence.name}, in a map of {len(asked.landmarks)} landmarks"
-    write_results(result, given, subtitle)
-    return result
+    return result_of(config, folder, asked, sequence.notes, given, subtitle)
 
 
 def _provenance(given: GivenMap | None, sequence: ImageSequence) -> dict[str, Any]:
@@ -400,9 +383,9 @@ class Scored:
     attempts: tuple[Attempt, ...]
     answers: Answers
     errors: LocalisationErrors
-    counts: LocalisationScore
-    familiar: LocalisationScore
-    apart: LocalisationScore
+    counts: dict[str, Any]
+    familiar: dict[str, Any]
+    apart: dict[str, Any]
 
 
 def bounds_of(config: LocalisationConfig) -> Bounds:
@@ -435,15 +418,20 @@ def answers_of(attempts: Sequence[Attempt]) -> Answers:
         poses=np.array(poses, np.float64).reshape(-1, 4, 4),
         covariances=np.array(covariances, np.float64).reshape(-1, 6, 6),
         truth=np.array([one.truth for one in attempts], np.float64).reshape(-1, 4, 4),
-        visible=np.array([one.sighted.visible for one in attempts], np.int64),
-        familiar=np.array([one.sighted.familiar for one in attempts], np.int64),
+        visible=np.array([one.visible for one in attempts], np.int64),
+        familiar=np.array([one.familiar for one in attempts], np.int64),
     )
 
 
 def result_of(
-    config: LocalisationConfig, folder: Path | None, asked: Asked, notes: Sequence[str]
+    config: LocalisationConfig,
+    folder: Path | None,
+    asked: Asked,
+    notes: Sequence[str],
+    given: GivenMap | None = None,
+    subtitle: str = "",
 ) -> LocalisationResult:
-    """Sentences and tables of a run."""
+    """Sentences and tables of a run; with a folder and its map all files. Raises OutputError."""
     judged = scored(config, asked)
     verdicts = [Counter(one.verdict for one in j.attempts) for j in judged]
     rows = tuple(
@@ -451,7 +439,7 @@ def result_of(
         for name in sorted(set().union(*verdicts))
     )
     columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
-    return LocalisationResult(
+    result = LocalisationResult(
         config=config,
         folder=folder or Path(),
         status="finished" if asked.whole else "interrupted",
@@ -465,6 +453,9 @@ def result_of(
         written=folder is not None,
         asked=asked,
     )
+    if folder is not None and given is not None:
+        write_results(result, judged, given, subtitle)
+    return result
 
 
 def in_frames(count: int) -> str:
@@ -479,16 +470,18 @@ def _within(config: LocalisationConfig) -> str:
 
 def _sentence(config: LocalisationConfig, judged: Scored) -> str:
     counts, few = judged.counts, judged.apart
-    start = f"from {in_frames(judged.frames)}: {counts.accepted} of {counts.queries} queries found"
-    if not counts.known:
+    start = (
+        f"from {in_frames(judged.frames)}: {counts['accepted']} of {counts['asked']} queries found"
+    )
+    if not counts["with_truth"]:
         return f"{start}; their errors are not known"
     apart = (
-        f"; counted apart: {few.queries} poses from which fewer than {_LEAST_VISIBLE} landmarks "
-        f"are visible, {few.accepted} of them found, {few.false} false"
-    ) * bool(few.queries)
+        f"; counted apart: {few['asked']} poses from which fewer than {_LEAST_VISIBLE} landmarks "
+        f"are visible, {few['accepted']} of them found, {few['false']} false"
+    ) * bool(few["asked"])
     return (
-        f"{start}, {counts.right} ({_percent(counts.share_right)}) {_within(config)}, "
-        f"{counts.inexact} less exact, {counts.false} false{apart}"
+        f"{start}, {counts['right']} ({number_text(counts['share_right'], '.1%')}) "
+        f"{_within(config)}, {counts['inexact']} less exact, {counts['false']} false{apart}"
     )
 
 
@@ -507,36 +500,36 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
     )
     rows = []
     for one in judged:
-        name, ms = in_frames(one.frames), Spread.of(_milliseconds(one)[0])
-        times = f"{number_text(ms.median, '.0f')}, {number_text(ms.p95, '.0f')}"
+        name, ms = in_frames(one.frames), spread(_milliseconds(one)[0])
+        times = f"{number_text(ms['median'], '.0f')}, {number_text(ms['p95'], '.0f')}"
         shown = {name: (one.counts, times)}
-        if one.apart.queries or one.familiar.queries != one.counts.queries:
+        if one.apart["asked"] or one.familiar["asked"] != one.counts["asked"]:
             shown[f"{name}, {_LEAST_VISIBLE} in view from familiar sides"] = one.familiar, UNKNOWN
             shown[f"{name}, fewer than {_LEAST_VISIBLE} in view"] = one.apart, UNKNOWN
         rows += [(text, (*_score_cells(counts), last)) for text, (counts, last) in shown.items()]
     return TextTable("score", "Localisation", "query", columns, tuple(rows))
 
 
-def _score_cells(counts: LocalisationScore) -> tuple[str, ...]:
-    judged = [str(n) for n in (counts.right, counts.inexact, counts.false)]
-    return (
-        str(counts.queries),
-        *(judged if counts.known else [UNKNOWN] * 3),
-        str(counts.queries - counts.accepted),
-        _spread(counts.metres, 100.0, ".1f"),
-        _spread(counts.degrees, 1.0, ".2f"),
-        number_text(counts.nees_per_dof),
-        _percent(counts.held),
+def _score_cells(counts: Mapping[str, Any]) -> tuple[str, ...]:
+    judged = [str(counts[name]) for name in ("right", "inexact", "false")]
+    centimetres, degrees = (
+        ", ".join(
+            number_text(factor * value, spec) for value in values.values() if value is not None
+        )
+        for values, factor, spec in (
+            (counts["error_m"], 100.0, ".1f"),
+            (counts["error_deg"], 1.0, ".2f"),
+        )
     )
-
-
-def _percent(share: float | None) -> str:
-    return UNKNOWN if share is None else f"{100 * share:.1f} %"
-
-
-def _spread(values: Spread, factor: float, spec: str) -> str:
-    parts = [value for value in asdict(values).values() if value is not None]
-    return ", ".join(format(factor * part, spec) for part in parts) or UNKNOWN
+    return (
+        str(counts["asked"]),
+        *(judged if counts["with_truth"] else [UNKNOWN] * 3),
+        str(counts["asked"] - counts["accepted"]),
+        centimetres or UNKNOWN,
+        degrees or UNKNOWN,
+        number_text(counts["nees_per_dof"]),
+        number_text(counts["share_in_95_percent"], ".1%"),
+    )
 
 
 def _milliseconds(judged: Scored) -> tuple[FloatArray, FloatArray]:
@@ -564,12 +557,11 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) -> None:
+def write_results(
+    result: LocalisationResult, judged: Sequence[Scored], given: GivenMap, subtitle: str
+) -> None:
     """All files of a run into its folder, which holds its config.yaml. Raises OutputError."""
-    if not result.written:
-        return
     folder, asked = result.folder, result.asked
-    judged = scored(result.config, asked)
     rows = (row for one in judged for row in _rows(one))
     write_csv(folder / "localisation.csv", _COLUMNS, rows)
     timing = ((a.frame, a.frames, a.milliseconds, a.frontend_ms) for a in asked.attempts)
@@ -598,7 +590,7 @@ def write_results(result: LocalisationResult, given: GivenMap, subtitle: str) ->
 def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
     errors = judged.errors
     for k, attempt in enumerate(judged.attempts):
-        found, sighted = attempt.found, attempt.sighted
+        found = attempt.found
         query = attempt.frame, attempt.frames, attempt.verdict
         if found is None:
             yield *query, *[None] * (len(_COLUMNS) - 4), attempt.problem
@@ -616,7 +608,7 @@ def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
             found.expected,
             found.second,
             found.residual_px,
-            *(n if n >= 0 else None for n in (sighted.visible, sighted.familiar)),
+            *(n if n >= 0 else None for n in (attempt.visible, attempt.familiar)),
             errors.metres[k],
             np.rad2deg(errors.radians[k]),
             errors.nees[k],
@@ -628,33 +620,13 @@ def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
 def _numbers(judged: Scored) -> dict[str, JsonValue]:
     answers, frontend = _milliseconds(judged)
     return {
-        **_score_numbers(judged.counts),
-        "familiar_view": _score_numbers(judged.familiar),
-        "too_few_in_view": _score_numbers(judged.apart),
+        **judged.counts,
+        "familiar_view": judged.familiar,
+        "too_few_in_view": judged.apart,
         "verdicts": dict(sorted(Counter(a.verdict for a in judged.attempts).items())),
-        "locate_ms": _spread_numbers(Spread.of(answers)),
-        "frontend_ms": _spread_numbers(Spread.of(frontend)),
+        "locate_ms": spread(answers),
+        "frontend_ms": spread(frontend),
     }
-
-
-def _score_numbers(counts: LocalisationScore) -> dict[str, JsonValue]:
-    return {
-        "asked": counts.queries,
-        "accepted": counts.accepted,
-        "with_truth": counts.known,
-        "right": counts.right,
-        "inexact": counts.inexact,
-        "false": counts.false,
-        "share_right": counts.share_right,
-        "error_m": _spread_numbers(counts.metres),
-        "error_deg": _spread_numbers(counts.degrees),
-        "nees_per_dof": counts.nees_per_dof,
-        "share_in_95_percent": counts.held,
-    }
-
-
-def _spread_numbers(values: Spread) -> dict[str, JsonValue]:
-    return {"median": values.median, "p95": values.p95, "max": values.largest}
 
 
 def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
@@ -732,8 +704,8 @@ def localize(wanted: Wanted, progress: Progress, stopped: Callable[[], bool]) ->
         loop = (1, progress, stopped, Executor())
         context = Context(out or Path(), False, UnitStore(None), *loop)
         asked = ask_all(config, given, sequence, context)
-        result = result_of(config, out, asked, notes)
-        write_results(result, given, f"{sequence.name}, in the map {given.path}")
+        subtitle = f"{sequence.name}, in the map {given.path}"
+        result = result_of(config, out, asked, notes, given, subtitle)
     attempts = asked.attempts
     share = LocatedShare(sum(one.accepted for one in attempts), len(attempts))
     if len(attempts) == 1:
@@ -785,18 +757,14 @@ def _config_of(wanted: Wanted, made_with: Mapping[str, Any]) -> LocalisationConf
 
 
 def _open_wanted(wanted: Wanted, config: LocalisationConfig, progress: Progress) -> ImageSequence:
-    frame = wanted.frame
-    if frame is None:
-        return open_sequence(config.as_experiment(), progress)
+    frame, where = wanted.frame, "" if wanted.frame is None else f"--frame {wanted.frame}: "
     try:
         sequence = open_sequence(config.as_experiment(), progress)
     except FgslamError as error:
-        raise type(error)(f"--frame {frame}: {error}") from None
-    if len(sequence) < wanted.frames:
+        raise type(error)(f"{where}{error}") from None
+    if frame is not None and len(sequence) < wanted.frames:
         last = config.dataset.start + (len(sequence) - 1) * config.dataset.stride
-        raise ConfigError(
-            f"--frame {frame}: {sequence.name} ends with frame {last}; choose a smaller one"
-        )
+        raise ConfigError(f"{where}{sequence.name} ends with frame {last}; choose a smaller one")
     return sequence
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 
@@ -226,42 +226,30 @@ _BEHIND = 1.05  # times the rendered depth, plus the next: what is farther off i
 _BEHIND_M = 0.05
 
 
-@dataclass(frozen=True, slots=True)
-class Sighted:
-    """How many landmarks are truly in view of a pose; -1 where that is not known.
+Sights: TypeAlias = Callable[[int, FloatArray], tuple[int, int]]
+"""Landmarks in view of a true pose ``wTc`` in the selected frame ``i``; -1 where it is not known.
 
-    Attributes:
-        visible: in all images, not too near and not too small for the rig, and not hidden.
-        familiar: of these, seen from a direction from which they were seen before.
+In all images, not too near and not too small for the rig, and not hidden; and how many of these are
+seen from a direction from which they were seen before.
+"""
+
+
+def true_sights(
+    saved: SavedMap, landmarks: LandmarkMap, sequence: ImageSequence, frontend: FrontendSettings
+) -> Sights:
+    """Counts the landmarks in view of true poses, by the database's own expectation.
+
+    Of ``landmarks``, those of the map that count; of a recording without depth nothing.
     """
+    rig, largest = sequence.rig, frontend.stereo.largest_disparity_px
+    database = LandmarkDatabase(rig, frontend.database, largest)
+    database.load(saved)
 
-    visible: int = -1
-    familiar: int = -1
-
-
-class TrueSights:
-    """Counts the landmarks in view of true poses, by the database's own expectation."""
-
-    def __init__(
-        self,
-        saved: SavedMap,
-        landmarks: LandmarkMap,
-        sequence: ImageSequence,
-        frontend: FrontendSettings,
-    ) -> None:
-        """Of ``landmarks``, those of the map that count; of a recording without depth nothing."""
-        self._sequence, self._landmarks = sequence, landmarks
-        largest = frontend.stereo.largest_disparity_px
-        self._database = LandmarkDatabase(sequence.rig, frontend.database, largest)
-        if isinstance(sequence, TrueDepth):
-            self._database.load(saved)
-
-    def of(self, i: int, wTc: FloatArray) -> Sighted:
-        """In the selected frame ``i``, whose true pose in the map's world is ``wTc``."""
-        if not isinstance(self._sequence, TrueDepth) or not np.isfinite(wTc).all():
-            return Sighted()
-        rig, depth = self._sequence.rig, self._sequence.depth(i)
-        expected = self._database.expected(self._landmarks, wTc)
+    def in_view(i: int, wTc: FloatArray) -> tuple[int, int]:
+        if not isinstance(sequence, TrueDepth) or not np.isfinite(wTc).all():
+            return -1, -1
+        depth = sequence.depth(i)
+        expected = database.expected(landmarks, wTc)
         column, row, disparity = expected.measurement.T
         rise = 0.0
         if rig.vertical_baseline is not None:
@@ -271,28 +259,18 @@ class TrueSights:
         at = np.rint(np.column_stack([row, column])[inside]).astype(np.int64)
         near = depth[at[:, 0], at[:, 1]]
         shown = rig.fx * rig.baseline / disparity[inside] <= _BEHIND * near + _BEHIND_M
-        familiar = shown & expected.certain[inside]
-        return Sighted(int(shown.sum()), int(familiar.sum()))
+        return int(shown.sum()), int((shown & expected.certain[inside]).sum())
+
+    return in_view
 
 
 _SAME_TIME_S = 1e-3
 _MOST_SLACK_RAD = 0.5  # of positions whose errors are all made of it: at most, not likely
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TruthInMap:
-    """True poses of a recording's frames in the map's world.
-
-    Attributes:
-        poses: (n, 4, 4) of the selected frames; NaN where unknown.
-        alignment: how the two worlds were brought together, in words.
-    """
-
-    poses: FloatArray
-    alignment: str
-
-
-def truth_in_map(saved: SavedMap, sequence: ImageSequence, config: ExperimentConfig) -> TruthInMap:
+def truth_in_map(
+    saved: SavedMap, sequence: ImageSequence, config: ExperimentConfig
+) -> tuple[FloatArray, str]:
     """True poses in the map's world, as far as they can be known.
 
     Of rendered places exactly, since the map's world is where its first drive began. Of recordings
@@ -303,29 +281,31 @@ def truth_in_map(saved: SavedMap, sequence: ImageSequence, config: ExperimentCon
         saved: the map.
         sequence: the recording.
         config: what it was opened with.
+
+    Returns:
+        (n, 4, 4) poses of the selected frames, NaN where unknown; and how the two worlds were
+        brought together, in words.
     """
     unknown = np.full((len(sequence), 4, 4), np.nan)
-    if sequence.ground_truth is None:
-        return TruthInMap(unknown, "the recording has no ground truth")
-    drives = saved.about.get("drives") or [{}]
+    truth, drives = sequence.ground_truth, saved.about.get("drives") or [{}]
+    if truth is None:
+        return unknown, "the recording has no ground truth"
     if isinstance(config.dataset, RenderedLabSettings):
-        return _of_rendered(_drive_config(drives[0]), sequence, config) or TruthInMap(
-            unknown, "the map is of another place, so errors are not known"
-        )
+        own = _of_rendered(_drive_config(drives[0]), sequence, config)
+        if own is None:
+            return unknown, "the map is of another place, so errors are not known"
+        return own, "truth in the world of the map's first frame, exactly"
     mapped = _drive_config(drives[-1])
     aligned = None if mapped is None else _of_recorded(saved, mapped, config)
     if aligned is None:
-        return TruthInMap(unknown, "the map is of another recording, so errors are not known")
+        return unknown, "the map is of another recording, so errors are not known"
     mTw, matched, slack = aligned
     if slack > _MOST_SLACK_RAD:
-        words = "the map's drive is too straight to lay the truth onto it, so errors are not known"
-        return TruthInMap(unknown, words)
-    times, true_rows = associate(
-        sequence.timestamps, sequence.ground_truth.timestamps, _SAME_TIME_S
-    )
-    unknown[times] = mTw @ sequence.ground_truth.poses[true_rows]
-    words = f"truth aligned to the map's trajectory, SE3 over {matched} poses"
-    return TruthInMap(unknown, words)
+        why = "the map's drive is too straight to lay the truth onto it, so errors are not known"
+        return unknown, why
+    times, true_rows = associate(sequence.timestamps, truth.timestamps, _SAME_TIME_S)
+    unknown[times] = mTw @ truth.poses[true_rows]
+    return unknown, f"truth aligned to the map's trajectory, SE3 over {matched} poses"
 
 
 def _drive_config(drive: object) -> ExperimentConfig | None:
@@ -341,8 +321,8 @@ def _drive_config(drive: object) -> ExperimentConfig | None:
 
 def _of_rendered(
     mapped: ExperimentConfig | None, sequence: ImageSequence, config: ExperimentConfig
-) -> TruthInMap | None:
-    """Both worlds are camera poses in one room."""
+) -> FloatArray | None:
+    """Both worlds are camera poses in one room; None where they are not."""
     from fgslam.datasets.rendered import RenderedLabSequence, first_camera_pose  # scipy's, slow
 
     now, then = config.dataset, None if mapped is None else mapped.dataset
@@ -351,8 +331,7 @@ def _of_rendered(
     if not isinstance(sequence, RenderedLabSequence) or now.place != then.place:
         return None
     own = sequence.room_from_world @ sequence.ground_truth.poses
-    words = "truth in the world of the map's first frame, exactly"
-    return TruthInMap(inverse(first_camera_pose(then)) @ own, words)
+    return np.asarray(inverse(first_camera_pose(then)) @ own)
 
 
 def _of_recorded(
