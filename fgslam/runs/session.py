@@ -25,7 +25,7 @@ from fgslam.core.saved_map import SavedMap, load_map, save_map
 from fgslam.core.saved_map import require_rig as require_rig_of_map
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import LandmarkMap, Relocalisation, Trajectory
+from fgslam.core.types import Estimate, LandmarkMap, Relocalisation, Trajectory
 from fgslam.datasets.layouts import is_recording
 from fgslam.datasets.settings import OdometrySettings
 from fgslam.frontend.settings import FrontendSettings
@@ -190,6 +190,34 @@ def drives_of(saved: SavedMap) -> list[dict[str, Any]]:
     """What the map records of the drives that made it, the last one last."""
     found = saved.about.get("drives")
     return [drive for drive in found if isinstance(drive, dict)] if isinstance(found, list) else []
+
+
+_DRIVE = (
+    *("name", "fgslam", "recording", "frames", "estimator", "valid_hits"),
+    *("remark", "remarks", "settings"),
+)
+"""What a map records of a drive, in this order."""
+
+
+def map_of(session: Session, estimate: Estimate, before: SavedMap | None, **drive: Any) -> SavedMap:
+    """The map of a session that may have begun in another one, with what is recorded of its drive.
+
+    Args:
+        session: as it is now.
+        estimate: its estimator's.
+        before: the map that it began in.
+        drive: of :data:`_DRIVE` what the session itself does not know.
+    """
+    known = drive | {
+        "fgslam": __version__,
+        "frames": len(session.recorder),
+        "estimator": session.pipeline.estimator.kind,
+        "valid_hits": session.frontend.database.valid_hits,
+    }
+    drives = [] if before is None else drives_of(before)
+    about = {"drives": [*drives, {name: known[name] for name in _DRIVE if name in known}]}
+    evidence = evidence_of(session.pipeline, session.recorder, before)
+    return saved_map(session.pipeline, session.rig, estimate, about, evidence)
 
 
 def remark_of_map(saved: SavedMap) -> str:
@@ -434,24 +462,11 @@ class Slam(Session):
         """
         found = super().result()
         points = map_points(found.estimate.landmarks, self.pipeline.tracker.database)
-        drives = [] if self._before is None else drives_of(self._before)
-        about = {"drives": [*drives, self._drive(found)]}
-        evidence = evidence_of(self.pipeline, self.recorder, self._before)
-        saved = saved_map(self.pipeline, self.rig, found.estimate, about, evidence)
+        drive = {"remark": self._remark, "remarks": list(map(sentence, found.remarks))}
+        saved = map_of(self, found.estimate, self._before, name="session", **drive)
         values = {name: getattr(found, name) for name in found.__dataclass_fields__}
         values["notes"] = tuple(map(sentence, found.notes))
         return Result(**values, map=Map(saved, points, self._remark))
-
-    def _drive(self, found: SessionResult) -> dict[str, Any]:
-        return {
-            "name": "session",
-            "fgslam": __version__,
-            "frames": len(self),
-            "estimator": found.kind,
-            "valid_hits": self.frontend.database.valid_hits,
-            "remark": self._remark,
-            "remarks": list(map(sentence, found.remarks)),
-        }
 
 
 def _beginning(config: ExperimentConfig) -> MapStart | None:

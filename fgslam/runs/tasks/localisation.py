@@ -68,6 +68,7 @@ from fgslam.runs.folder import (
 )
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.results import PICTURES, UNKNOWN, number_text, write_page
+from fgslam.runs.session import drives_of
 from fgslam.runs.tasks.slam import drive_first
 from fgslam.runs.tasks.slam_map_entry import FIRST_FOLDER, MAP_FILE, GivenMap, open_map
 from fgslam.runs.tasks.slam_results import true_sights, truth_in_map
@@ -770,9 +771,7 @@ def _open_wanted(wanted: Wanted, config: LocalisationConfig, progress: Progress)
 
 def settings_of_map(saved: SavedMap) -> dict[str, Any]:
     """Settings of the last drive that made the map; empty where it holds none."""
-    drives = saved.about.get("drives")
-    last = drives[-1] if isinstance(drives, list) and drives else {}
-    settings = last.get("settings") if isinstance(last, dict) else None
+    settings = (drives_of(saved) or [{}])[-1].get("settings")
     return settings if isinstance(settings, dict) else {}
 
 

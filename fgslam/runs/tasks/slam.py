@@ -15,16 +15,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from fgslam.core import __version__, store
+from fgslam.core import store
 from fgslam.core.arrays import StateArrays
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import remove_file, remove_files
 from fgslam.core.log import ImageSequence, MeasurementLog
 from fgslam.core.saved_map import save_map
 from fgslam.core.store import load_arrays, write_arrays
-from fgslam.core.types import Remark
 from fgslam.evaluation.statistics import EstimatorMetrics
-from fgslam.report.content import sentence
 from fgslam.runs.config import ExperimentConfig, load_config
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of, run_task
 from fgslam.runs.folder import (
@@ -40,6 +38,7 @@ from fgslam.runs.folder import (
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.report import located, report_from_folder
 from fgslam.runs.results import PICTURES
+from fgslam.runs.session import map_of
 from fgslam.runs.slam_comparison import judged_apart, named, replay_apart, with_odometry
 from fgslam.runs.tables import comparison_particulars, comparison_tables, write_comparison_csv
 from fgslam.runs.tasks.slam_map_entry import (
@@ -47,9 +46,13 @@ from fgslam.runs.tasks.slam_map_entry import (
     MAP_FILE,
     Entry,
     GivenMap,
+    arrival_by,
     enter,
+    entry_notes,
     entry_of,
+    left_out_notes,
     open_map,
+    require_same_map,
 )
 from fgslam.runs.tasks.slam_results import (
     RunOutputs,
@@ -62,7 +65,7 @@ from fgslam.runs.tasks.slam_results import (
     summary_table,
 )
 from fgslam.runs.units import Progress
-from fgslam.slam.build import evidence_of, make_estimator, make_stream, require_map_user, saved_map
+from fgslam.slam.build import make_estimator, make_stream, require_map_user
 from fgslam.slam.motion import body_motion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import RunRecorder
@@ -287,24 +290,18 @@ def _leave_map(outputs: RunOutputs) -> str:
     if config.map.save is None:
         return ""
     estimate, values = pipeline.estimate(), config.as_values()
-    drive = {
-        "name": config.name,
-        "fgslam": __version__,
-        "recording": {"name": outputs.sequence.name, "identity": outputs.sequence.identity},
-        "frames": len(outputs.recorder),
-        "estimator": pipeline.estimator.kind,
-        "valid_hits": config.frontend.database.valid_hits,
-        "remark": outputs.remark,
-        "remarks": list(estimate.remarks),
-        "settings": {
+    saved = map_of(
+        outputs.session,
+        estimate,
+        None if outputs.given is None else outputs.given.saved,
+        name=config.name,
+        recording={"name": outputs.sequence.name, "identity": outputs.sequence.identity},
+        remark=outputs.remark,
+        remarks=list(estimate.remarks),
+        settings={
             name: values[name] for name in ("seed", "odometry", "frontend", "estimator", "dataset")
         },
-    }
-    before = None if outputs.given is None else outputs.given.saved
-    drives = [] if before is None else before.about.get("drives", ())
-    evidence = evidence_of(pipeline, outputs.recorder, before)
-    about = {"drives": [*drives, drive]}
-    saved = saved_map(pipeline, outputs.sequence.rig, estimate, about, evidence)
+    )
     size = save_map(saved, Path(config.map.save))
     return (
         f"{config.map.save}: {len(saved)} landmarks, {int(saved.permanent.sum())} of them "
@@ -324,7 +321,6 @@ class OpenedRun:
         config: as given.
         given: the map to go on with; None without one, or while it is still to be made.
         entry: how the run enters it; None where it does not, or that is not yet known.
-        resumed: the folder holds a state to go on from.
         frames_before: selected frames before the first that shows enough to begin a map: left out.
     """
 
@@ -333,7 +329,6 @@ class OpenedRun:
     sequence: ImageSequence
     given: GivenMap | None
     entry: Entry | None
-    resumed: bool
     frames_before: int = 0
 
     @property
@@ -341,7 +336,7 @@ class OpenedRun:
         """What it takes to repeat the run, next to its configuration."""
         out = provenance_of(self.sequence)
         if self.entry is not None:
-            out["map"] = self.entry.as_values()
+            out["map"] = self.entry
         if self.frames_before:
             out[_FRAMES_BEFORE] = self.frames_before
         return out
@@ -373,8 +368,8 @@ def open_run(config: ExperimentConfig, opening: Opening) -> OpenedRun:
     if resumed:
         known = load_config(folder / RUN_MARKER).provenance or {}
         before = int(known.get(_FRAMES_BEFORE, 0))
-    run = OpenedRun(config, folder, sequence, given, None, resumed, before)
-    return dataclasses.replace(run, entry=_entry(run, given))
+    run = OpenedRun(config, folder, sequence, given, None, before)
+    return dataclasses.replace(run, entry=_entry(run, given, resumed))
 
 
 def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
@@ -383,24 +378,22 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     Raises:
         FgslamError: of any kind, with a message for the user.
     """
-    config = run.config
+    config, resumed = run.config, (run.folder / STATE_FILE).is_file()
     if config.map.made_from is not None:
         made = open_map(run.folder / FIRST_FOLDER / MAP_FILE)
-        run = dataclasses.replace(run, given=made, entry=_entry(run, made))
+        run = dataclasses.replace(run, given=made, entry=_entry(run, made, resumed))
         write_config(run.folder, config, run.provenance)
     given, entry, sequence = run.given, run.entry, run.sequence
-    before = run.frames_before if entry is None else entry.frames_before
+    before = run.frames_before if entry is None else entry["frames_before"]
     if before:
         start = config.dataset.start + before * config.dataset.stride
         later = dataclasses.replace(config.dataset, start=start)
         config = config.model_copy(update={"dataset": later})
         sequence = open_sequence(config, progress)
-    arrival = None
-    notes: tuple[str, ...] = ()
-    if run.frames_before:
-        notes = (sentence(Remark("left_out", values={"count": run.frames_before})),)
+    arrival, notes = None, left_out_notes(run.frames_before)
     if entry is not None and given is not None:
-        arrival, notes = entry.arrival(given, config.map), entry.notes(given, config.map)
+        arrival = arrival_by(entry, given, config.map)
+        notes = entry_notes(entry, given, config.map)
     session = Session(
         sequence.rig,
         config.estimator,
@@ -412,7 +405,7 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     session.recorder.left_out = run.frames_before
     first = config.dataset.start
     outputs = RunOutputs(run.folder, run.config, sequence, session, first, notes, given)
-    if run.resumed:
+    if resumed:
         _load_checkpoint(run.folder, session.pipeline, session.recorder)
     return outputs
 
@@ -420,20 +413,20 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
 def _begin_later(run: OpenedRun, frames: int) -> OpenedRun:
     """The run without so many frames more; nothing of what was driven over these is kept."""
     before = run.frames_before + frames
-    run = dataclasses.replace(run, frames_before=before, resumed=False)
+    run = dataclasses.replace(run, frames_before=before)
     remove_file(run.folder / STATE_FILE)
     remove_files(run.folder / PICTURES, "*.png")
     write_config(run.folder, run.config, run.provenance)
     return run
 
 
-def _entry(run: OpenedRun, given: GivenMap | None) -> Entry | None:
+def _entry(run: OpenedRun, given: GivenMap | None, resumed: bool) -> Entry | None:
     """How the run enters the map; on resuming, how it did."""
     if given is None:
         return None
-    known = entry_of(run.folder) if run.resumed else None
+    known = entry_of(run.folder) if resumed else None
     if known is not None:
-        known.require_same(given)
+        require_same_map(known, given)
     return known or enter(run.config, given, run.sequence)
 
 

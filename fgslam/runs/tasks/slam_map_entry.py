@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -39,67 +38,45 @@ class GivenMap:
     saved: SavedMap
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Entry:
-    """How a run entered a map: kept in its config.yaml, for those who resume or replay it.
+Entry: TypeAlias = dict[str, Any]
+"""How a run entered a map, as its config.yaml states it for those who resume or replay it.
 
-    Attributes:
-        file: the map's.
-        identity: of the map's file.
-        frames_before: selected frames left out because they could not be located.
-        relocalised: the first pose was found without a prior.
-        prior: pose expected of the first frame.
-    """
+The map's ``file`` and its digest ``sha256``; ``frames_before``, selected frames left out because
+they could not be located; whether the first pose was found without a prior, ``relocalised``; the
+pose expected of the first frame, ``wTc`` (4, 4) with ``covariance`` (6, 6), exact.
+"""
 
-    file: str
-    identity: str
-    frames_before: int
-    relocalised: bool
-    prior: Prediction
 
-    def as_values(self) -> dict[str, Any]:
-        """Plain values for YAML, exact."""
-        return {
-            "file": self.file,
-            "sha256": self.identity,
-            "frames_before": self.frames_before,
-            "relocalised": self.relocalised,
-            "wTc": self.prior.wTc.tolist(),
-            "covariance": self.prior.covariance.tolist(),
-        }
-
-    @staticmethod
-    def of(values: Mapping[str, Any]) -> Entry:
-        """Back from :meth:`as_values`."""
-        prior = Prediction(np.array(values["wTc"]), np.array(values["covariance"]))
-        return Entry(
-            values["file"], values["sha256"], values["frames_before"], values["relocalised"], prior
+def require_same_map(entry: Entry, given: GivenMap) -> None:
+    """Refuses another map than the run entered. Raises MapError."""
+    if entry["sha256"] != given.identity:
+        raise MapError(
+            f"{given.path}: the map has changed since the run began; restore it, or run again "
+            "with --overwrite"
         )
 
-    def require_same(self, given: GivenMap) -> None:
-        """Refuses another map than the run entered. Raises MapError."""
-        if self.identity != given.identity:
-            raise MapError(
-                f"{given.path}: the map has changed since the run began; restore it, or run again "
-                "with --overwrite"
-            )
 
-    def arrival(self, given: GivenMap, settings: MapSettings) -> Arrival:
-        """Where a run's parts begin."""
-        return Arrival(given.saved, self.prior, self.relocalised, settings.extend)
+def arrival_by(entry: Entry, given: GivenMap, settings: MapSettings) -> Arrival:
+    """Where a run's parts begin."""
+    prior = Prediction(np.array(entry["wTc"]), np.array(entry["covariance"]))
+    return Arrival(given.saved, prior, entry["relocalised"], settings.extend)
 
-    def notes(self, given: GivenMap, settings: MapSettings) -> tuple[str, ...]:
-        """Notes on the entry: which map, where, and frames left out."""
-        x, y, z = self.prior.wTc[:3, 3]
-        how = "located" if self.relocalised else f"put back at its {settings.start}"
-        use = "extended" if settings.extend else "left as it is"
-        entered = (
-            f"map {given.path} of {len(given.saved)} landmarks, {use}: {how} at ({x:.2f}, "
-            f"{y:.2f}, {z:.2f}) m"
-        )
-        if not self.frames_before:
-            return (entered,)
-        return (entered, sentence(Remark("left_out", values={"count": self.frames_before})))
+
+def entry_notes(entry: Entry, given: GivenMap, settings: MapSettings) -> tuple[str, ...]:
+    """Notes on the entry: which map, where, and frames left out."""
+    x, y, z = np.array(entry["wTc"])[:3, 3]
+    how = "located" if entry["relocalised"] else f"put back at its {settings.start}"
+    use = "extended" if settings.extend else "left as it is"
+    entered = (
+        f"map {given.path} of {len(given.saved)} landmarks, {use}: {how} at ({x:.2f}, "
+        f"{y:.2f}, {z:.2f}) m"
+    )
+    return (entered, *left_out_notes(entry["frames_before"]))
+
+
+def left_out_notes(frames: int) -> tuple[str, ...]:
+    """That so many frames before the first were left out; none for none."""
+    return (sentence(Remark("left_out", values={"count": frames})),) if frames else ()
 
 
 def open_map(path: Path) -> GivenMap:
@@ -120,13 +97,20 @@ def enter(config: ExperimentConfig, given: GivenMap, sequence: ImageSequence) ->
     if arrival is None:
         before, found = _locate(config, given, sequence)
         arrival = start.at(found.wTc, relocalised=True)
-    return Entry(str(given.path), given.identity, before, arrival.relocalised, arrival.prior)
+    return {
+        "file": str(given.path),
+        "sha256": given.identity,
+        "frames_before": before,
+        "relocalised": arrival.relocalised,
+        "wTc": arrival.prior.wTc.tolist(),
+        "covariance": arrival.prior.covariance.tolist(),
+    }
 
 
 def _locate(
     config: ExperimentConfig, given: GivenMap, sequence: ImageSequence
 ) -> tuple[int, Relocalisation]:
-    """The first frame that the map's landmarks place beyond doubt, and its number."""
+    """The first frame that the map's landmarks place for certain, and its number."""
     locate = make_locator(sequence.rig, config.frontend, given.saved, config.seed)
     within, why = min(config.map.begin.within, len(sequence)), "no image could be read"
     stream = make_stream(sequence, config.frontend)()
@@ -159,24 +143,27 @@ def arrival_of(run: Path) -> Arrival | None:
         return None
     settings = load_config(run / RUN_MARKER).map
     first = run / FIRST_FOLDER / MAP_FILE
-    given = open_map(Path(entry.file) if settings.made_from is None else first)
-    entry.require_same(given)
-    return entry.arrival(given, settings)
+    given = open_map(Path(entry["file"]) if settings.made_from is None else first)
+    require_same_map(entry, given)
+    return arrival_by(entry, given, settings)
 
 
 def entry_of(run: Path) -> Entry | None:
     """How the run in a folder entered its map; None without.
 
     Raises:
-        ConfigError: config.yaml says it in words of another fgslam.
+        ConfigError: config.yaml states it as another fgslam does.
     """
     if not is_run_folder(run):
         return None
-    values = (load_config(run / RUN_MARKER).provenance or {}).get("map")
+    entry = (load_config(run / RUN_MARKER).provenance or {}).get("map")
     try:
-        return None if values is None else Entry.of(values)
+        if entry is not None:
+            Prediction(np.array(entry["wTc"], float), np.array(entry["covariance"], float))
+            _ = entry["file"], entry["sha256"], entry["frames_before"], entry["relocalised"]
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{run / RUN_MARKER}: provenance.map does not say how the run entered its map "
             f"({type(error).__name__}: {error}); run again with --overwrite"
         ) from None
+    return entry

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias, runtime_checkable
@@ -57,7 +58,7 @@ from fgslam.runs.report import (
     write_closures,
 )
 from fgslam.runs.results import PICTURES
-from fgslam.runs.session import map_points
+from fgslam.runs.session import drives_of, map_points
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
 from fgslam.runs.tables import NOISE_TABLE, picture_title, write_estimate, write_noise
 from fgslam.runs.tasks.slam_map_entry import GivenMap
@@ -287,7 +288,7 @@ def truth_in_map(
         brought together, in words.
     """
     unknown = np.full((len(sequence), 4, 4), np.nan)
-    truth, drives = sequence.ground_truth, saved.about.get("drives") or [{}]
+    truth, drives = sequence.ground_truth, drives_of(saved) or [{}]
     if truth is None:
         return unknown, "the recording has no ground truth"
     if isinstance(config.dataset, RenderedLabSettings):
@@ -308,15 +309,13 @@ def truth_in_map(
     return unknown, f"truth aligned to the map's trajectory, SE3 over {matched} poses"
 
 
-def _drive_config(drive: object) -> ExperimentConfig | None:
+def _drive_config(drive: Mapping[str, Any]) -> ExperimentConfig | None:
     """What a map's drive was opened with; None where this fgslam cannot tell."""
-    if not isinstance(drive, dict) or not isinstance(drive.get("settings"), dict):
-        return None
-    try:
-        values = {"name": "map", **drive["settings"]}
-        return parse(ExperimentConfig, values, "map")
-    except FgslamError:
-        return None
+    settings = drive.get("settings")
+    with suppress(FgslamError):
+        if isinstance(settings, dict):
+            return parse(ExperimentConfig, {"name": "map", **settings}, "map")
+    return None
 
 
 def _of_rendered(
