@@ -368,23 +368,6 @@ def _text(cell: Cell) -> str:
     return f"{cell:.10g}" if isinstance(cell, float) else str(cell)
 
 
-@dataclass(frozen=True, slots=True)
-class StageTime:
-    """How long one stage took for one frame.
-
-    Attributes:
-        frame: the recording's frame number.
-        timestamp: seconds.
-        stage: name of the stage (`sift`, `match`, ...).
-        milliseconds: wall-clock time.
-    """
-
-    frame: int
-    timestamp: float
-    stage: str
-    milliseconds: float
-
-
 def write_metrics(
     path: Path,
     frames: int,
@@ -425,14 +408,11 @@ def read_metrics(path: Path) -> dict[str, Any]:
     raise DatasetError(f"{path} holds no metrics; give the metrics.json of a run folder")
 
 
-def write_timing(path: Path, times: Sequence[StageTime]) -> None:
-    """Write timing.csv: frame, timestamp (s), stage, milliseconds. Raises OutputError."""
+def write_timing(path: Path, times: Iterable[tuple[int, float, str, float]]) -> None:
+    """timing.csv: frame, timestamp (s), stage (`sift`, ...), milliseconds. Raises OutputError."""
     columns = ("frame", "timestamp", "stage", "milliseconds")
-    write_csv(
-        path,
-        columns,
-        [(t.frame, f"{t.timestamp:.9f}", t.stage, f"{t.milliseconds:.4f}") for t in times],
-    )
+    rows = ((frame, f"{stamp:.9f}", stage, f"{ms:.4f}") for frame, stamp, stage, ms in times)
+    write_csv(path, columns, rows)
 
 
 def plain(value: Any) -> Any:

@@ -28,9 +28,8 @@ from fgslam.runs.config import (
     Experiment,
     ExperimentConfig,
     HomingExperiment,
-    is_homing,
-    load_config,
-    load_homing,
+    as_task,
+    load_experiment,
     make_experiment,
 )
 from fgslam.runs.engine import (
@@ -300,7 +299,10 @@ def _load_run(run: Path) -> ExperimentConfig | HomingExperiment:
             what = "not a run folder; give it to fgslam run first, or add --trials N"
         raise DatasetError(f"{run}: {what}")
     path = run / RUN_MARKER
-    return load_homing(path) if is_homing(path) else load_config(path)
+    config = load_experiment(path)
+    if isinstance(config, HomingExperiment):
+        return config
+    return as_task(ExperimentConfig, config, str(path))
 
 
 def require_room(folder: Path, run: Path, existing: ExistingFolder) -> None:

@@ -521,16 +521,9 @@ class LocalisationConfig(Experiment):
 
         The front-end looks for no loops and recovers from nothing: a submap is a few frames long.
         """
-        return ExperimentConfig(
-            name=self.name,
-            seed=self.seed,
-            dataset=self.dataset,
-            odometry=self.odometry,
-            frontend=self.frontend,
-            estimator=self.estimator,
-            map=MapSettings(load=self.map.load, made_from=self.map.made_from),
-            output=self.output,
-        )
+        shared = ("name", "seed", "dataset", "odometry", "frontend", "estimator", "output")
+        given = MapSettings(load=self.map.load, made_from=self.map.made_from)
+        return ExperimentConfig(map=given, **{name: getattr(self, name) for name in shared})
 
     def problem(self) -> str:
         """Also a map that is missing or given twice, and data without images."""
@@ -739,20 +732,6 @@ HOMING_TASKS = tuple(
 )
 
 
-__all__ = [
-    "Experiment",
-    "ExperimentConfig",
-    "HomingExperiment",
-    "LocalisationConfig",
-    "as_task",
-    "is_homing",
-    "load_config",
-    "load_experiment",
-    "load_homing",
-    "make_config",
-    "make_experiment",
-]
-
 _Model = TypeVar("_Model", bound=Experiment)
 
 
@@ -795,16 +774,6 @@ def make_config(
     if "task" in values:  # before its keys are refused, which SLAM would not know
         overrides = ()
     return as_task(ExperimentConfig, make_experiment(values, where, overrides), where)
-
-
-def load_homing(path: Path, overrides: Iterable[str] = ()) -> HomingExperiment:
-    """Reads a homing experiment. Raises ConfigError, also where it is of another task."""
-    return as_task(HomingExperiment, load_experiment(path, overrides), str(path))
-
-
-def is_homing(path: Path) -> bool:
-    """Whether a configuration file is of a homing experiment. Raises ConfigError."""
-    return read_mapping(path).get("task") in HOMING_TASKS
 
 
 def _model_of(values: Mapping[str, Any], where: str) -> type[Experiment]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Literal, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeAlias, TypeVar
 
 from fgslam.core.errors import ConfigError, DatasetError, OutputError
 from fgslam.core.threads import one_blas_thread
@@ -36,6 +36,10 @@ from fgslam.runs.folder import (
 )
 from fgslam.runs.units import Done, Progress, Stopped, UnitStore, holds_units
 from fgslam.runs.workers import Argument, Executor, Failed, Pool, Result
+
+if TYPE_CHECKING:
+    from fgslam.core.log import ImageSequence, MeasurementRecording
+    from fgslam.datasets.omni import OmniRecording
 
 _GROUND = ("log", "trials", "first_seed")
 """What a resumed run must find as it was, of its provenance, next to the data set's identity."""
@@ -189,21 +193,9 @@ class Task(Generic[R_co]):
     run: Callable[[Context], R_co]
 
 
-class Identified(Protocol):
-    """A recording of any kind."""
-
-    @property
-    def name(self) -> str:
-        """What users call it."""
-        ...
-
-    @property
-    def identity(self) -> str:
-        """Digest of what it holds."""
-        ...
-
-
-def provenance_of(recording: Identified) -> dict[str, Any]:
+def provenance_of(
+    recording: ImageSequence | OmniRecording | MeasurementRecording,
+) -> dict[str, Any]:
     """What config.yaml states of a recording, by which a changed one is recognised on resuming."""
     return {"dataset": {"name": recording.name, "identity": recording.identity}}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -83,40 +83,47 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         require_output(path, wanted.overwrite, inputs)
     if wanted.images is not None:
         require_output(wanted.images, wanted.overwrite, inputs, folder=True)
+    asked = any((wanted.map, wanted.trajectory, wanted.graph, wanted.images))
+    folder: Path | None = None  # of an estimator
     if run.is_file():
         if wanted.colour or (wanted.graph, wanted.images, wanted.estimator) != (None, None, None):
             raise ConfigError(
                 f"{run}: a saved map has landmarks and a trajectory, no other estimators, graph or "
                 "images; give --map or --trajectory, or a run folder"
             )
-        return _export_map(run, wanted)
-    folder = run / results_folder(run, wanted.estimator)
-    if not any((wanted.map, wanted.trajectory, wanted.graph, wanted.images)):
-        raise ConfigError(
-            "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o or "
-            "--images FOLDER"
-        )
-    if wanted.graph is not None:
-        require_graph_suffix(wanted.graph)  # now, not after seconds of reading
-    remark = read_metrics(run / "metrics.json").get("remark") or ""
-    trajectory, lines = Trajectory.load(folder / "final.tum"), []
-    if wanted.trajectory is not None:
-        is_bag = wanted.trajectory.suffix.lower() == MCAP_SUFFIX
-        covariances = read_covariances(folder / "covariance.csv")[1] if is_bag else None
-        lines.append(_save(wanted.trajectory, trajectory, covariances, remark))
-    if wanted.graph or wanted.colour or wanted.images or wanted.map:
-        points, log = read_ply(folder / "map.ply"), cache(lambda: MeasurementLog.load(log_of(run)))
+        saved = load_map(run)
+        if not asked:
+            return describe_map(saved, run)
+        remark, trajectory, read = remark_of_map(saved), saved.trajectory, partial(points_of, saved)
+    else:
+        folder = run / results_folder(run, wanted.estimator)
+        if not asked:
+            raise ConfigError(
+                "nothing to export; give --map FILE.ply, --trajectory FILE.tum, --graph FILE.g2o "
+                "or --images FOLDER"
+            )
         if wanted.graph is not None:
-            lines.append(export_graph(wanted.graph, log(), trajectory, points, remark))
-        points = points.select(points.valid) if wanted.valid_only else points
-        if wanted.colour or wanted.images:
-            config = load_config(run / RUN_MARKER)
-            points, line = export_images(wanted.images, config, log(), trajectory, points)
-            lines += [line] if line else []
-        if wanted.map is not None:
-            write_map(wanted.map, points, remark)
-            lines.append(f"{wanted.map}: {len(points)} landmarks")
-    return [*([f"note: {remark}"] if remark else []), *lines]
+            require_graph_suffix(wanted.graph)  # now, not after seconds of reading
+        remark = read_metrics(run / "metrics.json").get("remark") or ""
+        trajectory = Trajectory.load(folder / "final.tum")
+        read = partial(read_ply, folder / "map.ply")
+    lines = [f"note: {remark}"] if remark else []
+    if wanted.trajectory is not None:
+        lines.append(_save(wanted.trajectory, trajectory, folder, remark))
+    if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
+        return lines
+    points, log = read(), cache(lambda: MeasurementLog.load(log_of(run)))
+    if wanted.graph is not None:
+        lines.append(export_graph(wanted.graph, log(), trajectory, points, remark))
+    points = points.select(points.valid) if wanted.valid_only else points
+    if wanted.colour or wanted.images:
+        config = load_config(run / RUN_MARKER)
+        points, line = export_images(wanted.images, config, log(), trajectory, points)
+        lines += [line] if line else []
+    if wanted.map is not None:
+        write_map(wanted.map, points, remark)
+        lines.append(f"{wanted.map}: {len(points)} landmarks")
+    return lines
 
 
 def sources_of(run: Path) -> tuple[Path, ...]:
@@ -126,9 +133,11 @@ def sources_of(run: Path) -> tuple[Path, ...]:
     return (run, *load_experiment(run / RUN_MARKER).inputs)
 
 
-def _save(path: Path, trajectory: Trajectory, covariances: FloatArray | None, remark: str) -> str:
+def _save(path: Path, trajectory: Trajectory, folder: Path | None, remark: str) -> str:
+    """Writes a trajectory; of an estimator, with its folder, .mcap has covariances."""
     if path.suffix.lower() == MCAP_SUFFIX:
-        write_mcap(path, trajectory, covariances)
+        known = None if folder is None else read_covariances(folder / "covariance.csv")[1]
+        write_mcap(path, trajectory, known)
     else:
         trajectory.save(path, remark)
     return f"{path}: {len(trajectory)} poses"
@@ -172,23 +181,6 @@ def results_folder(run: Path, wanted: str | None) -> str:
             f"{run}: no estimator {chosen!r}; give --estimator with one of {', '.join(found)}"
         )
     return chosen
-
-
-def _export_map(path: Path, wanted: Wanted) -> list[str]:
-    """Writes what was asked for of a saved map, or describes it; a line about each."""
-    saved = load_map(path)
-    if wanted.map is None and wanted.trajectory is None:
-        return describe_map(saved, path)
-    remark = remark_of_map(saved)
-    lines = [f"note: {remark}"] if remark else []
-    if wanted.map is not None:
-        points = points_of(saved)
-        points = points.select(points.valid) if wanted.valid_only else points
-        write_map(wanted.map, points, remark)
-        lines.append(f"{wanted.map}: {len(points)} landmarks")
-    if wanted.trajectory is not None:
-        lines.append(_save(wanted.trajectory, saved.trajectory, None, remark))
-    return lines
 
 
 def describe_map(saved: SavedMap, path: Path) -> list[str]:

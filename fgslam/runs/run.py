@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fgslam.core.errors import ConfigError
 from fgslam.core.files import require_output
-from fgslam.runs.config import (
-    DrivingConfig,
-    Experiment,
-    ExperimentConfig,
-    FollowConfig,
-    HomingPairsConfig,
-    HomingTrialsConfig,
-    JoinConfig,
-    LocalisationConfig,
-    OmniVideoConfig,
-    TeachConfig,
-    TopologicalMapConfig,
-)
+from fgslam.runs.config import Experiment, ExperimentConfig
 from fgslam.runs.engine import Opener, RunResult, run_task
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.units import Progress, Stopped
@@ -44,7 +31,7 @@ def require_outputs(
         config: the experiment, whose inputs are never replaced.
         folder: the run folder; what is in there is its own affair.
         existing: other files are replaced, unless it is `refuse`.
-        others: files that are written beside those of the configuration.
+        others: files that are written next to those of the configuration.
         source: the experiment's file or the recording.
 
     Raises:
@@ -80,20 +67,20 @@ def run_experiment(
     return run_task(opener_of(config, watch), config, folder, existing, progress, stopped)
 
 
-_TASKS: Mapping[type[Experiment], Callable[[], Opener[RunResult]]] = {
-    LocalisationConfig: lambda: import_module("fgslam.runs.tasks.localisation").open_localisation,
-    HomingPairsConfig: lambda: import_module("fgslam.runs.tasks.homing_views").open_pairs,
-    TopologicalMapConfig: lambda: (
-        import_module("fgslam.runs.tasks.homing_views").open_topological_map
-    ),
-    OmniVideoConfig: lambda: import_module("fgslam.runs.tasks.homing_drives").open_video,
-    TeachConfig: lambda: import_module("fgslam.runs.tasks.routes").open_teaching,
-    FollowConfig: lambda: import_module("fgslam.runs.tasks.routes").open_following,
-    JoinConfig: lambda: import_module("fgslam.runs.tasks.routes").open_joining,
-    HomingTrialsConfig: lambda: import_module("fgslam.runs.tasks.homing_replay").open_trials,
-    DrivingConfig: lambda: import_module("fgslam.runs.tasks.homing_drives").open_drives,
+_OPENERS = {
+    "localisation": "localisation.open_localisation",
+    "homing_pairs": "homing_views.open_pairs",
+    "topological_map": "homing_views.open_topological_map",
+    "omni_video": "homing_drives.open_video",
+    "teach": "routes.open_teaching",
+    "follow": "routes.open_following",
+    "join": "routes.open_joining",
+    "homing_trials": "homing_replay.open_trials",
+    "homing": "homing_drives.open_drives",
+    "path_following": "homing_drives.open_drives",
+    "crossroads": "homing_drives.open_drives",
 }
-"""What gives the opener of each kind of configuration; a task is imported when it is run."""
+"""Module and function that open each task; it is imported when it is run."""
 
 
 def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResult]:
@@ -106,7 +93,5 @@ def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResul
         from fgslam.runs.tasks.slam import open_slam
 
         return partial(open_slam, watch=watch)
-    for kind, opener in _TASKS.items():
-        if isinstance(config, kind):
-            return opener()
-    raise ConfigError(f"task {config.task_name}: cannot be run")
+    module, name = _OPENERS[config.task_name or ""].split(".")
+    return getattr(import_module(f"fgslam.runs.tasks.{module}"), name)  # type: ignore[no-any-return]

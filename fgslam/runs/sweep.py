@@ -428,8 +428,8 @@ def _leaves(values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, 
 # Finished cases: the journal, and the table of all
 
 
-class Journal:
-    """Results by key, a line of JSON each, appended as they come; memory holds their places.
+class Journal(dict[str, CaseResult]):
+    """Results by key, a line of JSON each, appended as they come.
 
     A line that was cut off, because the process was killed or the disk was full, is dropped when
     the file is opened again: that case is done again, nothing else.
@@ -437,28 +437,24 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         """Opens or begins it. Raises OutputError where it cannot be written."""
-        self._path, self._places = path, dict[str, int]()
+        super().__init__()
+        self._path = path
         with clear_output_errors(path):
             self._file: BinaryIO = path.open("a+b")
             self._file.seek(0)
-            at = 0
-            while line := self._file.readline():
-                if not line.endswith(b"\n"):
-                    self._file.truncate(at)
-                    break
+            whole = 0
+            while (line := self._file.readline()).endswith(b"\n"):
+                whole += len(line)
                 with suppress(ValueError, TypeError):  # a line of something else is passed over
-                    key, _, _ = json.loads(line)
-                    self._places[str(key)] = at
-                at += len(line)
+                    key, seconds, rows = json.loads(line)
+                    self[str(key)] = CaseResult(seconds, tuple(Row(*row) for row in rows))
+            self._file.truncate(whole)
 
     def __enter__(self) -> Journal:
         return self
 
     def __exit__(self, *error: object) -> None:
         self._file.close()
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._places
 
     def add(self, key: str, result: CaseResult) -> None:
         """Keeps a result. Raises OutputError."""
@@ -471,13 +467,7 @@ class Journal:
             except OSError:
                 self._file.truncate(at)
                 raise
-        self._places[key] = at
-
-    def result(self, key: str) -> CaseResult:
-        """What was kept."""
-        self._file.seek(self._places[key])
-        _, seconds, rows = json.loads(self._file.readline())
-        return CaseResult(seconds, tuple(Row(*row) for row in rows))
+        self[key] = result
 
 
 CASE, EXPERIMENT, ESTIMATOR, FAILURE = "case", "experiment", "estimator", "failure"
@@ -897,7 +887,7 @@ def _write_table(
     numbers, times = make_table(
         plan,
         (
-            (number, journal.result(key) if key in journal else reasons[key])
+            (number, journal[key] if key in journal else reasons[key])
             for number, key in enumerate(keys)
             if key in journal or key in reasons
         ),

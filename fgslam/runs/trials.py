@@ -253,18 +253,9 @@ def write_trials(
 # --------------------------------------------------------------------------------------------
 # What all trials show: means, pooled consistency, paired tests
 
-_AVERAGED = (
-    "ate_rmse_m",
-    "rpe_trans_m",
-    "rpe_rot_deg",
-    "drift_percent",
-    "end_error_m",
-    "end_error_deg",
-    "landmark_rmse_m",
-    "landmark_median_m",
-    "nis_per_dof",
-)
 _AVERAGED_ONLINE = ("ate_rmse_m", "rpe_trans_m", "rpe_rot_deg", "end_error_m", "end_error_deg")
+_OF_CONTRACT = (*_AVERAGED_ONLINE[:3], "drift_percent", *_AVERAGED_ONLINE[3:])
+_AVERAGED = (*_OF_CONTRACT, "landmark_rmse_m", "landmark_median_m", "nis_per_dof")
 _SIGNIFICANT = 0.05
 
 
@@ -291,15 +282,10 @@ def pool_trials(trials: Sequence[Trial], title: str, kind: str) -> EstimatorMetr
         return {name: None if mean is None else asdict(mean) for name, mean in means.items()}
 
     final, online = intervals(_AVERAGED), intervals(_AVERAGED_ONLINE, "online.")
-    mean = {name: None if one is None else one["mean"] for name, one in final.items()}
+    mean: dict[str, Any] = {k: None if one is None else one["mean"] for k, one in final.items()}
     pose, landmark = pooled["pose"], pooled["landmark"]
     return EstimatorMetrics(
-        ate_rmse_m=mean["ate_rmse_m"],
-        rpe_trans_m=mean["rpe_trans_m"],
-        rpe_rot_deg=mean["rpe_rot_deg"],
-        drift_percent=mean["drift_percent"],
-        end_error_m=mean["end_error_m"],
-        end_error_deg=mean["end_error_deg"],
+        **dict[str, Any]((name, mean[name]) for name in _OF_CONTRACT),
         nees_pose_per_dof=None if pose is None else pose.per_dof,
         nees_landmark_per_dof=None if landmark is None else landmark.per_dof,
         more={

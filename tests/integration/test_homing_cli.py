@@ -14,7 +14,7 @@ from running import main, mistake, units_in_this_process, write_config
 
 from fgslam.core.bearings import BearingLog
 from fgslam.core.errors import DatasetError
-from fgslam.runs.config import load_homing, make_experiment
+from fgslam.runs.config import load_experiment, make_experiment
 from fgslam.runs.folder import RUN_MARKER
 from fgslam.runs.report import report_from_folder
 from fgslam.runs.run import run_experiment
@@ -59,7 +59,7 @@ def test_trials_leave_a_whole_folder(trials: Path) -> None:
         "trials_timing.csv",
         "logs/outliers_00_trial_0000.npz",
     }
-    config = load_homing(trials / RUN_MARKER)
+    config = load_experiment(trials / RUN_MARKER)
     assert config.provenance is not None
     assert "gtsam" in config.provenance["versions"]
     rows = list(csv.DictReader((trials / "trials.csv").read_text(encoding="utf-8").splitlines()))
@@ -88,7 +88,7 @@ def test_the_log_has_the_truth_and_all_images(trials: Path) -> None:
 def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not(
     trials: Path, tmp_path: Path
 ) -> None:
-    config = load_homing(trials / RUN_MARKER, ["trials=1"])
+    config = load_experiment(trials / RUN_MARKER, ["trials=1"])
     again = tmp_path / "again"
     run_experiment(config, again)
     first = (trials / "trials.csv").read_text(encoding="utf-8").splitlines()
@@ -106,7 +106,7 @@ def test_logs_are_compared(
     arguments = ("compare", trials, "--estimators", "paper_ekf", "--set", override, "--out", out)
     assert main(monkeypatch, *arguments) == 0
     assert "paper_ekf" in capfd.readouterr().out
-    (compared,) = load_homing(out / RUN_MARKER).estimators
+    (compared,) = load_experiment(out / RUN_MARKER).estimators
     assert (compared.title, compared.gate_sigmas) == ("paper_ekf", 2.5)
     rows = list(csv.DictReader((out / "estimates.csv").read_text(encoding="utf-8").splitlines()))
     log = BearingLog.load(trials / "logs" / "outliers_00_trial_0000.npz")
@@ -142,7 +142,7 @@ def test_trials_repeat_simulated_homings_with_other_noise(
     assert main(monkeypatch, "compare", trials, *arguments) == 0
     numbers = values_of(out)
     assert (numbers["trials"], list(numbers["estimators"])) == (3, ["homing_ekf", "alv"])
-    assert load_homing(out / RUN_MARKER).seed == 7
+    assert load_experiment(out / RUN_MARKER).seed == 7
 
 
 def test_other_commands_say_that_it_is_homing(

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fgslam.runs.config import load_homing
+from fgslam.runs.config import load_experiment
 from fgslam.runs.run import run_experiment
 
 pytestmark = pytest.mark.slow
@@ -16,7 +16,7 @@ EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 
 def metrics_of(name: str, out: Path, *overrides: str) -> dict[str, Any]:
-    config = load_homing(EXPERIMENTS / f"{name}.yaml", (*overrides, "output.pictures=0"))
+    config = load_experiment(EXPERIMENTS / f"{name}.yaml", (*overrides, "output.pictures=0"))
     run_experiment(config, out, "refuse", lambda what, done, total: None, lambda: False)
     values = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
     assert isinstance(values, dict)

@@ -15,7 +15,7 @@ from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
 from fgslam.evaluation.judging import predicted_poses
 from fgslam.evaluation.statistics import JsonValue
-from fgslam.report.content import StageTime, write_timing
+from fgslam.report.content import write_timing
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
@@ -50,8 +50,15 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
     folder = context.folder
     write_log_and_truth(folder, recording)
     metrics = replay_apart(config, folder, config.estimators, context)
-    rows = _live_rows(folder, config)
-    _write_times(folder, recording, rows)
+    # Frame by frame, what the estimator of `estimator.kind` did; nothing where it gave none.
+    path = folder / config.estimator.title / FRAMES_FILE
+    rows = read_frames(path) if path.is_file() else []
+    times = (
+        (increment.index, increment.timestamp, stage, milliseconds)
+        for increment, row in zip(recording.log.increments, rows, strict=False)
+        for stage, milliseconds in (("track", row.solve_ms), ("update", row.update_ms))
+    )
+    write_timing(folder / "timing.csv", times)
     if config.output.pictures and rows:
         draw_run(folder, _figures(folder, config, recording, rows))
     about = _about(config, recording, rows)
@@ -66,22 +73,6 @@ def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:
     if recording.landmark_truth is not None:
         exact = np.zeros(len(recording.landmark_truth))
         write_landmark_truth(folder / LANDMARK_TRUTH_FILE, recording.landmark_truth, exact)
-
-
-def _live_rows(folder: Path, config: ExperimentConfig) -> list[ReplayRow]:
-    """Frame by frame, what the estimator of `estimator.kind` did; nothing where it gave none."""
-    path = folder / config.estimator.title / FRAMES_FILE
-    return read_frames(path) if path.is_file() else []
-
-
-def _write_times(folder: Path, recording: MeasurementRecording, rows: list[ReplayRow]) -> None:
-    increments = recording.log.increments[: len(rows)]
-    times = [
-        StageTime(increment.index, increment.timestamp, stage, milliseconds)
-        for increment, row in zip(increments, rows, strict=True)
-        for stage, milliseconds in (("track", row.solve_ms), ("update", row.update_ms))
-    ]
-    write_timing(folder / "timing.csv", times)
 
 
 def _about(

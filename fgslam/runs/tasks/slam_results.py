@@ -37,7 +37,6 @@ from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.tracking.landmarks import LandmarkDatabase
 from fgslam.report.content import (
     Column,
-    StageTime,
     TextTable,
     sentence,
     write_csv,
@@ -542,7 +541,15 @@ class RunOutputs:
         more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | closure_counts(taken)
         metrics = dataclasses.replace(metrics, more=more)
         self.write_metrics({self.title: metrics}, status)
-        self._write_timing(estimate.trajectory)
+        stamps, numbers = estimate.trajectory.timestamps, self.recorder.log.numbers
+        frames = zip(numbers.tolist(), stamps.tolist(), self.recorder.stage_ms, strict=True)
+        times = (
+            (frame, stamp, stage, milliseconds)
+            for frame, stamp, row in frames
+            for stage, milliseconds in zip(STAGES, row.tolist(), strict=True)
+            if not math.isnan(milliseconds)  # of a session before
+        )
+        write_timing(self.folder / "timing.csv", times)
         if self.pipeline.calibration is not None:
             rectifier = getattr(self.sequence, "rectifier", None)  # recordings of files have one
             write_calibration(self.folder, self.pipeline.calibration, rectifier)
@@ -584,17 +591,6 @@ class RunOutputs:
         points = map_points(estimate.landmarks, self.pipeline.tracker.database)
         write_estimate(folder, online, estimate, points, self.remark)
         write_noise(folder / NOISE_TABLE, online.timestamps, self.recorder.noise)
-
-    def _write_timing(self, trajectory: Trajectory) -> None:
-        stamps = trajectory.timestamps.tolist()
-        rows = zip(self.recorder.log.numbers.tolist(), stamps, self.recorder.stage_ms, strict=True)
-        times = [
-            StageTime(frame, timestamp, stage, milliseconds)
-            for frame, timestamp, row in rows
-            for stage, milliseconds in zip(STAGES, row.tolist(), strict=True)
-            if not math.isnan(milliseconds)  # of a session before
-        ]
-        write_timing(self.folder / "timing.csv", times)
 
     def remarks(self) -> tuple[str, ...]:
         """Notes on the recording, its cameras and its first images."""

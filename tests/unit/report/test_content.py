@@ -14,7 +14,6 @@ from fgslam.evaluation.statistics import EstimatorMetrics, UpdateTime
 from fgslam.report.content import (
     SIGMAS,
     Column,
-    StageTime,
     TextTable,
     exaggeration,
     level_axes,
@@ -201,7 +200,7 @@ def test_broken_metrics_files(tmp_path: Path, text: str | None, why: str) -> Non
 
 
 def test_timing_is_plain_csv(tmp_path: Path) -> None:
-    times = [StageTime(0, 0.5, "sift", 12.34567), StageTime(0, 0.5, "match", 1.0)]
+    times = [(0, 0.5, "sift", 12.34567), (0, 0.5, "match", 1.0)]
     write_timing(tmp_path / "timing.csv", times)
     with (tmp_path / "timing.csv").open(newline="") as file:
         first, second = csv.DictReader(file)

@@ -14,11 +14,11 @@ from fgslam.runs.config import (
     TASKS,
     Experiment,
     ExperimentConfig,
+    HomingExperiment,
     HomingTrialsConfig,
-    is_homing,
+    as_task,
     load_config,
     load_experiment,
-    load_homing,
     make_config,
     make_experiment,
 )
@@ -396,8 +396,6 @@ def test_maps_that_contradict_themselves(maps: dict[str, Any], expected: str) ->
 def test_configuration_class_follows_from_the_task(tmp_path: Path) -> None:
     assert isinstance(load_experiment(written(tmp_path, TRIALS)), HomingTrialsConfig)
     assert isinstance(load_experiment(written(tmp_path, LAB)), ExperimentConfig)
-    assert is_homing(written(tmp_path, TRIALS))
-    assert not is_homing(written(tmp_path, LAB))
 
 
 @pytest.mark.parametrize(
@@ -428,4 +426,4 @@ def test_slam_s_own_commands_refuse_homing_and_the_other_way_round(tmp_path: Pat
     with pytest.raises(ConfigError, match="task homing_trials is a homing experiment"):
         load_config(written(tmp_path, TRIALS))
     with pytest.raises(ConfigError, match="has no task"):
-        load_homing(written(tmp_path, LAB))
+        as_task(HomingExperiment, load_experiment(written(tmp_path, LAB)), "test")
