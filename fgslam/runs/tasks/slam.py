@@ -57,8 +57,7 @@ from fgslam.runs.tasks.slam_map_entry import (
 from fgslam.runs.tasks.slam_results import (
     RunOutputs,
     draw_frame,
-    draw_run,
-    figures_of,
+    draw_live,
     frames_to_show,
     run_notes,
     stereo_precision,
@@ -223,7 +222,7 @@ def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
     config, folder = outputs.config, outputs.folder
     live = outputs.write_results("finished")
     about_map = _leave_map(outputs)
-    pictures = tuple(draw_run(folder, figures_of(outputs))) if config.output.pictures else ()
+    pictures = tuple(draw_live(outputs)) if config.output.pictures else ()
     compared = _compare(outputs, live, context)
     if config.output.report:
         report_from_folder(folder)

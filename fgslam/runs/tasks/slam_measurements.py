@@ -23,7 +23,7 @@ from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.report import spread
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
 from fgslam.runs.tables import FRAMES_FILE, read_frames
-from fgslam.runs.tasks.slam_results import RunFigures, draw_run
+from fgslam.runs.tasks.slam_results import draw_run
 from fgslam.slam.replay import ReplayRow
 
 
@@ -60,7 +60,7 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
     )
     write_timing(folder / "timing.csv", times)
     if config.output.pictures and rows:
-        draw_run(folder, _figures(folder, config, recording, rows))
+        _draw(folder, config, recording, rows)
     about = _about(config, recording, rows)
     return write_comparison(context, config, len(recording.log), metrics, about, folder)
 
@@ -88,28 +88,23 @@ def _about(
     }
 
 
-def _figures(
-    folder: Path,
-    config: ExperimentConfig,
-    recording: MeasurementRecording,
-    rows: list[ReplayRow],
-) -> RunFigures:
-    """From the files of the first estimator."""
+def _draw(
+    folder: Path, config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow]
+) -> None:
+    """Pictures from the files of the first estimator."""
     own = folder / config.estimator.title
     points = read_ply(own / "map.ply")
     landmarks = LandmarkMap(points.ids, points.positions, points.covariances)
     covariances = read_covariances(own / "covariance.csv")[1]
+    frames = np.array([i.index for i in recording.log.increments[: len(rows)]], np.int64)
     counts = np.array([(r.matched, r.inliers, r.landmarks) for r in rows], np.int64).T
-    return RunFigures(
-        name=config.name,
-        synthetic=False,
-        estimate=Estimate(Trajectory.load(own / "final.tum"), covariances, landmarks),
-        truth=recording.ground_truth,
-        valid=points.valid,
-        frames=np.array([i.index for i in recording.log.increments[: len(rows)]], np.int64),
-        predicted=predicted_poses((row.status for row in rows), config.estimator.kind),
-        matched=counts[0],
-        inliers=counts[1],
-        landmarks=counts[2],
-        up=vertical_of(recording.log.rig.bTc),
+    draw_run(
+        folder,
+        config,
+        Estimate(Trajectory.load(own / "final.tum"), covariances, landmarks),
+        recording.ground_truth,
+        points.valid,
+        predicted_poses((row.status for row in rows), config.estimator.kind),
+        vertical_of(recording.log.rig.bTc),
+        (frames, *counts),
     )

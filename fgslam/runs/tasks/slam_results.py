@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -557,7 +557,17 @@ class RunOutputs:
 
     def write_metrics(self, estimators: Mapping[str, EstimatorMetrics], status: str) -> None:
         """metrics.json of the live estimator and of those that replayed its log."""
-        about = self._about(status) | run_numbers(self.recorder)
+        about: dict[str, JsonValue] = {
+            "name": self.config.name,
+            "status": status,
+            "frames_in_recording": self.frames,
+            "odometry": self.config.odometry.kind,
+            "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
+            "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
+            "remark": self.remark or None,
+            "notes": list(self.remarks()),
+            **run_numbers(self.recorder),
+        }
         # Place recognition is asked for, or it joined parts of the map.
         taken = () if self.pipeline.places is None else self.pipeline.places.taken
         if self.config.frontend.loops or self.config.frontend.lost or taken:
@@ -602,18 +612,6 @@ class RunOutputs:
             *(() if share.enough else (few,)),
             *map(sentence, session_remarks(self.pipeline, self.recorder)),
         )
-
-    def _about(self, status: str) -> dict[str, JsonValue]:
-        return {
-            "name": self.config.name,
-            "status": status,
-            "frames_in_recording": self.frames,
-            "odometry": self.config.odometry.kind,
-            "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
-            "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
-            "remark": self.remark or None,
-            "notes": list(self.remarks()),
-        }
 
 
 _PROBLEMS_SHOWN = 5
@@ -712,7 +710,9 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
 
     folder = make_subfolder(outputs.folder, PICTURES)
     images = report.found.frame.images
-    title = _title(outputs, f"frame {report.increment.index}")
+    predicted = predicted_poses(outputs.recorder.column("status").tolist())  # so far
+    what = f"{outputs.config.name}: frame {report.increment.index}"
+    title = picture_title(what, int(predicted.sum()), bool(outputs.remark))
     if report.found.features:
         draw_features(folder / f"features_{i:06d}.png", images, report.found.features, title)
     draw_disparities(folder / f"disparities_{i:06d}.png", images[0], report.stereo.pixels, title)
@@ -721,94 +721,71 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
         draw_flow(folder / f"flow_{i:06d}.png", images[0], before, after, title)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RunFigures:
-    """What the pictures of a whole run are drawn from.
-
-    Attributes:
-        name: of the run, for titles.
-        synthetic: whether its odometry was made from ground truth, which every title says.
-        estimate: of the estimator drawn.
-        truth: true poses, or None.
-        valid: (n,) which landmarks of the estimate were seen often enough (Se et al. 6.1).
-        frames: (m,) the recording's numbers of the frames.
-        predicted: (m,) poses that no landmark measured, which every title counts.
-        matched, inliers, landmarks: (m,) counts of each frame.
-        up: (3,) the vertical in the first camera's frame.
-    """
-
-    name: str
-    synthetic: bool
-    estimate: Estimate
-    truth: Trajectory | None
-    valid: BoolArray
-    frames: IntArray
-    predicted: BoolArray
-    matched: IntArray
-    inliers: IntArray
-    landmarks: IntArray
-    up: FloatArray
-
-    def title(self, what: str) -> str:
-        """Title of one picture."""
-        return picture_title(f"{self.name}: {what}", int(self.predicted.sum()), self.synthetic)
-
-
-def figures_of(outputs: RunOutputs) -> RunFigures:
-    """A live run's figures."""
+def draw_live(outputs: RunOutputs) -> list[Path]:
+    """The pictures of a live run."""
     # Once for all pictures: a smoother's estimate may take long.
     estimate = outputs.pipeline.estimate()
     database, recorder = outputs.pipeline.tracker.database, outputs.recorder
-    return RunFigures(
-        name=outputs.config.name,
-        synthetic=bool(outputs.remark),
-        estimate=estimate,
-        truth=outputs.sequence.ground_truth,
-        valid=database.valid[database.rows(estimate.landmarks.ids)],
-        frames=recorder.log.numbers,
-        predicted=predicted_poses(recorder.column("status").tolist()),
-        matched=recorder.column("matched"),
-        inliers=recorder.column("inliers"),
-        landmarks=recorder.column("landmarks"),
-        up=vertical_of(outputs.sequence.rig.bTc),
+    columns = (recorder.column(name) for name in ("matched", "inliers", "landmarks"))
+    return draw_run(
+        outputs.folder,
+        outputs.config,
+        estimate,
+        outputs.sequence.ground_truth,
+        database.valid[database.rows(estimate.landmarks.ids)],
+        predicted_poses(recorder.column("status").tolist()),
+        vertical_of(outputs.sequence.rig.bTc),
+        (recorder.log.numbers, *columns),
     )
 
 
-def draw_run(run: Path, figures: RunFigures) -> list[Path]:
-    """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time."""
+def draw_run(
+    run: Path,
+    config: ExperimentConfig,
+    estimate: Estimate,
+    truth: Trajectory | None,
+    valid: BoolArray,
+    predicted: BoolArray,
+    up: FloatArray,
+    counts: Sequence[IntArray],
+) -> list[Path]:
+    """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time.
+
+    Args:
+        run: the folder.
+        config: its name stands in the titles, which also say where odometry is synthetic.
+        estimate: of the estimator drawn.
+        truth: true poses, or None.
+        valid: (n,) which landmarks of the estimate were seen often enough (Se et al. 6.1).
+        predicted: (m,) poses that no landmark measured, which every title counts.
+        up: (3,) the vertical in the first camera's frame.
+        counts: (m,) each: the recording's numbers of the frames; landmarks matched, used and held.
+    """
     from fgslam.report import figures as drawn  # Plotly and Matplotlib take a second
     from fgslam.report.pictures import draw_figure, draw_views
 
+    def title(what: str) -> str:
+        words = f"{config.name}: {what}"
+        return picture_title(words, int(predicted.sum()), bool(config.remark))
+
     folder = make_subfolder(run, PICTURES)
     # Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short.
-    estimate, valid = figures.estimate, figures.valid
     if valid.any():
         estimate = replace(estimate, landmarks=estimate.landmarks.select(valid))
-    report = judged_report("estimate", "", estimate, None, figures.truth)
-    if len(figures.predicted):
-        report = replace(report, predicted=figures.predicted)
-    truth = truth_in_their_world((report,), figures.truth)
-    results = ReportData(
-        title=figures.name, subtitle="", estimators=(report,), truth=truth, up=figures.up
-    )
+    report = judged_report("estimate", "", estimate, None, truth)
+    if len(predicted):
+        report = replace(report, predicted=predicted)
+    truth = truth_in_their_world((report,), truth)
+    results = ReportData(title=config.name, subtitle="", estimators=(report,), truth=truth, up=up)
     kind = "valid landmarks" if valid.any() else "landmarks"
-    what = figures.title(f"{len(report.landmarks):,} {kind}")
+    what = title(f"{len(report.landmarks):,} {kind}")
     above = drawn.drive_from_above(results, drawn.ON_PAPER)
     draw_figure(folder / "map_from_above.png", above, what, {drawn.LANDMARK_ELLIPSES})
     draw_views(folder / "map_views.png", drawn.map_to_turn(results, drawn.ON_PAPER), what)
     # The first frame has no landmarks to match.
-    counts = (figures.frames, figures.matched, figures.inliers, figures.landmarks)
     matches = drawn.matches_over_time(*(values[1:] for values in counts))
-    draw_figure(folder / "matches.png", matches, figures.title("landmark matches"))
+    draw_figure(folder / "matches.png", matches, title("landmark matches"))
     if truth is not None:
-        title = figures.title("position error, first pose aligned")
-        draw_figure(folder / "position_error.png", drawn.error_by_axis(results), title)
+        what = title("position error, first pose aligned")
+        draw_figure(folder / "position_error.png", drawn.error_by_axis(results), what)
     return sorted(folder.glob("*.png"))
-
-
-def _title(outputs: RunOutputs, what: str) -> str:
-    """Title of a frame's picture, with the poses predicted so far."""
-    predicted = predicted_poses(outputs.recorder.column("status").tolist())
-    return picture_title(
-        f"{outputs.config.name}: {what}", int(predicted.sum()), bool(outputs.remark)
-    )

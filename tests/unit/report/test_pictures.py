@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -34,7 +33,7 @@ from fgslam.report.pictures import (
     oriented_squares,
 )
 from fgslam.report.results import ReportData, judged_report
-from fgslam.runs.tasks.slam_results import RunFigures
+from fgslam.runs.tables import picture_title
 
 YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 
@@ -204,17 +203,9 @@ def test_only_images_with_features_are_drawn(tmp_path: Path) -> None:
 
 
 def test_poses_that_no_landmark_measured_are_counted_in_every_title() -> None:
-    data = results(40, 6, full=True)
-    predicted = np.array([False, False, True, True, False, False])
-    report = data.estimators[0]
-    counts = np.arange(6)
-    figures = RunFigures(
-        "drive", True, Estimate(report.final, report.covariances, report.landmarks), None,
-        np.ones(40, np.bool_), counts, predicted, counts, counts, counts, data.up,
-    )  # fmt: skip
-    assert figures.title("matches") == "drive: matches, 2 poses predicted, synthetic odometry"
-    whole = replace(figures, predicted=np.zeros(6, np.bool_), synthetic=False)
-    assert whole.title("matches") == "drive: matches"
+    title = picture_title("drive: matches", 2, synthetic=True)
+    assert title == "drive: matches, 2 poses predicted, synthetic odometry"
+    assert picture_title("drive: matches", 0, synthetic=False) == "drive: matches"
 
 
 @pytest.mark.usefixtures("coarse")
