@@ -22,6 +22,7 @@ CLEAN = (
     "fgslam/factors",
     "fgslam/frontend",
     "fgslam/homing",
+    "fgslam/runs",
     "fgslam/worlds",
     "README.md",
 )
@@ -48,6 +49,7 @@ WORDS = {
 MEANT = {
     # A bend of the way; the option `looks` of `PathFollower`; reasons in commands.csv.
     "fgslam/homing": r"\b(bends?|looks|matched anew)\b",
+    "fgslam/runs": r"\blooks\b",  # where a camera looks; the option of `PathFollower`
     "fgslam/worlds": r"\bbooks\b",  # in a shelf
 }
 """What a room means literally."""

@@ -47,13 +47,13 @@ class Bare:
     Attributes:
         values: the short configuration.
         config: the same, checked, with overrides.
-        said: what the recording is and how it is taken, in one line; then a line for each thing
-            that was tolerated.
+        description: what the recording is and how it is taken, in one line; then a line for each
+            thing that was tolerated.
     """
 
     values: dict[str, Any]
     config: ExperimentConfig
-    said: str
+    description: str
 
 
 def bare_experiment(
@@ -131,7 +131,7 @@ def experiment_of(
     path = find_experiment(given)
     if is_recording(path):
         bare = bare_experiment(path, camera, overrides)
-        return bare.config, bare.said
+        return bare.config, bare.description
     require_no_camera(path, camera)
     if not path.exists():
         raise ConfigError(f"{path}: no such file or folder; {suggestion(path)}")
@@ -152,8 +152,8 @@ def short_config(folder: Path, camera: Path | None = None, overrides: Iterable[s
     bare = bare_experiment(folder, camera, overrides)
     values = deepcopy(bare.values)
     apply_overrides(values, overrides)
-    said = bare.said.replace("\n", "\n# ")
-    return f"# {said}\n{yaml.safe_dump(values, sort_keys=False)}"
+    comment = bare.description.replace("\n", "\n# ")
+    return f"# {comment}\n{yaml.safe_dump(values, sort_keys=False)}"
 
 
 def _name(recording: Path) -> str:

@@ -134,7 +134,7 @@ def calibrate_wide_camera(
         model: of the lens, one of :data:`WIDE_MODELS`.
         mount: of the camera, one of :data:`MOUNTS`.
         out: the camera file, .yaml, for :func:`fgslam.load_camera`, `teach` and `follow`; the
-            calibration that it names is written beside it: of camera.yaml camera_lens.json.
+            calibration that it names is written next to it: of camera.yaml camera_lens.json.
         progress: called with what is done, how far, of how much.
 
     Raises:
@@ -185,8 +185,8 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
         found = find_cameras(folders[0])
         if found is None:
             raise DatasetError(
-                f"{folders[0]}: images of two cameras are not told apart there; name them left and "
-                "right, or give a folder for each"
+                f"{folders[0]}: images of two cameras cannot be distinguished there; name them left "
+                "and right, or give a folder for each"
             )
         pairs, notes = pair_files(found, at_once=False)
         return [(left, right) for right, left in pairs], notes
@@ -341,8 +341,7 @@ def wide_verdict(files: Files, found: BoardCalibration, held: HeldOutAlone | Non
 
 def _verdict(faults: Sequence[str], checked: bool) -> str:
     if faults or not checked:
-        said = "; ".join(faults or ["not checked"])
-        return f"verdict     doubtful: {said}; {_MORE_IMAGES}"
+        return f"verdict     doubtful: {'; '.join(faults or ['not checked'])}; {_MORE_IMAGES}"
     return "verdict     good for mapping"
 
 
@@ -489,7 +488,7 @@ def _whole_numbers(text: str, separator: str, option: str, example: str) -> tupl
 
 
 def convert_calibration(asked: Asked, out: Path, form: str | None = None) -> list[str]:
-    """Writes the calibration in a format, None: the one that the name of ``out`` says; lines.
+    """Writes the calibration in a format, None: that of the name of ``out``; lines.
 
     Raises:
         CalibrationError: it cannot be read, or that format has no such cameras.
@@ -576,7 +575,7 @@ def _draw(found: Calibration, rig: StereoRig | None, path: Path) -> None:
         size, half, outline = camera.size, 0.5, np.empty((0, 2))
         if camera.width:
             half = 0.5 * float(camera.field_of_view()[0])
-        else:  # as large as the principal point says
+        else:  # as large as the principal point makes it
             width, height = np.round(2.0 * camera.matrix[:2, 2]).astype(int).tolist()
             size = max(width, 1), max(height, 1)
         if rig is not None and k in rig.sources and rig.rectifier is not None:

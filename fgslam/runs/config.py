@@ -1,6 +1,6 @@
 """Reads the configuration of an experiment: one YAML file and dotted overrides, strictly.
 
-The key `task` says which model of :mod:`fgslam.runs.config` it is; without it, SLAM's.
+The key `task` states which model of :mod:`fgslam.runs.config` it is; without it, SLAM's.
 Unknown keys are refused with the nearest known one suggested.
 """
 
@@ -53,7 +53,7 @@ from fgslam.slam.settings import FirstDriveSettings, MapSettings
 Model = TypeVar("Model", bound=BaseModel)
 
 _GROUPS_OF_KINDS = ("dataset", "odometry", "estimator")
-"""Groups told apart by `kind`: an override of it drops the file's keys of the kind before."""
+"""Groups distinguished by `kind`: an override of it drops the file's keys of the kind before."""
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -199,7 +199,7 @@ _PLAIN_WORDS = {
     "float_parsing": "give a number",
     "bool_type": "give true or false",
     "bool_parsing": "give true or false",
-    "string_type": "give text, in quotes where it looks like a number",
+    "string_type": "give text, in quotes where it reads as a number",
     "finite_number": "give a finite number",
     "string_unicode": "it has bytes that are no UTF-8; give the file or folder another name (or, "
     "where the locale is at fault: export LC_ALL=C.UTF-8)",
@@ -406,7 +406,7 @@ class Experiment(BaseModel):
         return tuple(path.parent if "*" in path.name else path for path in found)
 
     def resolved(self) -> Experiment:
-        """What the run's own config.yaml says: all that the task settles by itself filled in."""
+        """What the run's own config.yaml states: all that the task settles by itself filled in."""
         return self
 
     def problem(self) -> str:
@@ -519,7 +519,7 @@ class LocalisationConfig(Experiment):
     def as_experiment(self) -> ExperimentConfig:
         """The run that would drive the queries' recording in the map: of its parts some are used.
 
-        The front-end looks for no loops and recovers from nothing: a submap is a few frames long.
+        The front-end seeks no loops and recovers from nothing: a submap is a few frames long.
         """
         shared = ("name", "seed", "dataset", "odometry", "frontend", "estimator", "output")
         given = MapSettings(load=self.map.load, made_from=self.map.made_from)
@@ -560,7 +560,7 @@ class HomingPairsConfig(HomingExperiment):
     features: OmniFeatureSettings = OmniFeatureSettings()
     homing_vector: HomingVectorSettings = HomingVectorSettings()
     reference: bool = Field(
-        default=True, description="plain SIFT and two-point RANSAC beside it, for comparison"
+        default=True, description="plain SIFT and two-point RANSAC next to it, for comparison"
     )
 
 
@@ -601,7 +601,7 @@ class TeachConfig(HomingExperiment):
     poses: str | None = Field(
         default=None,
         description="trajectory of SLAM on the same drive, by the same clock: a TUM file; a "
-        "covariance.csv beside it is taken, too; null: a route without metres",
+        "covariance.csv next to it is taken, too; null: a route without metres",
     )
 
     @property

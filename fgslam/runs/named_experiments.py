@@ -1,7 +1,7 @@
 """The experiments that come with fgslam, found by name.
 
 A wheel carries them in ``fgslam/experiments`` (see ``setup.py``); a checkout, and so an editable
-install, has them beside the package.
+install, has them next to the package.
 """
 
 from __future__ import annotations

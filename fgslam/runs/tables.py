@@ -409,7 +409,7 @@ def write_comparison_csv(
 
 
 # --------------------------------------------------------------------------------------------
-# What is said beside them
+# What stands next to them
 
 
 def comparison_particulars(values: Mapping[str, Any], out: Path) -> tuple[tuple[str, str], ...]:
@@ -486,8 +486,8 @@ SYNTHETIC = "synthetic odometry"
 
 def with_marks(title: str, marks: Iterable[str]) -> str:
     """The title with its marks in brackets; without any, as it is."""
-    said = ", ".join(filter(None, marks))
-    return f"{title} ({said})" if said else title
+    joined = ", ".join(filter(None, marks))
+    return f"{title} ({joined})" if joined else title
 
 
 def predicted_mark(count: int | None) -> str:
@@ -510,7 +510,7 @@ def picture_title(what: str, predicted: int, synthetic: bool) -> str:
 def marked(values: Mapping[str, Any], remark: str = "", say_failed: bool = True) -> dict[str, Any]:
     """The metrics of estimators under titles that say what is not all there.
 
-    That it failed (but for a page, which says so itself), how many of the frames it saw, how many
+    That it failed (but for a page, which states it itself), how many of the frames it saw, how many
     of its poses no landmark measured, and ``remark``, what all of a run's are marked with.
     """
     frames = max((value_at(m, "frames") or 0 for m in values.values()), default=0)

@@ -176,7 +176,7 @@ def test_mistakes_of_calibrate(tmp_path: Path, monkeypatch: Patch, capfd: Captur
     text = ("--out", tmp_path / "rig.txt")
     assert "is written as .json" in reported("stereo", tmp_path, *sizes, *text)
     (tmp_path / "empty").mkdir()
-    assert "not told apart" in reported("stereo", tmp_path / "empty", *sizes)
+    assert "cannot be distinguished" in reported("stereo", tmp_path / "empty", *sizes)
     three = [tmp_path, tmp_path, tmp_path / "empty"]
     assert "different numbers of images" in reported("trinocular", *three, *sizes)
     markers = ("--target", "charuco", "--dictionary", "DICT_9X9")

@@ -360,8 +360,8 @@ def _slope(
 ) -> dict[str, JsonValue]:
     """Growth of values, one array a drive and one value a leg, with the leg's number."""
     legs = np.concatenate([np.empty(0, np.int64), *(np.arange(len(v)) + 1 for v in values)])
-    beside = None if known is None else np.concatenate([np.empty(0), *known])
-    slope = slope_by_leg(legs, np.concatenate([np.empty(0), *values]), beside)
+    explained = None if known is None else np.concatenate([np.empty(0), *known])
+    slope = slope_by_leg(legs, np.concatenate([np.empty(0), *values]), explained)
     return {**asdict(slope), "flat": slope.flat if np.isfinite(slope.value) else None}
 
 

@@ -1,4 +1,4 @@
-"""Writes the run folder from what a run has computed so far, and says it in a table."""
+"""Writes the run folder from what a run has computed so far, and its summary as a table."""
 
 from __future__ import annotations
 
@@ -493,7 +493,7 @@ class RunOutputs:
 
     Attributes:
         first_frame: number in the recording of the sequence's frame 0.
-        notes: what is to be said of the run, besides the recording's own.
+        notes: what is to be reported of the run, besides the recording's own.
         given: the map that it goes on with; None without one.
     """
 
@@ -688,7 +688,7 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
         lines.append(note)
     if not metrics.landmarks:
         lines.append(
-            "there is no landmark in the map; fgslam inspect says what is wrong with the recording"
+            "there is no landmark in the map; fgslam inspect states what the recording's fault is"
         )
     return tuple(lines)
 

@@ -211,7 +211,7 @@ def test_a_camchain_says_which_topics_are_its_cameras(
     file = camchain(tmp_path, {name: topics[name] for name in order})
     found = bare_experiment(path, Path(file))
     named = ", ".join(topics[name] for name in order)
-    assert f"note: topics by rostopic of camchain.yaml: {named}\n" in found.said + "\n"
+    assert f"note: topics by rostopic of camchain.yaml: {named}\n" in found.description + "\n"
     assert codes(opened(path, camera_file=file), 1) == (11, 61)
     chosen = opened(path, camera_file=file, topics=("/a/cam1", "/b/cam0"))
     assert codes(chosen, 1) == (11, 61)
@@ -240,7 +240,7 @@ def test_three_cameras(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", views(images)[:-1])  # the last image of the right one
     file = camchain(tmp_path, TRIO)
     found = bare_experiment(path, Path(file))
-    assert found.said.startswith("a: ROS bag, 3 cameras 32x24; 1 frames")
+    assert found.description.startswith("a: ROS bag, 3 cameras 32x24; 1 frames")
     recording = opened(path, camera_file=file)
     assert codes(recording, 0) == (10, 60, 110)
     assert recording.rig.vertical_baseline == pytest.approx(0.15)
@@ -374,7 +374,7 @@ def test_poses_of_odometry(tmp_path: Path, ending: str) -> None:
     # The body looks along x, the camera along z.
     assert np.array_equal(recording.rig.bTc[:3, 2], [1.0, 0.0, 0.0])
     assert "taken to look straight ahead" in recording.notes[-1]
-    assert "; odometry; " in bare_experiment(path).said
+    assert "; odometry; " in bare_experiment(path).description
 
 
 def test_odometry_that_never_moves_is_told(tmp_path: Path) -> None:

@@ -135,7 +135,7 @@ def test_the_noise_of_depth_is_part_of_the_experiment(tmp_path: Path) -> None:
     # 250 px * 0.08 m * 1.425 mm, and 0.15 px by which a point is found again.
     assert bare.values["frontend"] == {"stereo": {"disparity_sigma_px": 0.153}}
     assert bare.config.frontend.stereo.disparity_sigma_px == 0.153
-    assert "walk: colour and depth, 2 cameras 32x24; 3 frames" in bare.said
+    assert "walk: colour and depth, 2 cameras 32x24; 3 frames" in bare.description
 
 
 @pytest.mark.parametrize(("kind", "units"), [(np.uint16, 1000.0), (np.float32, 1.0)])

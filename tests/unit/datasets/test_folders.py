@@ -398,7 +398,7 @@ def test_any_names_in_natural_order(tmp_path: Path, name: str) -> None:
 def test_a_pattern_of_files(tmp_path: Path) -> None:
     root = loose(tmp_path, lambda k: (f"{k}_left.png", f"{k}_right.png"), [1, 2, 30])
     assert len(opened_loose(root / "?_*.png")) == 2
-    assert "2 frames at 10 Hz" in bare_experiment(root / "?_*.png").said
+    assert "2 frames at 10 Hz" in bare_experiment(root / "?_*.png").description
 
 
 def test_what_has_no_partner_is_counted_or_refused(tmp_path: Path) -> None:

@@ -481,7 +481,7 @@ def test_euroc_turns_as_its_gyroscope_says(tmp_path: Path) -> None:
 
 def test_a_bare_recording_says_that_it_has_a_gyroscope(tmp_path: Path) -> None:
     found = bare_experiment(euroc_with_gyroscope(tmp_path))
-    assert "; a gyroscope, no odometry" in found.said
+    assert "; a gyroscope, no odometry" in found.description
     assert found.config.odometry.kind == "recorded"
 
 
@@ -509,7 +509,7 @@ def test_a_bag_turns_by_its_imu(tmp_path: Path) -> None:
     bag = write_bag(tmp_path / "walk.bag", stereo(4) + gyroscope(stamps.tolist(), RATE))
     recording = open_recording(BagSettings(path=str(bag)), DEFAULT)
     np.testing.assert_allclose(only_step((recording.odometry(1),)), 0.1 * RATE, atol=1e-6)
-    assert "; a gyroscope, no odometry" in bare_experiment(bag).said
+    assert "; a gyroscope, no odometry" in bare_experiment(bag).description
 
 
 # --------------------------------------------------------------------------------------------

@@ -94,10 +94,10 @@ def test_files_that_macos_hides_beside_others_are_none(
     tmp_path: Path, make: Callable[[Path], Path]
 ) -> None:
     root = make(tmp_path / "walk")
-    expected = bare_experiment(root).said
+    expected = bare_experiment(root).description
     for path in [path for path in root.rglob("*") if path.is_file()]:
         path.with_name(f"._{path.name}").write_bytes(b"\x00\x05\x16\x07Mac OS X" + bytes(60))
-    assert bare_experiment(root).said == expected
+    assert bare_experiment(root).description == expected
 
 
 def test_noise_settings_reach_the_odometry(tmp_path: Path) -> None:

@@ -516,7 +516,7 @@ def test_oxts_are_odometry_and_truth_of_the_camera(tmp_path: Path) -> None:
     assert step is not None
     assert np.linalg.norm(step.motion[:3, 3]) == pytest.approx(SPEED * PERIOD, abs=1e-3)
     assert np.arctan2(step.motion[1, 0], step.motion[0, 0]) == pytest.approx(0.04, abs=1e-6)
-    assert "; odometry; truth, for evaluation only" in bare_experiment(path).said
+    assert "; odometry; truth, for evaluation only" in bare_experiment(path).description
 
 
 def test_without_its_place_on_the_car_it_is_odometry_alone(tmp_path: Path) -> None:

@@ -173,7 +173,7 @@ def test_both_views_in_one_film(
         assert np.abs(levels(recording, i) - [140 + 10 * i, 40 + 10 * i]).max() <= _NEAR
     assert np.allclose(np.diff(recording.timestamps), 0.05, rtol=0.0, atol=1e-9)
     assert recording.notes == (f"the film is taken as {name}",)
-    assert "walk: film, 2 cameras 64x48; 6 frames at 20 Hz" in bare_experiment(path).said
+    assert "walk: film, 2 cameras 64x48; 6 frames at 20 Hz" in bare_experiment(path).description
     assert recording.colour(1)[0].shape == (SIZE[1], SIZE[0], 3)
 
 
@@ -224,7 +224,7 @@ def test_a_film_of_each_of_three_cameras(tmp_path: Path) -> None:
     notes = " ".join(recording.notes)
     assert "three films are paired by their number: all must begin at one time" in notes
     assert "the left film has 5 frames, the third one 4" in notes
-    assert "film, 3 cameras 64x48; 4 frames at 20 Hz" in bare_experiment(tmp_path).said
+    assert "film, 3 cameras 64x48; 4 frames at 20 Hz" in bare_experiment(tmp_path).description
 
 
 def test_three_films_are_paired_by_time_where_one_parts_from_the_others(tmp_path: Path) -> None:

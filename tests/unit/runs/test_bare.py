@@ -45,8 +45,10 @@ def test_a_recording_without_odometry_runs_by_constant_velocity(tmp_path: Path) 
         odometry=ConstantVelocitySettings(),
         estimator=Isam2Settings(),
     )
-    assert found.said.startswith("walk: image folder, 2 cameras 32x24; 6 frames at 10 Hz; no odom")
-    assert "truth" not in found.said
+    assert found.description.startswith(
+        "walk: image folder, 2 cameras 32x24; 6 frames at 10 Hz; no odom"
+    )
+    assert "truth" not in found.description
 
 
 def test_recorded_odometry_is_used_and_truth_only_mentioned(tmp_path: Path) -> None:
@@ -57,15 +59,17 @@ def test_recorded_odometry_is_used_and_truth_only_mentioned(tmp_path: Path) -> N
     found = bare_experiment(root)
     assert found.config.odometry == RecordedOdometrySettings()
     assert found.config == without_truth
-    assert "; odometry; truth, for evaluation only; estimator " in found.said
+    assert "; odometry; truth, for evaluation only; estimator " in found.description
 
 
 def test_every_layout_is_named_in_the_line(tmp_path: Path) -> None:
     drive, _ = kitti(tmp_path / "car", 3, "06")
     flight = euroc(tmp_path / "drone", MOUNTINGS)
-    assert "KITTI 06: KITTI odometry, 2 cameras 32x24; 3 frames" in bare_experiment(drive).said
+    assert (
+        "KITTI 06: KITTI odometry, 2 cameras 32x24; 3 frames" in bare_experiment(drive).description
+    )
     drone = "drone: EuRoC native, 2 cameras 64x48, unrectified; 4 frames at 20"
-    assert drone in bare_experiment(flight).said
+    assert drone in bare_experiment(flight).description
 
 
 def test_the_printed_configuration_keeps_what_was_asked_for(tmp_path: Path) -> None:
@@ -151,7 +155,9 @@ def test_two_layouts_that_fit_equally_are_both_named_and_one_can_be_chosen(tmp_p
     line = refused(root)
     assert "fits several layouts equally well: image folder; EuRoC native; say which" in line
     assert bare_experiment(root, None, ["dataset.kind=euroc"]).config.dataset.kind == "euroc"
-    assert bare_experiment(root, None, ["dataset.kind=image_folder"]).said.startswith("both: image")
+    assert bare_experiment(root, None, ["dataset.kind=image_folder"]).description.startswith(
+        "both: image"
+    )
     assert "is no layout of a folder of images" in refused(root, "dataset.kind=rendered_lab")
 
 
