@@ -185,8 +185,8 @@ def _files(folders: Sequence[Path]) -> tuple[list[tuple[Path, ...]], tuple[str, 
         found = find_cameras(folders[0])
         if found is None:
             raise DatasetError(
-                f"{folders[0]}: images of two cameras cannot be distinguished there; name them left "
-                "and right, or give a folder for each"
+                f"{folders[0]}: images of two cameras cannot be distinguished there; name them "
+                "left and right, or give a folder for each"
             )
         pairs, notes = pair_files(found, at_once=False)
         return [(left, right) for right, left in pairs], notes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,39 +19,45 @@ from fgslam.report.content import (
     write_csv,
     write_json,
 )
+from fgslam.runs.config import Experiment
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import METRICS_FILE, REPORT_FILE, RUN_MARKER, versions
 
 if TYPE_CHECKING:
     import pandas as pd
 
-R = TypeVar("R", bound=RunResult)
-
 PICTURES = "pictures"
 UNKNOWN = "-"
 
 
 def finish(
-    result: R,
+    config: Experiment,
+    folder: Path,
+    whole: bool,
     numbers: Mapping[str, JsonValue],
     subtitle: str,
     figures: Sequence[Figure] = (),
     pictures: Sequence[Picture] = (),
     estimators: Mapping[str, JsonValue] | None = None,
-) -> R:
-    """The result, its metrics.json written, and its page if wanted.
+    **shown: Any,
+) -> RunResult:
+    """The result of a task whose results are tables; metrics.json is written, its page if wanted.
 
     Args:
-        result: of a task whose results are tables: homing, localisation.
+        config: what was run.
+        folder: the run folder.
+        whole: whether all of it was done.
         numbers: the task's own, after those that each task has.
         subtitle: of the page.
         figures: of the page.
         pictures: of the page.
         estimators: numbers by title.
+        shown: further attributes of :class:`RunResult`: lines, tables, notes, ...
 
     Raises:
         OutputError: a file cannot be written.
     """
+    result = RunResult(config, folder, "finished" if whole else "interrupted", **shown)
     write_document(result, numbers, estimators)
     write_page(result, subtitle, figures, pictures)
     return result

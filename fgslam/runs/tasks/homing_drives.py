@@ -59,7 +59,7 @@ from fgslam.report.homing_figures import (
     local_map_figure,
 )
 from fgslam.runs.config import CrossroadsConfig, DrivingConfig, OmniVideoConfig
-from fgslam.runs.engine import Context, Opening, RunResult, Status, Task, provenance_of
+from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.results import UNKNOWN, draw_picture, finish, median, numbers_table
 from fgslam.runs.tasks.homing_replay import replay_homing, save_bearing_logs
 
@@ -283,14 +283,17 @@ def finish_drives(
     subtitle = f"seeds {config.seed} to {config.seed + config.trials - 1}, {len(driven)} driven"
     if config.trials == 1:
         subtitle = f"one drive, seed {config.seed}"
-    status: Status = "finished" if len(driven) == config.trials else "interrupted"
-    tables, notes = _leg_tables(records), tuple(failures)
     return finish(
-        RunResult(config, folder, status, _sentences(numbers), tables, notes),
+        config,
+        folder,
+        len(driven) == config.trials,
         numbers,
         subtitle,
-        figures=tuple(_figures(config, driven)),
-        pictures=draw_leg_views(folder, driven[0].seed, driven[0].views) if driven else (),
+        tuple(_figures(config, driven)),
+        draw_leg_views(folder, driven[0].seed, driven[0].views) if driven else (),
+        lines=_sentences(numbers),
+        tables=_leg_tables(records),
+        notes=tuple(failures),
     )
 
 
@@ -619,18 +622,16 @@ def _run_video(config: OmniVideoConfig, recording: OmniRecording, context: Conte
         f"through {numbers['track_life_median_frames']} frames (median)."
     )
     return finish(
-        RunResult(
-            config,
-            folder,
-            "finished" if len(tracks.frames) == len(recording) else "interrupted",
-            (sentence if len(counts) else "No frame was tracked.",),
-            (numbers_table("video", "The tracks", numbers, names),),
-            recording.notes,
-        ),
+        config,
+        folder,
+        len(tracks.frames) == len(recording),
         numbers,
         f"{len(tracks.frames)} frames of {recording.name}",
-        figures=(figure,),
-        pictures=tuple(tracks.pictures),
+        (figure,),
+        tracks.pictures,
+        lines=(sentence if len(counts) else "No frame was tracked.",),
+        tables=(numbers_table("video", "The tracks", numbers, names),),
+        notes=recording.notes,
     )
 
 

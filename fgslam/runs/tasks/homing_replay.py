@@ -302,18 +302,16 @@ def _run_trials(config: HomingTrialsConfig, context: Context) -> RunResult:
         shares = {f"{share:g}": _summary_numbers(of) for share, of in homings[title].items()}
         estimators[title] = _estimator_numbers(settings, {"outliers": shares}, judged)
     return finish(
-        RunResult(
-            config,
-            folder,
-            "finished" if len(trials) == len(units) else "interrupted",
-            tuple(_best(homings, config.outliers)) or ("No trial gave a result.",),
-            tables,
-            tuple(failures),
-        ),
+        config,
+        folder,
+        len(trials) == len(units),
         numbers,
         f"{len(trials)} simulated homings of bearings alone, seed {config.seed}",
-        figures=tuple(_trial_figures(homings, config.outliers)),
+        tuple(_trial_figures(homings, config.outliers)),
         estimators=estimators,
+        lines=tuple(_best(homings, config.outliers)) or ("No trial gave a result.",),
+        tables=tables,
+        notes=tuple(failures),
     )
 
 
@@ -497,19 +495,17 @@ def _compare(
         if one.failure
     ]
     return finish(
-        RunResult(
-            config,
-            folder,
-            "interrupted" if context.stopped() else "finished",
-            (f"{heading}.",),
-            (table,),
-            tuple(failures),
-            failed=len(failures) == len(logs) * len(replays),
-        ),
+        config,
+        folder,
+        not context.stopped(),
         {"logs": sorted(logs)},
         "bearing logs replayed",
-        figures=tuple(_figures(logs, replays)),
+        tuple(_figures(logs, replays)),
         estimators=numbers,
+        lines=(f"{heading}.",),
+        tables=(table,),
+        notes=tuple(failures),
+        failed=len(failures) == len(logs) * len(replays),
     )
 
 

@@ -122,18 +122,19 @@ def _run_pairs(config: HomingPairsConfig, views: OmniRecording, context: Context
                 f"direction and {errors.rotation.abs().median():.2f} of the rotation; the worst "
                 f"answer is off by {uncertainty.max():.1f} degrees."
             )
-    result = RunResult(
+    return finish(
         config,
         folder,
-        "finished" if whole and not context.stopped() else "interrupted",
-        tuple(lines),
-        error_tables(numbers["errors"]),
-        (*views.notes, *failures),
+        whole and not context.stopped(),
+        numbers,
+        f"{len(answers)} pairs of {len(features)} views of {views.name}",
+        figures,
+        draw_uncertain(folder, views, search, answered, uncertainty, config.output.pictures),
+        lines=tuple(lines),
+        tables=error_tables(numbers["errors"]),
+        notes=(*views.notes, *failures),
         reached=f"after {len(answers)} of {every} pairs",
     )
-    subtitle = f"{len(answers)} pairs of {len(features)} views of {views.name}"
-    pictures = draw_uncertain(folder, views, search, answered, uncertainty, config.output.pictures)
-    return finish(result, numbers, subtitle, figures, pictures)
 
 
 def _reference(
@@ -215,23 +216,20 @@ def _run_map(config: TopologicalMapConfig, views: OmniRecording, context: Contex
         lines.append(f"Localisation finds {right} of {len(located)} held-out views at a neighbour.")
     missing = [f"route {'-'.join(r.asked)}: {r.reason}" for r in routes if r.reason]
     whole = len(features) == len(views) and len(found) == len(pairs) and not context.stopped()
-    result = RunResult(
-        config,
-        folder,
-        "finished" if whole else "interrupted",
-        tuple(lines),
-        (numbers_table("map", "The map", numbers, _MAP_ROWS),),
-        (*views.notes, *failures, *missing),
-    )
     by_pair = {(one.a, one.b): one for one in found}
     linked = [by_pair[link.a, link.b] for link in topology.links]
     uncertainty = -np.array([link.support for link in topology.links])
     return finish(
-        result,
+        config,
+        folder,
+        whole,
         numbers,
         f"{len(topology)} views of {views.name}",
         (map_figure(topology, views.poses),),
         draw_uncertain(folder, views, search, linked, uncertainty, config.output.pictures),
+        lines=tuple(lines),
+        tables=(numbers_table("map", "The map", numbers, _MAP_ROWS),),
+        notes=(*views.notes, *failures, *missing),
     )
 
 

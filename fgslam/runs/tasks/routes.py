@@ -133,19 +133,17 @@ def _run_teaching(
         y={"rangemode": "tozero"},
     )
     return finish(
-        RunResult(
-            config,
-            folder,
-            "finished" if whole else "interrupted",
-            tuple(lines),
-            (_path_image_table(rows),),
-            (*recording.notes, *taught.unusable),
-            (("route", str(written)),),
-        ),
+        config,
+        folder,
+        whole,
         numbers,
         f"{len(rows)} path images of {recording.name}",
         (figure,),
         _sheet(folder, recording, taught) if config.output.pictures else (),
+        lines=tuple(lines),
+        tables=(_path_image_table(rows),),
+        notes=(*recording.notes, *taught.unusable),
+        particulars=(("route", str(written)),),
     )
 
 
@@ -332,19 +330,17 @@ def _run_following(
         heading = "Images without a homing vector"
         tables.append(TextTable("refusals", heading, "reason", columns, refused))
     return finish(
-        RunResult(
-            config,
-            folder,
-            "finished" if len(rows) == count else "interrupted",
-            _follow_sentences(numbers, path),
-            tuple(tables),
-            (*recording.notes, *left_out.values()),
-            (("table", str(folder / FOLLOW_FILE)),),
-            failed=not numbers["sure"],
-        ),
+        config,
+        folder,
+        len(rows) == count,
         numbers,
         f"{len(commands)} images of {recording.name} along {len(path)} path images",
-        figures=_follow_figures(commands),
+        _follow_figures(commands),
+        lines=_follow_sentences(numbers, path),
+        tables=tuple(tables),
+        notes=(*recording.notes, *left_out.values()),
+        particulars=(("table", str(folder / FOLLOW_FILE)),),
+        failed=not numbers["sure"],
     )
 
 
@@ -514,16 +510,14 @@ def _run_joining(
     rows = tuple((names, (str(count),)) for names, count in meetings.items())
     table = TextTable("meetings", "Where routes meet", "routes", (column,), rows)
     return finish(
-        RunResult(
-            config,
-            folder,
-            "finished",
-            lines,
-            (table,),
-            tuple(failures),
-            (("map", str(written)),),
-        ),
+        config,
+        folder,
+        True,
         numbers,
         f"{len(joined)} path images of {len(routes)} routes",
-        figures=(map_figure(joined.topology),),
+        (map_figure(joined.topology),),
+        lines=lines,
+        tables=(table,),
+        notes=tuple(failures),
+        particulars=(("map", str(written)),),
     )
