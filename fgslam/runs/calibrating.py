@@ -54,6 +54,7 @@ from fgslam.datasets.images import bits_of, read_grey_image
 from fgslam.datasets.layouts import find_cameras, images_in
 from fgslam.datasets.times import pair_files
 from fgslam.report.content import write_csv
+from fgslam.runs.units import Progress
 
 _WITHIN_RIM = 0.98  # of a mirror's radius: its edge is a border of two bands, too
 _SEED = 0  # of the search for a mirror's circle: the same image gives the same calibration
@@ -70,7 +71,6 @@ grow clockwise in it, and that in words."""
 
 Files = Sequence[tuple[Path, ...]]
 """Images of each moment, in the cameras' order."""
-Progress = Callable[[str, int, int], None]
 Finder = Callable[[Image], Corners | None]
 
 _OFF_PX = 0.5  # stereo matching takes rows that agree to 1.5; half a pixel leaves it room

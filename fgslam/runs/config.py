@@ -755,7 +755,16 @@ def make_experiment(
     overrides = tuple(overrides)
     chosen = [o.value for o in map(Override.of, overrides) if o.keys == ("task",)]
     asked = {"task": chosen[-1]} if chosen else values
-    config = parse(_model_of(asked, where), values, where, overrides)
+    task = asked.get("task")
+    model = TASKS.get(task if isinstance(task, str) else "")
+    if "task" not in asked:
+        model = TASKS[None]
+    if model is None:
+        known = [name for name in TASKS if name is not None]
+        close = get_close_matches(str(task), known, n=1, cutoff=0.5)
+        hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}"
+        raise ConfigError(f"{where}: task is {task!r}; {hint} (SLAM has no key task)")
+    config = parse(model, values, where, overrides)
     problem = config.problem()
     if problem:
         raise ConfigError(f"{where}: {problem}")
@@ -774,20 +783,6 @@ def make_config(
     if "task" in values:  # before its keys are refused, which SLAM would not know
         overrides = ()
     return as_task(ExperimentConfig, make_experiment(values, where, overrides), where)
-
-
-def _model_of(values: Mapping[str, Any], where: str) -> type[Experiment]:
-    """Model of a task. Raises ConfigError where there is no such task."""
-    if "task" not in values:
-        return TASKS[None]
-    task = values["task"]
-    model = TASKS.get(task) if isinstance(task, str) else None
-    if model is None:
-        known = [name for name in TASKS if name is not None]
-        close = get_close_matches(str(task), known, n=1, cutoff=0.5)
-        hint = f"did you mean {close[0]}?" if close else f"use one of {', '.join(known)}"
-        raise ConfigError(f"{where}: task is {task!r}; {hint} (SLAM has no key task)")
-    return model
 
 
 def as_task(model: type[_Model], config: Experiment, where: str) -> _Model:

@@ -6,9 +6,8 @@ A check returns findings as data: a code, and the values of its sentence (:mod:`
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -39,9 +38,7 @@ from fgslam.runs.findings import (
 )
 from fgslam.runs.inspect_matches import Facts, check_matches, match_facts, match_frames, spread_over
 from fgslam.runs.opening import open_sequence
-
-Progress: TypeAlias = Callable[[str, int, int], None]
-"""Called with what is under way, how much is done, and of how much."""
+from fgslam.runs.units import Progress
 
 _READ_AT_LEAST = 300  # frames whose images are read; a few seconds
 
@@ -65,13 +62,17 @@ def inspect_recording(
     Raises:
         FgslamError: the recording cannot be opened at all, or the configuration is wrong.
     """
-    config = _configure(dataset, overrides, camera)
+    if dataset.suffix.lower() in (".yaml", ".yml"):
+        require_no_camera(dataset, camera)
+        config = load_config(dataset, overrides)
+    else:  # the kind is named so that an override of one of its keys finds it
+        keys = dataset_of(dataset, camera, tuple(overrides))
+        values = {"name": "inspect", "dataset": keys, "odometry": {"kind": "recorded"}}
+        config = make_config(values, str(dataset), overrides)
     sequence = open_sequence(config, progress)
     read = max(frames, _READ_AT_LEAST)
-    general = check_sequence(sequence, read, lambda done, total: progress("reading", done, total))
-    matched = match_frames(
-        sequence, config.frontend, frames, lambda done, total: progress("matching", done, total)
-    )
+    general = check_sequence(sequence, read, progress)
+    matched = match_frames(sequence, config.frontend, frames, progress)
     stereo = config.frontend.stereo
     findings = by_severity((*general, *check_matches(matched, sequence.rig, stereo)))
     count = min(read, len(sequence))
@@ -86,14 +87,14 @@ def inspect_recording(
 def check_sequence(
     sequence: ImageSequence,
     samples: int = 20,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda what, done, total: None,
 ) -> tuple[Finding, ...]:
     """Findings of all checks that need no features, the worst first.
 
     Args:
         sequence: the recording.
         samples: how many frames, spread over it, are read.
-        progress: called with how many of these have been read, and how many there are.
+        progress: called after each of these.
     """
     return by_severity(
         (
@@ -107,22 +108,6 @@ def check_sequence(
             *check_clock(sequence),
         )
     )
-
-
-def _configure(dataset: Path, overrides: Sequence[str], camera: Path | None) -> ExperimentConfig:
-    """The experiment's configuration, or the default one for a folder in a known layout.
-
-    Raises:
-        FgslamError: the layout is not known, or the configuration is wrong.
-    """
-    if dataset.suffix.lower() in (".yaml", ".yml"):
-        require_no_camera(dataset, camera)
-        return load_config(dataset, overrides)
-    # The kind is named so that an override of one of its keys finds it.
-    odometry = {"kind": "recorded"}
-    keys = dataset_of(dataset, camera, tuple(overrides))
-    values = {"name": "inspect", "dataset": keys, "odometry": odometry}
-    return make_config(values, str(dataset), overrides)
 
 
 # --------------------------------------------------------------------------------------------
@@ -149,7 +134,7 @@ def _kind(image: Image) -> str:
 def check_images(
     sequence: ImageSequence,
     samples: int = 20,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda what, done, total: None,
 ) -> tuple[Finding, ...]:
     """Unreadable, black, white and flat images, cameras of unequal brightness, copies.
 
@@ -169,7 +154,7 @@ def check_images(
             for c, image in enumerate(frame.images):
                 same = np.array_equal(frame.images[0], image)
                 rows.append((frame.index, c, _kind(image), float(image.mean()), same))
-        progress(done, len(chosen))
+        progress("reading", done, len(chosen))
     found: list[Finding] = []
     if unreadable:
         part = share(len(unreadable), len(chosen))

@@ -7,7 +7,6 @@ gate on rows or on the sign of the disparity; outliers are expected, so medians 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
@@ -27,6 +26,7 @@ from fgslam.frontend.features.sift import SiftExtractor
 from fgslam.frontend.settings import FrontendSettings, StereoSettings
 from fgslam.frontend.stereo import StereoMatcher
 from fgslam.runs.findings import Finding, Level, finding, first_of
+from fgslam.runs.units import Progress
 
 Facts: TypeAlias = tuple[tuple[str, str], ...]
 """Labels and values."""
@@ -125,7 +125,7 @@ def match_frames(
     sequence: ImageSequence,
     settings: FrontendSettings,
     frames: int,
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> Samples | None:
     """Features and matches of up to ``frames`` frames spread over the recording; None: of none.
 
@@ -149,7 +149,7 @@ def match_frames(
                 counts.append([len(one) for one in features])
                 pairs.append(len(matcher.match_left(features[0], features[1])[0]))
                 stereo.append(matcher.match(features))
-            progress(done, len(chosen))
+            progress("matching", done, len(chosen))
     if not numbers:
         return None
     left, top = reduce(Matches.join, others[0]), None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias, cast, get_args
@@ -18,7 +18,7 @@ from fgslam.core.types import Trajectory
 from fgslam.datasets.layouts import is_recording, recognise_layout
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.runs.bare import experiment_of
-from fgslam.runs.config import ExperimentConfig, make_config
+from fgslam.runs.config import make_config
 from fgslam.runs.engine import RunResult
 from fgslam.runs.folder import ExistingFolder
 from fgslam.runs.named_experiments import find_experiment, suggestion
@@ -26,6 +26,7 @@ from fgslam.runs.opening import open_sequence
 from fgslam.runs.run import require_outputs, run_experiment
 from fgslam.runs.session import Overrides, override_texts, slam_config
 from fgslam.runs.sweep import SweepResult, make_plan, run_sweep
+from fgslam.runs.units import Progress
 from fgslam.runs.workers import Pool
 from fgslam.slam.build import chosen_estimator, is_settings
 from fgslam.slam.replay import Replay
@@ -33,9 +34,6 @@ from fgslam.slam.replay import replay as replay_log
 
 RecordedFrame: TypeAlias = tuple[float, tuple[Image, ...] | None, Odometry | None]
 """Time in seconds, images (left, right[, top]) or None, odometry of the body or None."""
-
-Progress: TypeAlias = Callable[[str, int, int], None]
-"""Called with what is under way, how much of it is done, and of how much."""
 
 _WORLDS = {"lab": "lab_loop"}
 """Worlds that are rendered, and the experiment that describes each."""
@@ -123,7 +121,16 @@ def open_recording(path: str | Path, overrides: Overrides = ()) -> RecordedFrame
         ConfigError: no such experiment, or a key or value is wrong.
     """
     found = as_path(path, DatasetError, "recording")
-    return RecordedFrames(open_sequence(_recording_config(found, overrides)))
+    if is_recording(found):
+        values = {"name": "recording", "dataset": dict(recognise_layout(found))}
+        config = make_config(values, str(found), override_texts(overrides))
+    elif find_experiment(found).is_file():
+        config = slam_config(found, overrides)
+    else:
+        raise DatasetError(
+            f"{found}: no such folder of a recording; check the path, or {suggestion(found)}"
+        )
+    return RecordedFrames(open_sequence(config))
 
 
 def rendered_recording(world: str = "lab", frames: int | None = None) -> RecordedFrames:
@@ -154,17 +161,6 @@ def _checked_existing(existing: ExistingFolder) -> ExistingFolder:
     if existing not in known:
         raise ConfigError(f"existing is {existing!r}; use one of {', '.join(known)}")
     return existing
-
-
-def _recording_config(path: Path, overrides: Overrides) -> ExperimentConfig:
-    if not is_recording(path):
-        if not find_experiment(path).is_file():
-            raise DatasetError(
-                f"{path}: no such folder of a recording; check the path, or {suggestion(path)}"
-            )
-        return slam_config(path, overrides)
-    values = {"name": "recording", "dataset": dict(recognise_layout(path))}
-    return make_config(values, str(path), override_texts(overrides))
 
 
 def run(
@@ -284,16 +280,9 @@ def replay(
         raise ConfigError(
             f"replay: ego_motion is a {type(ego_motion).__name__}; give settings of it, or None"
         )
-    return replay_log(log, _unused(chosen_estimator(estimator)), ego_motion or EgoMotionSettings())
-
-
-def _unused(estimator: EstimatorSettings | Estimator) -> EstimatorSettings | Estimator:
-    """The estimator. Raises ConfigError for an object that holds landmarks of frames before."""
-    if is_settings(estimator):
-        return estimator
-    own = cast("Estimator", estimator)
-    if len(own.landmarks()):
+    chosen = chosen_estimator(estimator)
+    if not is_settings(chosen) and len(cast("Estimator", chosen).landmarks()):
         raise ConfigError(
-            f"estimator: this {type(own).__name__} has taken in frames already; give a new one"
+            f"estimator: this {type(chosen).__name__} has taken in frames already; give a new one"
         )
-    return own
+    return replay_log(log, chosen, ego_motion or EgoMotionSettings())

@@ -124,11 +124,8 @@ def points_from_log(
 
 def _counts(parts: list[IntArray], ids: IntArray) -> IntArray:
     """How often each of ``ids`` (ascending) occurs in all parts together."""
-    found, counts = np.unique(np.concatenate([np.empty(0, np.int64), *parts]), return_counts=True)
-    out = np.zeros(len(ids), np.int64)
-    _, rows, of = np.intersect1d(ids, found, return_indices=True)
-    out[rows] = counts[of]
-    return out
+    every = np.concatenate([np.empty(0, np.int64), *parts])
+    return np.bincount(np.searchsorted(ids, every[np.isin(every, ids)]), minlength=len(ids))
 
 
 UNKNOWN = "-"

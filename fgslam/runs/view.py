@@ -57,10 +57,10 @@ from fgslam.runs.report import load_report
 from fgslam.runs.tasks.routes import FOLLOW_FILE, ROUTE_FILE, recording_along
 from fgslam.runs.tasks.slam import Watch
 from fgslam.runs.tasks.slam_results import RunOutputs
+from fgslam.runs.units import Progress
 from fgslam.slam.pipeline import FrameReport
 
 _MOST_FPS = 30.0
-Progress = Callable[[str, int, int], None]
 
 
 def film_of_run(

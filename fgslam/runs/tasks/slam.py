@@ -108,7 +108,11 @@ def _run(opened: OpenedRun, context: Context, watch: Watch | None) -> SlamResult
         return ended
     outputs = begin(opened, context.progress)
     while isinstance(saved := _loop(outputs, context, watch), int):
-        opened = _begin_later(opened, saved)
+        # Without so many frames more; nothing of what was driven over these is kept.
+        opened = dataclasses.replace(opened, frames_before=opened.frames_before + saved)
+        remove_file(context.folder / STATE_FILE)
+        remove_files(context.folder / PICTURES, "*.png")
+        write_config(context.folder, opened.config, opened.provenance)
         outputs = begin(opened, context.progress)
     if saved is not None:
         return _result(outputs, saved)
@@ -407,16 +411,6 @@ def begin(run: OpenedRun, progress: Progress) -> RunOutputs:
     if resumed:
         _load_checkpoint(run.folder, session.pipeline, session.recorder)
     return outputs
-
-
-def _begin_later(run: OpenedRun, frames: int) -> OpenedRun:
-    """The run without so many frames more; nothing of what was driven over these is kept."""
-    before = run.frames_before + frames
-    run = dataclasses.replace(run, frames_before=before)
-    remove_file(run.folder / STATE_FILE)
-    remove_files(run.folder / PICTURES, "*.png")
-    write_config(run.folder, run.config, run.provenance)
-    return run
 
 
 def _entry(run: OpenedRun, given: GivenMap | None, resumed: bool) -> Entry | None:

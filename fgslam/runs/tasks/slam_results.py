@@ -535,7 +535,12 @@ class RunOutputs:
         estimate = self.pipeline.estimate()
         self.recorder.log.save(self.folder / LOG_FILE)
         truth = self._write_truth(with_landmarks=status == "finished")
-        self._write_estimate(estimate)
+        online = np.array(self.recorder.online_poses).reshape(-1, 4, 4)
+        online_path = Trajectory(estimate.trajectory.timestamps, online)
+        points = map_points(estimate.landmarks, self.pipeline.tracker.database)
+        own = make_subfolder(self.folder, self.title)
+        write_estimate(own, online_path, estimate, points, self.remark)
+        write_noise(own / NOISE_TABLE, online_path.timestamps, self.recorder.noise)
         metrics = estimator_metrics(estimate, truth, self.recorder)
         taken = () if self.pipeline.places is None else self.pipeline.places.taken
         more = {"kind": self.pipeline.estimator.kind} | dict(metrics.more) | closure_counts(taken)
@@ -592,15 +597,6 @@ class RunOutputs:
         if found is not None:
             write_landmark_truth(self.folder / LANDMARK_TRUTH_FILE, *found)
         return load_truth(self.folder, self.recorder.log)
-
-    def _write_estimate(self, estimate: Estimate) -> None:
-        folder = make_subfolder(self.folder, self.title)
-        online = Trajectory(
-            estimate.trajectory.timestamps, np.array(self.recorder.online_poses).reshape(-1, 4, 4)
-        )
-        points = map_points(estimate.landmarks, self.pipeline.tracker.database)
-        write_estimate(folder, online, estimate, points, self.remark)
-        write_noise(folder / NOISE_TABLE, online.timestamps, self.recorder.noise)
 
     def remarks(self) -> tuple[str, ...]:
         """Notes on the recording, its cameras and its first images."""
