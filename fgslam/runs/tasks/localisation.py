@@ -375,18 +375,16 @@ class Scored:
         attempts: all of them.
         answers: the same as arrays.
         errors: of the accepted ones.
-        counts: of those from which enough landmarks are visible.
-        familiar: of those from which enough are visible from about where they were seen before.
-        apart: of those from which too few are visible.
+        numbers: as metrics.json has them: the score of those from which enough landmarks are
+            visible; that of those from which enough are visible from about where they were seen
+            before, ``familiar_view``, and ``too_few_in_view``; verdicts and times.
     """
 
     frames: int
     attempts: tuple[Attempt, ...]
     answers: Answers
     errors: LocalisationErrors
-    counts: dict[str, Any]
-    familiar: dict[str, Any]
-    apart: dict[str, Any]
+    numbers: dict[str, Any]
 
 
 def bounds_of(config: LocalisationConfig) -> Bounds:
@@ -404,8 +402,16 @@ def scored(config: LocalisationConfig, asked: Asked) -> tuple[Scored, ...]:
         attempts = asked.of(frames)
         answers = answers_of(attempts)
         visible, familiar = (enough(n, bounds) for n in (answers.visible, answers.familiar))
-        parts = (score(answers.select(rows), bounds) for rows in (visible, familiar, ~visible))
-        out.append(Scored(frames, attempts, answers, localisation_errors(answers), *parts))
+        times = np.array([(a.milliseconds, a.frontend_ms) for a in attempts]).reshape(-1, 2)
+        numbers = {
+            **score(answers.select(visible), bounds),
+            "familiar_view": score(answers.select(familiar), bounds),
+            "too_few_in_view": score(answers.select(~visible), bounds),
+            "verdicts": dict(sorted(Counter(one.verdict for one in attempts).items())),
+            "locate_ms": spread(times[:, 0]),
+            "frontend_ms": spread(times[:, 1]),
+        }
+        out.append(Scored(frames, attempts, answers, localisation_errors(answers), numbers))
     return tuple(out)
 
 
@@ -434,9 +440,9 @@ def result_of(
 ) -> LocalisationResult:
     """Sentences and tables of a run; with a folder and its map all files. Raises OutputError."""
     judged = scored(config, asked)
-    verdicts = [Counter(one.verdict for one in j.attempts) for j in judged]
+    verdicts = [one.numbers["verdicts"] for one in judged]
     rows = tuple(
-        (name, tuple(str(count[name]) for count in verdicts))
+        (name, tuple(str(count.get(name, 0)) for count in verdicts))
         for name in sorted(set().union(*verdicts))
     )
     columns = tuple(Column(in_frames(j.frames), "queries that ended so") for j in judged)
@@ -470,7 +476,7 @@ def _within(config: LocalisationConfig) -> str:
 
 
 def _sentence(config: LocalisationConfig, judged: Scored) -> str:
-    counts, few = judged.counts, judged.apart
+    counts, few = judged.numbers, judged.numbers["too_few_in_view"]
     start = (
         f"from {in_frames(judged.frames)}: {counts['accepted']} of {counts['asked']} queries found"
     )
@@ -501,13 +507,14 @@ def _score_table(config: LocalisationConfig, judged: Sequence[Scored]) -> TextTa
     )
     rows = []
     for one in judged:
-        name, ms = in_frames(one.frames), spread(_milliseconds(one)[0])
+        name, counts, ms = in_frames(one.frames), one.numbers, one.numbers["locate_ms"]
+        familiar, few = counts["familiar_view"], counts["too_few_in_view"]
         times = f"{number_text(ms['median'], '.0f')}, {number_text(ms['p95'], '.0f')}"
-        shown = {name: (one.counts, times)}
-        if one.apart["asked"] or one.familiar["asked"] != one.counts["asked"]:
-            shown[f"{name}, {_LEAST_VISIBLE} in view from familiar sides"] = one.familiar, UNKNOWN
-            shown[f"{name}, fewer than {_LEAST_VISIBLE} in view"] = one.apart, UNKNOWN
-        rows += [(text, (*_score_cells(counts), last)) for text, (counts, last) in shown.items()]
+        shown = {name: (counts, times)}
+        if few["asked"] or familiar["asked"] != counts["asked"]:
+            shown[f"{name}, {_LEAST_VISIBLE} in view from familiar sides"] = familiar, UNKNOWN
+            shown[f"{name}, fewer than {_LEAST_VISIBLE} in view"] = few, UNKNOWN
+        rows += [(text, (*_score_cells(part), last)) for text, (part, last) in shown.items()]
     return TextTable("score", "Localisation", "query", columns, tuple(rows))
 
 
@@ -531,13 +538,6 @@ def _score_cells(counts: Mapping[str, Any]) -> tuple[str, ...]:
         number_text(counts["nees_per_dof"]),
         number_text(counts["share_in_95_percent"], ".1%"),
     )
-
-
-def _milliseconds(judged: Scored) -> tuple[FloatArray, FloatArray]:
-    """(n,) times of the answers, and of the front-end."""
-    times = [(a.milliseconds, a.frontend_ms) for a in judged.attempts]
-    answers, frontend = np.array(times).reshape(-1, 2).T
-    return answers, frontend
 
 
 def sigmas_of(found: Relocalisation) -> tuple[float, float]:
@@ -574,7 +574,7 @@ def write_results(
         "landmarks": len(asked.landmarks),
         "alignment": asked.alignment,
         "notes": list(result.notes),
-        "queries": {str(one.frames): _numbers(one) for one in judged},
+        "queries": {str(one.frames): one.numbers for one in judged},
     }
     write_json(folder / METRICS_FILE, document)
     bounds = bounds_of(result.config)
@@ -616,18 +616,6 @@ def _rows(judged: Scored) -> Iterator[tuple[Any, ...]]:
             errors.dof[k],
             found.why,
         )
-
-
-def _numbers(judged: Scored) -> dict[str, JsonValue]:
-    answers, frontend = _milliseconds(judged)
-    return {
-        **judged.counts,
-        "familiar_view": judged.familiar,
-        "too_few_in_view": judged.apart,
-        "verdicts": dict(sorted(Counter(a.verdict for a in judged.attempts).items())),
-        "locate_ms": spread(answers),
-        "frontend_ms": spread(frontend),
-    }
 
 
 def _figure(given: GivenMap, judged: Scored, bounds: Bounds) -> Figure:
