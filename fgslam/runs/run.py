@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -67,20 +67,20 @@ def run_experiment(
     return run_task(opener_of(config, watch), config, folder, existing, progress, stopped)
 
 
-_OPENERS = {
-    "localisation": "localisation.open_localisation",
-    "homing_pairs": "homing_views.open_pairs",
-    "topological_map": "homing_views.open_topological_map",
-    "omni_video": "homing_drives.open_video",
-    "teach": "routes.open_teaching",
-    "follow": "routes.open_following",
-    "join": "routes.open_joining",
-    "homing_trials": "homing_replay.open_trials",
-    "homing": "homing_drives.open_drives",
-    "path_following": "homing_drives.open_drives",
-    "crossroads": "homing_drives.open_drives",
+_OPENERS: Mapping[str | None, Callable[[], Opener[RunResult]]] = {
+    "localisation": lambda: import_module("fgslam.runs.tasks.localisation").open_localisation,
+    "homing_pairs": lambda: import_module("fgslam.runs.tasks.homing_views").open_pairs,
+    "topological_map": lambda: import_module("fgslam.runs.tasks.homing_views").open_topological_map,
+    "omni_video": lambda: import_module("fgslam.runs.tasks.homing_drives").open_video,
+    "teach": lambda: import_module("fgslam.runs.tasks.routes").open_teaching,
+    "follow": lambda: import_module("fgslam.runs.tasks.routes").open_following,
+    "join": lambda: import_module("fgslam.runs.tasks.routes").open_joining,
+    "homing_trials": lambda: import_module("fgslam.runs.tasks.homing_replay").open_trials,
+    "homing": lambda: import_module("fgslam.runs.tasks.homing_drives").open_drives,
+    "path_following": lambda: import_module("fgslam.runs.tasks.homing_drives").open_drives,
+    "crossroads": lambda: import_module("fgslam.runs.tasks.homing_drives").open_drives,
 }
-"""Module and function that open each task; it is imported when it is run."""
+"""What gives the opener of each task; its module is imported when it is run."""
 
 
 def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResult]:
@@ -93,5 +93,4 @@ def opener_of(config: Experiment, watch: Watch | None = None) -> Opener[RunResul
         from fgslam.runs.tasks.slam import open_slam
 
         return partial(open_slam, watch=watch)
-    module, name = _OPENERS[config.task_name or ""].split(".")
-    return getattr(import_module(f"fgslam.runs.tasks.{module}"), name)  # type: ignore[no-any-return]
+    return _OPENERS[config.task_name]()
