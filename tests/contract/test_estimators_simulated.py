@@ -150,8 +150,9 @@ def frontend_settings(dof: int, rescue: bool) -> FrontendSettings:
 
 
 @pytest.mark.parametrize(
-    ("dof", "rescue"),
-    [(6, True), (3, False)],
+    ("settings", "dof", "rescue"),
+    [*((name, 6, True) for name in SETTINGS), ("landmark_kalman", 3, False)],
+    indirect=["settings"],
 )
 def test_a_replay_repeats_the_live_run(settings: EstimatorSettings, dof: int, rescue: bool) -> None:
     """To the last bit, over missing images and missing odometry."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 import pytest
@@ -59,6 +59,7 @@ from fgslam.frontend.places.relocalisation import (
 from fgslam.frontend.settings import AppearanceSettings, EgoMotionSettings, RelocalisationSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem, Resection
 from fgslam.slam.build import make_estimator
+from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.motion import ConstantVelocityMotion
 from fgslam.slam.pipeline import FrameReport, SlamPipeline, observe
 from fgslam.slam.replay import replay_frame
@@ -99,14 +100,25 @@ def states_of(pipeline: SlamPipeline) -> State:
     return State(*(state_of(one) for one in held), taken=pipeline.places.taken)
 
 
-@lru_cache(maxsize=2)
+@cache
+def frames_of_ring() -> list[FeatureFrame]:
+    return list(seen(RING, DARK))
+
+
+@cache
 def ring_and_states(refusing: bool) -> tuple[SlamPipeline, list[FrameReport], list[State]]:
-    """Once round and past the start, a part of it in the dark; the state before each frame."""
+    """Once round and past the start, a part of it in the dark; the state before each frame.
+
+    A drive whose closures are refused is the other one up to the first of them.
+    """
     pipeline, reports, states = round_the_ring(), list[FrameReport](), list[State]()
     with pytest.MonkeyPatch.context() as patch:
         if refusing:
+            _, reports, states = ring_and_states(False)
+            first = closings(reports)[0]
+            pipeline, reports, states = gone_on(False, first), reports[:first], states[:first]
             refuse_closures(patch)
-        for frame in seen(RING, DARK):
+        for frame in frames_of_ring()[len(reports) :]:
             states.append(states_of(pipeline))
             reports += drive(pipeline, [frame])
     return pipeline, reports, states
@@ -199,7 +211,7 @@ def test_landmarks_found_twice_become_one() -> None:
 def test_a_map_saved_right_after_a_closure_has_each_landmark_once() -> None:
     """The next frame would make them one; who saves the map now leaves out those that end."""
     first = closings(ring()[1])[0]
-    pipeline, frames = gone_on(False, first), list(seen(RING, DARK))
+    pipeline, frames = gone_on(False, first), frames_of_ring()
     drive(pipeline, [frames[first]])
     assert pipeline.places is not None
     ending, held = pipeline.places.ending, pipeline.estimator.landmarks().ids
@@ -219,7 +231,7 @@ def test_a_refused_closure_changes_nothing_but_that_a_rest_follows() -> None:
     rest = LOOPS.rest
     assert (np.diff(offered) > rest).all()
     without = pipeline_of(RING, 0.9, loops=None, lost=None)
-    for report, expected in zip(reports, drive(without, seen(RING, DARK)), strict=True):
+    for report, expected in zip(reports, drive(without, frames_of_ring()), strict=True):
         np.testing.assert_array_equal(report.stats.wTc, expected.stats.wTc)
         assert_same_bits(report.increment.observations, expected.increment.observations)
         np.testing.assert_array_equal(report.increment.pruned_ids, expected.increment.pruned_ids)
@@ -244,7 +256,7 @@ def test_only_a_closure_that_was_taken_bounds_later_drift(monkeypatch: pytest.Mo
         pipeline = gone_on(refusing, first)
         if refusing:
             refuse_closures(monkeypatch)
-        (report,) = drive(pipeline, [list(seen(RING, DARK))[first]])
+        (report,) = drive(pipeline, [frames_of_ring()[first]])
         loop = report.increment.loops[0]
         way[refusing] = pipeline.places.memory.way_since(loop.frame)
     assert way[False] < 0.01
@@ -278,7 +290,7 @@ def test_continued_from_its_state_it_goes_on_to_the_bit(
     if refusing:
         refuse_closures(monkeypatch)
     stop = closings(reports)[0] + after_closing
-    state, frames = states[stop], list(seen(RING, DARK))
+    state, frames = states[stop], frames_of_ring()
     again = gone_on(refusing, stop)
     assert_same_bits(state_of(again.places), state.places)
     assert again.places.taken == state.taken
