@@ -201,18 +201,27 @@ def outer_address() -> str:
         return str(probe.getsockname()[0])
 
 
-def test_workers_of_this_machine_are_reached_from_nowhere_else() -> None:
+@pytest.fixture(scope="module")
+def local() -> Iterator[tuple[Pool, list[tuple[str, int]]]]:
+    """A worker that is a process, and where this one listened before it began."""
     before = listening(0)
-    with Pool(1) as pool:
-        ((_, of_worker),) = pool.run(listening, [1], never)
-        assert isinstance(of_worker, list)
-        opened = [*of_worker, *(one for one in listening(0) if one not in before)]
-        assert len(of_worker) >= 1
-        assert len(opened) > len(of_worker)
-        assert {address for address, _ in opened} == {"0100007F"}
-        for _, port in opened:
-            with pytest.raises(ConnectionRefusedError):
-                socket.create_connection((outer_address(), port), timeout=5.0)
+    with Pool(1) as found:
+        yield found, before
+
+
+def test_workers_of_this_machine_are_reached_from_nowhere_else(
+    local: tuple[Pool, list[tuple[str, int]]],
+) -> None:
+    pool, before = local
+    ((_, of_worker),) = pool.run(listening, [1], never)
+    assert isinstance(of_worker, list)
+    opened = [*of_worker, *(one for one in listening(0) if one not in before)]
+    assert len(of_worker) >= 1
+    assert len(opened) > len(of_worker)
+    assert {address for address, _ in opened} == {"0100007F"}
+    for _, port in opened:
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection((outer_address(), port), timeout=5.0)
 
 
 def napping(seconds: float) -> int:
@@ -225,11 +234,13 @@ def own_number(value: int) -> int:
     return os.getpid()
 
 
-def test_workers_are_used_again_except_for_what_wants_a_fresh_process() -> None:
-    with Pool(1) as pool:
-        first, second = dict(pool.run(own_number, [1, 2], never)).values()
-        (third,) = dict(pool.run(own_number, [1], never)).values()
-        fresh = set(dict(pool.run(own_number, [1, 2], never, fresh=True)).values())
+def test_workers_are_used_again_except_for_what_wants_a_fresh_process(
+    local: tuple[Pool, list[tuple[str, int]]],
+) -> None:
+    pool, _ = local
+    first, second = dict(pool.run(own_number, [1, 2], never)).values()
+    (third,) = dict(pool.run(own_number, [1], never)).values()
+    fresh = set(dict(pool.run(own_number, [1, 2], never, fresh=True)).values())
     assert first == second == third
     assert len(fresh) == 2
     assert first not in fresh
