@@ -417,6 +417,22 @@ def export(  # noqa: PLR0913 - each option is a parameter
 
 
 @command(app)
+def pictures(run_folder: options.RunFolder) -> None:
+    """Draw a run's map and errors as pictures, for print: RUN/pictures/*.png.
+
+    The map from above with its ellipses and in perspective, errors along the axes, matches over
+    time; report.html shows the same as figures.
+
+    Args:
+        run_folder (RUN): a run folder
+    """
+    from fgslam.runs.report import draw_run
+
+    for path in draw_run(run_folder):
+        typer.echo(str(path))
+
+
+@command(app)
 def film(
     run_folder: options.RunFolder,
     out: Annotated[Path, typer.Argument()],

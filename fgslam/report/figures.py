@@ -17,7 +17,7 @@ import numpy as np
 from plotly import graph_objects as go
 from plotly.subplots import make_subplots
 
-from fgslam.core.arrays import FloatArray, IntArray
+from fgslam.core.arrays import FloatArray
 from fgslam.core.types import Estimate, Trajectory
 from fgslam.evaluation.judging import Answer, Comparable, require_named
 from fgslam.evaluation.statistics import to_estimate_world
@@ -531,23 +531,34 @@ def _missing(data: ReportData) -> str:
     return "there is no ground truth" if data.truth is None else "nothing was recorded"
 
 
-def matches_over_time(
-    frames: IntArray, matched: IntArray, inliers: IntArray, landmarks: IntArray
-) -> Figure:
-    """Landmarks matched and used in each frame, and landmarks in the map; (n,) each."""
+_COUNTS = {
+    "matched": (1, "matched", "y"),
+    "inliers": (0, "used for the pose", "y"),
+    "landmarks": (2, "landmarks in the map", "y2"),
+}
+"""Of each column of frames.csv: colour, words and panel."""
+
+
+def matches_over_time(estimator: EstimatorReport) -> Figure:
+    """Landmarks matched and used in each frame, and landmarks in the map."""
+    # The first frame has no landmarks to match.
+    seconds = (estimator.timestamps - estimator.timestamps[:1])[1:]
+    counts = {name: values[1:] for name, values in estimator.counts.items()}
     traces = [
-        curve(name, frames.astype(np.float64), counts.astype(np.float64), colour(number),
-              width=1.8, yaxis=axis)
-        for number, name, counts, axis in (
-            (1, "matched", matched, "y"),
-            (0, "used for the pose", inliers, "y"),
-            (2, "landmarks in the map", landmarks, "y2"),
-        )
-    ]  # fmt: skip
-    out = panels(traces, ["landmarks a frame", "landmarks in the map"], "frame")
-    note = f"median {np.median(matched):.0f} matched, least {matched.min()}" if len(frames) else ""
-    words = "Landmarks matched and used in each frame, and landmarks in the map."
-    return Figure("matches", "Matches and map", words, out.update_yaxes(rangemode="tozero"), note)
+        curve(words, seconds, counts[name], colour(number), width=1.8, yaxis=axis)
+        for name, (number, words, axis) in _COUNTS.items()
+    ]
+    out = panels(traces, ["landmarks a frame", "landmarks in the map"])
+    matched, note = counts["matched"], ""
+    if len(matched):
+        note = f"median {np.median(matched):.0f} matched, least {matched.min():.0f}"
+    return Figure(
+        "matches",
+        "Matches and map",
+        "Landmarks matched and used in each frame, and landmarks in the map.",
+        out.update_yaxes(rangemode="tozero"),
+        note=note,
+    )
 
 
 def nees_over_time(data: ReportData) -> Figure:

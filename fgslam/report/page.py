@@ -172,6 +172,7 @@ def slam_page(data: ReportData) -> Page:
             drawn.error_by_axis(data),
             drawn.nees_over_time(data),
             drawn.time_per_frame(data),
+            *(drawn.matches_over_time(e) for e in data.estimators[:1] if e.counts),
             *([drawn.noise_over_time(data)] if any(e.noise for e in data.estimators) else []),
             *([drawn.calibration_over_time(rig, data.start)] if rig is not None else []),
         ),

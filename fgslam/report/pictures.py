@@ -17,15 +17,13 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap, LogNorm, Normalize, hsv_to_rgb
+from matplotlib.colors import Normalize, hsv_to_rgb
 from matplotlib.figure import Figure as Canvas
-from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator, ScalarFormatter
+from matplotlib.ticker import MaxNLocator
 
 from fgslam.core.arrays import BoolArray, FloatArray, Image
 from fgslam.core.files import replacing
-from fgslam.core.types import Features
 from fgslam.report.content import Figure, bulk_limits
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
@@ -283,140 +281,6 @@ def _paper_size(layout: Any, panels: int) -> tuple[float, float]:
 
 # --------------------------------------------------------------------------------------------
 # Images with what was found in them
-
-_CAMERAS = ("Right", "Left", "Top")
-# The descriptor covers a window of about twelve scales; a square of four stays readable.
-_SQUARE_SIDE_IN_SCALES = 4.0
-# Wider images than this are stacked rather than set side by side.
-_PANORAMIC_ASPECT = 2.2
-# Without the dark end, which would be lost in the shadows of the image.
-_DISPARITY_COLOURS = ListedColormap(matplotlib.colormaps["plasma"](np.linspace(0.3, 1.0, 256)))
-_ALONE_INCHES, _IMAGE_INCHES = 9.0, 5.6  # widths of images, alone in a row or not
-_HEADING_INCHES, _TITLE_INCHES = 0.42, 0.45
-
-
-def draw_features(
-    path: Path, images: tuple[Image, ...], features: tuple[Features, ...], title: str = ""
-) -> None:
-    """SIFT features as squares: side proportional to scale, turned by orientation (Fig. 1).
-
-    Args:
-        path: the PNG to write.
-        images: (height, width) uint8, in the order right, left[, top]; drawn as top, left, right.
-        features: of each image, or of the first ones alone: only these are drawn.
-        title: heading of the whole picture, e.g. the frame.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    count, (height, width) = len(features), images[0].shape
-    stacked = count == 1 or width > _PANORAMIC_ASPECT * height
-    rows, columns = (count, 1) if stacked else (1, count)
-    inches = _ALONE_INCHES if stacked else _IMAGE_INCHES
-    tall = rows * (inches * height / width + _HEADING_INCHES) + (_TITLE_INCHES if title else 0.0)
-    with picture(path, columns * inches + 0.2, tall) as figure:
-        panels = figure.subplots(rows, columns, squeeze=False).ravel()
-        for axes, k in zip(panels, reversed(range(count)), strict=True):
-            show_image(axes, images[k], _CAMERAS[k], f"{len(features[k])} features")
-            add_segments(axes, oriented_squares(features[k]), 1.1, color=YELLOW)
-        if title:
-            figure.suptitle(title, **_SUPTITLE)
-
-
-def oriented_squares(features: Features) -> FloatArray:
-    """Outlines (n, 7, 2): once around the square, then a stroke from its centre ahead."""
-    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [0, 0]], dtype=float)
-    half = 0.5 * _SQUARE_SIDE_IN_SCALES * features.scale[:, None]
-    ahead = half * np.column_stack([np.cos(features.orientation), np.sin(features.orientation)])
-    # A quarter turn clockwise on the screen, where rows grow downwards.
-    aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
-    offsets = corners[None, :, :1] * ahead[:, None] + corners[None, :, 1:] * aside[:, None]
-    return np.asarray(features.xy[:, None] + offsets)
-
-
-def draw_disparities(path: Path, image: Image, pixels: FloatArray, title: str = "") -> None:
-    """Matches over the cameras: lines as long as the disparities, coloured by them (Fig. 2).
-
-    Args:
-        path: the PNG to write.
-        image: the reference (right) image, (height, width) uint8.
-        pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top one.
-        title: heading, e.g. the frame.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    right, left, top = pixels.transpose(1, 0, 2)
-    disparity = left[:, 0] - right[:, 0]
-    low, high = (float(disparity.min()), float(disparity.max())) if len(pixels) else (0.0, 1.0)
-    # Logarithmic where disparities span a wide range, so that far features differ too.
-    wide = low > 0.0 and high > 8.0 * low
-    norm = LogNorm(low, high) if wide else Normalize(low, max(high, low + 1.0))
-    colours: dict[str, Any] = {"cmap": _DISPARITY_COLOURS, "norm": norm}
-    with _one_image(path, image, title or "Stereo matches", f"{len(pixels)} matches", 1.2) as axes:
-        across = np.stack([right, np.column_stack([left[:, 0], right[:, 1]])], axis=1)
-        lines = add_segments(axes, across, 1.6, array=disparity, **colours)
-        if np.isfinite(top).any():
-            down = np.stack([right, np.column_stack([right[:, 0], top[:, 1]])], axis=1)
-            add_segments(axes, down, 1.6, array=disparity, **colours)
-        rims: dict[str, Any] = {"edgecolors": "black", "linewidths": 0.6}
-        axes.scatter(*right.T, s=16, c=disparity, **rims, **colours)
-        colour_bar(axes, lines, "horizontal disparity (px)")
-        if wide:
-            scale = axes.child_axes[0].yaxis
-            scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            scale.set_major_formatter(ScalarFormatter())
-            scale.set_minor_locator(NullLocator())
-
-
-def draw_flow(
-    path: Path, image: Image, before: FloatArray, after: FloatArray, title: str = ""
-) -> None:
-    """How matched features moved between two frames: dot, line, cross (Fig. 3).
-
-    Args:
-        path: the PNG to write.
-        image: the earlier frame's reference image, (height, width) uint8.
-        before: (n, 2) (column, row) in the earlier frame, pixels.
-        after: (n, 2) in the later frame.
-        title: heading, e.g. the frames and the motion between them.
-
-    Raises:
-        OutputError: the file cannot be written.
-    """
-    note = f"{len(before)} matches"
-    if len(before):
-        flow = np.linalg.norm(after - before, axis=1)
-        note += f", median flow {np.median(flow):.1f} px"
-    alone: dict[str, Any] = {"linestyle": "none"}
-    with _one_image(path, image, title or "Flow between frames", note, higher=0.15) as axes:
-        add_segments(axes, np.stack([before, after], axis=1), 1.6, color=SKY)
-        rims: dict[str, Any] = {"edgecolors": "black", "linewidths": 0.7, "zorder": 3}
-        axes.scatter(*before.T, s=26, c=YELLOW, **rims)
-        cross: dict[str, Any] = {"s": 42, "marker": "x", "zorder": 4}
-        axes.scatter(*after.T, c="black", alpha=0.6, linewidths=3.4, **cross)
-        axes.scatter(*after.T, c=ORANGE, linewidths=1.8, **cross)
-        dot = Line2D([], [], label="position in the earlier frame", marker="o", markersize=7,
-                     markeredgecolor=INK, color=YELLOW, **alone)  # fmt: skip
-        mark = Line2D([], [], label="position in the later frame", marker="x", markersize=8,
-                      markeredgewidth=2.0, color=ORANGE, **alone)  # fmt: skip
-        motion = Line2D([], [], label="motion", color=SKY, linewidth=2.0)
-        figure = axes.get_figure(root=True)
-        figure.legend(handles=[dot, mark, motion], loc="outside lower center", ncols=3)
-
-
-@contextmanager
-def _one_image(
-    path: Path, image: Image, title: str, note: str, wider: float = 0.0, higher: float = 0.0
-) -> Iterator[Any]:
-    """Axes that show an image; a picture of it with room for a bar (wider) or a legend (higher)."""
-    height, width = image.shape
-    tall = _ALONE_INCHES * height / width + _HEADING_INCHES + _TITLE_INCHES
-    with picture(path, _ALONE_INCHES + 0.2 + wider, tall + higher) as figure:
-        axes = figure.subplots()
-        show_image(axes, image, title, note)
-        yield axes
-
 
 _PAIR_WIDTH_IN, _VIEW_WIDTH_IN, _SHEET_WIDTH_IN = 9.0, 11.0, 11.0
 _SHEET_COLUMNS = 4

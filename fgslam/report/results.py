@@ -50,6 +50,8 @@ class EstimatorReport:
         failure: why it ended early, with what it had until then, or gave nothing; else empty.
         predicted: (n,) poses that no landmark measured.
         noise: (n,) each, the columns of noise.csv; empty where nothing is known of it.
+        counts: (n,) each, landmarks `matched`, `inliers` (used for the pose) and `landmarks` (in
+            the map) of each frame; empty where nothing is known of them.
     """
 
     title: str
@@ -71,9 +73,11 @@ class EstimatorReport:
     remarks: tuple[str, ...] = ()
     failure: str = ""
     noise: Mapping[str, FloatArray] = field(default_factory=dict)
+    counts: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        rows = {f.name: getattr(self, f.name) for f in fields(self)} | dict(self.noise)
+        rows = {f.name: getattr(self, f.name) for f in fields(self)}
+        rows |= dict(self.noise) | dict(self.counts)
         del rows["landmarks"]
         for name, values in rows.items():
             if isinstance(values, np.ndarray) and len(values) != len(self):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, fields, replace
@@ -13,6 +14,7 @@ import yaml
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, FgslamError
+from fgslam.core.files import make_subfolder
 from fgslam.core.log import MeasurementLog
 from fgslam.core.sensors import vertical_of
 from fgslam.core.types import (
@@ -43,6 +45,7 @@ from fgslam.report.content import (
     write_csv,
 )
 from fgslam.report.formats import read_ply
+from fgslam.report.overlays import draw_plan
 from fgslam.report.results import (
     NO_LANDMARKS,
     EstimatorReport,
@@ -53,8 +56,16 @@ from fgslam.report.results import (
 )
 from fgslam.runs.engine import LocatedShare
 from fgslam.runs.folder import CALIBRATION_FILE, LOG_FILE, REPORT_FILE, RUN_MARKER
-from fgslam.runs.tables import NOISE_TABLE, SYNTHETIC, marked, page_tables
-from fgslam.slam.replay import peak_memory_mb
+from fgslam.runs.results import PICTURES
+from fgslam.runs.tables import (
+    FRAMES_FILE,
+    NOISE_TABLE,
+    SYNTHETIC,
+    marked,
+    page_tables,
+    picture_title,
+)
+from fgslam.slam.replay import ReplayRow, peak_memory_mb
 from fgslam.slam.results import STAGES, RunRecorder, located_frames
 
 # ------------------------------------------------------------------------------------------
@@ -80,6 +91,24 @@ def estimator_metrics(estimate: Estimate, truth: Truth, recorder: RunRecorder) -
         predicted=predicted_poses(recorder.column("status").tolist()),
     )
     return judge_answer(answer, truth).metrics
+
+
+def frame_rows(recorder: RunRecorder) -> list[ReplayRow]:
+    """The live estimator's frames.csv, frame by frame, as of a replayed one."""
+    times = _stage_sum(np.array(recorder.stage_ms).reshape(-1, len(STAGES)), _ESTIMATOR_STAGES)
+    return [
+        ReplayRow(
+            status=row.status,
+            matched=row.matched,
+            inliers=row.inliers,
+            landmarks=row.landmarks,
+            nis=row.nis,
+            nis_dof=row.nis_dof,
+            update_ms=milliseconds,
+            solve_ms=math.nan,  # the front-end's own
+        )
+        for row, milliseconds in zip(recorder.rows, times.tolist(), strict=True)
+    ]
 
 
 def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
@@ -239,17 +268,22 @@ def read_closures(path: Path) -> tuple[TextTable, tuple[tuple[int, int], ...]]:
 # A folder read back for its page
 
 _UP = np.array([0.0, -1.0, 0.0])
-_TIMED_STAGES = ("predict", "update")
+COUNTS = ("matched", "inliers", "landmarks")
+"""Columns of frames.csv that the page draws."""
 _MOST_NOTES = 20
 
 
-def report_from_folder(folder: Path, run: Path | None = None) -> Path:
+def report_from_folder(
+    folder: Path, run: Path | None = None, page: bool = True, plan: bool = False
+) -> Path:
     """Writes ``report.html`` into a folder of results.
 
     Args:
         folder: what `fgslam run` or `fgslam compare` wrote.
         run: where configuration, truth, log and pictures are sought that ``folder`` lacks; None
             for the folder above it, where that is a run.
+        page: whether to.
+        plan: whether to draw the first estimator's path and landmarks from above, too.
 
     Returns:
         The page.
@@ -257,11 +291,49 @@ def report_from_folder(folder: Path, run: Path | None = None) -> Path:
     Raises:
         FgslamError: there are no results, one of the files is damaged, or writing failed.
     """
-    from fgslam.report.page import write_report  # loads Plotly
+    data = load_report(folder, run)
+    if plan:
+        draw_plan(make_subfolder(folder, PICTURES) / "map_from_above.png", data)
+    if page:
+        from fgslam.report.page import write_report  # loads Plotly
 
-    page = folder / REPORT_FILE
-    write_report(page, load_report(folder, run))
-    return page
+        write_report(folder / REPORT_FILE, data)
+    return folder / REPORT_FILE
+
+
+def draw_run(run: Path) -> list[Path]:
+    """Pictures of a run by the estimator that steered, as PNG files in its folder `pictures`.
+
+    `map_from_above` (Se, Lowe and Little 2001, Fig. 5), `map_views` (in perspective, Fig. 6),
+    `position_error` where truth is known, and `matches`.
+
+    Raises:
+        FgslamError: there are no results, one of the files is damaged, or writing failed.
+    """
+    from fgslam.report import figures as drawn  # loads Plotly
+    from fgslam.report.pictures import draw_figure, draw_views  # loads Matplotlib
+
+    data = load_report(run)
+    live = data.estimators[0]
+    data = replace(data, estimators=(live,))
+    folder = make_subfolder(run, PICTURES)
+
+    def title(what: str) -> str:
+        return picture_title(
+            f"{data.title}: {what}", int(live.predicted.sum()), SYNTHETIC in live.title
+        )
+
+    what = title(f"{len(live.landmarks):,} landmarks")
+    above = drawn.drive_from_above(data, drawn.ON_PAPER)
+    draw_figure(folder / "map_from_above.png", above, what, {drawn.LANDMARK_ELLIPSES})
+    draw_views(folder / "map_views.png", drawn.map_to_turn(data, drawn.ON_PAPER), what)
+    if live.counts:
+        matches = drawn.matches_over_time(live)
+        draw_figure(folder / "matches.png", matches, title("landmark matches"))
+    if data.truth is not None:
+        errors = title("position error, first pose aligned")
+        draw_figure(folder / "position_error.png", drawn.error_by_axis(data), errors)
+    return sorted(path for path in folder.glob("*.png") if path.stem in _FIGURES_OF_THE_PAGE)
 
 
 def load_report(folder: Path, run: Path | None = None) -> ReportData:
@@ -282,18 +354,11 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
             "report.html, or give it to `fgslam compare`"
         )
     truth = None if (file := find("ground_truth.tum")) is None else Trajectory.load(file)
-    steering = _section(config, "estimator")
-    live = str(steering.get("label") or steering.get("kind") or "")
-    # Of a comparison's folder the clock is not the run's.
-    timing = find("timing.csv") if folder == folders[-1] else None
     titles = marked(
         metrics["estimators"], SYNTHETIC if metrics.get("remark") else "", say_failed=False
     )
     estimators = tuple(
-        replace(
-            _estimator(folder / name, values or {}, truth, timing if name == live else None),
-            title=title,
-        )
+        replace(_estimator(folder / name, values or {}, truth), title=title)
         for title, (name, values) in zip(titles, metrics["estimators"].items(), strict=True)
     )
     pictures = next((p for p in folders if (p / "pictures").is_dir()), folder) / "pictures"
@@ -369,16 +434,13 @@ def _up(log: Path | None) -> FloatArray:
         return _UP
 
 
-def _estimator(
-    folder: Path, values: dict[str, Any], truth: Trajectory | None, timing: Path | None
-) -> EstimatorReport:
+def _estimator(folder: Path, values: dict[str, Any], truth: Trajectory | None) -> EstimatorReport:
     """One estimator's files; what is not there is not known.
 
     Args:
         folder: of the estimator.
         values: its numbers in metrics.json.
         truth: true poses.
-        timing: the live run's timing.csv, where this is the estimator that steered.
     """
     title, kind = folder.name, str(values.get("kind") or folder.name)
     failure = str(values.get("failure") or "")
@@ -406,16 +468,20 @@ def _estimator(
     if (path := folder / NOISE_TABLE).is_file() and (columns := _columns(path)) is not None:
         stamps = columns.pop("timestamp", np.empty(0))
         noise = {name: _at(final, stamps, column) for name, column in columns.items()}
-    update_ms = report.update_ms
-    if (path := folder / "frames.csv").is_file():
-        table = read_table(path, ("timestamp", "update_ms"))
-        update_ms = _at(final, table["timestamp"].to_numpy(), table["update_ms"].to_numpy())
-    elif timing is not None:
-        table = read_table(timing, ("timestamp", "milliseconds"), ("stage",))
-        table = table[table["stage"].isin(_TIMED_STAGES)]
-        sums = table.groupby("timestamp")["milliseconds"].sum()
-        update_ms = _at(final, sums.index.to_numpy(np.float64), sums.to_numpy())
-    return replace(report, update_ms=update_ms, failure=failure, predicted=predicted, noise=noise)
+    update_ms, counts = report.update_ms, {}
+    if (path := folder / FRAMES_FILE).is_file():
+        table = read_table(path, ("timestamp", "update_ms", *COUNTS))
+        stamps = table["timestamp"].to_numpy()
+        update_ms = _at(final, stamps, table["update_ms"].to_numpy())
+        counts = {name: _at(final, stamps, table[name].to_numpy(np.float64)) for name in COUNTS}
+    return replace(
+        report,
+        update_ms=update_ms,
+        failure=failure,
+        predicted=predicted,
+        noise=noise,
+        counts=counts,
+    )
 
 
 def _at(final: Trajectory, stamps: FloatArray, values: FloatArray) -> FloatArray:
@@ -432,12 +498,11 @@ def _at(final: Trajectory, stamps: FloatArray, values: FloatArray) -> FloatArray
 
 _CAPTIONS = {
     "flow": "Matches of two frames: dot where a landmark was, cross where it is, line its motion",
-    "matches": "Landmarks matched and used in each frame, and landmarks in the map",
     "disparities": "Stereo matches: a line as long as the disparity from each feature",
     "features": "SIFT features: a square for each, its side the scale, the stroke its orientation",
 }
 """By kind, in the order of the page; pictures of frames have a number at the end."""
-_FIGURES_OF_THE_PAGE = frozenset({"map_from_above", "map_views", "position_error"})
+_FIGURES_OF_THE_PAGE = frozenset({"map_from_above", "map_views", "position_error", "matches"})
 """The page shows these as figures, drawn from the same values."""
 
 

@@ -65,7 +65,7 @@ def write_replay(
     folder = make_subfolder(run, replay.title)
     points = points_from_log(replay.estimate.landmarks, log, look)
     write_estimate(folder, replay.online, replay.estimate, points, remark)
-    write_frames(folder / FRAMES_FILE, replay)
+    write_frames(folder / FRAMES_FILE, replay.online.timestamps, replay.rows)
     write_noise(folder / NOISE_TABLE, replay.online.timestamps, replay.noise)
 
 
@@ -76,10 +76,10 @@ def write_noise(path: Path, timestamps: FloatArray, noise: Sequence[FrameNoise])
     write_csv(path, ("timestamp", *FrameNoise._fields), rows)
 
 
-def write_frames(path: Path, replay: Replay) -> None:
+def write_frames(path: Path, timestamps: FloatArray, frames: Sequence[ReplayRow]) -> None:
     """Write frames.csv: time stamp, then a column for each name of :class:`ReplayRow`."""
     lines = [",".join(("timestamp", *ReplayRow._fields))]
-    for stamp, row in zip(replay.online.timestamps, replay.rows, strict=True):
+    for stamp, row in zip(timestamps.tolist(), frames, strict=True):
         cells = (f"{cell:.6g}" if isinstance(cell, float) else str(cell) for cell in row)
         lines.append(",".join((f"{stamp:.9f}", *cells)))
     write_text(path, "\n".join(lines) + "\n")

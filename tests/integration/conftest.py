@@ -13,10 +13,9 @@ from running import Finished, run_values, units_in_this_process
 
 @pytest.fixture(scope="module", autouse=True)  # of a session it would last into other folders
 def _coarse_pictures() -> Iterator[None]:
-    """What pictures look like is tested elsewhere; here few and coarse ones, drawn faster."""
+    """What pictures look like is tested elsewhere; here coarse ones, drawn faster."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fgslam.report.pictures.DPI", 50)
-        patch.setattr("fgslam.runs.tasks.slam_results.SHOWN", (0.0,))
         yield
 
 

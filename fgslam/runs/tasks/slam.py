@@ -57,7 +57,6 @@ from fgslam.runs.tasks.slam_map_entry import (
 from fgslam.runs.tasks.slam_results import (
     RunOutputs,
     draw_frame,
-    draw_live,
     frames_to_show,
     run_notes,
     stereo_precision,
@@ -226,11 +225,11 @@ def _finish(outputs: RunOutputs, context: Context) -> SlamResult:
     config, folder = outputs.config, outputs.folder
     live = outputs.write_results("finished")
     about_map = _leave_map(outputs)
-    pictures = tuple(draw_live(outputs)) if config.output.pictures else ()
     compared = _compare(outputs, live, context)
-    if config.output.report:
-        report_from_folder(folder)
-    result = _result(outputs, live, pictures, compared, about_map)
+    output = config.output
+    if output.pictures or output.report:
+        report_from_folder(folder, page=output.report, plan=output.pictures)
+    result = _result(outputs, live, compared, about_map)
     if compared and context.stopped():
         return result  # the replays that are missing are for the next session
     # The checkpoint goes last: while anything is left, a run goes on from its last frames.
@@ -258,17 +257,17 @@ def _compare(outputs: RunOutputs, live: EstimatorMetrics, context: Context) -> d
 def _result(
     outputs: RunOutputs,
     live: EstimatorMetrics,
-    pictures: tuple[Path, ...] = (),
     compared: Mapping[str, Any] | None = None,
     about_map: str = "",
 ) -> SlamResult:
     """The result of an interrupted run."""
     config, compared = outputs.config, compared or {}
+    pictures = tuple(sorted((outputs.folder / PICTURES).glob("*.png")))
     files = {
         "trajectory": f"{outputs.folder / outputs.title / 'final.tum'}",
         "map": f"{outputs.folder / outputs.title / 'map.ply'}",
         "saved map": about_map,
-        "pictures": f"{pictures[0].parent}/" if pictures else "",
+        "pictures": f"{outputs.folder / PICTURES}/" if pictures else "",
     }
     tables = comparison_tables(named(config), len(outputs.recorder), compared)
     particulars = comparison_particulars(compared, outputs.folder)

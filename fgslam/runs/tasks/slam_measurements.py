@@ -9,21 +9,16 @@ import numpy as np
 
 from fgslam.core.errors import ConfigError
 from fgslam.core.log import LANDMARK_TRUTH_FILE, MeasurementRecording, write_landmark_truth
-from fgslam.core.sensors import vertical_of
-from fgslam.core.types import Estimate, LandmarkMap, Trajectory, read_covariances
 from fgslam.datasets.opening import open_measurements
 from fgslam.datasets.settings import MeasurementDatasetSettings
-from fgslam.evaluation.judging import predicted_poses
 from fgslam.evaluation.statistics import JsonValue
 from fgslam.report.content import write_timing
-from fgslam.report.formats import read_ply
 from fgslam.runs.config import ExperimentConfig
 from fgslam.runs.engine import Context, Opening, RunResult, Task, provenance_of
 from fgslam.runs.folder import LOG_FILE
 from fgslam.runs.report import spread
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, replay_apart, write_comparison
 from fgslam.runs.tables import FRAMES_FILE, read_frames
-from fgslam.runs.tasks.slam_results import draw_run
 from fgslam.slam.replay import ReplayRow
 
 
@@ -59,8 +54,6 @@ def _run(config: ExperimentConfig, recording: MeasurementRecording, context: Con
         for stage, milliseconds in (("track", row.solve_ms), ("update", row.update_ms))
     )
     write_timing(folder / "timing.csv", times)
-    if config.output.pictures and rows:
-        _draw(folder, config, recording, rows)
     about = _about(config, recording, rows)
     return write_comparison(context, config, len(recording.log), metrics, about, folder)
 
@@ -86,25 +79,3 @@ def _about(
         "status_counts": dict(sorted(Counter(row.status for row in rows).items())),
         "landmark_matches": spread(np.array([row.inliers for row in rows[1:]], np.int64)),
     }
-
-
-def _draw(
-    folder: Path, config: ExperimentConfig, recording: MeasurementRecording, rows: list[ReplayRow]
-) -> None:
-    """Pictures from the files of the first estimator."""
-    own = folder / config.estimator.title
-    points = read_ply(own / "map.ply")
-    landmarks = LandmarkMap(points.ids, points.positions, points.covariances)
-    covariances = read_covariances(own / "covariance.csv")[1]
-    frames = np.array([i.index for i in recording.log.increments[: len(rows)]], np.int64)
-    counts = np.array([(r.matched, r.inliers, r.landmarks) for r in rows], np.int64).T
-    draw_run(
-        folder,
-        config,
-        Estimate(Trajectory.load(own / "final.tum"), covariances, landmarks),
-        recording.ground_truth,
-        points.valid,
-        predicted_poses((row.status for row in rows), config.estimator.kind),
-        vertical_of(recording.log.rig.bTc),
-        (frames, *counts),
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,8 +28,8 @@ from fgslam.core.log import (
     write_landmark_truth,
 )
 from fgslam.core.saved_map import SavedMap
-from fgslam.core.sensors import CameraRig, moved_pixels, vertical_of
-from fgslam.core.types import WHOLE_PX, Estimate, LandmarkMap, StereoFeatures, Trajectory
+from fgslam.core.sensors import CameraRig, moved_pixels
+from fgslam.core.types import WHOLE_PX, LandmarkMap, StereoFeatures, Trajectory
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.evaluation.judging import Truth, closure_counts, predicted_poses
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, align, associate
@@ -43,7 +43,6 @@ from fgslam.report.content import (
     write_metrics,
     write_timing,
 )
-from fgslam.report.results import ReportData, judged_report, truth_in_their_world
 from fgslam.runs.config import Experiment, ExperimentConfig, parse
 from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE, LOG_FILE, METRICS_FILE
 from fgslam.runs.opening import open_sequence
@@ -51,6 +50,7 @@ from fgslam.runs.report import (
     closures_of,
     estimator_metrics,
     frame_problems,
+    frame_rows,
     located,
     place_numbers,
     run_numbers,
@@ -59,7 +59,14 @@ from fgslam.runs.report import (
 from fgslam.runs.results import PICTURES
 from fgslam.runs.session import drives_of, map_points
 from fgslam.runs.slam_comparison import GROUND_TRUTH_FILE, load_truth
-from fgslam.runs.tables import NOISE_TABLE, picture_title, write_estimate, write_noise
+from fgslam.runs.tables import (
+    FRAMES_FILE,
+    NOISE_TABLE,
+    picture_title,
+    write_estimate,
+    write_frames,
+    write_noise,
+)
 from fgslam.runs.tasks.slam_map_entry import GivenMap
 from fgslam.slam.build import calibrates_itself
 from fgslam.slam.pipeline import FrameReport, SlamPipeline
@@ -540,6 +547,7 @@ class RunOutputs:
         points = map_points(estimate.landmarks, self.pipeline.tracker.database)
         own = make_subfolder(self.folder, self.title)
         write_estimate(own, online_path, estimate, points, self.remark)
+        write_frames(own / FRAMES_FILE, online_path.timestamps, frame_rows(self.recorder))
         write_noise(own / NOISE_TABLE, online_path.timestamps, self.recorder.noise)
         metrics = estimator_metrics(estimate, truth, self.recorder)
         taken = () if self.pipeline.places is None else self.pipeline.places.taken
@@ -689,20 +697,16 @@ def run_notes(outputs: RunOutputs, metrics: EstimatorMetrics) -> tuple[str, ...]
     return tuple(lines)
 
 
-SHOWN = (0.0, 60 / 249, 120 / 249, 180 / 249)
-"""Frames shown, as parts of the run: those of the paper's Figure 4."""
-
-
 def frames_to_show(count: int) -> frozenset[int]:
-    """Which of ``count`` frames are drawn; the second is among them for the first flow."""
-    return frozenset({round(part * count) for part in SHOWN} | {1}) & frozenset(range(count))
+    """Which of ``count`` frames are drawn: the first, of which all features are, and the middle."""
+    return frozenset({0, count // 2})
 
 
 def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     """Features (Fig. 1), disparities (Fig. 2) and flow from the frame before (Fig. 3)."""
     if report.found.frame is None:
         return
-    from fgslam.report.pictures import draw_disparities, draw_features, draw_flow
+    from fgslam.report.overlays import draw_disparities, draw_features, draw_flow
 
     folder = make_subfolder(outputs.folder, PICTURES)
     images = report.found.frame.images
@@ -715,73 +719,3 @@ def draw_frame(outputs: RunOutputs, i: int, report: FrameReport) -> None:
     if len(outputs.recorder.log) > 1:
         before, after = moved_pixels(*outputs.recorder.log.increments[-2:])
         draw_flow(folder / f"flow_{i:06d}.png", images[0], before, after, title)
-
-
-def draw_live(outputs: RunOutputs) -> list[Path]:
-    """The pictures of a live run."""
-    # Once for all pictures: a smoother's estimate may take long.
-    estimate = outputs.pipeline.estimate()
-    database, recorder = outputs.pipeline.tracker.database, outputs.recorder
-    columns = (recorder.column(name) for name in ("matched", "inliers", "landmarks"))
-    return draw_run(
-        outputs.folder,
-        outputs.config,
-        estimate,
-        outputs.sequence.ground_truth,
-        database.valid[database.rows(estimate.landmarks.ids)],
-        predicted_poses(recorder.column("status").tolist()),
-        vertical_of(outputs.sequence.rig.bTc),
-        (recorder.log.numbers, *columns),
-    )
-
-
-def draw_run(
-    run: Path,
-    config: ExperimentConfig,
-    estimate: Estimate,
-    truth: Trajectory | None,
-    valid: BoolArray,
-    predicted: BoolArray,
-    up: FloatArray,
-    counts: Sequence[IntArray],
-) -> list[Path]:
-    """Map from above (Fig. 5), in perspective (Fig. 6), errors and matches over time.
-
-    Args:
-        run: the folder.
-        config: its name stands in the titles, which also say where odometry is synthetic.
-        estimate: of the estimator drawn.
-        truth: true poses, or None.
-        valid: (n,) which landmarks of the estimate were seen often enough (Se et al. 6.1).
-        predicted: (m,) poses that no landmark measured, which every title counts.
-        up: (3,) the vertical in the first camera's frame.
-        counts: (m,) each: the recording's numbers of the frames; landmarks matched, used and held.
-    """
-    from fgslam.report import figures as drawn  # Plotly and Matplotlib take a second
-    from fgslam.report.pictures import draw_figure, draw_views
-
-    def title(what: str) -> str:
-        words = f"{config.name}: {what}"
-        return picture_title(words, int(predicted.sum()), bool(config.remark))
-
-    folder = make_subfolder(run, PICTURES)
-    # Valid landmarks only (6.1), as in the paper's Figure 6; all while the run is too short.
-    if valid.any():
-        estimate = replace(estimate, landmarks=estimate.landmarks.select(valid))
-    report = judged_report("estimate", "", estimate, None, truth)
-    if len(predicted):
-        report = replace(report, predicted=predicted)
-    truth = truth_in_their_world((report,), truth)
-    results = ReportData(title=config.name, subtitle="", estimators=(report,), truth=truth, up=up)
-    kind = "valid landmarks" if valid.any() else "landmarks"
-    what = title(f"{len(report.landmarks):,} {kind}")
-    above = drawn.drive_from_above(results, drawn.ON_PAPER)
-    draw_figure(folder / "map_from_above.png", above, what, {drawn.LANDMARK_ELLIPSES})
-    draw_views(folder / "map_views.png", drawn.map_to_turn(results, drawn.ON_PAPER), what)
-    # The first frame has no landmarks to match.
-    matches = drawn.matches_over_time(*(values[1:] for values in counts))
-    draw_figure(folder / "matches.png", matches, title("landmark matches"))
-    if truth is not None:
-        what = title("position error, first pose aligned")
-        draw_figure(folder / "position_error.png", drawn.error_by_axis(results), what)
-    return sorted(folder.glob("*.png"))

@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from fgslam.core.arrays import Image
 from fgslam.core.errors import OutputError
 from fgslam.core.geometry import se3_exp
-from fgslam.core.types import Estimate, Features, LandmarkMap, Trajectory
+from fgslam.core.types import Estimate, LandmarkMap, Trajectory
 from fgslam.report.figures import (
     LANDMARK_ELLIPSES,
     drive_from_above,
@@ -24,47 +23,15 @@ from fgslam.report.figures import (
     matches_over_time,
 )
 from fgslam.report.homing_figures import Located, located_figure
-from fgslam.report.pictures import (
-    draw_disparities,
-    draw_features,
-    draw_figure,
-    draw_flow,
-    draw_views,
-    oriented_squares,
-)
+from fgslam.report.pictures import draw_figure, draw_views
 from fgslam.report.results import ReportData, judged_report
 from fgslam.runs.tables import picture_title
-
-YELLOW = np.array([0xF0, 0xE4, 0x42]) / 255.0
 
 
 @pytest.fixture
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few dots an inch: the same drawing, several times faster."""
     monkeypatch.setattr("fgslam.report.pictures.DPI", 50)
-
-
-def features(n: int, seed: int = 1) -> Features:
-    rng = np.random.default_rng(seed)
-    return Features(
-        xy=rng.uniform([0, 0], [160, 120], (n, 2)),
-        scale=rng.uniform(1, 6, n),
-        orientation=rng.uniform(0, 2 * np.pi, n),
-        descriptors=np.zeros((n, 128), np.uint8),
-    )
-
-
-def grey(seed: int = 2) -> Image:
-    return np.random.default_rng(seed).integers(0, 255, (120, 160), dtype=np.uint8)
-
-
-def pixels(n: int, cameras: int) -> np.ndarray:
-    right = np.random.default_rng(3).uniform(20, 100, (n, 2))
-    disparity = np.linspace(1, 30, n)
-    left, top = right.copy(), right.copy()
-    left[:, 0] += disparity
-    top[:, 1] += disparity if cameras == 3 else np.nan
-    return np.stack([right, left, top], axis=1)
 
 
 def results(n: int, frames: int, *, full: bool) -> ReportData:
@@ -94,18 +61,16 @@ def located(n: int) -> Located:
 
 
 def all_pictures(n: int, *, full: bool) -> dict[str, Callable[[Path], None]]:
-    images = (grey(), grey(), grey()) if full else (grey(), grey())
-    counts = np.arange(n)
+    one = results(n, n, full=full).estimators[0]
+    counts = np.arange(float(n))
+    counted = replace(
+        one, counts={"matched": counts, "inliers": counts + 5, "landmarks": 10 * counts}
+    )
     return {
-        "features": lambda p: draw_features(p, images, (features(n),) * len(images), "Frame 1"),
-        "disparities": lambda p: draw_disparities(p, grey(), pixels(n, len(images))),
-        "flow": lambda p: draw_flow(p, grey(), features(n).xy, features(n, 9).xy),
         "above": lambda p: draw_figure(p, drive_from_above(results(n, n, full=full)), "Above"),
         "views": lambda p: draw_views(p, map_to_turn(results(n, n, full=full)), "Map"),
         "errors": lambda p: draw_figure(p, error_by_axis(results(n, n, full=full)), "Errors"),
-        "matches": lambda p: draw_figure(
-            p, matches_over_time(counts, counts + 5, counts, 10 * counts), "Matches"
-        ),
+        "matches": lambda p: draw_figure(p, matches_over_time(counted), "Matches"),
         "located": lambda p: draw_figure(p, located_figure(located(n), "k", "Found"), "Found"),
     }
 
@@ -148,58 +113,11 @@ def test_pictures_need_no_display_and_no_pyplot() -> None:
 
 def test_unwritable_path_is_one_clear_line(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="does not exist"):
-        draw_flow(tmp_path / "absent" / "a.png", grey(), np.zeros((0, 2)), np.zeros((0, 2)))
+        all_pictures(0, full=False)["above"](tmp_path / "absent" / "a.png")
 
 
 # --------------------------------------------------------------------------------------------
 # What is drawn
-
-
-def test_squares_have_side_and_orientation_of_the_feature() -> None:
-    shown = oriented_squares(features(30))
-    given = features(30)
-    corners = shown[:, 1:5]
-    sides = np.linalg.norm(np.diff(corners, axis=1), axis=2)
-    np.testing.assert_allclose(sides, np.tile(4.0 * given.scale[:, None], (1, 3)))
-    np.testing.assert_allclose(corners.mean(axis=1), given.xy)
-    stroke = shown[:, -2] - shown[:, -1]
-    np.testing.assert_allclose(shown[:, -1], given.xy)
-    angles = np.arctan2(stroke[:, 1], stroke[:, 0]) % (2 * np.pi)
-    np.testing.assert_allclose(angles, given.orientation)
-    np.testing.assert_allclose(np.linalg.norm(stroke, axis=1), 2.0 * given.scale)
-
-
-def test_feature_appears_where_it_was_found(tmp_path: Path) -> None:
-    one = Features(
-        xy=np.array([[120.0, 90.0]]),
-        scale=np.array([5.0]),
-        orientation=np.zeros(1),
-        descriptors=np.zeros((1, 128), np.uint8),
-    )
-    black = np.zeros((120, 160), np.uint8)
-    none = features(0)
-    draw_features(tmp_path / "a.png", (black, black), (one, none))
-    picture = imread(tmp_path / "a.png")[..., :3]
-    columns = np.flatnonzero((np.abs(picture - YELLOW).max(axis=2) < 0.1).any(axis=0))
-    # The left image is on the left half; the right one has the feature at 3/4 of its width.
-    dark = np.flatnonzero((picture.max(axis=2) < 0.05).any(axis=0))
-    gap = dark[np.argmax(np.diff(dark)) + 1]
-    width = dark[-1] - gap
-    assert columns.min() > gap
-    assert 0.5 * (columns.min() + columns.max()) - gap == pytest.approx(0.75 * width, abs=4)
-    assert columns.max() - columns.min() == pytest.approx(20 / 160 * width, abs=6)
-
-
-def test_only_images_with_features_are_drawn(tmp_path: Path) -> None:
-    """On key frames of carried landmarks SIFT sees the reference image alone."""
-    white = np.full((120, 160), 255, np.uint8)
-    aspects = []
-    for seen in (1, 2, 3):
-        draw_features(tmp_path / f"{seen}.png", (white,) * 3, (features(4),) * seen)
-        height, width = imread(tmp_path / f"{seen}.png").shape[:2]
-        aspects.append(width / height)
-    assert aspects[1] > 1.5 * aspects[0]
-    assert aspects[2] > 1.3 * aspects[1]
 
 
 def test_poses_that_no_landmark_measured_are_counted_in_every_title() -> None:

@@ -1,0 +1,256 @@
+"""Images with what was found in them, by OpenCV: features, disparities, flow (Se et al., Fig. 1-3).
+
+A frame takes milliseconds: every run draws some.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from fgslam.core.arrays import FloatArray, Image
+from fgslam.core.files import replacing
+from fgslam.core.types import Features
+from fgslam.report.content import bulk_limits, level_axes
+from fgslam.report.results import ReportData
+
+# Okabe and Ito's colours, which the colour-blind can tell apart; in blue, green, red.
+_INK, _PAPER, _RIM = (34, 34, 34), (255, 255, 255), (20, 20, 20)
+_DOT = (160, 150, 140)
+_ORANGE, _SKY, _YELLOW = (0, 159, 230), (233, 180, 86), (66, 228, 240)
+_WHITE = 0.78  # whites become this grey, so that bright marks stand out on windows and posters
+_ALONE_PX, _BESIDE_PX = 1400, 900  # widths of images, alone in a row or not
+_PANORAMIC_ASPECT = 2.2  # wider images are stacked rather than set side by side
+_HEADING_PX, _BAR_PX, _MARGIN_PX = 44, 110, 10
+_TEXT_PX = 20
+_SHIFT = 4  # binary digits of a pixel's part in OpenCV's drawing
+_CAMERAS = ("Right", "Left", "Top")
+# The descriptor covers a window of about twelve scales; a square of four stays readable.
+_SQUARE_SIDE_IN_SCALES = 4.0
+
+
+def draw_features(
+    path: Path, images: tuple[Image, ...], features: tuple[Features, ...], title: str = ""
+) -> None:
+    """SIFT features as squares: side proportional to scale, turned by orientation (Fig. 1).
+
+    Args:
+        path: the PNG to write.
+        images: (height, width) uint8, in the order right, left[, top]; drawn as top, left, right.
+        features: of each image, or of the first ones alone: only these are drawn.
+        title: heading of the whole picture, e.g. the frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    count, (height, width) = len(features), images[0].shape
+    stacked = count == 1 or width > _PANORAMIC_ASPECT * height
+    panels = []
+    for k in reversed(range(count)):
+        panel, scale = _enlarged(images[k], _ALONE_PX if stacked else _BESIDE_PX)
+        _draw_lines(panel, scale * (oriented_squares(features[k]) + 0.5), [_YELLOW])
+        panel = _headed(panel, _CAMERAS[k], f"{len(features[k])} features")
+        apart = (0, 0 if stacked else _MARGIN_PX)
+        panels.append(np.pad(panel, ((0, 0), apart, (0, 0)), constant_values=255))
+    whole = np.concatenate(panels, axis=0 if stacked else 1)
+    _write(path, _headed(whole, title, "") if title else whole)
+
+
+def oriented_squares(features: Features) -> FloatArray:
+    """Outlines (n, 7, 2): once around the square, then a stroke from its centre ahead."""
+    corners = np.array([[1, 0], [1, 1], [-1, 1], [-1, -1], [1, -1], [1, 0], [0, 0]], dtype=float)
+    half = 0.5 * _SQUARE_SIDE_IN_SCALES * features.scale[:, None]
+    ahead = half * np.column_stack([np.cos(features.orientation), np.sin(features.orientation)])
+    # A quarter turn clockwise on the screen, where rows grow downwards.
+    aside = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    offsets = corners[None, :, :1] * ahead[:, None] + corners[None, :, 1:] * aside[:, None]
+    return np.asarray(features.xy[:, None] + offsets)
+
+
+def draw_disparities(path: Path, image: Image, pixels: FloatArray, title: str = "") -> None:
+    """Matches over the cameras: lines as long as the disparities, coloured by them (Fig. 2).
+
+    Args:
+        path: the PNG to write.
+        image: the reference (right) image, (height, width) uint8.
+        pixels: (n, 3, 2) raw (column, row) in right, left and top image; NaN without a top one.
+        title: heading, e.g. the frame.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    panel, scale = _enlarged(image, _ALONE_PX)
+    right, left, top = scale * (pixels.transpose(1, 0, 2) + 0.5)
+    disparity = pixels[:, 1, 0] - pixels[:, 0, 0]
+    low, high = (float(disparity.min()), float(disparity.max())) if len(pixels) else (0.0, 1.0)
+    high = max(high, low + 1.0)
+    # Logarithmic where disparities span a wide range, so that far features differ too.
+    wide = low > 0.0 and high > 8.0 * low
+    ends = np.log([low, high]) if wide else np.array([low, high])
+    values = np.log(disparity) if wide else disparity
+    colours = _colours((values - ends[0]) / (ends[1] - ends[0]))
+    across = np.stack([right, np.column_stack([left[:, 0], right[:, 1]])], axis=1)
+    _draw_lines(panel, across, colours)
+    down = np.stack([right, np.column_stack([right[:, 0], top[:, 1]])], axis=1)
+    seen = np.isfinite(top).all(axis=1)
+    _draw_lines(panel, down[seen], [colours[k] for k in np.flatnonzero(seen)])
+    _draw_dots(panel, right, colours)
+    panel = _headed(panel, title or "Stereo matches", f"{len(pixels)} matches")
+    # The colour bar: its ends and steps between them.
+    tall = len(panel) - _HEADING_PX
+    ramp = np.array(_colours(np.linspace(1.0, 0.0, tall)), np.uint8)[:, None]
+    bar = np.full((len(panel), _BAR_PX, 3), 255, np.uint8)
+    bar[_HEADING_PX:, _MARGIN_PX : 3 * _MARGIN_PX] = ramp
+    for part in np.linspace(0.0, 1.0, 5).tolist():
+        value = ends[0] + part * (ends[1] - ends[0])
+        row = _HEADING_PX + (1.0 - part) * (tall - _TEXT_PX) + 0.85 * _TEXT_PX
+        _put_text(bar, f"{np.exp(value) if wide else value:.3g} px", (3.5 * _MARGIN_PX, row))
+    _write(path, np.concatenate([panel, bar], axis=1))
+
+
+def draw_flow(
+    path: Path, image: Image, before: FloatArray, after: FloatArray, title: str = ""
+) -> None:
+    """How matched features moved between two frames: dot, line, cross (Fig. 3).
+
+    Args:
+        path: the PNG to write.
+        image: the later frame's reference image, (height, width) uint8.
+        before: (n, 2) (column, row) in the earlier frame, pixels.
+        after: (n, 2) in the later frame.
+        title: heading, e.g. the frames and the motion between them.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    note = f"{len(before)} matches"
+    if len(before):
+        flow = np.linalg.norm(after - before, axis=1)
+        note += f", median flow {np.median(flow):.1f} px"
+    panel, scale = _enlarged(image, _ALONE_PX)
+    start, end = scale * (before + 0.5), scale * (after + 0.5)
+    _draw_lines(panel, np.stack([start, end], axis=1), [_SKY])
+    _draw_dots(panel, start, [_YELLOW])
+    arm = np.array([[-5.0, -5.0], [5.0, 5.0]])
+    for stroke in (arm, arm * [1.0, -1.0]):
+        _draw_lines(panel, end[:, None] + stroke, [_ORANGE])
+    legend = "dot: where it was in the earlier frame; line: its motion; cross: where it is"
+    below = np.full((_HEADING_PX, panel.shape[1], 3), 255, np.uint8)
+    _put_text(below, legend, (_MARGIN_PX, 0.65 * _HEADING_PX))
+    panel = _headed(panel, title or "Flow between frames", note)
+    _write(path, np.concatenate([panel, below]))
+
+
+def draw_plan(path: Path, data: ReportData) -> None:
+    """The first estimator's path and landmarks from above, with the truth and a scale (Fig. 5).
+
+    Args:
+        path: the PNG to write.
+        data: of the run.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    one, level = data.estimators[0], level_axes(data.up)[:2]
+    way, dots = one.final_poses[:, :3, 3] @ level.T, one.landmarks.positions @ level.T
+    limits = np.array(bulk_limits(way, dots))
+    size = np.diff(limits)[:, 0]
+    scale = _ALONE_PX / float(size.max())
+    wide, tall = (max(round(scale * side), _ALONE_PX // 3) for side in size.tolist())
+    canvas = np.full((tall, wide, 3), 255, np.uint8)
+
+    def pixels(points: FloatArray) -> FloatArray:
+        middle = np.array([wide, tall]) / 2.0
+        return np.asarray(middle + scale * (points - limits.mean(axis=1)) * [1.0, -1.0])
+
+    inside = ((dots > limits[:, 0]) & (dots < limits[:, 1])).all(axis=1)
+    columns, rows = np.clip(pixels(dots[inside]).astype(int), 0, [wide - 1, tall - 1]).T
+    for right, down in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        canvas[np.minimum(rows + down, tall - 1), np.minimum(columns + right, wide - 1)] = _DOT
+    lines = [(way, _SKY, 3)]
+    if data.truth is not None:
+        lines.append((data.truth.poses[:, :3, 3] @ level.T, _INK, 1))
+    for points, colour, thickness in lines:
+        known = points[np.isfinite(points).all(axis=1)]
+        cv2.polylines(
+            canvas, [_fixed(pixels(known))], False, colour, thickness, cv2.LINE_AA, _SHIFT
+        )
+    _draw_dots(canvas, pixels(way[-1:]), [_ORANGE])
+    # The longest of 1, 2 and 5 times a power of ten metres that a third of the picture holds.
+    room = wide / 3.0 / scale
+    power = 10.0 ** np.floor(np.log10(room))
+    length = power * max(k for k in (1.0, 2.0, 5.0) if k * power <= room)
+    end = np.array([[_MARGIN_PX, tall - 15.0], [_MARGIN_PX + scale * length, tall - 15.0]])
+    cv2.polylines(canvas, [_fixed(end)], False, _INK, 3, cv2.LINE_AA, _SHIFT)
+    _put_text(canvas, f"{length:g} m", (_MARGIN_PX, tall - 24.0))
+    words = "blue: path; grey: landmarks" + "; black: truth" * (data.truth is not None)
+    title = f"{data.title}: {one.title}, {len(dots):,} landmarks"
+    _write(path, _headed(_headed(canvas, words, ""), title, ""))
+
+
+def _enlarged(image: Image, width: int) -> tuple[Image, float]:
+    """The image, dimmed, in blue, green, red at a width near to ``width``; and its scale."""
+    scale = max(1.0, float(round(width / image.shape[1])))
+    darkest, brightest = np.percentile(image, [0.5, 99.5])
+    span = max(float(brightest - darkest), 32.0) / _WHITE
+    grey = cv2.convertScaleAbs(np.maximum(image, darkest) - darkest, alpha=255.0 / span)
+    grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    return cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), scale
+
+
+def _headed(panel: Image, title: str, note: str) -> Image:
+    """A panel below its title, in bold, and a note at the right."""
+    head = np.full((_HEADING_PX, panel.shape[1], 3), 255, np.uint8)
+    row = 0.65 * _HEADING_PX
+    _put_text(head, title, (_MARGIN_PX, row), weight=700)
+    if note:
+        wide = cv2.getTextSize((1, 1), note, (0, 0), cv2.FontFace("sans"), _TEXT_PX)[2]
+        _put_text(head, note, (panel.shape[1] - wide - _MARGIN_PX, row))
+    return np.concatenate([head, panel])
+
+
+def _put_text(canvas: Image, text: str, at: tuple[float, float], weight: int = 400) -> None:
+    place = (round(at[0]), round(at[1]))
+    cv2.putText(canvas, text, place, _INK, cv2.FontFace("sans"), _TEXT_PX, weight)
+
+
+def _draw_lines(canvas: Image, lines: FloatArray, colours: list[tuple[int, ...]]) -> None:
+    """Polylines (n, k, 2) with a dark rim, visible on bright and dark ground alike.
+
+    Of one colour, or each of its own.
+    """
+    points = list(_fixed(lines))
+    cv2.polylines(canvas, points, False, _RIM, 4, cv2.LINE_AA, _SHIFT)
+    for colour, group in zip(colours, [points] if len(colours) == 1 else points, strict=True):
+        own = group if len(colours) == 1 else [group]
+        cv2.polylines(canvas, own, False, colour, 2, cv2.LINE_AA, _SHIFT)
+
+
+def _draw_dots(canvas: Image, centres: FloatArray, colours: list[tuple[int, ...]]) -> None:
+    for k, centre in enumerate(_fixed(centres)):
+        place = tuple(centre.tolist())
+        cv2.circle(canvas, place, 5 << _SHIFT, _RIM, -1, cv2.LINE_AA, _SHIFT)
+        colour = colours[k % len(colours)]
+        cv2.circle(canvas, place, 4 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+
+
+def _fixed(points: FloatArray) -> npt.NDArray[np.int32]:
+    """Points as OpenCV's numbers of fixed parts of a pixel, whose centres are whole."""
+    return np.rint((points - 0.5) * (1 << _SHIFT)).astype(np.int32)
+
+
+def _colours(parts: FloatArray) -> list[tuple[int, ...]]:
+    """Of parts from 0 to 1; without the dark end, which would be lost in shadows."""
+    levels = np.rint(255.0 * (0.3 + 0.7 * parts)).astype(np.uint8).reshape(-1, 1)
+    painted = cv2.applyColorMap(levels, cv2.COLORMAP_PLASMA) if len(levels) else np.empty((0, 3))
+    return [tuple(row) for row in painted.reshape(-1, 3).astype(np.int64).tolist()]
+
+
+def _write(path: Path, canvas: Image) -> None:
+    # Level 1 takes a third of the time of 3, for a tenth more bytes.
+    packed = cv2.imencode(".png", canvas, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+    with replacing(path) as partial:
+        partial.write_bytes(packed.tobytes())
