@@ -18,7 +18,7 @@ from fgslam.core.geometry import rotation_from_quaternion
 from fgslam.core.types import Trajectory, read_covariances
 from fgslam.evaluation.statistics import to_estimate_world
 from fgslam.report.results import EstimatorReport
-from fgslam.runs.report import load_report, report_from_folder
+from fgslam.runs.report import draw_run, load_report, report_from_folder
 from fgslam.runs.view import claimed_positions, half_axes, view_run
 
 Capture = pytest.CaptureFixture[str]
@@ -97,10 +97,12 @@ def test_errors_over_time_are_those_of_displaced_poses(run: Path) -> None:
 
 @pytest.mark.parametrize(
     "absent",
-    ["ground_truth.tum", "timing.csv", "measurements.npz", "config.yaml"]
+    ["ground_truth.tum", "measurements.npz", "config.yaml"]
     + [
         f"{KIND}/{name}"
-        for name in ("online.tum", "covariance.csv", "map.ply", "final.tum", "noise.csv")
+        for name in (
+            "online.tum", "covariance.csv", "map.ply", "final.tum", "noise.csv", "frames.csv"
+        )
     ],
 )
 def test_a_run_that_lacks_a_file_has_a_page(run: Path, absent: str) -> None:
@@ -120,19 +122,34 @@ def test_a_run_that_lacks_a_file_has_a_page(run: Path, absent: str) -> None:
         assert "can be believed is not known" in text
     elif absent.endswith("noise.csv"):
         assert "Noise estimated" not in text
-    elif absent == "timing.csv":
+    elif absent.endswith("frames.csv"):
         assert np.isnan(estimator.update_ms).all()
+        assert not estimator.counts
 
 
-def test_times_of_a_replay_come_from_its_own_file(run: Path) -> None:
+def test_times_and_counts_come_from_the_estimator_s_own_file(run: Path) -> None:
     stamps = Trajectory.load(run / KIND / "final.tum").timestamps.tolist()
-    rows = [f"{t:.9f},{k}.5,ok" for k, t in enumerate(stamps)]
-    rows[3] = f"{stamps[3]:.9f},,ok"
-    text = "\n".join(["timestamp,update_ms,status", *rows]) + "\n"
+    rows = [f"{t:.9f},{k}.5,ok,{2 * k},{k},9" for k, t in enumerate(stamps)]
+    rows[3] = f"{stamps[3]:.9f},,ok,,,"
+    text = "\n".join(["timestamp,update_ms,status,matched,inliers,landmarks", *rows]) + "\n"
     (run / KIND / "frames.csv").write_text(text, encoding="utf-8")
-    times = only(run).update_ms
+    estimator = only(run)
+    times, matched = estimator.update_ms, estimator.counts["matched"]
     assert times[[0, 1, 11]].tolist() == [0.5, 1.5, 11.5]
+    assert matched[[0, 1, 11]].tolist() == [0, 2, 22]
     assert np.isnan(times[3])
+    assert np.isnan(matched[3])
+
+
+def test_pictures_of_a_run_are_drawn_from_its_files(run: Path) -> None:
+    found = draw_run(run)
+    assert [path.stem for path in found] == [
+        "map_from_above", "map_views", "matches", "position_error"
+    ]  # fmt: skip
+    assert all(path.read_bytes()[:4] == b"\x89PNG" for path in found)
+    (run / "ground_truth.tum").unlink()
+    (run / "pictures" / "position_error.png").unlink()
+    assert "position_error" not in {path.stem for path in draw_run(run)}
 
 
 def test_a_comparison_s_folder_borrows_from_the_run_above(run: Path) -> None:
@@ -142,8 +159,6 @@ def test_a_comparison_s_folder_borrows_from_the_run_above(run: Path) -> None:
     data = load_report(inside)
     assert data.truth is not None
     assert "landmark_kalman" in data.config_yaml
-    # The live run's clock is not the replay's.
-    assert np.isnan(data.estimators[0].update_ms).all()
     elsewhere = Path(shutil.copytree(inside, run.parent / "elsewhere"))
     assert load_report(elsewhere).truth is None
     assert load_report(elsewhere, run).truth is not None
