@@ -101,7 +101,12 @@ def test_errors_over_time_are_those_of_displaced_poses(run: Path) -> None:
     + [
         f"{KIND}/{name}"
         for name in (
-            "online.tum", "covariance.csv", "map.ply", "final.tum", "noise.csv", "frames.csv"
+            "online.tum",
+            "covariance.csv",
+            "map.ply",
+            "final.tum",
+            "noise.csv",
+            "frames.csv",
         )
     ],
 )
