@@ -55,7 +55,7 @@ SLAM_ROOMS = (
 """Rooms of SLAM; those of homing are the ones with `homing` in their name."""
 
 THIRD_PARTY_HOMES: dict[str, frozenset[str]] = {
-    "cv2": frozenset({"frontend", "datasets", "cameras"}),
+    "cv2": frozenset({"frontend", "datasets", "cameras", "report"}),
     "open3d": frozenset({"worlds", "report"}),
     "gtsam": frozenset({"factors", "backend"}),
     "gtsam_unstable": frozenset({"factors", "backend"}),
