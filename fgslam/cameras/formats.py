@@ -37,6 +37,7 @@ from fgslam.cameras.trees import (
     camera_of,
     intrinsic_matrix,
     kind_of,
+    lens_named,
     read_tree,
 )
 from fgslam.core.arrays import FloatArray
@@ -73,7 +74,6 @@ _ONE = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M")
 _OF_ONE = (
     *("distortion_coefficients", "distCoeffs", "Distortion_Coefficients", "D", "dist_coeffs"),
 )
-_FISHEYE = ("fisheye", "equidistant", "kannala_brandt")
 
 
 def is_opencv_pair(tree: Tree) -> bool:
@@ -139,8 +139,10 @@ def _read_opencv_one(path: Path, tree: Tree, size: Size | None) -> Calibration:
     model = "radtan"
     if "xi" in part:
         model, coefficients = "omni", np.append(part.number("xi"), coefficients)
-    elif part.number("fisheye_model", 0.0) or part.text("model") in _FISHEYE:
+    elif part.number("fisheye_model", 0.0):
         model = "equidistant"
+    elif stated := part.text("distortion_model") or part.text("model"):
+        model = lens_named(stated) or model
     size = size or _opencv_size(part)
     camera = checked_camera(RawCamera(*size, matrix, coefficients, np.eye(4), path.name, model))
     return Calibration(str(path), "OpenCV calibration", (camera,))
@@ -180,10 +182,10 @@ def read_opencv_pair(path: Path, tree: Tree, size: Size | None) -> Calibration:
         model, parameters = _opencv_lens(part, distortions[k], matrices[k], k)
         matrix, name = part.matrix(matrices[k], 3, 3), f"{path.name}: {matrices[k]}"
         cameras.append(checked_camera(RawCamera(*size, matrix, parameters, bTc, name, model)))
-    notes: tuple[str, ...] = ()
-    if cameras[0].model == "equidistant" and "distortion_model" not in part:
-        notes = (f"four coefficients next to {matrices[0]}: taken as those of cv2.fisheye",)
-    return Calibration(str(path), "OpenCV stereo calibration", tuple(cameras), True, None, notes)
+    stated = part.text("distortion_model") or part.text("model")
+    guessed = "" if stated or any(len(c.distortion) != 4 for c in cameras) else cameras[0].model
+    found = Calibration(str(path), "OpenCV stereo calibration", tuple(cameras), True)
+    return replace(found, guessed_lens=guessed)
 
 
 def _opencv_lens(part: Values, distortion: str, matrix: str, k: int) -> tuple[str, FloatArray]:
@@ -191,11 +193,10 @@ def _opencv_lens(part: Values, distortion: str, matrix: str, k: int) -> tuple[st
     coefficients = part.numbers(distortion)
     if f"xi{k + 1}" in part:
         return "omni", np.append(part.number(f"xi{k + 1}"), coefficients)
-    stated = part.text("distortion_model")
     fisheye = matrix.rpartition(" ")[2][0] == "K" and len(coefficients) == 4
-    if stated in _FISHEYE or (not stated and fisheye):
-        return "equidistant", coefficients
-    return "radtan", coefficients
+    if stated := part.text("distortion_model") or part.text("model"):
+        return lens_named(stated) or "radtan", coefficients
+    return "equidistant" if fisheye else "radtan", coefficients
 
 
 def _opencv_size(part: Values) -> Size:
@@ -225,13 +226,8 @@ _ROS = Row(
     matrix="camera_matrix",
     kind=("distortion_model",),
     lenses={
-        "plumb_bob": ("radtan", (_COEFFICIENTS,)),
-        "rational_polynomial": ("radtan", (_COEFFICIENTS,)),
-        "thin_prism": ("radtan", (_COEFFICIENTS,)),
-        "equidistant": ("equidistant", (_COEFFICIENTS,)),
-        "fisheye": ("equidistant", (_COEFFICIENTS,)),
-        "kannala_brandt": ("equidistant", (_COEFFICIENTS,)),
         "none": ("radtan", (_COEFFICIENTS,)),
+        **{model: (model, (_COEFFICIENTS,)) for model in ("radtan", "equidistant", "fov")},
     },
 )
 
@@ -297,22 +293,22 @@ def read_camera_info_pair(files: tuple[Path, Path], trees: tuple[Tree, Tree]) ->
 def _ros_camera(path: Path, tree: Tree) -> tuple[RawCamera, FloatArray, FloatArray]:
     """The camera, its rectifying rotation (3, 3) and its projection (3, 4)."""
     tree = _as_ros_file(tree)
-    kind = Values(path, tree).text("distortion_model") or "none"
-    given = tree.get(_COEFFICIENTS)
-    data = given.get("data") if isinstance(given, dict) else given
-    if isinstance(data, np.ndarray | list) and not np.size(data):  # CameraInfo.msg: none
-        fisheye = _ROS.lenses.get(kind, ("", ()))[0] == "equidistant"
-        given = [0.0] * (4 if fisheye else 5)
-    part = Values(path, {**tree, "distortion_model": kind, _COEFFICIENTS: given})
-    raw = camera_of(part, _ROS)
-    rotation, projection = np.eye(3), np.column_stack([raw.matrix, np.zeros(3)])
+    part = Values(path, tree)
+    rotation, projection = np.eye(3), np.zeros((3, 4))
+    if "projection_matrix" in part:
+        projection = part.matrix("projection_matrix", 3, 4)
+    uncalibrated = not part.numbers("camera_matrix").any()
+    if uncalibrated and not part.numbers(_COEFFICIENTS).any():
+        # Of images that are rectified already some drivers state P alone.
+        part = Values(path, {**tree, "camera_matrix": projection[:, :3]})
+    raw = camera_of(part, _ROS, name=path.name if path.suffix else str(path))
+    if not projection.any():
+        projection = np.column_stack([raw.matrix, np.zeros(3)])
     if "rectification_matrix" in part:
         turn = pose(part.matrix("rectification_matrix", 3, 3), np.zeros(3))
         rotation = reorthonormalise(turn)[:3, :3]
         if not np.allclose(rotation, turn[:3, :3], atol=1e-3):
             raise part.refuse("rectification_matrix is not a rotation; calibrate again")
-    if "projection_matrix" in part:
-        projection = part.matrix("projection_matrix", 3, 4)
     return raw, rotation, projection
 
 
@@ -431,10 +427,10 @@ _KALIBR = {
     "pinhole-radtan": ("radtan", 0),
     "pinhole-none": ("radtan", 0),
     "pinhole-equidistant": ("equidistant", 0),
-    "pinhole-equi": ("equidistant", 0),
     "pinhole-fov": ("fov", 0),
     "omni-radtan": ("omni", 1),
     "omni-none": ("omni", 1),
+    "mei-radtan": ("omni", 1),
     "ds-none": ("ds", 2),
     "eucm-none": ("eucm", 2),
 }
@@ -479,8 +475,6 @@ def _kalibr_camera(part: Values, bTc: FloatArray) -> RawCamera:
     intrinsics = part.numbers("intrinsics", own + 4)
     none = part.text("distortion_model", "none") == "none"
     coefficients = np.zeros(0) if none else part.numbers("distortion_coeffs")
-    if model in ("radtan", "omni") and not len(coefficients):
-        coefficients = np.zeros(4)
     return checked_camera(
         RawCamera(
             *part.size("resolution"),
@@ -525,14 +519,8 @@ _ASL = Row(
     focal=("intrinsics",),
     kind=("distortion_model",),
     lenses={
-        "radial-tangential": ("radtan", _LISTED),
-        "radtan": ("radtan", _LISTED),
-        "plumb_bob": ("radtan", _LISTED),
-        "rational": ("radtan", _LISTED),
         "none": ("radtan", ()),
-        "equidistant": ("equidistant", _LISTED),
-        "fisheye": ("equidistant", _LISTED),
-        "fov": ("fov", _LISTED),
+        **{model: (model, _LISTED) for model in ("radtan", "equidistant", "fov")},
     },
 )
 
@@ -564,13 +552,14 @@ def read_asl_mounting(path: Path) -> FloatArray:
 # Settings of SLAM programs: ORB-SLAM 2 and 3, camodocal, VINS-Fusion
 
 
-_ORB = {"pinhole": "radtan", "kannalabrandt8": "equidistant", "rectified": "radtan"}
+_ORB = ("radtan", "equidistant", "rectified")
 
 
 def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
     """The pair of a stereo file, or the one camera of another; the body is the left one."""
     part, view = Values(path, {"Camera.type": "pinhole", **tree}), None
-    model = _ORB[kind_of(part, ("Camera.type",), _ORB)]
+    kind = kind_of(part, ("Camera.type",), _ORB)
+    model = "radtan" if kind == "rectified" else kind
     if "Camera.width" in part or size is None:
         size = part.size("Camera.width", "Camera.height")
     part = Values(path, {**part.tree, "size": list(size)})
@@ -737,9 +726,7 @@ _OAK = Row(
 
 
 def _oak_camera(part: Values, bTc: FloatArray) -> RawCamera:
-    kind, lens = round(part.number("cameraType", 0.0)), part.numbers("distortionCoeff")
-    lens = lens[:4] if kind == 1 else lens  # of a fisheye padded
-    values = {**part.tree, "cameraType": kind, "distortionCoeff": lens}
+    values = {**part.tree, "cameraType": round(part.number("cameraType", 0.0))}
     return camera_of(Values(part.path, values, part.where), _OAK, bTc)
 
 
@@ -800,12 +787,6 @@ def _read_zed(path: Path, text: str, size: Size | None) -> Calibration:
 
 
 _PRINCIPAL = ("fx", "fy", "ppx", "ppy")  # rs2_intrinsics
-_RS2_MODELS = {  # by rs2_distortion's name or number, else OpenCV's
-    **dict.fromkeys(("", "brownconrady", "modifiedbrownconrady", "1", "4"), "radtan"),
-    **dict.fromkeys(("plumbbob", "radtan", "pinhole", "opencv"), "radtan"),
-    **dict.fromkeys(("kannalabrandt4", "kannalabrandt", "5"), "equidistant"),
-    **dict.fromkeys(("equidistant", "fisheye", "opencvfisheye"), "equidistant"),
-}
 _LISTS = ("coeffs", "distortion", "distortion_coefficients", "dist_coeffs", "dist", "D")
 
 
@@ -834,8 +815,8 @@ def _realsense(path: Path, tree: Tree) -> RawCamera:
 def _realsense_lens(part: Values) -> tuple[str, FloatArray]:
     """Model and parameters, by rs2_distortion where that is stated, else OpenCV's."""
     key = next((k for k in ("model", "distortion_model", "camera_model") if k in part), "model")
-    stated = re.sub(r"[^a-z0-9]|^(rs2_)?distortion[._]", "", part.text(key))
-    model = _RS2_MODELS.get(stated, "")
+    model = lens_named(part.text(key))
+    model = model if model in ("radtan", "equidistant") else ""
     listed = next((k for k in _LISTS if k in part), None)
     if listed is not None:
         found = part.numbers(listed)
@@ -846,7 +827,7 @@ def _realsense_lens(part: Values) -> tuple[str, FloatArray]:
         if found[5:].any() and "p1" not in part:
             raise part.refuse('k1 to k4 without p1, p2 need "model": fisheye or brown_conrady')
     if model == "equidistant":
-        return model, found[:4]
+        return model, found
     if found.any() and not model:
         raise part.refuse(
             f"{key} {part.text(key)} is not known with coefficients other than 0; known: "

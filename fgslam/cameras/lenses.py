@@ -440,11 +440,19 @@ def _between(a: FloatArray, b: FloatArray) -> float:
 
 
 def checked_camera(camera: RawCamera) -> RawCamera:
-    """The camera itself.
+    """The camera itself, with as many parameters as its model takes.
+
+    Zeros behind those that a model has carry nothing: drivers pad their lists. So do a rational
+    model's terms that are left out, and a list without any number.
 
     Raises:
         CalibrationError: a number is impossible, the message names it.
     """
+    given, sizes = camera.distortion, camera.lens.sizes
+    used = int(np.flatnonzero(given)[-1]) + 1 if given.any() else 0
+    whole = next((size for size in sizes if size >= used), 0)
+    if len(given) not in sizes and whole and (len(given) > sizes[0] or not len(given)):
+        camera = replace(camera, distortion=np.append(given[:used], np.zeros(whole - used)))
     for fault in _camera_faults(camera):
         raise CalibrationError(f"{camera.name}: {fault}; correct the file")
     return camera
@@ -544,6 +552,8 @@ class Calibration(Brief):
         view: the rectification that it states; None where there is none.
         corrections: of images rectified like that, what a drive found, by the names of its terms
             (:func:`fgslam.core.correction.term_names`); None where there are none.
+        guessed_lens: model that four coefficients are taken for where nothing states it: they are
+            Brown's k1 k2 p1 p2 or those of a fisheye; else empty.
         notes: what a user should know, a line each.
     """
 
@@ -554,6 +564,14 @@ class Calibration(Brief):
     view: StatedView | None = None
     notes: tuple[str, ...] = field(default=())
     corrections: Mapping[str, float] | None = None
+    guessed_lens: str = ""
+
+    def with_lens(self, model: str | None) -> Calibration:
+        """The calibration with its coefficients as those of ``model``, where nothing states it."""
+        if not model or not self.guessed_lens:
+            return self
+        cameras = tuple(checked_camera(replace(c, model=model)) for c in self.cameras)
+        return replace(self, cameras=cameras, guessed_lens="")
 
     def require_uncorrected(self, what: str) -> None:
         """Raises CalibrationError where it has corrections, which ``what`` would lose."""

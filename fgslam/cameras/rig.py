@@ -129,6 +129,7 @@ def load_rig(
     unit_m: float = 1.0,
     fov_deg: float | None = None,
     cameras: Sequence[int] | None = None,
+    lens: str | None = None,
 ) -> StereoRig:
     """The rig of calibration files; the format is recognised by the content.
 
@@ -149,6 +150,8 @@ def load_rig(
         fov_deg: wanted horizontal angle of the rectified view in degrees, below 170; None: as much
             as all cameras fill, at most 120.
         cameras: which of the file's cameras form the rig, two or three; None: all.
+        lens: "radtan" or "equidistant", what four coefficients are where the file does not state
+            it; None: by its names.
 
     Raises:
         CalibrationError: the format or a camera model is not known, a value is missing or
@@ -160,7 +163,7 @@ def load_rig(
     own = _own_rectified(file, cameras, unit_m) if file2 is None else None
     if own is not None and size in (None, (own.width, own.height)) and fov_deg is None:
         return with_masks(own, file)
-    found = read_calibration_file(file, file2, size)
+    found = read_calibration_file(file, file2, size).with_lens(lens)
     found = at_size(in_metres(chosen_cameras(found, cameras), unit_m), size, scale)
     return with_masks(rig_of(found, fov_deg), file)
 
@@ -516,6 +519,10 @@ def rig_of(calibration: Calibration, fov_deg: float | None = None) -> StereoRig:
     stated = StatedView(tuple(turns), view.matrix, view.size)
     found = replace(found, calibration=replace(calibration, view=stated, corrections=None))
     remarks = (*calibration.notes, *notes, *also)
+    if model := calibration.guessed_lens:
+        text = f"{source} does not state the model of its four coefficients: taken as {model}"
+        other = "equidistant" if model == "radtan" else "radtan"
+        remarks = (*remarks, f"{text}; if they are {other}, say --set dataset.lens={other}")
     if calibration.sided and len(sources) == 2:
         found = replace(found, order=tuple(_GIVEN_AS[k] for k in sources))
         if sources == (0, 1) and not notes:

@@ -53,6 +53,34 @@ class Row(NamedTuple):
     matrix: str = ""
 
 
+_LENSES = {"": "radtan"} | {
+    name: model
+    for model, names in (
+        (
+            "radtan",
+            "radtan radialtangential plumbbob brown brownconrady modifiedbrownconrady rational "
+            "rationalpolynomial radtan8 thinprism opencv fullopencv pinhole perspective 1 4",
+        ),
+        (
+            "equidistant",
+            "equidistant equi fisheye opencvfisheye kannalabrandt kannalabrandt4 kannalabrandt8 "
+            "kb kb4 kb8 5",
+        ),
+        ("fov", "fov atan"),
+        ("omni", "omni omnidirectional mei"),
+        ("ds", "ds doublesphere"),
+        ("eucm", "eucm"),
+    )
+    for name in names.split()
+}
+"""Our model by what tools call it (of RealSense also its numbers), in small letters alone."""
+
+
+def lens_named(text: str) -> str:
+    """Our model of a lens by any tool's name for it; empty where that is not known."""
+    return _LENSES.get(re.sub(r"[^a-z0-9]|^(rs2_)?distortion[._]", "", text.lower()), "")
+
+
 def camera_of(part: Values, row: Row, bTc: FloatArray = ORIGIN, name: str = "") -> RawCamera:
     """The camera that a part of a file holds by a row. Raises CalibrationError."""
     model, keys = row.lenses[kind_of(part, row.kind, row.lenses)]
@@ -63,8 +91,15 @@ def camera_of(part: Values, row: Row, bTc: FloatArray = ORIGIN, name: str = "") 
 
 
 def kind_of(part: Values, keys: Sequence[str], known: Iterable[str]) -> str:
-    """The texts under some keys, joined by `-`. Raises CalibrationError: they are not known."""
+    """The texts under some keys, joined by `-`; the last may be any name of a lens (`lens_named`).
+
+    Raises:
+        CalibrationError: they are not known.
+    """
     texts = [part.text(key, "none") for key in keys]
+    named = "-".join([*texts[:-1], lens_named(texts[-1])] if texts else texts)
+    if "-".join(texts) not in known and named in known:
+        return named
     if "-".join(texts) not in known:
         stated = " with ".join(f"{key} {text}" for key, text in zip(keys, texts, strict=True))
         raise part.refuse(f"{stated} is not known; known: {', '.join(known)}")

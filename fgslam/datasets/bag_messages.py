@@ -32,6 +32,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistStamped"
 TWIST_WITH_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 IMU = "sensor_msgs/msg/Imu"
+NUMBER = "std_msgs/msg/Float32"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 # --------------------------------------------------------------------------------------------
@@ -138,11 +139,11 @@ def _pixels(message: Any, channels: int, where: str, more_rows: int = 0) -> npt.
 _HEADER = 12  # bytes before a compressed depth: a kind, and two numbers by which floats are coded
 
 
-def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
-    """Depths (height, width) in metres of an Image or CompressedImage; 0 or NaN where unknown.
+def depth_of(message: Any, where: str) -> npt.NDArray[Any]:
+    """Depths (height, width) of an Image or CompressedImage as stored; 0 or NaN where unknown.
 
-    Integers are millimetres, floats metres (REP 118); the transport of compressed depth codes
-    floats by their inverse.
+    Integers are in a unit of their own (by REP 118 millimetres), floats metres; the transport of
+    compressed depth codes floats by their inverse.
 
     Raises:
         FrameError: it is no depth, or its data are incomplete.
@@ -169,7 +170,7 @@ def depth_of(message: Any, where: str) -> npt.NDArray[np.float32]:
             with np.errstate(divide="ignore"):
                 inverses = a / (stored.astype(np.float32) - b)
             return np.where(stored > 0, inverses, np.float32(np.nan))
-    return without_unknown(stored).astype(np.float32) * np.float32(1e-3)
+    return without_unknown(stored)
 
 
 # --------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ class Chosen:
         infos: of the camera_info of left and right; None where there is none.
         motion: of odometry, or None.
         transforms: of tf_static; where the bag has none, of tf, which states again what stays.
+        unit: of the metres in a unit of depth, as RealSense's viewer records it; or empty.
     """
 
     views: tuple[str, ...]
@@ -47,6 +48,7 @@ class Chosen:
     infos: tuple[str | None, str | None] = (None, None)
     motion: Topic | None = None
     transforms: tuple[str, ...] = ()
+    unit: str = ""
 
     @property
     def left(self) -> str:
@@ -109,7 +111,13 @@ def choose_topics(
     trees = tuple(topic.name for topic in used if topic.kind in messages.TRANSFORMS)
     static = tuple(name for name in trees if name.endswith("tf_static"))
     infos = _infos([t.name for t in used if t.kind == messages.CAMERA_INFO], *chosen.views[:2])
-    return replace(chosen, notes=notes, infos=infos, motion=motion, transforms=static or trees)
+    sensor = SENSOR.match(chosen.left)
+    of_sensor = (t.name for t in used if t.kind == messages.NUMBER and sensor is not None
+                 and t.name.startswith(sensor[0]) and _DEPTH_UNIT.search(t.name))  # fmt: skip
+    unit = next(of_sensor, "") if chosen.depth else ""
+    return replace(
+        chosen, notes=notes, infos=infos, motion=motion, transforms=static or trees, unit=unit
+    )
 
 
 def _cameras_of_file(settings: BagSettings) -> tuple[RawCamera, ...]:
@@ -267,6 +275,7 @@ _REGISTERED = re.compile(r"aligned|regist|to_(rgb|colou?r)", re.IGNORECASE)
 _COLOUR = re.compile(r"rgb|colou?r", re.IGNORECASE)
 _OF_DEPTHAI = re.compile(r"/stereo/image_raw(/|$)")  # next to its colour camera's images
 SENSOR = re.compile(r"/device_\d+/(sensor_\d+)/")  # of a file of RealSense's viewer
+_DEPTH_UNIT = re.compile(r"/option/depth[_ ]units(/value)?$", re.IGNORECASE)
 _DEPTHS = ("", "/compressedDepth", TRANSPORT)
 """Endings of topics of depth, plain before compressed."""
 

@@ -40,13 +40,16 @@ from fgslam.datasets.bag_topics import (
 )
 from fgslam.datasets.depth import (
     DEPTH_SIGMA_M,
+    MILLIMETRES,
     Depth,
     camera_of_file,
     colour_and_depth_notes,
     depth_images,
     depth_rig,
     depth_sigma_px,
+    depth_unit,
     require_one_camera,
+    sample_depths,
 )
 from fgslam.datasets.images import bits_held, mosaic_note, require_size
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
@@ -112,8 +115,17 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
 
         def read(index: int) -> tuple[Image, Depth, str]:
             colour, depth = places[index].tolist()
-            return image(colour, True), bag.read(depth, messages.depth_of), f"message {depth}"
+            metres = bag.read(depth, messages.depth_of).astype(np.float32) / np.float32(scale)
+            return image(colour, True), metres, f"message {depth}"
 
+        seen, of_integers = sample_depths(
+            where, len(places), lambda k: bag.read(int(places[k, 1]), messages.depth_of), size
+        )
+        stated = settings.depth_scale or bag.depth_scale(chosen.unit)
+        if stated is None and of_integers and not SENSOR.match(chosen.left):
+            stated = MILLIMETRES  # REP 118
+        scale, reported = depth_unit(where, seen, of_integers, stated)
+        unpaired = (*unpaired, *reported)
         load = depth_images(read, rig, placed.cameras[1])
         sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
         unpaired = colour_and_depth_notes(unpaired)
@@ -266,6 +278,18 @@ class Bag:
             return str(self._decoded(connection, raw).header.frame_id)
         except (StopIteration, FrameError, DatasetError):
             return ""
+
+    def depth_scale(self, topic: str) -> float | None:
+        """Units of depth in a metre by the topic that states metres a unit; None where none does.
+
+        Raises:
+            DatasetError: the topic cannot be read.
+        """
+        if not topic:
+            return None
+        connection, _, raw = next(self._messages((topic,)))
+        metres = float(self._decoded(connection, raw).data)
+        return round(1.0 / metres, 3) if metres > 0.0 else None
 
     def index(self, chosen: Chosen) -> None:
         """Once through the whole bag, for all but the images. Raises DatasetError as it opens."""
@@ -445,12 +469,18 @@ def rig_of_bag(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
     Raises:
         CalibrationError: nothing states where the cameras are, or what does is malformed.
     """
-    if chosen.depth:
-        placed = _rig_of_depth(settings, bag, chosen)
-    elif settings.camera_file is not None:
-        placed = _rig_of_file(settings, Path(settings.camera_file), bag, chosen)
-    else:
-        placed = _rig_of_topics(settings, bag, chosen)
+    try:
+        if chosen.depth:
+            placed = _rig_of_depth(settings, bag, chosen)
+        elif settings.camera_file is not None:
+            placed = _rig_of_file(settings, Path(settings.camera_file), bag, chosen)
+        else:
+            placed = _rig_of_topics(settings, bag, chosen)
+    except CalibrationError as fault:
+        text = str(fault).removesuffix("; correct the file")
+        if settings.camera_file is not None or text == str(fault):
+            raise
+        raise CalibrationError(f"{text}; give the calibration by --camera FILE") from None
     if settings.camera_yaw_deg is not None or settings.lever_arm_m is not None:
         rig, notes = mounted(placed.rig, settings), placed.rig.remarks
     else:
@@ -500,7 +530,8 @@ def _rig_of_depth(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
         )
     taken = f"{text}: it is taken as registered to colour, as it was chosen by --topics"
     if settings.camera_file is not None:
-        camera = camera_of_file(Path(settings.camera_file), bag.size, settings.resized)
+        view = chosen.right.removesuffix(TRANSPORT)
+        camera = camera_of_file(settings, Path(settings.camera_file), bag.size, view)
     else:
         # Registered depth has the colour camera's calibration.
         topic = chosen.infos[1] or chosen.infos[0]
@@ -590,7 +621,11 @@ def _info_of(settings: BagSettings, bag: Bag, topic: str, rectified: bool) -> In
         CalibrationError: its numbers are 0.
     """
     info = bag.infos[topic]
-    if not info["camera_matrix"]["data"][0]:
+    k, p, d = (
+        info[name]["data"]
+        for name in ("camera_matrix", "projection_matrix", "distortion_coefficients")
+    )
+    if not k[0] and (not p[0] or (any(d) and not rectified)):
         raise CalibrationError(
             f"{settings.path}: {topic} is of a camera that is not calibrated (its numbers are 0); "
             "calibrate it, and give the calibration of all cameras by --camera FILE"
@@ -613,11 +648,11 @@ def _info_of(settings: BagSettings, bag: Bag, topic: str, rectified: bool) -> In
         info = {**info, **matrices, "image_width": sent[0], "image_height": sent[1]}
     if not rectified:
         return info
-    p = info["projection_matrix"]["data"]
+    p, k = (info[name]["data"] for name in ("projection_matrix", "camera_matrix"))
     return {
         **info,
         "distortion_model": "plumb_bob",
-        "camera_matrix": {"data": [*p[0:3], *p[4:7], *p[8:11]]},
+        "camera_matrix": {"data": [*p[0:3], *p[4:7], *p[8:11]] if p[0] else k},
         "distortion_coefficients": {"data": [0.0] * 5},
         "rectification_matrix": {"data": np.eye(3).ravel().tolist()},
     }

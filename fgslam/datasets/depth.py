@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import cv2
 import numpy as np
@@ -37,6 +37,7 @@ from fgslam.datasets.layouts import (
     CameraFiles,
     colour_and_depth,
     colour_and_depth_files,
+    counts_by_one,
     images_in,
 )
 from fgslam.datasets.recording import (
@@ -45,8 +46,14 @@ from fgslam.datasets.recording import (
     mounted,
     on_wheels,
 )
-from fgslam.datasets.settings import CalibratedSettings, RecordedOdometrySettings, RgbdSettings
+from fgslam.datasets.settings import (
+    CalibratedSettings,
+    DepthSettings,
+    RecordedOdometrySettings,
+    RgbdSettings,
+)
 from fgslam.datasets.times import (
+    ASSUMED_FPS,
     NANOSECONDS,
     pair_files,
     pair_stamps,
@@ -170,7 +177,7 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
         CalibrationError: nothing states the colour camera's focal length.
     """
     root = Path(settings.path)
-    pairs, stamps, notes, lists = _pairs(root)
+    pairs, stamps, notes, lists = _pairs(root, settings.fps)
     size = first_size(colour for colour, _ in pairs)
     if size is None:
         raise DatasetError(f"{root}: not one colour image can be read; check dataset.path")
@@ -178,7 +185,12 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
     camera, known = _camera(root, settings, size)
     rig = mounted(depth_rig(camera), settings)
     rig, mounting, wheels, source = on_wheels(rig, root, settings, odometry)
-    scale, reported = _scale(root, pairs, settings, size)
+    seen, of_integers = sample_depths(
+        root, len(pairs), lambda k: read_depth_image(pairs[k][1]), size
+    )
+    stated = settings.depth_scale or _stated_scale(root, settings)
+    of_tum = (root / "depth.txt").is_file()
+    scale, reported = depth_unit(root, seen, of_integers, stated, of_tum)
 
     def read(index: int) -> tuple[Image, Depth, str]:
         colour_file, depth_file = pairs[index]
@@ -219,7 +231,7 @@ def colour_and_depth_notes(notes: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _pairs(
-    root: Path,
+    root: Path, fps: float | None
 ) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...], tuple[Path, ...]]:
     """Colour and depth of each frame, their stamps (n,) in seconds, notes and lists."""
     lists = (root / "rgb.txt", root / "depth.txt")
@@ -229,7 +241,10 @@ def _pairs(
         rows, notes = pair_stamps(colour_at, others, str(lists[0]))
         pairs = tuple((colours[i], depths[j]) for i, j in rows.tolist())
         stamps = NANOSECONDS * colour_at[rows[:, 0]].astype(np.float64)
+        stamps = stamps if fps is None else rows[:, 0] / fps
         return pairs, stamps, colour_and_depth_notes(notes), lists
+    if path := next((root / n for n in _ASSOCIATIONS if (root / n).is_file()), None):
+        return *_associated(path, fps), (path,)
     if (folders := colour_and_depth(root)) is not None:
         mixed = images_in(folders[0]), images_in(folders[1])
         if empty := [str(f) for f, images in zip(folders, mixed, strict=True) if not images]:
@@ -242,8 +257,44 @@ def _pairs(
     cameras = CameraFiles(depth_files, colour_files, root, interleaved=False)
     pairs, notes = pair_files(cameras)
     used = [colour for colour, _ in pairs]
-    stamps, assumed, found = stamps_of(used, (used[0].parent, root), None, colour_files)
+    stamps, assumed, found = stamps_of(used, (used[0].parent, root), fps, colour_files)
     return pairs, stamps, (*colour_and_depth_notes(notes), *assumed), found
+
+
+_ASSOCIATIONS = ("associations.txt", "association.txt", "associate.txt", "associated.txt")
+"""Of TUM's associate.py: lines `seconds file seconds file`, colour or depth first."""
+
+
+def _associated(
+    path: Path, fps: float | None
+) -> tuple[tuple[tuple[Path, Path], ...], FloatArray, tuple[str, ...]]:
+    """Files of colour and depth, colour's stamps (n,) in seconds, and notes.
+
+    Stamps that count the images, as ICL-NUIM's, state no times.
+    """
+    rows = [(number, text.split()) for number, text in read_lines(path)]
+    for number, words in rows:
+        if len(words) != 4 or not all(re.fullmatch(r"\d+(\.\d+)?", w) for w in words[::2]):
+            raise DatasetError(
+                f"{path}, line {number}: expected seconds, file, seconds, file; correct it"
+            )
+    depth_first = bool(rows) and "depth" in rows[0][1][1].lower()
+    (colour_at, colour), (_, depth) = ((2, 3), (0, 1)) if depth_first else ((0, 1), (2, 3))
+    pairs = tuple((path.parent / w[colour], path.parent / w[depth]) for _, w in rows)
+    times = [words[colour_at] for _, words in rows]
+    counted = all(map(str.isdecimal, times)) and counts_by_one([int(t) for t in times])
+    if fps is not None or counted:
+        stamps, notes, _ = stamps_of([pair[0] for pair in pairs], (), fps or ASSUMED_FPS)
+        reason = f"{path.name} counts images and states no times: taken as {ASSUMED_FPS:g} frames"
+        return (
+            pairs,
+            stamps,
+            (*notes, *([] if fps else [f"{reason} a second (--fps says another)"])),
+        )
+    stamps = np.array([float(t) for t in times])
+    if len(stamps) == 0 or np.any(np.diff(stamps) <= 0.0):
+        raise DatasetError(f"{path}: lists no image, or times do not increase; restore the file")
+    return pairs, stamps, ()
 
 
 def _listed(path: Path) -> tuple[IntArray, list[Path]]:
@@ -265,7 +316,7 @@ def _listed(path: Path) -> tuple[IntArray, list[Path]]:
 # The unit of depth
 
 
-_TUM_SCALE, _MILLIMETRES = 5000.0, 1000.0
+_TUM_SCALE, MILLIMETRES = 5000.0, 1000.0
 _NEAREST_M, _FARTHEST_M = 0.05, 50.0  # of the median depth of an image
 # Where 16 bits are only assumed to be millimetres: farther than RealSense, Kinect and Orbbec see.
 _FARTHEST_GUESSED_M = 10.0
@@ -275,11 +326,8 @@ _SAMPLES = 5  # depth images, over the whole recording
 _SCALES = ("depth_scale", "DepthMapFactor", "RGBD.DepthMapFactor", "png_depth_scale", "scale")
 
 
-def _scale(
-    root: Path,
-    pairs: tuple[tuple[Path, Path], ...],
-    settings: RgbdSettings,
-    size: tuple[int, int],
+def depth_unit(
+    where: Path, seen: FloatArray, of_integers: bool, stated: float | None, of_tum: bool = False
 ) -> tuple[float, tuple[str, ...]]:
     """Units a metre, and the depth that follows from it in words.
 
@@ -290,14 +338,11 @@ def _scale(
     Raises:
         DatasetError: no depth camera sees as far.
     """
-    seen, of_integers = _some_depths(root, pairs, size)
-    stated = settings.depth_scale or _stated_scale(root, settings)
     caveat: tuple[str, ...] = ()
     if stated is None and of_integers:
-        of_tum = (root / "depth.txt").is_file()
-        own, other = (_TUM_SCALE, _MILLIMETRES) if of_tum else (_MILLIMETRES, _TUM_SCALE)
+        own, other = (_TUM_SCALE, MILLIMETRES) if of_tum else (MILLIMETRES, _TUM_SCALE)
         near, far = np.percentile(seen, _ENDS)
-        nearest = {_TUM_SCALE: _NEAREST_OF_TUM_M, _MILLIMETRES: _NEAREST_M}
+        nearest = {_TUM_SCALE: _NEAREST_OF_TUM_M, MILLIMETRES: _NEAREST_M}
         possible = {
             scale: near > nearest[scale] * scale and far < _FARTHEST_GUESSED_M * scale
             for scale in (own, other)
@@ -319,7 +364,7 @@ def _scale(
     median = float(np.median(seen)) / scale
     if not _NEAREST_M < median < farthest:
         raise DatasetError(
-            f"{root}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
+            f"{where}: the median depth is {median:.4g} m at {scale:g} units a metre, which no "
             "depth camera sees; say the unit: --set dataset.depth_scale=1000 for millimetres, "
             "10000 for tenths of them, 5000 as in TUM's, 1 for metres"
         )
@@ -341,18 +386,18 @@ def _stated_scale(root: Path, settings: RgbdSettings) -> float | None:
     return None
 
 
-def _some_depths(
-    root: Path, pairs: tuple[tuple[Path, Path], ...], size: tuple[int, int]
+def sample_depths(
+    root: Path, count: int, read: Callable[[int], npt.NDArray[Any]], size: tuple[int, int]
 ) -> tuple[FloatArray, bool]:
     """Known depths (n,) of some images, in their own units, and whether these are integers."""
-    images = []
-    for row in np.unique(np.linspace(0, len(pairs) - 1, _SAMPLES).astype(int)).tolist():
+    images, faults = [], [""]
+    for row in np.unique(np.linspace(0, count - 1, _SAMPLES).astype(int)).tolist():
         try:
-            images.append(read_depth_image(pairs[row][1]))
-        except FrameError:
-            continue
+            images.append(read(row))
+        except FrameError as fault:
+            faults.append(str(fault))
     if not images:
-        raise DatasetError(f"{root}: not one depth image can be read; restore them")
+        raise DatasetError(f"{root}: not one depth image can be read: {faults[-1]}")
     if all(depth.shape != size[::-1] for depth in images):  # a few may be damaged
         own = f"{images[0].shape[1]}x{images[0].shape[0]}"
         raise DatasetError(
@@ -363,7 +408,7 @@ def _some_depths(
     known = [depth[np.isfinite(depth) & (depth > 0)] for depth in images]
     seen = np.concatenate(known).astype(np.float64)
     if len(seen) == 0:
-        raise DatasetError(f"{pairs[0][1]} holds no depth at all; check the depth images")
+        raise DatasetError(f"{root}: its depth images hold no depth at all; check them")
     return seen, bool(images[0].dtype == np.uint16)
 
 
@@ -379,11 +424,52 @@ _TUM_CAMERAS = {
 """fx, fy, cx, cy of the colour cameras, as TUM publishes them; their distortion is left out."""
 
 
-def camera_of_file(path: Path, size: tuple[int, int], resized: bool) -> RawCamera:
-    """The first camera of a calibration file, for images of this size."""
-    found = read_calibration_file(path, size=size)
-    alone = replace(found, cameras=found.cameras[:1], view=None)
-    return at_size(alone, size, resized).cameras[0]
+_OF_COLOUR = re.compile(r"rgb|colou?r", re.IGNORECASE)
+
+
+def camera_of_file(
+    settings: DepthSettings, path: Path, size: tuple[int, int], topic: str = ""
+) -> RawCamera:
+    """The colour camera of a calibration file, for images of this size.
+
+    Of several the one that the settings name, that of the images' topic, the only one of their
+    size, or the only one whose name or topic says so.
+
+    Raises:
+        CalibrationError: it remains unknown which it is.
+    """
+    found = read_calibration_file(path, size=size).with_lens(settings.lens)
+    left, number = list(found.cameras), settings.colour_camera
+    if number is not None and number >= len(left):
+        raise CalibrationError(
+            f"{path}: dataset.colour_camera is {number}, but it has cameras 0 to {len(left) - 1}"
+        )
+    if number is not None:
+        left = [left[number]]
+    view = "/" + topic.strip("/")
+    for fits in (
+        lambda c: bool(topic) and "/" + c.topic.strip("/") == view,
+        lambda c: (
+            bool(topic) and "/" + c.topic.strip("/").rpartition("/")[0] == view.rpartition("/")[0]
+        ),
+        lambda c: c.size == size,
+        lambda c: _OF_COLOUR.search(f"{c.name.rpartition(':')[2]} {c.topic}") is not None,
+    ):
+        left = list(filter(fits, left)) or left
+    if any(not _alike(camera, left[0]) for camera in left):
+        raise CalibrationError(
+            f"{path} holds {len(found.cameras)} cameras, and nothing states which of them took the "
+            f"colour images: say it: --set dataset.colour_camera=0 for {found.cameras[0].name}, "
+            f"1 for {found.cameras[1].name}, and so on"
+        )
+    alone = replace(found, cameras=(left[0],), view=None)
+    return at_size(alone, size, settings.resized).cameras[0]
+
+
+def _alike(a: RawCamera, b: RawCamera) -> bool:
+    return a.model == b.model and all(
+        map(np.array_equal, (a.matrix, a.distortion), (b.matrix, b.distortion))
+    )
 
 
 def _camera(
@@ -391,10 +477,10 @@ def _camera(
 ) -> tuple[RawCamera, tuple[str, ...]]:
     """The colour camera by the given file, the folder's own, or as TUM publishes it."""
     if settings.camera_file is not None:
-        return camera_of_file(Path(settings.camera_file), size, settings.resized), ()
+        return camera_of_file(settings, Path(settings.camera_file), size), ()
     own = _own_files(root)
     if len(own) == 1:
-        return camera_of_file(own[0], size, settings.resized), ()
+        return camera_of_file(settings, own[0], size), ()
     known = re.search(r"(?:freiburg|fr)([123])(?!\d)", root.resolve().name)
     if known is None or size != (640, 480):
         raise CalibrationError(

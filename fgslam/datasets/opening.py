@@ -60,11 +60,39 @@ def open_recording(
         DatasetError: the recording is missing, malformed or empty.
         CalibrationError: its calibration is missing or impossible.
     """
-    found: Recording = READERS[settings.kind]()(settings, odometry or RecordedOdometrySettings())
+    read, odometry = READERS[settings.kind](), odometry or RecordedOdometrySettings()
+    found: Recording = read(settings, odometry)
+    known = None if found.rectifier is None else found.rectifier.calibration
+    if known is not None and known.guessed_lens:
+        found = _by_lens(found, known.guessed_lens, lambda s: read(s, odometry), settings)
     if found.unrectified:
         misfit = fit_notes(lambda i: found.frame(i).images, len(found))
         found = replace(found, notes=(*misfit, *found.notes))
     return found if settings.scale == 1.0 else smaller(found, settings.scale)
+
+
+def _by_lens(
+    found: Recording,
+    guessed: str,
+    read: Callable[[Any], Recording],
+    settings: FileRecordingSettings,
+) -> Recording:
+    """The recording by that lens model by which the rows of its first pairs agree best."""
+    other = "equidistant" if guessed == "radtan" else "radtan"
+    both = {guessed: found, other: read(replace(settings, lens=other))}  # type: ignore[arg-type]
+    offsets = {name: np.concatenate(_first_offsets(each)) for name, each in both.items()}
+    if max(map(len, offsets.values())) < _FEWEST_MATCHES:
+        return found
+    rows = {n: float(np.median(np.abs(its[:, 1]))) if len(its) else np.inf
+            for n, its in offsets.items()}  # fmt: skip
+    best, worse = sorted(rows, key=lambda name: rows[name])
+    chosen = both[best] if best == other else read(replace(settings, lens=best))  # type: ignore[arg-type]
+    note = (
+        f"nothing states the lens model of the calibration: taken as {best}, by which the rows of "
+        f"the first pairs agree to {rows[best]:.2g} px, by {worse} to {rows[worse]:.2g} "
+        f"(dataset.lens={worse} states otherwise)"
+    )
+    return replace(chosen, notes=(note, *chosen.notes))
 
 
 _SMALLEST_PX = 8  # SIFT finds nothing in less
@@ -222,12 +250,7 @@ def fit_notes(load: Callable[[int], tuple[Image, ...]], count: int) -> tuple[str
             FrameError.
         count: how many frames there are.
     """
-    pairs: list[tuple[Image, ...]] = []
-    for index in range(min(count, _TRIED)):
-        with suppress(FrameError):
-            pairs.append(load(index)[:2])
-        if len(pairs) == _PAIRS:
-            break
+    pairs = _first_pairs(load, count)
     found = [_matched(*pair) for pair in pairs]
     if sum(map(len, found)) < _FEWEST_MATCHES:
         return ()
@@ -251,6 +274,21 @@ def fit_notes(load: Callable[[int], tuple[Image, ...]], count: int) -> tuple[str
             f"the first {len(found)} pairs have negative disparity; swap the images",
         )
     return ()
+
+
+def _first_pairs(load: Callable[[int], tuple[Image, ...]], count: int) -> list[tuple[Image, ...]]:
+    pairs: list[tuple[Image, ...]] = []
+    for index in range(min(count, _TRIED)):
+        with suppress(FrameError):
+            pairs.append(load(index)[:2])
+        if len(pairs) == _PAIRS:
+            break
+    return pairs
+
+
+def _first_offsets(recording: Recording) -> list[FloatArray]:
+    pairs = _first_pairs(lambda i: recording.frame(i).images, len(recording))
+    return [np.empty((0, 2)), *(_matched(*pair) for pair in pairs)]
 
 
 def _matched(right: Image, left: Image) -> FloatArray:

@@ -273,6 +273,7 @@ def loaded_rig(
             unit_m=settings.unit_m,
             fov_deg=settings.fov_deg,
             cameras=cameras,
+            lens=settings.lens,
         )
 
     rig = load(cameras)

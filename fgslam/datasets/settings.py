@@ -66,6 +66,11 @@ class CalibratedSettings(RecordingSettings):
         description="metres of one unit of the calibration's lengths: 0.001 for millimetres, "
         "the side of a square for one in squares",
     )
+    lens: Literal["radtan", "equidistant"] | None = Field(
+        default=None,
+        description="what four coefficients are whose model the calibration does not state; null: "
+        "by the rows of the first pairs",
+    )
     camera_yaw_deg: float | None = Field(
         default=None,
         description="heading of the camera in the body, degrees to the left; null: as calibrated",
@@ -106,20 +111,35 @@ class VideoSettings(CalibratedSettings):
     )
 
 
-@dataclass(frozen=True, config=STRICT)
-class RgbdSettings(CalibratedSettings):
-    """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/images.md)."""
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class DepthSettings(CalibratedSettings):
+    """What a recording has that may be of one camera and its depth."""
 
-    kind: Literal["rgbd"] = "rgbd"
     depth_scale: Positive | None = Field(
         default=None,
-        description="depth units in a metre; null: by the calibration's file, else 5000 (TUM), "
-        "1000 (16 bits), 1 (floats)",
+        description="depth units in a metre; null: as the recording or the calibration's file "
+        "states, else 5000 (TUM), 1000 (16 bits), 1 (floats)",
+    )
+    colour_camera: int | None = Field(
+        default=None,
+        ge=0,
+        description="which of the calibration's cameras, from 0, took the colour images; null: by "
+        "its topic, its size, or its name",
     )
 
 
 @dataclass(frozen=True, config=STRICT, kw_only=True)
-class BagSettings(CalibratedSettings):
+class RgbdSettings(DepthSettings):
+    """Colour and depth images, as in TUM RGB-D or in two folders (docs/datasets/images.md)."""
+
+    kind: Literal["rgbd"] = "rgbd"
+    fps: FramesASecond | None = Field(
+        default=None, description="frames a second; null: by lists of times or by names, else 10"
+    )
+
+
+@dataclass(frozen=True, config=STRICT, kw_only=True)
+class BagSettings(DepthSettings):
     """ROS 1 and ROS 2 bags: .bag, .db3, .mcap (docs/datasets/bags.md)."""
 
     path: str = Field(min_length=1, description="the bag, its folder, or a pattern of file names")

@@ -254,17 +254,23 @@ def pair_stamps(
     notes: list[str] = []
     for side, other, stamps in others:
         right = reference[rows[:, 0]]
-        partner = nearest_rows(stamps, right)
-        mutual = nearest_rows(right, stamps)[partner] == np.arange(len(right))
-        skew = NANOSECONDS * np.abs(stamps[partner] - right).astype(np.float64)
-        kept = np.flatnonzero(mutual & (skew <= TOLERANCE_S + 0.5 * NANOSECONDS))
+        kept, partner, skew = _partners(right, stamps)
+        if len(kept) < _MOST_OF_ALL * min(len(right), len(stamps)) / 2 and (
+            (away := _clock_offset(right, stamps)) is not None
+        ):
+            kept, partner, skew = _partners(right, stamps - away)
+            notes.append(
+                f"the clock of {other} is {abs(NANOSECONDS * away):.6g} s "
+                f"{'ahead of' if away > 0 else 'behind'} that of {name} throughout, and is taken so"
+            )
         if len(kept) == 0:
             spans = [f"{NANOSECONDS * s[0]:.3f} to {NANOSECONDS * s[-1]:.3f} s"
                      for s in (right, stamps)]  # fmt: skip
             raise DatasetError(
                 f"no image of {name} ({spans[0]}) has a partner in {other} ({spans[1]}) "
                 f"within {1e3 * TOLERANCE_S:g} ms, the nearest differ by {1e3 * skew.min():.4g} "
-                "ms; restore the stamps"
+                "ms, and no constant offset of their clocks makes them pairs; record both on one "
+                "clock, or put the images of each moment into left/ and right/ under one name"
             )
         notes += [
             f"{n} {camera} images have no partner within {1e3 * TOLERANCE_S:g} ms and are left out"
@@ -281,6 +287,35 @@ def pair_stamps(
     return rows, tuple(notes)
 
 
+def _partners(right: IntArray, stamps: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Rows of ``right`` that have a partner; of all the nearest row, and its distance, seconds."""
+    partner = nearest_rows(stamps, right)
+    mutual = nearest_rows(right, stamps)[partner] == np.arange(len(right))
+    skew = NANOSECONDS * np.abs(stamps[partner] - right).astype(np.float64)
+    return np.flatnonzero(mutual & (skew <= TOLERANCE_S + 0.5 * NANOSECONDS)), partner, skew
+
+
+_MOST_OF_ALL = 0.9  # of the images that a constant offset of two clocks must make pairs
+_FIRST = 5  # images at either end, one of which has its partner among those of the other camera
+
+
+def _clock_offset(right: IntArray, stamps: IntArray) -> int | None:
+    """Nanoseconds that nearly all of ``stamps`` are ahead of ``right``; None without one.
+
+    Of a steady rate an offset by a frame fits nearly as well: the best must be the only one.
+    """
+    ends = ((right[:_FIRST], stamps[:_FIRST]), (right[-_FIRST:], stamps[-_FIRST:]))
+    offsets = np.unique(np.concatenate([(b[:, None] - a).ravel() for a, b in ends]))
+    found = [len(_partners(right, stamps - each)[0]) for each in offsets]
+    best = offsets[np.array(found) == max(found)]
+    if max(found) < max(2.0, _MOST_OF_ALL * min(len(right), len(stamps))):
+        return None
+    if np.ptp(best) > 2.0 * TOLERANCE_S / NANOSECONDS:
+        return None
+    apart = _partners(right, stamps - best[len(best) // 2])
+    return int(np.median(stamps[apart[1][apart[0]]] - right[apart[0]]))
+
+
 # --------------------------------------------------------------------------------------------
 # Time stamps of images: a list next to them, or their own names, in whatever unit of time
 
@@ -291,7 +326,7 @@ LISTS = (
 )
 """Names of lists of times, the first that is there counts."""
 
-_ASSUMED_FPS = 10.0
+ASSUMED_FPS = 10.0
 _UNITS = {"seconds": 1.0, "milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 _SLOWEST_S = 10.0  # between two images: what makes a unit plausible
 
@@ -318,7 +353,7 @@ def stamps_of(
     written = written_stamps(images, folders, every) if fps is None else None
     if written is not None:
         return written
-    rate = fps or _ASSUMED_FPS
+    rate = fps or ASSUMED_FPS
     note = f"no list of times: taken as {rate:g} frames a second (--fps states otherwise)"
     place = {path: k for k, path in enumerate(every or images)}
     return np.array([place[path] for path in images]) / rate, () if fps else (note,), ()
@@ -553,7 +588,7 @@ def _by_names(found: CameraFiles, keys: Iterable[_Key]) -> Pairs | None:
     return None
 
 
-def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pairs:
+def _by_order(found: CameraFiles) -> Pairs:
     if len(found.right) != len(found.left):
         raise DatasetError(
             f"{found.folder}: {len(found.left)} images of the left camera and {len(found.right)} "
@@ -563,19 +598,12 @@ def _by_order(found: CameraFiles, why: str = "their names do not match") -> Pair
     pairs = tuple(zip(found.right, found.left, strict=True))
     if all(numbers_in(right.stem) == numbers_in(left.stem) != [] for right, left in pairs):
         return pairs, ()  # frame000012 and depth000012 are of one moment
-    return pairs, (f"left and right images are paired by their order: {why}",)
+    return pairs, ("left and right images are paired by their order: their names do not match",)
 
 
 def _by_time(found: CameraFiles, right: IntArray, left: IntArray) -> Pairs:
-    """The nearest in time; by order where each camera has a clock of its own that goes alike."""
-    try:
-        others = [("left", f"{found.folder}, left", left)]
-        rows, notes = pair_stamps(right, others, f"{found.folder}, right")
-    except DatasetError:
-        apart = NANOSECONDS * (left - right) if len(left) == len(right) else np.array([np.inf])
-        if not np.ptp(apart) <= TOLERANCE_S:
-            raise
-        away = abs(float(np.median(apart)))
-        return _by_order(found, f"the times that their names are lie {away:.6g} s apart throughout")
+    """The nearest in time."""
+    others = [("left", f"{found.folder}, left", left)]
+    rows, notes = pair_stamps(right, others, f"{found.folder}, right")
     note = "left and right images are paired by the times that their names are"
     return tuple((found.right[i], found.left[j]) for i, j in rows.tolist()), (note, *notes)
