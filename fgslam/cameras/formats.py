@@ -42,7 +42,7 @@ from fgslam.cameras.trees import (
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_lines
+from fgslam.core.files import read_lines, read_text
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,
     inverse,
@@ -555,8 +555,44 @@ def read_asl_mounting(path: Path) -> FloatArray:
 _ORB = ("radtan", "equidistant", "rectified")
 
 
+_STELLA = {"cols": "width", "rows": "height", "model": "type", "focal_x_baseline": "bf"}
+_STELLA_SIDES = {
+    f"{side}.{letter}": f"{letter}_{side.lower()}" for side in ("LEFT", "RIGHT") for letter in "KDR"
+}
+
+
+def is_orb_slam(tree: Tree) -> bool:
+    """Whether it holds settings of ORB-SLAM or of stella_vslam (OpenVSLAM)."""
+    return any(f"{name}.fx" in Values(Path(), tree) for name in ("Camera", "Camera1"))
+
+
+def _of_stella(path: Path, tree: Tree) -> tuple[Tree, tuple[str, ...]]:
+    """Settings of stella_vslam by the keys of ORB-SLAM's, and what was noticed; others as is."""
+    part = Values(path, tree)
+    if "Camera.cols" not in part:
+        return tree, ()
+    given = {k.partition(".")[2]: v for k, v in tree.items() if k.startswith("Camera.")}
+    camera = {**given, **part.inside("Camera").tree}
+    known = {f"Camera.{_STELLA.get(key, key)}": value for key, value in camera.items()}
+    notes: tuple[str, ...] = ()
+    if "StereoRectifier.K_left" in part:
+        for ours, theirs in _STELLA_SIDES.items():
+            known[ours] = part.numbers(f"StereoRectifier.{theirs}")
+        fx, fy, cx, cy, shift = Values(path, camera).values((*FOCAL, "focal_x_baseline"))
+        known["RIGHT.P"] = [fx, 0.0, cx, -shift, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+        width, middle = part.number("Camera.cols"), known["LEFT.K"][2]
+        if abs(middle / width - 0.25) < _SIDE_BY_SIDE:
+            known["Camera.width"] = round(0.5 * width)
+            notes = (f"{path.name}: {width:g} columns are both views side by side, and halved",)
+    return known, notes
+
+
+_SIDE_BY_SIDE = 0.1  # of both views' width, that the principal point lies off the middle of one
+
+
 def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
     """The pair of a stereo file, or the one camera of another; the body is the left one."""
+    tree, notes = _of_stella(path, tree)
     part, view = Values(path, {"Camera.type": "pinhole", **tree}), None
     kind = kind_of(part, ("Camera.type",), _ORB)
     model = "radtan" if kind == "rectified" else kind
@@ -577,7 +613,7 @@ def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
             )
             for side, turn, x in zip(("LEFT", "RIGHT"), turns, places, strict=True)
         ]
-        return Calibration(str(path), "ORB-SLAM settings", tuple(cameras), True, view)
+        return Calibration(str(path), "ORB-SLAM settings", tuple(cameras), True, view, notes)
 
     def camera(prefix: str, bTc: FloatArray) -> RawCamera:
         terms = KANNALA if model == "equidistant" else BROWN
@@ -639,6 +675,8 @@ def _read_vins(path: Path, tree: Tree, _: Size | None) -> Calibration:
         if f"cam{k}_calib" not in part:
             continue
         file = path.parent / str(part.tree[f"cam{k}_calib"])
+        if not file.is_file():  # a path of another machine
+            file = path.with_name(file.name)
         own = read_tree(file)
         if own is None or not is_camodocal(own):
             raise part.refuse(f"cam{k}_calib names {file}, which is no camera of camodocal")
@@ -875,13 +913,78 @@ def _read_ocamcalib(path: Path, *_: object) -> Calibration:
 
 
 # --------------------------------------------------------------------------------------------
+# COLMAP: cameras.txt, and rigs.txt next to it
+
+
+_COLMAP = {  # how many focal lengths, our model, and how many of its terms
+    "SIMPLE_PINHOLE": (1, "radtan", 0),
+    "PINHOLE": (2, "radtan", 0),
+    "SIMPLE_RADIAL": (1, "radtan", 1),
+    "RADIAL": (1, "radtan", 2),
+    "OPENCV": (2, "radtan", 4),
+    "FULL_OPENCV": (2, "radtan", 8),
+    "OPENCV_FISHEYE": (2, "equidistant", 4),
+    "SIMPLE_RADIAL_FISHEYE": (1, "equidistant", 1),
+    "RADIAL_FISHEYE": (1, "equidistant", 2),
+    "FOV": (2, "fov", 1),
+}
+_COLMAP_LINE = re.compile(r"^\d+ [A-Z_0-9]+ \d+ \d+( [-+.\deE]+)+\s*$", re.MULTILINE)
+
+
+def _read_colmap(path: Path, text: str, _: Size | None) -> Calibration:
+    """The cameras; the body is the rig, else the only camera."""
+    found = (match[0].split() for match in _COLMAP_LINE.finditer(text))
+    lines = {int(words[0]): words[1:] for words in found}
+    places = _colmap_rig(path.with_name("rigs.txt"))
+    if len(lines) > 1 and not places.keys() >= lines.keys():
+        raise CalibrationError(
+            f"{path} of COLMAP holds {len(lines)} cameras, but not how they stand to each other; "
+            "put the rigs.txt of COLMAP 3.12 or later next to it, which "
+            "`colmap model_converter --output_type TXT` writes"
+        )
+    cameras = []
+    for key, (name, *words) in lines.items():
+        part = Values(path, {"all": words}, f"camera {key}: ")
+        if name not in _COLMAP:
+            raise part.refuse(f"model {name} is not known; known: {', '.join(_COLMAP)}")
+        (focals, model, terms), numbers = _COLMAP[name], part.numbers("all")
+        if len(numbers) != 4 + focals + terms:
+            raise part.refuse(f"{name} has {2 + focals + terms} parameters; correct the line")
+        inner = numbers[2:]
+        matrix = intrinsic_matrix(inner[0], inner[focals - 1], *inner[focals : focals + 2])
+        lens = np.append(inner[focals + 2 :], np.zeros(max(0, 4 - terms) if model != "fov" else 0))
+        size = int(words[0]), int(words[1])
+        bTc = places.get(key, ORIGIN)
+        cameras.append(checked_camera(RawCamera(*size, matrix, lens, bTc, part.name, model)))
+    return Calibration(str(path), "COLMAP cameras", tuple(cameras))
+
+
+def _colmap_rig(path: Path) -> dict[int, FloatArray]:
+    """Pose (4, 4) of each camera in the first rig's reference sensor, by number; or none."""
+    places: dict[int, FloatArray] = {}
+    if not path.is_file():
+        return places
+    words = read_lines(path, CalibrationError)[0][1].split()
+    kind, number, rest = words[2], words[3], words[4:]
+    places = {int(number): ORIGIN} if kind == "CAMERA" else {}
+    while len(rest) >= 3:
+        posed = rest[2] == "1"
+        if rest[0] == "CAMERA" and posed:
+            w, x, y, z, *moved = Values(path, {"pose": rest[3:10]}).numbers("pose", 7)
+            turn = np.array([x, y, z, w]) / np.linalg.norm((w, x, y, z))
+            places[int(rest[1])] = inverse(pose(rotation_from_quaternion(turn), np.array(moved)))
+        rest = rest[10:] if posed else rest[3:]
+    return places
+
+
+# --------------------------------------------------------------------------------------------
 # Which format a file has
 
 
 KNOWN = (
     "known: calib.json of fgslam, Kalibr's camchain, OpenCV's stereo files (M1, D1, M2, D2, R, T), "
     "left.yaml and right.yaml of ROS camera_info, KITTI's calib.txt, EuRoC's sensor.yaml, settings "
-    "of ORB-SLAM and VINS, files of Basalt, OAK, ZED, RealSense and OCamCalib"
+    "of ORB-SLAM, stella_vslam and VINS, files of COLMAP, Basalt, OAK, ZED, RealSense and OCamCalib"
 )
 Reader = Callable[[Path, Tree, Size | None], Calibration]
 
@@ -901,7 +1004,7 @@ _READERS: tuple[tuple[Callable[[Tree], bool], Reader], ...] = (
     (is_camera_info, lambda path, tree, _: read_camera_info(path, tree)),
     (lambda tree: "cam0_calib" in tree, _read_vins),
     (is_camodocal, _one("camodocal camera", _camodocal)),
-    (lambda tree: "Camera.fx" in tree or "Camera1.fx" in tree, _read_orb_slam),
+    (is_orb_slam, _read_orb_slam),
     (lambda tree: bool(rgbd_part(tree)), _one("camera of colour and depth", _rgbd)),
     (is_opencv_pair, read_opencv_pair),
     (is_opencv_one, _read_opencv_one),
@@ -917,6 +1020,7 @@ _TEXTS: tuple[
     ),
     (lambda text: "[LEFT_CAM_" in text and "[STEREO]" in text, _read_zed),
     (_is_ocamcalib, _read_ocamcalib),
+    (lambda text: _COLMAP_LINE.search(text) is not None, _read_colmap),
 )
 """The same of files that are no keys and values."""
 
@@ -940,4 +1044,34 @@ def calibration_of_tree(path: Path, tree: Tree, size: Size | None) -> Calibratio
     for recognises, read in _READERS:
         if recognises(tree):
             return read(path, tree, size)
-    raise CalibrationError(f"{path}: not a calibration that is known; {KNOWN}")
+    raise CalibrationError(unknown_text(path))
+
+
+_ONE_OF_MANY = "the calibration of one camera alone; a stereo pair needs K, D of both, R and T"
+_FOREIGN = (
+    (r"map[LRlr12_]|Map[LRlr12_]|_(map|rect)[xy]\b|rmap|undistort_?map", "rectification maps of "
+     "OpenCV, no camera: rectify the images by them, and give K, D, R, T or fx and baseline"),
+    (r"^\s*([-+.\deE]+\s+){4,8}[-+.\deE]+\s*\n\s*\d+\s+\d+\s*\n|^(Pinhole|FOV|RadTan|EquiDistant|"
+     r"KannalaBrandt)\s[\d.]", f"a camera.txt of DSO or LSD-SLAM, {_ONE_OF_MANY}"),
+    (r"Calibration results|reprojection errors?:", "results of Kalibr as text; give the camchain"
+     ".yaml that Kalibr wrote next to it"),
+    (r'"transform_matrix"|"camera_angle_x"', "transforms.json of nerfstudio or instant-ngp, "
+     f"{_ONE_OF_MANY}"),
+    (r'"sfm_data_version"|"openMVG|"intrinsicId"|"ptr_wrapper"', "a scene of OpenMVG or "
+     f"AliceVision, {_ONE_OF_MANY}"),
+    (r'"cameras"\s*:\s*\[.*"(intrinsics|transform)"', "a rig of cuVSLAM (.edex); write its cameras "
+     "to a calib.json: docs/howto/your_camera.md has the keys"),
+    (r"<calibration>|<sensor\b|<projection>", f"a calibration of Metashape, {_ONE_OF_MANY}"),
+    (r'"projection_type"', f"cameras of OpenSfM, {_ONE_OF_MANY}"),
+    (r"^NVM_V3|^# Bundle file", f"a scene of VisualSFM or Bundler, {_ONE_OF_MANY}"),
+)  # fmt: skip
+"""What recognises files of tools that hold no calibration of a stereo pair, and what to do."""
+
+
+def unknown_text(path: Path) -> str:
+    """What a file of no known format is, where that is known, and what to give instead."""
+    text = read_text(path, CalibrationError)[:20_000]
+    for pattern, what in _FOREIGN:
+        if re.search(pattern, text, re.MULTILINE | re.DOTALL):
+            return f"{path} looks like {what}"
+    return f"{path}: not a calibration that is known; {KNOWN}"

@@ -311,7 +311,7 @@ _SUFFIXES = (*_TREES, ".txt", ".conf")
 def _tree_of(path: Path) -> Tree:
     tree = read_tree(path)
     if tree is None:
-        raise CalibrationError(f"{path} holds no keys and values of a calibration; {KNOWN}")
+        raise CalibrationError(formats.unknown_text(path))
     return tree
 
 
@@ -480,8 +480,9 @@ def at_size(calibration: Calibration, size: tuple[int, int] | None, scale: bool)
 
 
 _LEAST_BASELINE_M = 1e-3  # below it two cameras are one, up to rounding
-# Longer than any vehicle carries; in millimetres even an eye's 10 mm are more.
-_LONGEST_BASELINE_M = 3.0
+# Longer than nearly any vehicle carries (cars have 0.3 to 0.6 m); webcams of 60 mm calibrated in
+# squares of 20 to 30 mm have 2 to 3, in millimetres even an eye's 10 mm are more.
+_LONGEST_BASELINE_M = 1.0
 # Cosine of 45 degrees: beyond, a common image plane would magnify the rims out of use.
 _LEAST_COMMON_VIEW = 0.707
 # A stated view with less of the raw resolution than this has collapsed.

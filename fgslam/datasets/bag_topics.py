@@ -30,7 +30,8 @@ class Chosen:
     """Topics that are used.
 
     Attributes:
-        views: of left and right images, perhaps of top ones; or of depth and of colour.
+        views: of left and right images, perhaps of top ones; or of depth and of colour. One topic
+            twice has images that show both views.
         numbers: which cameras of the calibration file the views are, so that it determines the
             sides; empty: the topics do.
         notes: what else could have been taken.
@@ -208,10 +209,13 @@ def _by_names(
                 f"{where} has no topic of camera images (sensor_msgs Image or CompressedImage); it "
                 f"has {_list(topics)}: record both cameras' images"
             )
+        if len(views) == 1 and settings.camera_file is not None:
+            return Chosen((views[0], views[0]))
         if len(views) == 1:
             raise DatasetError(
                 f"{where} has images of one camera only, {views[0]}; a stereo pair is the least: "
-                "record both cameras"
+                "record both cameras; where each image shows both views, side by side or over "
+                "under, give the calibration of one pair of views: --camera FILE"
             )
         raise DatasetError(
             f"{where}: which of {', '.join(views)} are left and right is unknown by their names; "

@@ -51,7 +51,13 @@ from fgslam.datasets.depth import (
     require_one_camera,
     sample_depths,
 )
-from fgslam.datasets.images import bits_held, mosaic_note, require_size
+from fgslam.datasets.images import (
+    bits_held,
+    both_views,
+    mosaic_note,
+    require_size,
+    shown_together,
+)
 from fgslam.datasets.layouts import files_of, is_bag, is_packed_bag
 from fgslam.datasets.odometry import (
     POSE_COLUMNS,
@@ -94,7 +100,8 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     bag = Bag(paths_of(where))
     chosen = choose_topics(bag.topics, settings, bag.first_frame)
     bag.index(chosen)
-    placed = rig_of_bag(settings, bag, chosen)
+    whole = bag.size
+    placed = _rig_of_views(settings, bag, chosen)
     rig, chosen = placed.rig, placed.chosen
     views = (chosen.right, chosen.left, *chosen.views[2:])
     others = [
@@ -132,6 +139,10 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
     else:
 
         def load(index: int, colour: bool) -> tuple[Image, ...]:
+            if chosen.left == chosen.right:
+                place = int(places[index, 0])
+                shown = require_size(bag.image(place, colour), f"message {place}", *whole)
+                return rig.rectified(both_views(shown, size))
             return rig.rectified(tuple(image(place, colour) for place in places[index].tolist()))
 
     recording = image_recording(
@@ -461,6 +472,27 @@ class Placed:
     chosen: Chosen
     notes: tuple[str, ...] = ()
     on_body: bool = False
+
+
+def _rig_of_views(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:
+    """As :func:`rig_of_bag`; of one topic whose images show both views, of these.
+
+    Raises:
+        CalibrationError: as there, or the calibration is of no part of the images.
+    """
+    whole, fault = bag.size, None
+    if chosen.depth or chosen.left != chosen.right:
+        return rig_of_bag(settings, bag, chosen)
+    for name, columns, rows in shown_together(whole):
+        bag.size = (whole[0] // columns, whole[1] // rows)
+        try:
+            placed = rig_of_bag(settings, bag, chosen)
+        except CalibrationError as error:
+            fault = fault or error
+            continue
+        note = f"each image of {chosen.right} is taken as both views, {name}"
+        return replace(placed, notes=(note, *placed.notes))
+    raise fault or CalibrationError(f"{settings.path}: no views")
 
 
 def rig_of_bag(settings: BagSettings, bag: Bag, chosen: Chosen) -> Placed:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -244,6 +245,25 @@ def require_size(image: Image, name: str, width: int, height: int) -> Image:
             f"{width}x{height}; restore the right file"
         )
     return image
+
+
+_USUAL_SHAPE = 1.5  # width over height of a camera's image
+
+
+def shown_together(size: tuple[int, int]) -> list[tuple[str, int, int]]:
+    """How images of a size may show two views, the usual shape of these first.
+
+    Each in words, with the columns and rows of views.
+    """
+    ways = [("side by side", 2, 1), ("over under", 1, 2)]
+    width, height = size
+    return sorted(ways, key=lambda w: abs(math.log(width * w[2] / (height * w[1]) / _USUAL_SHAPE)))
+
+
+def both_views(image: Image, size: tuple[int, int]) -> tuple[Image, Image]:
+    """Right and left view, each of ``size`` (width, height), of an image that shows both."""
+    width, height = size
+    return image[-height:, -width:], image[:height, :width]
 
 
 def encoded_png(image: Image) -> bytes:

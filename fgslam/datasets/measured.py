@@ -17,6 +17,7 @@ import numpy as np
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, ConfigError, DatasetError
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,
     reorthonormalise,
@@ -189,8 +190,9 @@ def open_stereo_tracks(
     if not calibration.exists():
         calibration = path.with_name("VO_calibration.txt")  # of the `_large` one
     poses = path.with_name(f"VO_camera_poses{suffix}.txt")
-    tracks = read_table(path, _COLUMNS)
+    tracks, renumbered = _renumbered(read_table(path, _COLUMNS))
     rows, notes = _usable(tracks)
+    notes = (*renumbered, *notes)
     numbers = np.unique(tracks.values[rows, 0]).astype(np.int64)
     numbers = numbers[select_frames(len(numbers), settings, str(path))]
     rig = _read_rig(calibration, tracks.values[rows])
@@ -207,6 +209,28 @@ def open_stereo_tracks(
         landmark_truth=None,
         notes=notes,
     )
+
+
+_SPARSE = 10  # times as many as landmarks: arrays by number would be mostly empty
+
+
+def _renumbered(tracks: Table) -> tuple[Table, tuple[str, ...]]:
+    """Tracks whose landmarks count from 0, in order, where the file's numbers are much larger.
+
+    So are keys of GTSAM and hashes, whole numbers of 64 bits: a float holds 53 of them.
+    """
+    words = [text.split()[1] for _, text in read_lines(tracks.path)]
+    try:
+        numbers = [int(word) for word in words]
+    except ValueError:  # refused with its line
+        return tracks, ()
+    known = {number: k for k, number in enumerate(sorted(set(numbers)))}
+    if not known or (min(known) >= 0 and max(known) < max(1000, _SPARSE * len(known))):
+        return tracks, ()
+    values = tracks.values.copy()
+    values[:, 1] = [known[number] for number in numbers]
+    note = f"landmarks have numbers up to {max(known)}: they are counted from 0 in their order"
+    return replace(tracks, values=values), (note,)
 
 
 def _usable(tracks: Table) -> tuple[IntArray, tuple[str, ...]]:

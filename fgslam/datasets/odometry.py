@@ -158,7 +158,8 @@ def recorded_motions(name: str, read: Callable[[], OdometrySource]) -> OdometryS
         if len(frames) > 1 and all(step is None for step in steps):
             raise OdometryError(
                 f"{name} covers none of the frames ({frames[0]:.3f} to {frames[-1]:.3f} s); check "
-                "that both use one clock, or set odometry.time_offset_s"
+                "that both use one clock, or say what is to be added to its times: --set "
+                "odometry.time_offset_s=SECONDS"
             )
         return steps
 
@@ -196,7 +197,13 @@ def read_columns(path: Path, kind: str) -> Table:
 
 
 def _role(name: str) -> tuple[str, float] | None:
-    """What a column is, and what its numbers are multiplied by: NaN for times of unknown unit."""
+    """What a column is, and what its numbers are multiplied by: NaN for times of unknown unit.
+
+    Of a full name in ROS, field.pose.pose.position.x or /odom/pose/pose/position/x, its last two
+    parts say it.
+    """
+    if len(parts := re.split(r"[./]", name)) > 2 and (found := _role("_".join(parts[-2:]))):
+        return found
     clean = re.sub(r"[^a-z0-9]+", "_", name.strip().lower()).strip("_")
     if role := _ROLES.get(clean):
         return role, np.nan if role == "time" else 1.0

@@ -293,7 +293,9 @@ class RecordedOdometrySettings:
 
     kind: Literal["recorded"] = "recorded"
     time_offset_s: float = Field(
-        default=0.0, ge=-10.0, le=10.0, description="added to the odometry's time stamps, seconds"
+        default=0.0,
+        allow_inf_nan=False,
+        description="added to the odometry's time stamps, seconds",
     )
     speed_sigma_mps: Positive = Field(
         default=0.10, description="speed and yaw rate: noise of the forward speed, m/s"

@@ -6,7 +6,6 @@ Frames are decoded by number, those of several films are paired by number or by 
 from __future__ import annotations
 
 import errno
-import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
@@ -25,7 +24,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OutputError
 from fgslam.core.files import remove_left_behind, replacing
 from fgslam.core.sides import differ_in_number
-from fgslam.datasets.images import require_size
+from fgslam.datasets.images import both_views, require_size, shown_together
 from fgslam.datasets.layouts import films_in
 from fgslam.datasets.recording import (
     Recording,
@@ -36,11 +35,6 @@ from fgslam.datasets.recording import (
 )
 from fgslam.datasets.settings import RecordedOdometrySettings, VideoSettings
 from fgslam.datasets.times import NANOSECONDS, pair_stamps
-
-_VIEWS = {"side by side": (2, 1), "over under": (1, 2)}
-"""Columns and rows of views that one film shows."""
-
-_USUAL_SHAPE = 1.5  # width over height of a camera's image
 
 Views: TypeAlias = Callable[..., tuple[Image, ...]]
 """Right, left[, top] view (height, width, 3) in R, G, B, by numbers in the films; or FrameError."""
@@ -106,12 +100,8 @@ def _views(
         rig, order = _films_of_cameras(rig, films, folder)
         return lambda *numbers: tuple(films[k].load(numbers[k]) for k in order), rig, assumed
     film = films[0]
-    # Both arrangements, first that which gives the views a usual shape.
-    shape = {name: width * rows / (height * columns) for name, (columns, rows) in _VIEWS.items()}
-    by_shape = sorted(_VIEWS, key=lambda name: abs(math.log(shape[name] / _USUAL_SHAPE)))
     fault: CalibrationError | None = None
-    for name in by_shape:
-        columns, rows = _VIEWS[name]
+    for name, columns, rows in shown_together((width, height)):
         size = (width // columns, height // rows)
         try:
             rig, assumed = _rig(settings, folder, size, (columns, rows))
@@ -119,9 +109,8 @@ def _views(
             fault = fault or error
             continue
 
-        def halves(number: int, w: int = size[0], h: int = size[1]) -> tuple[Image, ...]:
-            image = film.load(number)
-            return image[-h:, -w:], image[:h, :w]
+        def halves(number: int, size: tuple[int, int] = size) -> tuple[Image, ...]:
+            return both_views(film.load(number), size)
 
         return halves, rig, (*assumed, f"the film is taken as {name}")
     with suppress(CalibrationError):
