@@ -42,7 +42,7 @@ from fgslam.cameras.trees import (
 )
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import CalibrationError
-from fgslam.core.files import read_lines, read_text
+from fgslam.core.files import read_lines
 from fgslam.core.geometry import (
     BODY_FORWARD_LEFT_UP_FROM_CAMERA,
     inverse,
@@ -475,6 +475,8 @@ def _kalibr_camera(part: Values, bTc: FloatArray) -> RawCamera:
     intrinsics = part.numbers("intrinsics", own + 4)
     none = part.text("distortion_model", "none") == "none"
     coefficients = np.zeros(0) if none else part.numbers("distortion_coeffs")
+    if model == "omni" and not len(coefficients):
+        coefficients = np.zeros(4)
     return checked_camera(
         RawCamera(
             *part.size("resolution"),
@@ -552,7 +554,10 @@ def read_asl_mounting(path: Path) -> FloatArray:
 # Settings of SLAM programs: ORB-SLAM 2 and 3, camodocal, VINS-Fusion
 
 
-_ORB = ("radtan", "equidistant", "rectified")
+_ORB = {
+    **dict.fromkeys(("pinhole", "perspective", "rectified"), "radtan"),
+    **dict.fromkeys(("kannalabrandt8", "fisheye"), "equidistant"),
+}
 
 
 _STELLA = {"cols": "width", "rows": "height", "model": "type", "focal_x_baseline": "bf"}
@@ -594,8 +599,7 @@ def _read_orb_slam(path: Path, tree: Tree, size: Size | None) -> Calibration:
     """The pair of a stereo file, or the one camera of another; the body is the left one."""
     tree, notes = _of_stella(path, tree)
     part, view = Values(path, {"Camera.type": "pinhole", **tree}), None
-    kind = kind_of(part, ("Camera.type",), _ORB)
-    model = "radtan" if kind == "rectified" else kind
+    model = _ORB[kind_of(part, ("Camera.type",), _ORB)]
     if "Camera.width" in part or size is None:
         size = part.size("Camera.width", "Camera.height")
     part = Values(path, {**part.tree, "size": list(size)})
@@ -865,7 +869,7 @@ def _realsense_lens(part: Values) -> tuple[str, FloatArray]:
         if found[5:].any() and "p1" not in part:
             raise part.refuse('k1 to k4 without p1, p2 need "model": fisheye or brown_conrady')
     if model == "equidistant":
-        return model, found
+        return model, found[:4]  # librealsense has five, the last without a meaning
     if found.any() and not model:
         raise part.refuse(
             f"{key} {part.text(key)} is not known with coefficients other than 0; known: "
@@ -1039,39 +1043,9 @@ def calibration_of_text(path: Path, text: str, size: Size | None) -> Calibration
     return next(found, None)
 
 
-def calibration_of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration:
-    """What keys and values say. Raises CalibrationError: they are of no format that is known."""
+def calibration_of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration | None:
+    """What keys and values say; None: they are of no format that is known."""
     for recognises, read in _READERS:
         if recognises(tree):
             return read(path, tree, size)
-    raise CalibrationError(unknown_text(path))
-
-
-_ONE_OF_MANY = "the calibration of one camera alone; a stereo pair needs K, D of both, R and T"
-_FOREIGN = (
-    (r"map[LRlr12_]|Map[LRlr12_]|_(map|rect)[xy]\b|rmap|undistort_?map", "rectification maps of "
-     "OpenCV, no camera: rectify the images by them, and give K, D, R, T or fx and baseline"),
-    (r"^\s*([-+.\deE]+\s+){4,8}[-+.\deE]+\s*\n\s*\d+\s+\d+\s*\n|^(Pinhole|FOV|RadTan|EquiDistant|"
-     r"KannalaBrandt)\s[\d.]", f"a camera.txt of DSO or LSD-SLAM, {_ONE_OF_MANY}"),
-    (r"Calibration results|reprojection errors?:", "results of Kalibr as text; give the camchain"
-     ".yaml that Kalibr wrote next to it"),
-    (r'"transform_matrix"|"camera_angle_x"', "transforms.json of nerfstudio or instant-ngp, "
-     f"{_ONE_OF_MANY}"),
-    (r'"sfm_data_version"|"openMVG|"intrinsicId"|"ptr_wrapper"', "a scene of OpenMVG or "
-     f"AliceVision, {_ONE_OF_MANY}"),
-    (r'"cameras"\s*:\s*\[.*"(intrinsics|transform)"', "a rig of cuVSLAM (.edex); write its cameras "
-     "to a calib.json: docs/howto/your_camera.md has the keys"),
-    (r"<calibration>|<sensor\b|<projection>", f"a calibration of Metashape, {_ONE_OF_MANY}"),
-    (r'"projection_type"', f"cameras of OpenSfM, {_ONE_OF_MANY}"),
-    (r"^NVM_V3|^# Bundle file", f"a scene of VisualSFM or Bundler, {_ONE_OF_MANY}"),
-)  # fmt: skip
-"""What recognises files of tools that hold no calibration of a stereo pair, and what to do."""
-
-
-def unknown_text(path: Path) -> str:
-    """What a file of no known format is, where that is known, and what to give instead."""
-    text = read_text(path, CalibrationError)[:20_000]
-    for pattern, what in _FOREIGN:
-        if re.search(pattern, text, re.MULTILINE | re.DOTALL):
-            return f"{path} looks like {what}"
-    return f"{path}: not a calibration that is known; {KNOWN}"
+    return None

@@ -7,6 +7,7 @@ of its cameras is which, and their common view (:func:`rig_of`).
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -298,6 +299,36 @@ _REMEDIES = {
     ".npz": f"write its arrays to {_AS_JSON}",
 }
 """What to do with files that hold calibrations in a form of one program."""
+_ONE_OF_MANY = "the calibration of one camera alone; a stereo pair needs K, D of both, R and T"
+_FOREIGN = (
+    (r"map[LRlr12_]|Map[LRlr12_]|_(map|rect)[xy]\b|rmap|undistort_?map", "rectification maps of "
+     "OpenCV, no camera: rectify the images by them, and give K, D, R, T or fx and baseline"),
+    (r"^\s*([-+.\deE]+\s+){4,8}[-+.\deE]+\s*\n\s*\d+\s+\d+\s*\n|^(Pinhole|FOV|RadTan|EquiDistant|"
+     r"KannalaBrandt)\s[\d.]", f"a camera.txt of DSO or LSD-SLAM, {_ONE_OF_MANY}"),
+    (r"Calibration results|reprojection errors?:", "results of Kalibr as text; give the camchain"
+     ".yaml that Kalibr wrote next to it"),
+    (r'"transform_matrix"|"camera_angle_x"', "transforms.json of nerfstudio or instant-ngp, "
+     f"{_ONE_OF_MANY}"),
+    (r'"sfm_data_version"|"openMVG|"intrinsicId"|"ptr_wrapper"', "a scene of OpenMVG or "
+     f"AliceVision, {_ONE_OF_MANY}"),
+    (r'"cameras"\s*:\s*\[.*"(intrinsics|transform)"', "a rig of cuVSLAM (.edex); write its cameras "
+     "to a calib.json: docs/howto/your_camera.md has the keys"),
+    (r"<calibration>|<sensor\b|<projection>", f"a calibration of Metashape, {_ONE_OF_MANY}"),
+    (r'"projection_type"', f"cameras of OpenSfM, {_ONE_OF_MANY}"),
+    (r"^NVM_V3|^# Bundle file", f"a scene of VisualSFM or Bundler, {_ONE_OF_MANY}"),
+)  # fmt: skip
+"""What recognises files of tools that hold no calibration of a stereo pair, and what to do."""
+
+
+def _unknown_text(path: Path) -> str:
+    """What a file of no known format is, where that is known, and what to give instead."""
+    text = read_text(path, CalibrationError)[:20_000]
+    for pattern, what in _FOREIGN:
+        if re.search(pattern, text, re.MULTILINE | re.DOTALL):
+            return f"{path} looks like {what}"
+    return f"{path}: not a calibration that is known; {KNOWN}"
+
+
 _PARTNERS = (
     ("left.yaml", "right.yaml"),
     ("intrinsics.yml", "extrinsics.yml"),
@@ -311,13 +342,15 @@ _SUFFIXES = (*_TREES, ".txt", ".conf")
 def _tree_of(path: Path) -> Tree:
     tree = read_tree(path)
     if tree is None:
-        raise CalibrationError(formats.unknown_text(path))
+        raise CalibrationError(_unknown_text(path))
     return tree
 
 
 def _of_tree(path: Path, tree: Tree, size: Size | None) -> Calibration:
     if formats.is_realsense(tree) or not is_rectified(tree):
-        return formats.calibration_of_tree(path, tree, size)
+        if (found := formats.calibration_of_tree(path, tree, size)) is None:
+            raise CalibrationError(_unknown_text(path))
+        return found
     if path.suffix.lower() != ".json":
         raise CalibrationError(
             f"{path}: {', '.join(sorted(OF_RECTIFIED & tree.keys()))} are keys of fgslam's "

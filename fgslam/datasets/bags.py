@@ -132,7 +132,7 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         if stated is None and of_integers and not SENSOR.match(chosen.left):
             stated = MILLIMETRES  # REP 118
         scale, reported = depth_unit(where, seen, of_integers, stated)
-        unpaired = (*unpaired, *reported)
+        placed = replace(placed, notes=(*placed.notes, *reported))
         load = depth_images(read, rig, placed.cameras[1])
         sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
         unpaired = colour_and_depth_notes(unpaired)

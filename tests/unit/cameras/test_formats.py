@@ -560,7 +560,7 @@ def test_orb_slam2_pair_by_focal_length_times_baseline(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "kind", "words"),
     [
-        (FIRST, "Omni", "Camera.type omni is not known; known: pinhole, kannalabrandt8, rectified"),
+        (FIRST, "Omni", "Camera.type omni is not known; known: pinhole, perspective, rectified"),
         (FIRST.replace("Camera1.cy: 248.375\n", ""), "PinHole", "Camera1.cy"),
         (FIRST.replace("458.654", "-458.654"), "PinHole", "must be positive"),
     ],

@@ -557,13 +557,13 @@ def test_what_is_behind_an_underscore_is_a_fraction(tmp_path: Path) -> None:
     ]
 
 
-def test_clocks_of_their_own_go_by_order(tmp_path: Path) -> None:
+def test_clocks_of_their_own_are_paired_by_their_constant_offset(tmp_path: Path) -> None:
     """Names by str(time.time()): .98 lies before .1234567 of the next, not by its digits."""
     rights = ["1700000001.1234567", "1700000001.98", "1700000002.5"]
     lefts = ["1700007001.1234", "1700007001.98", "1700007002.5"]
     *pairs, notes = paired(tmp_path, lefts, rights)
     assert pairs == [list(pair) for pair in zip(lefts, rights, strict=True)]
-    assert "paired by their order: the times that their names are lie 7000 s apart" in notes[0]
+    assert any("7000 s ahead of" in note for note in notes)
 
 
 def test_a_board_at_rest_is_paired_without_times(tmp_path: Path) -> None:
