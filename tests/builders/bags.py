@@ -204,6 +204,8 @@ class Maker:
             }
         elif kind.endswith("TwistStamped"):
             values = {"twist": self._twist(*fields["twist"])}
+        elif kind.endswith("Float32"):
+            return self.store.types[kind](**values)
         elif kind.endswith("Imu"):
             values = self._imu(fields["rate"])
         return self.store.types[kind](header=self._header(stamp, frame), **values)

@@ -568,3 +568,128 @@ def test_orb_slam2_pair_by_focal_length_times_baseline(tmp_path: Path) -> None:
 def test_wrong_settings_are_refused(tmp_path: Path, text: str, kind: str, words: str) -> None:
     with pytest.raises(CalibrationError, match=words):
         read_settings(tmp_path, text, kind=kind)
+
+
+# --------------------------------------------------------------------------------------------
+# Variants of known tools, and files that hold no pair
+
+
+EUROC_LENS = "-0.2834 0.0740 0.0002 0.00002"
+RIGS = (
+    "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[]\n"
+    "1 3 CAMERA 1 IMU 1 0 CAMERA 2 1 1 0 0 0 -0.11 0 0\n"
+)
+
+
+def colmap(root: Path, *models: str) -> Path:
+    lines = [f"{k} {model}" for k, model in enumerate(models, start=1)]
+    (root / "cameras.txt").write_text("# Camera list\n" + "\n".join(lines), encoding="utf-8")
+    return root / "cameras.txt"
+
+
+@pytest.mark.parametrize(
+    ("line", "model", "numbers", "focal"),
+    [
+        (f"OPENCV 752 480 458 457 367 248 {EUROC_LENS}", "radtan", 4, (458.0, 457.0)),
+        (f"FULL_OPENCV 752 480 458 457 367 248 {EUROC_LENS} 0 0 0 0", "radtan", 8, (458.0, 457.0)),
+        ("SIMPLE_RADIAL 752 480 458 367 248 -0.28", "radtan", 4, (458.0, 458.0)),
+        ("OPENCV_FISHEYE 752 480 458 457 367 248 0.1 0 0 0", "equidistant", 4, (458.0, 457.0)),
+        ("FOV 752 480 458 457 367 248 0.9", "fov", 1, (458.0, 457.0)),
+    ],
+)
+def test_cameras_of_colmap(
+    tmp_path: Path, line: str, model: str, numbers: int, focal: tuple[float, float]
+) -> None:
+    camera = read(colmap(tmp_path, line)).cameras[0]
+    assert (camera.model, len(camera.distortion)) == (model, numbers)
+    assert tuple(camera.intrinsics) == (*focal, 367.0, 248.0)
+
+
+def test_a_rig_of_colmap_needs_its_rigs_file(tmp_path: Path) -> None:
+    path = colmap(tmp_path, *["PINHOLE 752 480 458 457 367 248"] * 2)
+    with pytest.raises(CalibrationError, match=r"holds 2 cameras, .* put the rigs\.txt"):
+        read(path)
+    (tmp_path / "rigs.txt").write_text(RIGS, encoding="utf-8")
+    assert load_rig(tmp_path).baseline == pytest.approx(0.11, abs=1e-12)
+    with pytest.raises(CalibrationError, match=r"camera 2: model THIN is not known; known: SIMPLE"):
+        read(colmap(tmp_path, "PINHOLE 752 480 458 457 367 248", "THIN 752 480 1 2"))
+    with pytest.raises(CalibrationError, match=r"camera 1: FOV has 5 parameters"):
+        read(colmap(tmp_path, "FOV 752 480 458 457 367 248"))
+
+
+STELLA = {
+    "setup": "stereo",
+    "model": "perspective",
+    "fx": 500.0,
+    "fy": 500.0,
+    "cx": 320.0,
+    "cy": 240.0,
+    "cols": 640,
+    "rows": 480,
+    "focal_x_baseline": 60.0,
+}
+
+
+def test_settings_of_stella_vslam_nested_flat_and_side_by_side(tmp_path: Path) -> None:
+    path = tmp_path / "stella.yaml"
+    for values in ({"Camera": STELLA}, {f"Camera.{key}": v for key, v in STELLA.items()}):
+        path.write_text(yaml.safe_dump(values), encoding="utf-8")
+        rig = load_rig(path)
+        assert (rig.width, rig.fx, rig.baseline) == (640, 500.0, pytest.approx(0.12, abs=1e-12))
+    matrix, turn = [510.0, 0.0, 321.0, 0.0, 510.0, 241.0, 0.0, 0.0, 1.0], np.eye(3).ravel().tolist()
+    values = {"K": matrix, "D": [-0.1, 0.02, 0.0, 0.0], "R": turn}
+    sides = {f"{name}_{side}": its for side in ("left", "right") for name, its in values.items()}
+    both = {"Camera": STELLA | {"cols": 1280}, "StereoRectifier": sides}
+    path.write_text(yaml.safe_dump(both), encoding="utf-8")
+    rig = load_rig(path)
+    assert (rig.image_size, rig.baseline) == ((640, 480), pytest.approx(0.12, abs=1e-12))
+    assert "1280 columns are both views side by side, and halved" in rig.remarks[0]
+
+
+def test_files_of_vins_from_another_machine_lie_next_to_it(tmp_path: Path) -> None:
+    camera = {
+        "model_type": "PINHOLE",
+        "image_width": 640,
+        "image_height": 480,
+        "distortion_parameters": dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "projection_parameters": {"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0},
+    }
+    (tmp_path / "cam.yaml").write_text(yaml.safe_dump(camera), encoding="utf-8")
+    places = (np.eye(4), pose(np.eye(3), np.array([0.1, 0.0, 0.0])))
+    values = {f"cam{k}_calib": "/home/me/config/cam.yaml" for k in range(2)}
+    values |= {f"body_T_cam{k}": place.ravel().tolist() for k, place in enumerate(places)}
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    assert load_rig(path).baseline == pytest.approx(0.1, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("map.xml", "<?xml version='1.0'?><opencv_storage><stereoMapL_x type_id='opencv-matrix'>"
+         "<rows>1</rows><cols>1</cols><dt>f</dt><data>1</data></stereoMapL_x></opencv_storage>",
+         "rectification maps of OpenCV, no camera: rectify the images by them"),
+        ("camera.txt", "0.34 0.43 0.49 0.49 0.93\n1280 1024\ncrop\n640 480\n", "of DSO"),
+        ("camera.txt", "RadTan 458 457 367 248 0 0 0 0\n752 480\ncrop\n640 480\n", "of DSO"),
+        ("results-cam.txt", "Calibration results\n===\nNormalized Residuals\n", r"camchain\.yaml"),
+        ("transforms.json", '{"camera_angle_x": 0.7, "frames": []}', "nerfstudio"),
+        ("stereo.edex", '[{"version": "0.9", "cameras": [{"intrinsics": {}}]}]', "cuVSLAM"),
+        ("scene.sfm", '{"version": [1], "intrinsics": [{"intrinsicId": "1"}]}', "AliceVision"),
+        ("notes.yaml", "hello: 1\n", "not a calibration that is known; known: calib.json"),
+    ],
+)  # fmt: skip
+def test_files_of_no_pair_are_named(tmp_path: Path, name: str, text: str, words: str) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    with pytest.raises(CalibrationError, match=words) as raised:
+        read(tmp_path / name)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_baseline_in_squares_of_the_board_is_doubted(tmp_path: Path) -> None:
+    matrix = [[600.0, 0.0, 320.0], [0.0, 600.0, 240.0], [0.0, 0.0, 1.0]]
+    values = {"image_size": [640, 480], "R": np.eye(3).tolist(), "T": [-2.41, 0.0, 0.0]}
+    values |= {f"M{k}": matrix for k in (1, 2)} | {f"D{k}": [0.1, 0, 0, 0, 0] for k in (1, 2)}
+    path = tmp_path / "squares.json"
+    path.write_text(json.dumps(values), encoding="utf-8")
+    assert any("the side of a square" in remark for remark in load_rig(path).remarks)
+    assert load_rig(path, unit_m=0.025).remarks == ()

@@ -1061,3 +1061,89 @@ def test_what_is_no_depth_is_said(tmp_path: Path) -> None:
     uncalibrated = [each for each in walk() if not each[0].endswith("camera_info")]
     with pytest.raises(CalibrationError, match=f"no camera_info belongs to {COLOUR}; give its cal"):
         opened(write_bag(tmp_path / "bare.mcap", uncalibrated))
+
+
+# --------------------------------------------------------------------------------------------
+# What drivers and recorders do
+
+
+def changed_infos(written: list[Written], **changes: Any) -> list[Written]:
+    return [(*m[:3], m[3] | changes) if m[2].endswith("CameraInfo") else m for m in written]
+
+
+def test_a_rectified_stream_may_state_its_projection_alone(tmp_path: Path) -> None:
+    rectified = [(m[0].replace("image_raw", "image_rect"), *m[1:]) for m in stereo()]
+    usual = opened(write_bag(tmp_path / "usual.mcap", rectified)).rig
+    numbers = (usual.fx, usual.fy, usual.cx, usual.cy, usual.baseline)
+    written = changed_infos(rectified, k=np.zeros(9), d=np.zeros(8))
+    found = opened(write_bag(tmp_path / "zero.mcap", written)).rig
+    assert (found.fx, found.fy, found.cx, found.cy, found.baseline) == numbers
+    spoilt = changed_infos(stereo(), k=np.zeros(9), d=np.array([0.1, 0.0, 0.0, 0.0, 0.0]))
+    with pytest.raises(CalibrationError, match="not calibrated"):
+        opened(write_bag(tmp_path / "raw.mcap", spoilt))
+
+
+def test_a_fault_in_a_bag_names_it_and_asks_for_no_file(tmp_path: Path) -> None:
+    five = np.array([0.1, 0.0, 0.0, 0.0, 0.5])
+    written = changed_infos(stereo(), d=five, distortion_model="equidistant")
+    bag = write_bag(tmp_path / "five.mcap", written)
+    with pytest.raises(CalibrationError, match=r"five\.mcap:/cam/left/camera_info: equi.*--camera"):
+        opened(bag)
+    write_calibration(tmp_path)
+    assert len(opened(bag, camera_file=str(tmp_path / "calib.json"))) == 4
+
+
+def test_one_topic_may_show_both_views(tmp_path: Path) -> None:
+    for name, join in (("wide", np.hstack), ("high", np.vstack)):
+        shown = [join([picture(60 + k), picture(10 + k)]) for k in range(3)]
+        written = [image("/usb_cam/image_raw", k, raw_image(each)) for k, each in enumerate(shown)]
+        bag = write_bag(tmp_path / f"{name}.mcap", written)
+        with pytest.raises(DatasetError, match=r"shows both views.*--camera FILE"):
+            opened(bag)
+        write_calibration(tmp_path)
+        recording = opened(bag, camera_file=str(tmp_path / "calib.json"))
+        assert [codes(recording, k) for k in range(3)] == [(10, 60), (11, 61), (12, 62)]
+        assert "is taken as both views" in recording.notes[0]
+
+
+VIEWER = ("/device_0/sensor_0/Infrared_0/image/data", "/device_0/sensor_0/Depth_0/image/data")
+
+
+@pytest.mark.parametrize("topic", ["Depth_Units/value", "Depth Units", None])
+def test_the_unit_of_depth_is_the_one_that_the_viewer_states(
+    tmp_path: Path, topic: str | None
+) -> None:
+    unit = 0.00025
+    written = walk(lambda m: raw_image((m / unit).round().astype(np.uint16), "16UC1"), VIEWER)
+    written = [(m[0].replace("image/camera_info", "info/camera_info"), *m[1:]) for m in written]
+    if topic:
+        name = f"/device_0/sensor_0/option/{topic}"
+        written.append((name, START_NS, "std_msgs/msg/Float32", {"data": unit}))
+    bag = write_bag(tmp_path / "viewer.bag", written)
+    settings = {} if topic else {"depth_scale": 4000.0}
+    note = next(n for n in opened(bag, **settings).notes if "units a metre" in n)
+    assert note == f"depth is taken as 4000 units a metre: its median is {DEPTH_M:.3g} m"
+
+
+def test_the_colour_camera_of_several_is_the_one_of_the_topic(tmp_path: Path) -> None:
+    chain = {
+        f"cam{k}": {
+            "camera_model": "pinhole",
+            "distortion_model": "none",
+            "intrinsics": [300.0 + k, 300.0 + k, 15.0, 11.0],
+            "resolution": [WIDTH, HEIGHT],
+            "rostopic": topic,
+            **({"T_cn_cnm1": pose(np.eye(3), np.array([-0.1, 0.0, 0.0])).tolist()} if k else {}),
+        }
+        for k, topic in enumerate(("/camera/infra1/image_rect_raw", COLOUR))
+    }
+    path = tmp_path / "chain.yaml"
+    path.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    bag = write_bag(tmp_path / "walk.mcap", walk())
+    assert opened(bag, camera_file=str(path)).rig.fx == 301.0
+    for each in chain.values():
+        each["rostopic"] = ""
+    path.write_text(yaml.safe_dump(chain), encoding="utf-8")
+    with pytest.raises(CalibrationError, match=r"--set dataset\.colour_camera=0 for chain"):
+        opened(bag, camera_file=str(path))
+    assert opened(bag, camera_file=str(path), colour_camera=1).rig.fx == 301.0

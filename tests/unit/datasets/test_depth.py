@@ -275,3 +275,29 @@ def test_depth_that_is_not_registered_or_no_depth(tmp_path: Path) -> None:
         save(depth, np.full((12, 16), 10000, np.uint16))
     with pytest.raises(DatasetError, match=r"16x12 pixels, colour images 32x24; .* resize the col"):
         opened(root)
+
+
+@pytest.mark.parametrize("depth_first", [False, True])
+@pytest.mark.parametrize("counted", [False, True])
+def test_a_list_of_associations_pairs_and_times(
+    tmp_path: Path, depth_first: bool, counted: bool
+) -> None:
+    lines = []
+    for k in range(4):
+        save(tmp_path / "rgb" / f"{k}.png", np.dstack([picture(10 + k)] * 3))
+        save(tmp_path / "depth" / f"{7 - k}.png", np.full((HEIGHT, WIDTH), 2000 + k, np.uint16))
+        colour_at, depth_at = (
+            (str(k), str(k)) if counted else (f"{5.1 + k / 30}", f"{5.105 + k / 30}")
+        )
+        words = [f"{colour_at} rgb/{k}.png", f"{depth_at} depth/{7 - k}.png"]
+        lines.append(" ".join(words[::-1] if depth_first else words))
+    (tmp_path / "associations.txt").write_text("\n".join(lines), encoding="utf-8")
+    camera(tmp_path)
+    recording = opened(tmp_path, depth_scale=1000.0)
+    step = np.diff(recording.timestamps)
+    np.testing.assert_allclose(step, 0.1 if counted else 1 / 30, rtol=0.0, atol=1e-6)
+    assert any("--fps says another" in note for note in recording.notes) == counted
+    # What the message advises.
+    faster = opened(tmp_path, depth_scale=1000.0, fps=25.0)
+    np.testing.assert_allclose(np.diff(faster.timestamps), 0.04, rtol=0.0, atol=1e-9)
+    assert int(recording.frame(2).images[0][0, 0]) == 12

@@ -224,6 +224,22 @@ def test_missing_files_are_named(tracks: Path, tmp_path: Path) -> None:
         opened(tracks)
 
 
+@pytest.mark.parametrize("bits", [31, 40, 53, 62])
+def test_landmarks_may_have_any_numbers_of_64_bits(tracks: Path, bits: int) -> None:
+    """Keys of GTSAM and hashes: beyond 53 bits floats would make one of several."""
+    usual = opened(tracks)
+    rows = [line.split() for line in tracks.read_text("utf-8").splitlines()]
+    moved = [[row[0], str(int(row[1]) + 2**bits), *row[2:]] for row in rows]
+    tracks.write_text("\n".join(map(" ".join, moved)), "utf-8")
+    found = opened(tracks)
+    assert f"landmarks have numbers up to {max(IDS) + 2**bits}: they" in found.notes[0]
+    for ours, theirs in zip(found.log, usual.log, strict=True):
+        np.testing.assert_array_equal(np.sort(IDS)[ours.observations.ids], theirs.observations.ids)
+        np.testing.assert_array_equal(
+            ours.observations.measurement, theirs.observations.measurement
+        )
+
+
 # --------------------------------------------------------------------------------------------
 # The files inside the gtsam package
 

@@ -612,3 +612,24 @@ def test_gap_in_the_truth_leaves_the_step_without_odometry(tmp_path: Path) -> No
     assert "2 frames have no ground truth, so no odometry" in sequence.notes
     with pytest.raises(IndexError):
         sequence.odometry(0)
+
+
+@pytest.mark.parametrize("mark", [".", "/"])
+def test_full_names_of_ros_are_known_by_their_last_parts(tmp_path: Path, mark: str) -> None:
+    """As `rostopic echo -p` and PlotJuggler write them; linear_acceleration.x is no position."""
+    names = ["%time", "field.header.stamp"]
+    names += [f"field.pose.pose.position.{axis}" for axis in "xyz"]
+    names += [f"field.pose.pose.orientation.{axis}" for axis in "xyzw"]
+    names += [
+        "field.twist.twist.linear.x",
+        "field.twist.twist.angular.z",
+        "a.linear_acceleration.x",
+    ]
+    header = ",".join(name.replace(".", mark) for name in names)
+    rows = [f"{10**8 * k},0,{k},0,0,0,0,0,1,0.5,0.1,9" for k in range(3)]
+    path = tmp_path / "odom.csv"
+    path.write_text("\n".join([header, *rows]), encoding="utf-8")
+    table = read_columns(path, "speeds")
+    pose_names = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    assert table.names == ("time", "time", *pose_names, "speed", "yaw_rate")
+    np.testing.assert_allclose(table.values[:, 0], [0.0, 0.1, 0.2], rtol=0.0, atol=1e-12)

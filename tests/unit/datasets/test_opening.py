@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,6 +26,7 @@ from dataset_builders import (
 )
 from pydantic import TypeAdapter, ValidationError
 
+from fgslam.cameras.lenses import RawCamera
 from fgslam.cameras.rig import load_rig
 from fgslam.core.arrays import Image
 from fgslam.core.errors import CalibrationError, FgslamError, FrameError
@@ -406,3 +409,47 @@ def test_a_real_drive_fits_its_calibration_and_no_other(shared_data: Path) -> No
     assert not any("does not fit" in note for note in found.notes)
     wrong = open_recording(EurocSettings(path=str(root), stop=3, camera_file=str(other)))
     assert "the calibration does not fit the images" in wrong.notes[0]
+
+
+def seen_by(camera: RawCamera, wall: Image, shift_m: float) -> Image:
+    """A textured wall 3 m away, 5 mm a pixel, by a camera ``shift_m`` to the right."""
+    columns, rows = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = camera.unproject(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+    place = (3.0 * rays[:, :2] / rays[:, 2:] + [shift_m, 0.0]) / 0.005 + 700.0
+    u, v = place.T.reshape(2, *columns.shape).astype(np.float32)
+    return np.asarray(cv2.remap(wall, u, v, cv2.INTER_LINEAR), np.uint8)
+
+
+@pytest.mark.parametrize("model", ["radtan", "equidistant"])
+@pytest.mark.parametrize("matrices", ["K", "M"])
+def test_four_coefficients_are_of_the_lens_by_which_rows_agree(
+    tmp_path: Path, model: str, matrices: str
+) -> None:
+    """Nothing in the file states it, whatever it calls the matrices."""
+    lens = np.array([-0.28, 0.07, 0.004, 0.003] if model == "radtan" else [0.2, 0.1, -0.1, 0.03])
+    size, distortions = (320, 240), (lens, 0.8 * lens)
+    matrix = np.array([[200.0, 0.0, 155.0], [0.0, 200.0, 122.0], [0.0, 0.0, 1.0]])
+    wall = cv2.GaussianBlur(
+        np.random.default_rng(1).integers(0, 255, (1400, 1400), dtype=np.uint8), (0, 0), 3.0
+    )
+    wall = cv2.normalize(wall, np.empty_like(wall), 0, 255, cv2.NORM_MINMAX)
+    values: dict[str, Any] = {"image_size": size, "R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0]}
+    for k, (side, shift) in enumerate((("left", 0.0), ("right", 0.2))):
+        camera = RawCamera(*size, matrix, distortions[k], np.eye(4), model=model)
+        for frame in range(3):
+            name = f"{frame:06d}.png"
+            save(tmp_path / side / name, seen_by(camera, wall, shift + 0.3 * frame))
+        values |= {f"{matrices}{k + 1}": matrix.tolist(), f"D{k + 1}": distortions[k].tolist()}
+    (tmp_path / "calib.json").write_text(json.dumps(values), encoding="utf-8")
+    (tmp_path / "times.txt").write_text("".join(f"{k} {k / 10}\n" for k in range(3)), "utf-8")
+    other = "equidistant" if model == "radtan" else "radtan"
+    settings = ImageFolderSettings(path=str(tmp_path))
+    found = open_recording(settings)
+    assert f"taken as {model}, by which the rows" in found.notes[0]
+    assert found.rectifier is not None
+    assert found.rectifier.calibration is not None
+    assert found.rectifier.calibration.cameras[0].model == model
+    forced = open_recording(replace(settings, lens=other)).rectifier
+    assert forced is not None
+    assert forced.calibration is not None
+    assert forced.calibration.cameras[0].model == other  # what the note says states otherwise
