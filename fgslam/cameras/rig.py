@@ -325,7 +325,7 @@ def _unknown_text(path: Path) -> str:
     text = read_text(path, CalibrationError)[:20_000]
     for pattern, what in _FOREIGN:
         if re.search(pattern, text, re.MULTILINE | re.DOTALL):
-            return f"{path} looks like {what}"
+            return f"{path} seems to be {what}"
     return f"{path}: not a calibration that is known; {KNOWN}"
 
 

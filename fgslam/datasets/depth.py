@@ -289,7 +289,7 @@ def _associated(
         return (
             pairs,
             stamps,
-            (*notes, *([] if fps else [f"{reason} a second (--fps says another)"])),
+            (*notes, *([] if fps else [f"{reason} a second (--fps states another)"])),
         )
     stamps = np.array([float(t) for t in times])
     if len(stamps) == 0 or np.any(np.diff(stamps) <= 0.0):
@@ -433,7 +433,7 @@ def camera_of_file(
     """The colour camera of a calibration file, for images of this size.
 
     Of several the one that the settings name, that of the images' topic, the only one of their
-    size, or the only one whose name or topic says so.
+    size, or the only one whose name or topic states it.
 
     Raises:
         CalibrationError: it remains unknown which it is.

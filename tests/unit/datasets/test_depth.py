@@ -296,7 +296,7 @@ def test_a_list_of_associations_pairs_and_times(
     recording = opened(tmp_path, depth_scale=1000.0)
     step = np.diff(recording.timestamps)
     np.testing.assert_allclose(step, 0.1 if counted else 1 / 30, rtol=0.0, atol=1e-6)
-    assert any("--fps says another" in note for note in recording.notes) == counted
+    assert any("--fps states another" in note for note in recording.notes) == counted
     # What the message advises.
     faster = opened(tmp_path, depth_scale=1000.0, fps=25.0)
     np.testing.assert_allclose(np.diff(faster.timestamps), 0.04, rtol=0.0, atol=1e-9)
