@@ -38,6 +38,8 @@ _LEAST_SPREAD_PX = 0.1  # of points followed on sharp images
 _SIGNAL = 3.0
 """Spreads that the shift must amount to. Both sides err alike by the noise of the present image's
 patch, which at a standstill seems half a frame; at three spreads it is 0.06 of one."""
+_ALIKE = 0.25  # frames of lag: nearer to none than this
+_KNOWN = 0.1  # and known so well, images are of one moment
 _UNKNOWN_LAG = 10.0  # frames, standard deviation of its prior: none to speak of
 
 
@@ -70,6 +72,15 @@ class Lag:
         """Deviations by which it is nearer to one frame than to none; NaN where unknown."""
         return (self.frames - 0.5) / self.sigma
 
+    @property
+    def together(self) -> bool:
+        """Whether the images are of one moment for sure.
+
+        What is late by one camera's motion is as early by the other's: where that shows no
+        difference, something else than time displaces the points.
+        """
+        return self.sigma < _KNOWN and abs(self.frames) < _ALIKE
+
 
 class LagModel:
     """What the calibration of a rig may explain of the offsets in one of its other cameras."""
@@ -99,7 +110,8 @@ class LagModel:
         prior = np.zeros((design.shape[1],) * 2)
         prior[0, 0], prior[1:, 1:] = _UNKNOWN_LAG**-2, self._prior
         fit = cauchy_fit(design, rows.offset, prior, spread_px)
-        if np.sqrt(np.mean(rows.shift**2)) < _SIGNAL * fit.spread:
+        # Of most points: a few that slip along an edge do so alike in all images.
+        if 1.4826 * middle(np.abs(rows.shift)) < _SIGNAL * fit.spread:
             return Lag(np.nan, np.nan)
         residual = rows.offset - design @ fit.found
         return Lag(float(fit.found[0]), _sigma(design, residual, fit.spread, prior))
@@ -433,8 +445,6 @@ def _who(change: FloatArray, covariance: FloatArray) -> tuple[int, FloatArray, F
 _WIDE_PX = 400  # wider images are made smaller
 _SURE = 5.0  # deviations: by chance once in three million frames
 _WINDOW = 5  # frames that are judged together where one alone does not tell
-_ALIKE = 0.25  # frames of lag: nearer to none than this, the other direction need not be asked
-_KNOWN = 0.1  # nor where it is known so well
 _STOP = 2.0 ** (1.0 / 3.0)
 """Ratio of grey values: a third of a stop, the step in which exposures are set. Two cameras of one
 rig that differ by it do not have the same exposure."""
@@ -575,12 +585,21 @@ class CameraWatch:
         pair, (here, there) = self._pairs[camera - 1], places
         offset = (there - here)[:, pair.model.across]
         rows = self._shifted(moved, here, offset, there, pair)
-        newest = self._take(pair, camera, 0, rows)
-        sure = newest.sigma < _KNOWN and abs(newest.frames) < _ALIKE
-        if not sure or any(self._late):
+        newest, by_reference = self._take(pair, 0, rows)
+        if not newest.together or any(self._late):
             moved = followed(now.images[camera], self._before[camera], there)
             of_other = self._shifted(moved, there, -offset, there, pair)
-            self._take(pair, 0, 1, of_other)
+            _, by_other = self._take(pair, 1, of_other)
+            for suspect, way, lag, opposite in (
+                (camera, 0, by_reference, by_other),
+                (0, 1, by_other, by_reference),
+            ):
+                late = lag.late > 0.0
+                if abs(lag.late) > _SURE and self._late[suspect] != late:
+                    if late and opposite.together:
+                        continue
+                    self._late[suspect] = late
+                    pair.rows[way].clear()
         else:
             pair.rows[1].clear()
         return rows
@@ -605,23 +624,20 @@ class CameraWatch:
         size = float(self._factor)
         return LineRows(size * offset[kept], size * shift[kept], size * place[kept])
 
-    def _take(self, pair: _Pair, suspect: int, way: int, rows: LineRows) -> Lag:
-        """Books a frame's points; alone or with those before they may find the suspect late."""
+    def _take(self, pair: _Pair, way: int, rows: LineRows) -> tuple[Lag, Lag]:
+        """The lag by a frame's points; and that, or where it does not tell, by the last frames."""
         newest = pair.model.lag(self._signed(rows, way), self._spread)
-        late, window = newest.late, pair.rows[way]
-        if math.isnan(late):
-            return newest
+        window = pair.rows[way]
+        if math.isnan(newest.late):
+            return newest, newest
         window.append(rows)
         del window[:-_WINDOW]
-        if not abs(late) > _SURE and len(window) > 1:
-            together = LineRows.none()
-            for one in window:
-                together = together.join(one)
-            late = pair.model.lag(self._signed(together, way), self._spread).late
-        if abs(late) > _SURE and self._late[suspect] != (late > 0.0):
-            self._late[suspect] = late > 0.0
-            window.clear()
-        return newest
+        if abs(newest.late) > _SURE or len(window) == 1:
+            return newest, newest
+        together = LineRows.none()
+        for one in window:
+            together = together.join(one)
+        return newest, pair.model.lag(self._signed(together, way), self._spread)
 
     def _signed(self, rows: LineRows, way: int) -> LineRows:
         """The calibration displaces the other camera's points, from whichever it is looked at."""

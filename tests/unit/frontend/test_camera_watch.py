@@ -15,7 +15,7 @@ from scipy import ndimage
 import fgslam as fg
 from fgslam.core.arrays import FloatArray, Image
 from fgslam.core.correction import TERMS, camera_displacements
-from fgslam.core.geometry import so3_exp
+from fgslam.core.geometry import pose, so3_exp
 from fgslam.core.sensors import CAMERA_NAMES, CameraRig
 from fgslam.core.store import restore, state_of
 from fgslam.frontend.camera_faults import (
@@ -31,6 +31,15 @@ from fgslam.frontend.camera_faults import (
 )
 from fgslam.frontend.features.sift import contrast_share, noise_sigma
 from fgslam.report.content import sentence
+from fgslam.worlds.lab import (
+    PlaceChoice,
+    World,
+    camera_offsets,
+    make_rig,
+    open_room,
+    plan_in_place,
+)
+from fgslam.worlds.settings import LabRigSettings, RenderedLabSettings
 
 # ------------------------------------------------------------------------------------------
 # A camera that is late, frozen, swapped or darker is found out within frames; a sound one never
@@ -170,6 +179,38 @@ def test_watching_goes_on_where_it_stopped(lab: tuple[CameraRig, list[Images]]) 
         restore(then, state_of(first))
         assert reported + [then.look(images) for images in given[stop:]] == whole
         np.testing.assert_equal(state_of(first), state_of(first))
+
+
+@pytest.mark.parametrize("yaw", [4.8, pytest.param(5.6, marks=pytest.mark.slow)])
+def test_steps_as_long_as_the_baseline_are_no_lag(yaw: float) -> None:
+    """Sideways by 10 cm the left camera comes to where the right one was: all slips are alike."""
+    settings = RenderedLabSettings(rig=LabRigSettings(vertical_baseline_m=None))
+    place, rig = PlaceChoice.of(settings), make_rig(settings.rig)
+    world, drive = World(rig, open_room(place)), plan_in_place(place, settings.drive, rig)
+    body = drive.body_poses(drive.timestamps[:1])[0]
+    body[:3, :3] = so3_exp(np.array([0.0, 0.0, yaw])) @ body[:3, :3]
+    frames = []
+    for k in range(8):
+        wTc = body @ rig.bTc @ pose(np.eye(3), np.array([0.1 * (k - 4), 0.0, 0.0]))
+        both = [world.image(wTc @ offset, []) for offset in camera_offsets(rig)]
+        frames.append(tuple(noisy(np.asarray(image), k) for image in both))
+    watch = CameraWatch(rig)
+    assert not any(watch.look(images) for images in frames)
+
+
+@pytest.mark.data
+@pytest.mark.slow
+@pytest.mark.parametrize("stride", range(1, 7))
+@pytest.mark.parametrize("name", ["kitti06", "euroc_v101_kf100", "kitti_raw_0926_5hz"])
+def test_a_late_camera_is_found_at_any_stride(shared_data: Path, name: str, stride: int) -> None:
+    recording = fg.open_recording(shared_data / name)
+    frames = frames_of(recording, len(recording))[::stride]
+    watch = CameraWatch(recording.rig)
+    assert not any(watch.look(images) for images in frames)
+    late_left = [with_one(frames[k], 1, frames[k - 1][1]) for k in range(1, len(frames))]
+    watch = CameraWatch(recording.rig)
+    reported = [watch.look(images) for images in late_left]
+    assert any("the left camera delivers old images" in words for words in reported)
 
 
 SOUND = (
