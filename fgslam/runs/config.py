@@ -150,7 +150,9 @@ class Override(NamedTuple):
         except yaml.YAMLError:
             value = text
         plain = isinstance(value, str) and text[:1] not in ("'", '"')  # with any comment behind it
-        return Override(given, keys, text, text if plain or keys[-1] in ("kind", "task") else value)
+        # A kind is a text, whatever YAML makes of it.
+        as_typed = plain or (keys[-1] in ("kind", "task") and not isinstance(value, str))
+        return Override(given, keys, text, text if as_typed else value)
 
     def apply(self, values: dict[str, Any], value: Any) -> None:
         """Sets the key in place. Raises ConfigError where it leads through a value."""
@@ -741,7 +743,24 @@ def load_experiment(path: Path, overrides: Iterable[str] = ()) -> Experiment:
     Raises:
         ConfigError: the file is missing or no YAML mapping, or a key or value is wrong.
     """
-    return make_experiment(read_mapping(path), str(path), overrides)
+    return make_experiment(_from_anywhere(read_mapping(path)), str(path), overrides)
+
+
+_FILES = ("path", "camera_file", "file")
+
+
+def _from_anywhere(values: dict[str, Any]) -> dict[str, Any]:
+    """The values with files of the data that are not here where the run was started, if there."""
+    dataset, known = values.get("dataset"), values.get("provenance")
+    started = known.get("directory") if isinstance(known, dict) else None
+    if not isinstance(dataset, dict) or not isinstance(started, str):
+        return values
+    moved = {}
+    for key in _FILES:
+        given = dataset.get(key)
+        if isinstance(given, str) and not Path(given).exists() and (Path(started) / given).exists():
+            moved[key] = str(Path(started) / given)
+    return {**values, "dataset": {**dataset, **moved}}
 
 
 def make_experiment(
@@ -773,7 +792,7 @@ def make_experiment(
 
 def load_config(path: Path, overrides: Iterable[str] = ()) -> ExperimentConfig:
     """Reads an experiment of SLAM. Raises ConfigError, also where it is of another task."""
-    return make_config(read_mapping(path), str(path), overrides)
+    return make_config(_from_anywhere(read_mapping(path)), str(path), overrides)
 
 
 def make_config(

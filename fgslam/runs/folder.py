@@ -263,7 +263,8 @@ def write_config(folder: Path, config: Experiment, provenance: dict[str, Any]) -
     """config.yaml: every default filled in, with the versions and where the data came from."""
     import yaml  # not before: a wrong path is answered without it
 
-    values = config.as_values() | {"provenance": {"versions": versions()} | provenance}
+    known = {"versions": versions(), "directory": str(Path.cwd())} | provenance
+    values = config.as_values() | {"provenance": known}
     write_text(folder / RUN_MARKER, yaml.safe_dump(values, sort_keys=False))
 
 

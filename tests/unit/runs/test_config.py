@@ -427,3 +427,23 @@ def test_slam_s_own_commands_refuse_homing_and_the_other_way_round(tmp_path: Pat
         load_config(written(tmp_path, TRIALS))
     with pytest.raises(ConfigError, match="has no task"):
         as_task(HomingExperiment, load_experiment(written(tmp_path, LAB)), "test")
+
+
+@pytest.mark.parametrize("typed", ["ekf", '"ekf"', "'ekf'"])
+def test_a_kind_may_be_quoted_as_options_write_it(typed: str) -> None:
+    config = make_config(MINIMAL, "test", [f"estimator.kind={typed}"])
+    assert config.estimator.kind == "ekf"
+
+
+def test_a_run_knows_its_recording_from_any_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "there" / "drive").mkdir(parents=True)
+    values = {"name": "x", "dataset": {"kind": "image_folder", "path": "drive"}}
+    known = {"provenance": {"directory": str(tmp_path / "there")}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values | known), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    dataset = load_config(Path("config.yaml")).dataset
+    assert vars(dataset)["path"] == str(tmp_path / "there" / "drive")
+    monkeypatch.chdir(tmp_path / "there")
+    assert vars(load_config(Path("../config.yaml")).dataset)["path"] == "drive"
