@@ -62,7 +62,7 @@ from fgslam.core.sensors import (
     vertical_to_horizontal,
 )
 from fgslam.core.store import Kept
-from fgslam.core.types import EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
+from fgslam.core.types import LAGS, EgoMotion, EgoMotionStatus, Floor, LandmarkMap, Prediction
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
 
@@ -492,6 +492,7 @@ class SampledErrors(ErrorColumns):
 
     _terms: Kept[RigTerms]
     _noise: Kept[Persistence]
+    _recent: Kept[list[tuple[FloatArray, FloatArray]]]
 
     def __init__(self, solver: EgoMotionSolver, off: bool = False) -> None:
         """The first pose is known, the map empty.
@@ -509,6 +510,7 @@ class SampledErrors(ErrorColumns):
         self._sensor = solver.sensor
         self._noise = Persistence(solver.sensor)
         self._random = np.random.default_rng(_STREAM)
+        self._recent = []  # poses and their columns, the newest last
         self._taken = 1.0  # variance over the stated one that the newest pose took
         self._seen: tuple[IntArray, ObservedColumns, FloatArray] | None = None
         """Matches of the newest frame: rows of their landmarks, and the columns of these before."""
@@ -560,7 +562,7 @@ class SampledErrors(ErrorColumns):
     def close(
         self, loop: LoopClosure, landmarks: LandmarkMap, wTc: FloatArray, moved: Moved
     ) -> None:
-        """A closure has moved the drive.
+        """A closure has moved the drive; what it made of motions to frames before is not known.
 
         Args:
             loop: the closure.
@@ -570,6 +572,7 @@ class SampledErrors(ErrorColumns):
         """
         if self._off:
             return
+        self._recent = []
         rows, known = self.rows(landmarks.ids)
         self._map["columns"][rows[known]] = (
             moved.rotations[known] @ self._map["columns"][rows[known]]
@@ -597,6 +600,22 @@ class SampledErrors(ErrorColumns):
         return Prediction(
             newest.wTc, self._covariances(self._pose_columns, self._solver.floor.rigid_dof)
         )
+
+    def motions(self, wTc: FloatArray) -> FloatArray:
+        """(l, 6, 6) covariances of the motions over LAGS frames to the newest pose, NaN for none.
+
+        The newest pose is kept for those of later frames.
+        """
+        out = np.full((len(LAGS), 6, 6), np.nan)
+        if self._off:
+            return out
+        for found, lag in zip(out, LAGS, strict=True):
+            if lag <= len(self._recent):
+                earlier, columns = self._recent[-lag]
+                off = self._pose_columns - adjoint(inverse(wTc) @ earlier) @ columns
+                found[:] = self._covariances(off, self._solver.floor.rigid_dof)
+        self._recent = [*self._recent, (wTc, self._pose_columns)][-max(LAGS) :]
+        return out
 
     def landmarks(self, known: LandmarkMap) -> LandmarkMap:
         """Landmarks with the covariances of their errors; those without keep what they have."""

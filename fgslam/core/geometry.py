@@ -206,6 +206,23 @@ def compose_covariance(motion: FloatArray, before: FloatArray, noise: FloatArray
     return np.asarray(ad @ before @ ad.T + noise)
 
 
+def motion_covariance(
+    motion: FloatArray, before: FloatArray, after: FloatArray, cross: FloatArray
+) -> FloatArray:
+    """Covariance (..., 6, 6) of a motion ``iTj`` (..., 4, 4) between two poses, by their joint one.
+
+    Args:
+        motion: ``inverse(wTi) @ wTj``; its error is at its end.
+        before: of the first pose, in the tangent space at it.
+        after: of the second.
+        cross: of both: the first's errors in rows, the second's in columns.
+    """
+    ad = adjoint(inverse(motion))
+    shared = ad @ cross
+    found = after + ad @ before @ np.swapaxes(ad, -1, -2) - shared - np.swapaxes(shared, -1, -2)
+    return np.asarray(0.5 * (found + np.swapaxes(found, -1, -2)))
+
+
 def compose_odometry(steps: Iterable[Odometry]) -> Odometry:
     """Consecutive independent steps as one; measured, or else turned, if all of them are so."""
     motion, covariance, measured, turned = np.eye(4), np.zeros((6, 6)), True, True

@@ -59,6 +59,7 @@ def bridged(estimate: Estimate, parts: MapParts) -> Estimate:
     poses, covariances = trajectory.poses.copy(), estimate.covariances.copy()
     positions, spreads = estimate.landmarks.positions.copy(), estimate.landmarks.covariances.copy()
     of_landmarks = parts.of(estimate.landmarks.ids)
+    relative = {lag: one.copy() for lag, one in estimate.relative.items()}
     drive = _Drive(trajectory.timestamps, trajectory.poses, known)
     for part, frames, gap in _bridged_parts(parts):
         middle = frames[len(frames) // 2]
@@ -70,6 +71,9 @@ def bridged(estimate: Estimate, parts: MapParts) -> Estimate:
         pose, covariance = better
         moved = pose @ inverse(poses[middle])
         poses[frames] = moved @ poses[frames]
+        for lag, motions in relative.items():  # of which it is not known what they have in common
+            ends = np.unique(np.concatenate([frames, frames - lag]))
+            motions[ends[(ends >= 0) & (ends < len(motions))]] = np.nan
         covariances[frames] = congruence(adjoint(inverse(poses[frames]) @ pose), covariance)
         own = np.flatnonzero(of_landmarks == part)
         positions[own] = transform_to_world(moved, positions[own])
@@ -78,6 +82,7 @@ def bridged(estimate: Estimate, parts: MapParts) -> Estimate:
         estimate,
         trajectory=Trajectory(trajectory.timestamps, poses),
         covariances=covariances,
+        relative=relative,
         landmarks=LandmarkMap(estimate.landmarks.ids, positions, spreads),
     )
 

@@ -317,7 +317,9 @@ def estimate_of_failed(
         none = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
         return Estimate(online, covariances, none, remark), f"no final estimate: {reason(error)}"
     poses = Trajectory(found.trajectory.timestamps[:n], found.trajectory.poses[:n])
-    return replace(found, trajectory=poses, covariances=found.covariances[:n]), ""
+    relative = {lag: one[: max(n - lag, 0)] for lag, one in found.relative.items()}
+    covariances = found.covariances[:n]
+    return replace(found, trajectory=poses, covariances=covariances, relative=relative), ""
 
 
 def reason(error: BaseException) -> str:

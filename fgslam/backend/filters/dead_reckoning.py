@@ -15,13 +15,14 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.geometry import (
     adjoint,
     inverse,
+    motion_covariance,
     point_pose_jacobian,
     reorthonormalise,
     transform_to_camera,
 )
 from fgslam.core.sensors import CameraRig, Increment, MeasurementType, Observations, Odometry
 from fgslam.core.store import Kept
-from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.types import LAGS, EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 
 
 class DeadReckoning:
@@ -64,7 +65,14 @@ class DeadReckoning:
 
     def estimate(self) -> Estimate:
         """Trajectory as predicted, and the map."""
-        return Estimate(self._past.trajectory(), self._past.pose_covariances(), self._map)
+        path, covariances = self._past.trajectory(), self._past.pose_covariances()
+        relative = {}
+        for lag in LAGS:
+            motion = inverse(path.poses[:-lag]) @ path.poses[lag:]
+            inherited = covariances[:-lag] @ np.swapaxes(adjoint(inverse(motion)), 1, 2)
+            both = covariances[:-lag], covariances[lag:]
+            relative[lag] = motion_covariance(motion, *both, inherited)
+        return Estimate(path, covariances, self._map, relative=relative)
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of the named landmarks."""

@@ -50,7 +50,7 @@ from fgslam.core.sensors import (
     Odometry,
 )
 from fgslam.core.store import Kept
-from fgslam.core.types import EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
+from fgslam.core.types import LAGS, EgoMotion, Estimate, LandmarkMap, Prediction, UpdateStats
 from fgslam.frontend.settings import EgoMotionSettings
 from fgslam.frontend.tracking.ego_motion import EgoMotionSolver, PoseProblem
 
@@ -67,6 +67,7 @@ class LandmarkKalman:
     updates: ClassVar[type[FrameUpdate]] = FrameUpdate
     _current: Kept[Prediction]
     _past: Kept[FilteredTrajectory]
+    _motions: Kept[list[FloatArray]]
     _rows: Kept[LandmarkRows]
     _drive: Kept[DriveRecord]
     _errors: Kept[SampledErrors]
@@ -94,6 +95,7 @@ class LandmarkKalman:
         self._current = prior
         self._by_pose: FloatArray | None = None  # what landmarks take over of the pose's covariance
         self._past = FilteredTrajectory()
+        self._motions = []  # of each frame, covariances of the motions to it over LAGS frames
         self._rows = LandmarkRows()
         self._drive = DriveRecord()
         solver = EgoMotionSolver(rig, ego_motion or EgoMotionSettings())
@@ -139,6 +141,7 @@ class LandmarkKalman:
         closed = tuple(self._close(increment, loop) for loop in increment.loops)
         current = self._errors.pose(self._current)
         self._past.covariances[-1] = current.covariance
+        self._motions.append(self._errors.motions(current.wTc))
         return UpdateStats(
             current.wTc, current.covariance, len(self._rows), nis, 3 * len(used), closed
         )
@@ -216,12 +219,14 @@ class LandmarkKalman:
         """Trajectory as filtered, corrected by loops, and the map."""
         rows = self._rows
         held = LandmarkMap(rows.ids.copy(), rows.positions.copy(), rows.covariances.copy())
+        motions = np.array(self._motions).reshape(-1, len(LAGS), 6, 6)
         return Estimate(
             self._past.trajectory(),
             self._past.pose_covariances(),
             self._errors.landmarks(held),
             tuple(self._drive.remarks),
             noise_factor=1.0,
+            relative={lag: motions[lag:, k] for k, lag in enumerate(LAGS)},
         )
 
     def landmark_covariances(self, ids: IntArray) -> FloatArray:

@@ -317,6 +317,12 @@ class Bordered:
         found, first = self.held.poses(), self.held.system.columns
         return found + self._of(self.gain[first : first + 6 * len(found)], 6)
 
+    def pose_columns(self, rows: IntArray) -> FloatArray:
+        """(6n, 6k) covariances of all poses and some, by row of ``pose_keys``."""
+        held, first = self.held.pose_columns(rows), self.held.system.columns
+        gain = self.gain[first : first + len(held)]
+        return np.asarray(held + gain @ self.covariance @ gain[_entries_of(rows)].T)
+
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         return self.held.landmarks() + self._of(self.gain[: self.held.system.columns], 3)
@@ -824,6 +830,10 @@ class GraphMarginals:
         every = np.arange(len(self.system.pose_keys))
         return self.factor.inverse_blocks(every, every)
 
+    def pose_columns(self, rows: IntArray) -> FloatArray:
+        """(6n, 6k) covariances of all poses and some, by row of ``pose_keys``."""
+        return self.factor.solve(_unit_columns(rows, 6 * len(self.system.pose_keys)))
+
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         coupling = _times(self.system.coupling, self.inverse)
@@ -961,6 +971,12 @@ class ChainMarginals:
             out[segment.rows[::6] // 6] = segment.own + gain @ among @ np.swapaxes(gain, 1, 2)
         return out
 
+    def pose_columns(self, rows: IntArray) -> FloatArray:
+        """(6n, 6k) covariances of all poses and some, by row of ``pose_keys``."""
+        columns, n = self.system.columns, 6 * len(self.system.pose_keys)
+        unit = np.concatenate([np.zeros((columns, 6 * len(rows))), _unit_columns(rows, n)])
+        return -self.solve(unit)[columns:]
+
     def landmarks(self) -> FloatArray:
         """(m, 3, 3) marginals, in the order of ``landmark_keys``."""
         columns = self.system.columns
@@ -984,6 +1000,18 @@ class ChainMarginals:
                 return segment.columns, segment.gain[first : first + 6], segment.own[first // 6]
         first = int(np.searchsorted(self.kept, self.system.columns + 6 * pose))
         return first + np.arange(6), -np.eye(6), np.zeros((6, 6))
+
+
+def _entries_of(rows: IntArray) -> IntArray:
+    """(6k,) entries of poses (k,)."""
+    return np.asarray((6 * rows[:, None] + np.arange(6)).ravel())
+
+
+def _unit_columns(rows: IntArray, size: int) -> FloatArray:
+    """(size, 6k) columns of the identity, of poses (k,)."""
+    out = np.zeros((size, 6 * len(rows)))
+    out[_entries_of(rows), np.arange(6 * len(rows))] = 1.0
+    return out
 
 
 def _diagonal(matrix: FloatArray, size: int) -> FloatArray:

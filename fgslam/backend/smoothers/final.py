@@ -48,10 +48,10 @@ from fgslam.core.correction import (
     shared_displacements,
 )
 from fgslam.core.errors import EstimatorError
-from fgslam.core.geometry import reorthonormalise
+from fgslam.core.geometry import inverse, motion_covariance, reorthonormalise
 from fgslam.core.sensors import CameraRig
 from fgslam.core.threads import one_blas_thread
-from fgslam.core.types import Floor, GyroscopeBias, Prediction
+from fgslam.core.types import LAGS, Floor, GyroscopeBias, Prediction
 from fgslam.factors.graphs import number, poses_of_frame
 
 # ------------------------------------------------------------------------------------------
@@ -482,14 +482,48 @@ def solution(refined: Refined, frames: list[int], floor: Floor) -> Solution:
     try:
         marginals = refined.marginals
         covariances = dict(zip(variables, marginals.landmarks(), strict=True))
-        kept[frames] = allowed_parts(floor, poses[frames], marginals.poses())
+        own = marginals.poses()
+        kept[frames] = allowed_parts(floor, poses[frames], own)
+        relative = relative_covariances(marginals, own, poses, frames, floor)
     except EstimatorError as error:
         missing = {v: np.full((3, 3), np.nan) for v in variables}
         remarks = (*refined.remarks, str(error))
         return Solution(poses, kept, points, missing, remarks, noise_ratio=ratio)
     bias = refined.gyroscope
     remarks = refined.remarks if bias is None else (*refined.remarks, bias.words)
-    return Solution(poses, kept, points, covariances, remarks, True, ratio, bias)
+    return Solution(poses, kept, points, covariances, remarks, True, ratio, bias, relative)
+
+
+_MOTIONS = 50  # that are judged, evenly spread: each costs a solution of the graph
+
+
+def relative_covariances(
+    marginals: SolvedSystem, own: FloatArray, poses: FloatArray, frames: list[int], floor: Floor
+) -> dict[int, FloatArray]:
+    """Covariances of motions between poses, by :data:`~fgslam.core.types.LAGS`: (n - lag, 6, 6).
+
+    NaN but of some, evenly spread, both ends of which are in the graph.
+
+    Args:
+        marginals: of the solved graph.
+        own: (k, 6, 6) covariances of its poses.
+        poses: (n, 4, 4) by frame.
+        frames: (k) that the graph's poses are.
+        floor: what it holds exactly is left out.
+    """
+    row_of = np.full(len(poses) + max(LAGS), -1)
+    row_of[frames] = np.arange(len(frames))
+    out = {lag: np.full((max(len(poses) - lag, 0), 6, 6), np.nan) for lag in LAGS}
+    for row in np.unique(np.linspace(0, len(frames) - 1, _MOTIONS).astype(np.int64)).tolist():
+        start = frames[row]
+        cross = np.swapaxes(marginals.pose_columns(np.array([row])).reshape(-1, 6, 6), 1, 2)
+        for lag in LAGS:
+            end, other = start + lag, row_of[start + lag]
+            if other >= 0:
+                motion = inverse(poses[start]) @ poses[end]
+                found = motion_covariance(motion, own[row], own[other], cross[other])
+                out[lag][start] = floor.allowed_part(poses[end], found)
+    return out
 
 
 def lost_landmarks(builder: GraphBuilder, found: Refined) -> dict[int, str]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -514,6 +514,7 @@ class Solution:
             open when each frame came is added.
         noise_ratio: variance of the measurements over what the builder takes it to be.
         gyroscope: its bias, where it is a variable of the graph.
+        relative: as of :class:`~fgslam.core.types.Estimate`, up to the graph's last frame.
     """
 
     poses: FloatArray
@@ -524,6 +525,7 @@ class Solution:
     considers_rig: bool = False
     noise_ratio: float = 1.0
     gyroscope: GyroscopeBias | None = None
+    relative: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 def poses_of(values: Any, frames: list[int]) -> FloatArray:

@@ -262,6 +262,7 @@ class Smoother:
             return self.tracker.estimate()
         answer = self._solved()
         covariances, landmarks = answer.pose_covariances, self._map.reported(answer)
+        relative = answer.relative if answer.considers_rig or not self._considered.present else {}
         if self._considered.present and not answer.considers_rig:
             covariances = covariances + np.array(self._added)
             landmarks = self._considered.landmarks(landmarks)
@@ -272,6 +273,11 @@ class Smoother:
             (*self.solver.remarks, *self.builder.admission.remarks, *answer.remarks),
             noise_factor=float(np.sqrt(self.builder.noise.power * answer.noise_ratio)),
             gyroscope=answer.gyroscope,
+            relative={
+                lag: np.concatenate([one, np.full((n - lag - len(one), 6, 6), np.nan)])
+                for lag, one in relative.items()
+                if (n := len(self.inputs)) > lag
+            },
         )
 
     def _solved(self) -> Solution:
