@@ -77,6 +77,8 @@ def show(result: RunResult, resume: str = "") -> None:
     notes = list(result.notes[:_NOTES_SHOWN])
     if len(result.notes) > _NOTES_SHOWN:
         notes.append(f"and {len(result.notes) - _NOTES_SHOWN} more, see {METRICS_FILE}")
+    for alarm in result.alarms:
+        _console().out(alarm, style="bold red")
     labelled = [*(("note", note) for note in notes), *result.particulars, *_files(result)]
     show_parts(result.lines, result.tables, labelled)
     if result.status == "interrupted":

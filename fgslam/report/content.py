@@ -111,7 +111,7 @@ class Page:
         headline: sentences with the main results, most important first.
         notes: what was tolerated in the recording, warnings, in words.
         tables, figures, pictures: in the order of the page.
-        failed: rows of the tables that are of what failed.
+        failed: rows of the tables, and sentences of the headline, that are of what failed.
         remarks: of the estimators, in words; None where the page has no section for them.
         config_yaml: the resolved configuration, as text.
         versions: of the program and its libraries; None where one is not installed.

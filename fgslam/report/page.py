@@ -177,7 +177,7 @@ def slam_page(data: ReportData) -> Page:
             *([drawn.calibration_over_time(rig, data.start)] if rig is not None else []),
         ),
         pictures=data.pictures,
-        failed=frozenset(e.title for e in data.estimators if e.failure),
+        failed=frozenset((*data.alarms, *(e.title for e in data.estimators if e.failure))),
         notes=data.notes,
         remarks=data.remarks,
         config_yaml=data.config_yaml,
@@ -186,9 +186,10 @@ def slam_page(data: ReportData) -> Page:
 
 
 def headline(data: ReportData) -> tuple[str, ...]:
-    """Sentences about accuracy, consistency and failures, most important first."""
+    """Sentences about success, accuracy, consistency and failures, most important first."""
     working = [e for e in data.estimators if not e.failure]
-    lines = [_accuracy(data, working)] if working else ["No estimator gave a result."]
+    lines = [*data.alarms]
+    lines += [_accuracy(data, working)] if working else ["No estimator gave a result."]
     lines += _consistency(working)
     lines += [f"{e.title} failed: {e.failure}" for e in data.estimators if e.failure]
     return tuple(lines)

@@ -136,6 +136,7 @@ class ReportData:
         versions: of the program and its libraries; None where one is not installed.
         up: (3,) the world's vertical, upwards; need not be of unit length.
         alignment: how the errors behind ``ate_m`` were aligned, in words.
+        alarms: what makes the run no success, in sentences.
         calibration: (n,) each, the columns of calibration.csv; None where the run kept none.
     """
 
@@ -151,6 +152,7 @@ class ReportData:
     versions: Mapping[str, str | None] = field(default_factory=dict)
     up: FloatArray = field(default_factory=lambda: np.array([0.0, -1.0, 0.0]))
     alignment: str = "SE3 aligned"
+    alarms: tuple[str, ...] = ()
     calibration: Mapping[str, FloatArray] | None = None
 
     def __post_init__(self) -> None:

@@ -50,15 +50,20 @@ R_co = TypeVar("R_co", bound="RunResult", covariant=True)
 
 @dataclass(frozen=True, slots=True)
 class LocatedShare:
-    """How many frames (or queries) what was seen gave a pose, of how many."""
+    """How many frames (or queries) what was seen gave a pose in the map, of how many.
+
+    Attributes:
+        least: share that is a success.
+    """
 
     frames: int
     of: int
+    least: float = 0.5
 
     @property
     def enough(self) -> bool:
-        """Whether at least half were; less is no success, and `fgslam` exits with 3."""
-        return 2 * self.frames >= self.of
+        """Whether so many were; less is no success, and `fgslam` exits with 3."""
+        return self.frames >= self.least * self.of
 
     def __str__(self) -> str:
         share = 100.0 * self.frames / self.of if self.of else 0.0
@@ -81,6 +86,7 @@ class RunResult:
         written: there is a folder with files.
         reached: how far an interrupted run got, in words; may be empty.
         located: frames that were located; None where the task locates none.
+        alarms: sentences about what makes it no success.
     """
 
     config: Experiment
@@ -94,6 +100,7 @@ class RunResult:
     written: bool = True
     reached: str = ""
     located: LocatedShare | None = None
+    alarms: tuple[str, ...] = ()
 
     @property
     def metrics(self) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from fgslam.evaluation.judging import (
     predicted_poses,
 )
 from fgslam.evaluation.statistics import EstimatorMetrics, JsonValue, UpdateTime
+from fgslam.frontend.tracking.landmarks import MapParts
 from fgslam.report.content import (
     Cell,
     Column,
@@ -66,7 +67,7 @@ from fgslam.runs.tables import (
     picture_title,
 )
 from fgslam.slam.replay import ReplayRow, peak_memory_mb
-from fgslam.slam.results import STAGES, RunRecorder, located_frames
+from fgslam.slam.results import STAGES, RunRecorder, in_first_map
 
 # ------------------------------------------------------------------------------------------
 # The numbers of a run, as metrics.json holds them
@@ -124,7 +125,6 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
         "mean_residual_px": _of_known(np.median, recorder.column("mean_residual_px")),
         "stereo_precision": _of_known(np.mean, recorder.column("stereo_precision")),
         "correlation_x_yaw": float(np.median(correlations[:, 1, 3])) if len(correlations) else None,
-        "located": asdict(located(recorder)),
         "frames_without_image": int(np.count_nonzero(recorder.column("status") == _NO_IMAGE)),
         "frame_problems": frame_problems(recorder),
         "loop_ms": asdict(UpdateTime.of(_stage_sum(times, _LOOP_STAGES))),
@@ -132,13 +132,27 @@ def run_numbers(recorder: RunRecorder) -> dict[str, JsonValue]:
     }
 
 
-def located(recorder: RunRecorder) -> LocatedShare:
-    """Frames that landmarks gave a pose; the first one, which the world is, among them.
+_LEAST_IN_MAP = 2.0 / 3.0  # of the frames: a map of fewer is no map of the drive
+
+
+def located(recorder: RunRecorder, parts: MapParts) -> LocatedShare:
+    """Frames that landmarks gave a pose in the map that is reported, that of the first frame.
 
     Of all, with those before the first one.
     """
-    known = located_frames(recorder)
-    return LocatedShare(int(known.sum()), recorder.left_out + len(known))
+    all_of = recorder.left_out + len(recorder)
+    return LocatedShare(in_first_map(recorder, parts), all_of, _LEAST_IN_MAP)
+
+
+def alarms(share: LocatedShare | None, landmarks: object) -> tuple[str, ...]:
+    """What makes a run no success, in sentences: too few frames in its map, or no map."""
+    found = ["No success: there is no map, not one landmark was kept."] if landmarks == 0 else []
+    if share is not None and not share.enough:
+        found.append(
+            f"No success: {share} were located in the map; where the others are is predicted, or "
+            "known relative to each other only."
+        )
+    return tuple(found)
 
 
 def frame_problems(recorder: RunRecorder) -> list[str]:
@@ -375,6 +389,8 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         f"odometry: {odometry}" if odometry else "",
         "interrupted" if metrics.get("status") == "interrupted" else "",
     )
+    share, map_of = metrics.get("located"), metrics["estimators"].get(live) or {}
+    found = LocatedShare(share["frames"], share["of"], _LEAST_IN_MAP) if share else None
     notes = [metrics.get("remark"), *(metrics.get("notes") or ())]
     notes = [str(note) for note in (*notes, *(metrics.get("frame_problems") or ())) if note]
     if (more := len(notes) - _MOST_NOTES) > 0:
@@ -395,6 +411,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         },
         up=_up(find(LOG_FILE)),
         alignment="after SE3 alignment",
+        alarms=alarms(found, map_of.get("landmarks")),
         calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
     )
 

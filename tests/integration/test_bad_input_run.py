@@ -68,13 +68,14 @@ def test_a_frozen_camera_is_said_in_console_status_and_report(
     status = main(monkeypatch, "run", config, "--out", tmp_path / "run")
     said = " ".join(capsys.readouterr().out.split())
     assert status == 3  # hardly anything was located
-    assert "only 5 of 12 frames (42 %) were located by landmarks" in said
+    assert "No success: 5 of 12 frames (42 %) were located in the map" in said
     assert metrics_of(tmp_path / "run")["located"] == {"frames": 5, "of": 12}
     words = "image of the frame before once more: 7 of 12 frames, from 5 to 11, are not used"
     assert words in said
     assert metrics_of(tmp_path / "run")["status_counts"]["camera_fault"] == 7
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert words in page
+    assert '<p class="alarm">No success: 5 of 12 frames' in page
     assert f"{KIND} (7 poses predicted)" in page
     assert "x: a pose that no landmark measured" in page  # beside the drive from above
     found = metrics_of(tmp_path / "run")["estimators"][KIND]
@@ -180,6 +181,7 @@ def test_nothing_but_black_frames_leaves_the_odometry(own_recording: Path, tmp_p
         assert cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint8))
     run = run_values(experiment(own_recording), tmp_path / "run")
     assert run.result.live.landmarks == 0
+    assert run.result.alarms[0] == "No success: there is no map, not one landmark was kept."
     truth = Trajectory.load(run.folder / "ground_truth.tum")
     final = Trajectory.load(run.folder / KIND / "final.tum")
     assert np.abs(final.poses[-1] - truth.poses[-1]).max() < 0.05

@@ -24,13 +24,23 @@ from fgslam.core.types import (
 )
 from fgslam.evaluation.judging import Truth
 from fgslam.evaluation.statistics import value_at
-from fgslam.runs.report import estimator_metrics, frame_problems, run_numbers
+from fgslam.frontend.tracking.landmarks import MapParts
+from fgslam.runs.engine import LocatedShare
+from fgslam.runs.report import alarms, estimator_metrics, frame_problems, located, run_numbers
 from fgslam.slam.feature_stream import FeatureFrame
 from fgslam.slam.pipeline import FrameNoise, FrameReport
 from fgslam.slam.results import STAGES, FrameRow, RunRecorder
 
 RIG = CameraRig(32, 24, 30.0, 30.0, 15.5, 11.5, 0.1, None, np.eye(4))
 NO_IDS = np.empty(0, np.int64)
+
+
+class Apart(MapParts):
+    """Parts as given."""
+
+    def __init__(self, connected: list[bool]) -> None:
+        super().__init__()
+        self._frames = [int(not one) for one in connected]
 
 
 def pose_at(k: int) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -241,3 +251,22 @@ def test_without_truth_or_with_too_little_of_it(count: int) -> None:
     assert metrics.nees_pose_per_dof is None
     assert metrics.landmarks == 7
     assert estimator_metrics(estimate, Truth(estimate.trajectory), recorder).ate_rmse_m is None
+
+
+@pytest.mark.parametrize(("connected", "enough"), [(33, False), (34, True), (51, True)])
+def test_frames_beyond_the_map_that_is_reported_are_no_success(
+    connected: int, enough: bool
+) -> None:
+    """All 51 are located, some relative to each other only."""
+    share = located(recorder_of(51), Apart([k < connected for k in range(51)]))
+    assert (share.frames, share.of, share.enough) == (connected, 51, enough)
+    assert bool(alarms(share, landmarks=900)) is not enough
+    assert all("No success: 33 of 51 frames" in one for one in alarms(share, landmarks=900))
+
+
+def test_without_a_map_the_headline_says_so() -> None:
+    share = LocatedShare(51, 51)
+    assert alarms(share, landmarks=900) == ()
+    assert alarms(share, landmarks=0) == (
+        "No success: there is no map, not one landmark was kept.",
+    )
