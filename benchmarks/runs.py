@@ -161,8 +161,10 @@ def ate_m(pipeline: SlamPipeline, sequence: ImageSequence) -> float:
         return float("nan")
     with tempfile.TemporaryDirectory() as folder:  # a run's truth has the digits of its file
         path = Path(folder) / GROUND_TRUTH_FILE
-        sequence.ground_truth.save(path)
-        found = evaluate_trajectory(pipeline.estimate().trajectory, Trajectory.load(path))
+        frame, rig = sequence.truth_frame, sequence.rig
+        sequence.ground_truth.of(frame, rig).save(path)
+        estimate = pipeline.estimate().trajectory.of(frame, rig)
+        found = evaluate_trajectory(estimate, Trajectory.load(path))
     return float("nan") if found.ate_rmse_m is None else found.ate_rmse_m
 
 

@@ -38,7 +38,7 @@ with fg.Slam(rig, estimator="isam2") as slam:
 
 # %%
 result = slam.result()
-result.trajectory.save("path.tum")  # evo reads it
+result.trajectory.save("path.tum")  # of the right camera; evo reads it
 result.map.save("map.ply")  # MeshLab, CloudCompare and Open3D read it
 slam.log.save("drive.npz")  # the measurements, for other estimators: see filter_or_smoother.py
 print(f"{len(result.trajectory)} poses, {len(result.map)} landmarks")

@@ -24,7 +24,7 @@ from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import FrameError
 from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.core.log import Frame
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Odometry, PoseFrame
 from fgslam.core.types import Trajectory
 from fgslam.datasets.rendered import RENDER_VERSION, RenderedLabSequence
 from fgslam.worlds.lab import PlaceChoice, Room, World, camera_offsets, open_room
@@ -244,6 +244,11 @@ class RigInTheLab:
     def odometry(self, i: int) -> Odometry | None:
         """The lab's."""
         return self._lab.odometry(i)
+
+    @property
+    def truth_frame(self) -> PoseFrame:
+        """The right camera."""
+        return "right"
 
     @property
     def ground_truth(self) -> Trajectory:

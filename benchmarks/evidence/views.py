@@ -9,7 +9,7 @@ import numpy as np
 from fgslam.core.arrays import FloatArray
 from fgslam.core.geometry import inverse, pose, so3_exp
 from fgslam.core.log import Frame
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Odometry, PoseFrame
 from fgslam.core.types import Features, Trajectory
 from fgslam.datasets.rendered import RenderedLabSequence
 from fgslam.frontend.features.sift import SiftExtractor
@@ -107,6 +107,11 @@ class ViewPair:
     def odometry(self, i: int) -> Odometry | None:
         """What the wheels report of the motion of the robot's body."""
         return self.step if i == 1 else None
+
+    @property
+    def truth_frame(self) -> PoseFrame:
+        """The right camera."""
+        return "right"
 
     @property
     def ground_truth(self) -> Trajectory:

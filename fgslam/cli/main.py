@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from difflib import get_close_matches
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -380,6 +380,8 @@ def export(  # noqa: PLR0913 - each option is a parameter
     trajectory: Path | None = None,
     graph: Path | None = None,
     images: Path | None = None,
+    frame: Literal["left", "right", "body"] | None = None,
+    axes: Literal["camera", "ros"] | None = None,
     estimator: str | None = None,
     valid_only: bool = False,
     colour: bool = False,
@@ -395,6 +397,9 @@ def export(  # noqa: PLR0913 - each option is a parameter
         trajectory: camera poses as .tum, .kitti, .csv (EuRoC) or .mcap (ROS 2)
         graph: measurements, poses and landmarks as .g2o, for other solvers
         images (DIR): images, poses and points, for COLMAP
+        frame: what the trajectory is of; default what the recording's truth is of, else left
+        axes: of trajectory and map: x right, y down (camera), or x forward, z up (ros); default
+            ros with .mcap, else camera
         estimator: which estimator's; default the one that steered
         valid_only: landmarks seen in at least three frames
         colour: --map in the images' colours, with normals
@@ -407,6 +412,8 @@ def export(  # noqa: PLR0913 - each option is a parameter
         trajectory=trajectory,
         graph=graph,
         images=images,
+        frame=frame,
+        axes=axes,
         estimator=estimator,
         valid_only=valid_only,
         colour=colour,

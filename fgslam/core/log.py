@@ -23,6 +23,7 @@ from fgslam.core.sensors import (
     Increment,
     LoopClosure,
     Odometry,
+    PoseFrame,
 )
 from fgslam.core.settings import RigPlaces
 from fgslam.core.store import FileKind, require_ascending, require_covariances, require_finite
@@ -211,6 +212,11 @@ class ImageSequence(Protocol):
         ...
 
     @property
+    def truth_frame(self) -> PoseFrame:
+        """What the recording states its truth of, in which files of trajectories are, too."""
+        ...
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What was tolerated when opening the recording, in words (missing frames and the like)."""
         ...
@@ -267,6 +273,7 @@ class MeasurementRecording:
         landmark_truth: true landmark positions in that same world, or None. A landmark that moves
             during the recording is not in it.
         notes: what was tolerated, left out or simulated, in words.
+        truth_frame: what the recording states its truth of.
     """
 
     name: str
@@ -275,6 +282,7 @@ class MeasurementRecording:
     ground_truth: Trajectory | None
     landmark_truth: LandmarkTruth | None
     notes: tuple[str, ...]
+    truth_frame: PoseFrame = "right"
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import lru_cache
+from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
 from fgslam.core.arrays import BoolArray, Brief, FloatArray, IntArray, Rows
+from fgslam.core.errors import ConfigError
 from fgslam.core.settings import RigPlaces
 
 # ------------------------------------------------------------------------------------------
@@ -190,6 +192,10 @@ def moved_pixels(earlier: Increment | None, now: Increment) -> tuple[FloatArray,
     return before.measurement[a, :2], after.measurement[b, :2]
 
 
+PoseFrame: TypeAlias = Literal["left", "right", "body"]
+"""What a pose is of: a rectified camera (x right, y down, z forward), or the robot's body."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class CameraRig(Brief):
     """Two or three rectified pinhole cameras with equal intrinsics; the right one is the reference.
@@ -238,6 +244,16 @@ class CameraRig(Brief):
     def cameras(self) -> int:
         """Number of cameras, 2 or 3."""
         return 2 if self.vertical_baseline is None else 3
+
+    def fTc(self, frame: PoseFrame) -> FloatArray:
+        """(4, 4) pose of the reference camera in another frame. ConfigError: no such frame."""
+        if frame == "body":
+            return self.bTc
+        if frame not in get_args(PoseFrame):
+            raise ConfigError(f"no frame {frame!r}; use one of {', '.join(get_args(PoseFrame))}")
+        fTc = np.eye(4)
+        fTc[0, 3] = self.baseline if frame == "left" else 0.0
+        return fTc
 
 
 CAMERA_NAMES = ("right", "left", "top")

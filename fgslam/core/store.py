@@ -361,7 +361,8 @@ def _has_members(kind: Any, protocol: Any) -> bool:
 def _field_names(kind: Any) -> tuple[str, ...]:
     """Of a dataclass or a named tuple; empty of any other type."""
     if dataclasses.is_dataclass(kind):
-        return tuple(field.name for field in dataclasses.fields(kind) if field.init)
+        fields = dataclasses.fields(kind)
+        return tuple(f.name for f in fields if f.init and f.metadata.get("stored", True))
     return tuple(getattr(kind, "_fields", ()))
 
 

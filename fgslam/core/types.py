@@ -17,13 +17,15 @@ from fgslam.core.arrays import BoolArray, Brief, ByteArray, FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import as_path, read_text, write_text
 from fgslam.core.geometry import (
+    change_tangent_frame,
     congruence,
+    inverse,
     pose,
     quaternion_from_rotation,
     rotation_from_quaternion,
     so3_exp,
 )
-from fgslam.core.sensors import CameraRig, Observations, vertical_of
+from fgslam.core.sensors import CameraRig, Observations, PoseFrame, vertical_of
 from fgslam.core.store import from_upper
 
 # ------------------------------------------------------------------------------------------
@@ -271,34 +273,61 @@ _EUROC_HEADER = (
 _UPPER = np.triu_indices(6)
 _TANGENT = ("rx", "ry", "rz", "tx", "ty", "tz")
 _COVARIANCE_NAMES = [f"c_{_TANGENT[i]}_{_TANGENT[j]}" for i, j in zip(*_UPPER, strict=True)]
-_COVARIANCE_HEADER = (
-    "# covariance of xi in wTc = wTc_estimate * Exp(xi), tangent [rotation, translation] in the "
-    "reference camera's frame at the estimate (x right, y down, z forward); rad, m\n"
-    f"timestamp,{','.join(_COVARIANCE_NAMES)}\n"
-)
+_COVARIANCE_HEADER = f"timestamp,{','.join(_COVARIANCE_NAMES)}\n"
+_NAMED: dict[PoseFrame, tuple[str, str]] = {
+    "right": ("wTc", "right camera"),
+    "left": ("wTl", "left camera"),
+    "body": ("wTb", "body"),
+}
+"""Of each frame the symbol of its poses, and what they are of: as files name them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory(Brief):
-    """Stamped poses of the reference camera.
+    """Stamped poses of the reference camera, the right one, or of another frame of its rig.
 
     Attributes:
         timestamps: (n,) seconds, increasing.
         poses: (n, 4, 4) ``wTc``, metres.
+        frame: what they are of; the world stays that of the reference camera.
     """
 
     timestamps: FloatArray
     poses: FloatArray
+    frame: PoseFrame = field(default="right", metadata={"stored": False})
 
     def __len__(self) -> int:
         return len(self.timestamps)
+
+    @property
+    def named(self) -> str:
+        """What the poses are of, in words: as files state it."""
+        symbol, what = _NAMED[self.frame]
+        return f"{symbol}: pose of the {what}"
+
+    def of(self, frame: PoseFrame, rig: CameraRig) -> Trajectory:
+        """The same drive as poses of another frame, in the same world; of its own as it is.
+
+        Args:
+            frame: `left` or `right`, the rectified cameras, or `body`, the robot's.
+            rig: where they sit.
+
+        Raises:
+            ConfigError: no such frame.
+        """
+        fTc = rig.fTc(frame)
+        if frame == self.frame:
+            return self
+        wTc = self.poses @ rig.fTc(self.frame)
+        return Trajectory(self.timestamps, wTc @ inverse(fTc), frame)
 
     def save(self, path: str | Path, remark: str = "") -> None:
         """Writes the poses in the format that the suffix names: `.tum`, `.kitti` or `.csv` (EuRoC).
 
         Args:
-            path: the file, written whole or not at all.
-            remark: put into a comment line; `.kitti` knows neither times nor comments.
+            path: the file, written whole or not at all. A comment line states what the poses are
+                of; `.kitti` knows neither times nor comments.
+            remark: put into a comment line.
 
         Raises:
             OutputError: the suffix is another one, a pose is not finite, or writing failed.
@@ -312,6 +341,7 @@ class Trajectory(Brief):
                 "finite; the estimator diverged there, check its input before that time"
             )
         text = f"# {remark}\n" if remark else ""
+        text += f"# {self.named}\n"
         match path.suffix.lower():
             case ".tum":
                 rows = np.column_stack([self.timestamps, pose_rows(self.poses, decimals=12)])
@@ -335,6 +365,8 @@ class Trajectory(Brief):
     def load(path: str | Path) -> Trajectory:
         """Reads a TUM file: `timestamp tx ty tz qx qy qz qw` a line, seconds and metres.
 
+        Poses are of what a comment line states, as :meth:`save` writes it; else the right camera.
+
         Raises:
             DatasetError: the file is missing, a line is malformed, a quaternion is zero, or the
                 time stamps do not increase. The message names the line.
@@ -357,7 +389,9 @@ class Trajectory(Brief):
         poses = np.empty((len(values), 4, 4))
         for out, row in zip(poses, values, strict=True):
             out[:] = pose(rotation_from_quaternion(row[4:]), row[1:4])
-        return Trajectory(values[:, 0].copy(), poses)
+        named = (replace(Trajectory(values[:, 0].copy(), poses), frame=frame) for frame in _NAMED)
+        found = {one.frame: one for one in named if f"# {one.named}" in text}
+        return next(iter(found.values()), Trajectory(values[:, 0].copy(), poses))
 
 
 def pose_rows(poses: FloatArray, decimals: int | None = None) -> FloatArray:
@@ -378,19 +412,26 @@ def pose_rows(poses: FloatArray, decimals: int | None = None) -> FloatArray:
 
 
 def write_covariances(
-    path: Path, timestamps: FloatArray, covariances: FloatArray, remark: str = ""
+    path: Path, trajectory: Trajectory, covariances: FloatArray, remark: str = ""
 ) -> None:
     """Write the upper triangles of pose covariances, row by row, with a header naming the frame.
 
     Args:
         path: the file to write, atomically.
-        timestamps: (n,) seconds.
+        trajectory: the n poses.
         covariances: (n, 6, 6), [rotation, translation], in the tangent space at the estimate.
         remark: put into a further comment line.
     """
     upper = covariances[:, _UPPER[0], _UPPER[1]]
-    rows = _rows_text(np.column_stack([timestamps, upper + 0.0]), "%.9f" + 21 * ",%.9e")
-    write_text(path, (f"# {remark}\n" if remark else "") + _COVARIANCE_HEADER + rows)
+    rows = _rows_text(np.column_stack([trajectory.timestamps, upper + 0.0]), "%.9f" + 21 * ",%.9e")
+    symbol, what = _NAMED[trajectory.frame]
+    axes = "" if trajectory.frame == "body" else " (x right, y down, z forward)"
+    lines = [remark] if remark else []
+    lines.append(
+        f"covariance of xi in {symbol} = {symbol}_estimate * Exp(xi), tangent [rotation, "
+        f"translation] in the frame of the {what} at the estimate{axes}; rad, m"
+    )
+    write_text(path, "".join(f"# {line}\n" for line in lines) + _COVARIANCE_HEADER + rows)
 
 
 def read_covariances(path: Path) -> tuple[FloatArray, FloatArray]:
@@ -645,6 +686,10 @@ class GyroscopeBias(Brief):
         return f"bias of the gyroscope at the end, degrees/s: {axes}"
 
 
+LAGS = (1, 5, 20)
+"""Frames over which motions are judged by their own covariances."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Estimate(Brief):
     """An estimator's whole answer.
@@ -657,6 +702,9 @@ class Estimate(Brief):
         noise_factor: what the stated deviations of landmark measurements were multiplied by when
             they were weighed; None where none was.
         gyroscope: bias of the gyroscope; None where none is estimated.
+        relative: by :data:`LAGS`, of those that are known, (n - lag, 6, 6) covariances of the
+            motions over so many frames, by the joint covariance of both poses, in the tangent space
+            at the motion's end; NaN where one is not known.
     """
 
     trajectory: Trajectory
@@ -665,3 +713,14 @@ class Estimate(Brief):
     remarks: tuple[str, ...] = ()
     noise_factor: float | None = None
     gyroscope: GyroscopeBias | None = None
+    relative: Mapping[int, FloatArray] = field(default_factory=dict)
+
+    def of(self, frame: PoseFrame, rig: CameraRig) -> Estimate:
+        """The same with poses and their covariances of another frame (:meth:`Trajectory.of`)."""
+        trajectory = self.trajectory.of(frame, rig)
+        if trajectory is self.trajectory:
+            return self
+        gTf = rig.fTc(frame) @ inverse(rig.fTc(self.trajectory.frame))
+        covariances = change_tangent_frame(gTf, self.covariances)
+        relative = {lag: change_tangent_frame(gTf, one) for lag, one in self.relative.items()}
+        return replace(self, trajectory=trajectory, covariances=covariances, relative=relative)

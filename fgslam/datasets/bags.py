@@ -26,7 +26,7 @@ from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError, FrameError, OdometryError
 from fgslam.core.files import shown_in
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, inverse
-from fgslam.core.sensors import body_is_camera
+from fgslam.core.sensors import PoseFrame, body_is_camera
 from fgslam.core.sides import differ_in_number
 from fgslam.datasets import bag_messages as messages
 from fgslam.datasets.bag_messages import FrameTree, view_axes
@@ -155,7 +155,8 @@ def open_bag(settings: BagSettings, odometry: RecordedOdometrySettings) -> Recor
         (*bag.notes, *chosen.notes, *bag.stamp_notes, *unpaired, *held, *placed.notes),
         _odometry_source(chosen.motion, *bag.motions, odometry),
     )
-    return replace(recording, disparity_sigma_px=sigma)
+    frame: PoseFrame = "right" if chosen.depth else "left"  # the colour camera's
+    return replace(recording, disparity_sigma_px=sigma, truth_frame=frame)
 
 
 # --------------------------------------------------------------------------------------------

@@ -45,6 +45,7 @@ from fgslam.datasets.recording import (
     image_recording,
     mounted,
     on_wheels,
+    with_truth,
 )
 from fgslam.datasets.settings import (
     CalibratedSettings,
@@ -59,7 +60,6 @@ from fgslam.datasets.times import (
     pair_stamps,
     read_tum,
     stamps_of,
-    trajectory_at_frames,
 )
 
 Depth: TypeAlias = npt.NDArray[np.float32]
@@ -204,11 +204,10 @@ def open_rgbd(settings: RgbdSettings, odometry: RecordedOdometrySettings) -> Rec
     name, truth = root.resolve().name, root / "groundtruth.txt"
     recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
     sigma = depth_sigma_px(settings.scale * rig.fx, DEPTH_SIGMA_M)
-    recording = replace(recording, disparity_sigma_px=sigma)
+    recording = replace(recording, disparity_sigma_px=sigma, truth_frame="right")
     if not truth.is_file():
         return recording
-    at_frames = trajectory_at_frames(read_tum(truth), recording.timestamps)
-    return replace(recording, ground_truth=at_frames)
+    return with_truth(recording, read_tum(truth), truth, stamps)
 
 
 def require_one_camera(settings: CalibratedSettings) -> None:

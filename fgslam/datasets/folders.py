@@ -14,8 +14,7 @@ from fgslam.cameras.calib_json import read_json_object
 from fgslam.cameras.rig import StereoRig
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
-from fgslam.core.geometry import right_from_left_camera
-from fgslam.core.types import Trajectory
+from fgslam.core.sensors import PoseFrame
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import files_of, find_cameras
 from fgslam.datasets.recording import (
@@ -26,6 +25,7 @@ from fgslam.datasets.recording import (
     mounted,
     numbered,
     on_wheels,
+    with_truth,
 )
 from fgslam.datasets.settings import (
     ImageFolderSettings,
@@ -38,7 +38,6 @@ from fgslam.datasets.times import (
     read_tum,
     require_increasing,
     stamps_of,
-    trajectory_at_frames,
 )
 
 # ------------------------------------------------------------------------------------------
@@ -93,20 +92,16 @@ def open_image_folder(
         )
     present = [path for path in (calibration,) if path.is_file()]
     defining = [*present, root / "times.txt", *wheels]
-    truth = None
-    for file, of_left in ((TRUTH_RIGHT, False), (TRUTH_LEFT, True)):
-        if truth is None and (root / file).is_file():
-            truth = read_tum(root / file)
-            if of_left:
-                poses = right_from_left_camera(truth.poses, rig.baseline)
-                truth = Trajectory(truth.timestamps, poses)
+    truths: dict[PoseFrame, Path] = {"right": root / TRUTH_RIGHT, "left": root / TRUTH_LEFT}
+    frame = next((frame for frame, path in truths.items() if path.is_file()), None)
     listed = (path for found in cameras.values() for path in found.values())
     all_notes = (*mounting, *noticed, *notes)
     name, defined = root.resolve().name, (defining, listed)
     recording = image_recording(settings, name, rig, stamps, images, defined, all_notes, source)
-    if truth is None:
+    if frame is None:
         return recording
-    return replace(recording, ground_truth=trajectory_at_frames(truth, recording.timestamps))
+    truth = replace(read_tum(truths[frame]), frame=frame)
+    return with_truth(recording, truth, truths[frame], stamps)
 
 
 def _numbered_images(root: Path) -> dict[Path, dict[int, Path]]:

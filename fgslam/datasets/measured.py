@@ -72,7 +72,8 @@ def open_measurement_files(
     log = MeasurementLog.load(path)
     count = len(select_frames(len(log), settings, str(path)))
     log = make_log(log.rig, list(log)[:count], odometry)
-    poses = Trajectory.load(truth) if truth.is_file() else None
+    stated = Trajectory.load(truth) if truth.is_file() else None
+    poses = None if stated is None else stated.of("right", log.rig)
     if poses is not None:
         within = poses.timestamps < log.timestamps[-1] + _STAMP_STEP_S
         poses = Trajectory(poses.timestamps[within], poses.poses[within])
@@ -85,6 +86,7 @@ def open_measurement_files(
         ground_truth=poses,
         landmark_truth=read_landmark_truth(landmarks)[0] if landmarks.is_file() else None,
         notes=(),
+        truth_frame="right" if stated is None else stated.frame,
     )
 
 
@@ -208,6 +210,7 @@ def open_stereo_tracks(
         ground_truth=truth,
         landmark_truth=None,
         notes=notes,
+        truth_frame="left",
     )
 
 

@@ -25,7 +25,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.files import read_lines, read_text, shown_in
 from fgslam.core.geometry import inverse, pose, right_from_left_camera
-from fgslam.core.sensors import CameraRig, body_is_camera
+from fgslam.core.sensors import body_is_camera
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import first_size, list_numbered_images, open_frames, require_folder
 from fgslam.datasets.layouts import CameraFiles, images_in, kitti_raw_drive, natural
@@ -41,6 +41,7 @@ from fgslam.datasets.recording import (
     loaded_rig,
     mounted,
     read_rig,
+    with_truth,
 )
 from fgslam.datasets.settings import (
     EurocSettings,
@@ -57,7 +58,6 @@ from fgslam.datasets.times import (
     read_table,
     require_increasing,
     stamps_of,
-    trajectory_at_frames,
     written_stamps,
 )
 
@@ -122,18 +122,12 @@ def open_euroc(settings: EurocSettings, odometry: RecordedOdometrySettings) -> R
         (*noticed, *paired),
         source,
     )
-    return replace(recording, ground_truth=_euroc_truth(root, rig, recording.timestamps))
-
-
-def _euroc_truth(root: Path, rig: CameraRig, frames: FloatArray) -> Trajectory | None:
-    """True poses of the rectified right camera, interpolated at the frames' stamps (n,)."""
-    body = read_body_truth(root / "state_groundtruth_estimate0")
-    if body is None and not body_is_camera(rig.bTc):  # TUM-VI tracks the gyroscope
-        body = read_body_truth(root / "mocap0")
-    if body is None:
-        return None
-    at_frames = trajectory_at_frames(body, frames)
-    return Trajectory(at_frames.timestamps, at_frames.poses @ rig.bTc)
+    places = ("state_groundtruth_estimate0", "mocap0")  # TUM-VI tracks the gyroscope
+    for place in places[: 1 if body_is_camera(rig.bTc) else 2]:
+        if (body := read_body_truth(root / place)) is not None:
+            stamps = at_right[rows[:, 0]].astype(np.float64) * NANOSECONDS
+            return with_truth(recording, body, root / place / "data.csv", stamps)
+    return recording
 
 
 def read_camera_frames(folder: Path) -> tuple[IntArray, list[Path]]:
@@ -192,7 +186,7 @@ def read_body_truth(folder: Path) -> Trajectory | None:
     poses = poses_of(table, table.values[:, 1:4], table.values[:, [5, 6, 7, 4]])
     if (folder / "sensor.yaml").is_file():
         poses = poses @ inverse(read_asl_mounting(folder / "sensor.yaml"))
-    return Trajectory(table.values[:, 0] * NANOSECONDS, poses)
+    return Trajectory(table.values[:, 0] * NANOSECONDS, poses, "body")
 
 
 # --------------------------------------------------------------------------------------------
@@ -319,8 +313,10 @@ def open_kitti_raw(settings: KittiRawSettings, odometry: RecordedOdometrySetting
     recording = image_recording(settings, name, rig, stamps, images, files, notes, source)
     if of_unit is None or iTc is None:
         return recording
-    unit = trajectory_at_frames(truth, recording.timestamps, _MAX_TRUTH_GAP_S)
-    return replace(recording, ground_truth=Trajectory(unit.timestamps, unit.poses @ iTc))
+    path, known = drive / "oxts", replace(truth, frame="body")
+    if not np.array_equal(rig.bTc, iTc):  # settings have the odometry's body elsewhere
+        known = Trajectory(truth.timestamps, truth.poses @ iTc).of("left", rig)
+    return with_truth(recording, known, path, stamps, _MAX_TRUTH_GAP_S)
 
 
 def _raw_images(camera: Path) -> tuple[Path, ...]:

@@ -19,7 +19,7 @@ from fgslam.core.arrays import Brief, FloatArray, Image, IntArray
 from fgslam.core.errors import CalibrationError, DatasetError
 from fgslam.core.geometry import BODY_FORWARD_LEFT_UP_FROM_CAMERA, pose, so3_exp
 from fgslam.core.log import Frame
-from fgslam.core.sensors import CameraRig, Odometry, body_is_camera
+from fgslam.core.sensors import CameraRig, Odometry, PoseFrame, body_is_camera
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.images import ImageLoader
@@ -37,7 +37,7 @@ from fgslam.datasets.settings import (
     RecordingSettings,
     SyntheticOdometrySettings,
 )
-from fgslam.datasets.times import rows_at
+from fgslam.datasets.times import rows_at, time_unit, trajectory_at_frames
 
 Rig = TypeVar("Rig", bound=CameraRig)
 
@@ -55,6 +55,8 @@ class Recording(Brief):
         indices: (n,) the recording's own numbers of the selected frames.
         load_images: reads the images of one of the recording's own frames.
         ground_truth: true poses of the reference camera at the selected frames, or None.
+        truth_frame: what the recording states them of; without truth the left camera, as data sets
+            do.
         odometry_source: where the body's motions come from, or None. Asked once, when first
             needed, so that a bad odometry file hurts only its user.
         rectifier: what makes the images its own that the cameras gave; None where they are stored
@@ -71,6 +73,7 @@ class Recording(Brief):
     indices: IntArray
     load_images: ImageLoader
     ground_truth: Trajectory | None = None
+    truth_frame: PoseFrame = "left"
     odometry_source: OdometrySource | None = None
     rectifier: Rectifier | None = None
     margins: tuple[npt.NDArray[np.float32], ...] = ()
@@ -156,6 +159,41 @@ def image_recording(
         load_images,
         odometry_source=odometry_source,
         rectifier=rectifier,
+    )
+
+
+def with_truth(
+    recording: Recording, truth: Trajectory, path: Path, stamps: FloatArray, max_gap_s: float = 0.1
+) -> Recording:
+    """The recording with true poses of its frames.
+
+    Args:
+        recording: its selected frames.
+        truth: of any frame of the rig; in seconds, or in the unit in which it covers the recording.
+        path: of its file.
+        stamps: (n,) seconds of all frames, selected or not.
+        max_gap_s: between poses that are interpolated.
+
+    Raises:
+        DatasetError: the truth covers none of the recording's frames.
+    """
+    unit, seconds = time_unit(truth.timestamps)
+    for scale, notes in ((1.0, ()), (seconds, (f"times of {path} are read as {unit}",))):
+        scaled = replace(truth, timestamps=scale * truth.timestamps)
+        if len(trajectory_at_frames(scaled, stamps, max_gap_s)) > min(1, len(stamps) - 1):
+            found = trajectory_at_frames(scaled, recording.timestamps, max_gap_s)
+            return replace(
+                recording,
+                ground_truth=found.of("right", recording.rig),
+                truth_frame=truth.frame,
+                notes=(*recording.notes, *notes),
+            )
+    spans = [f"{s[0]:.3f} to {s[-1]:.3f} s" if len(s) else "empty"
+             for s in (truth.timestamps, stamps)]  # fmt: skip
+    raise DatasetError(
+        f"{path}: the truth is from {spans[0]}, the recording from {spans[1]}: it has next to no "
+        f"pose at a frame, or two at most {max_gap_s:g} s apart around one; give both the times of "
+        "one clock, in seconds, or move the file elsewhere"
     )
 
 

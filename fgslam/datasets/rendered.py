@@ -16,7 +16,7 @@ from fgslam.core import geometry
 from fgslam.core.arrays import FloatArray, Image, IntArray
 from fgslam.core.errors import ConfigError, FrameError
 from fgslam.core.log import Frame
-from fgslam.core.sensors import CameraRig, Odometry
+from fgslam.core.sensors import CameraRig, Odometry, PoseFrame
 from fgslam.core.settings import FrameSelection
 from fgslam.core.types import Trajectory
 from fgslam.datasets.recording import select_frames
@@ -52,6 +52,8 @@ class RenderedLabSequence:
     The world frame of the ground truth is the reference camera's pose at the first frame of the
     drive; of random poses, at that of the place's own drive.
     """
+
+    truth_frame: PoseFrame = "right"
 
     def __init__(
         self,

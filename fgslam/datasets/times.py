@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TypeAlias, TypeVar
@@ -207,7 +207,8 @@ def trajectory_at_frames(
 ) -> Trajectory:
     """The trajectory at those of the frames' stamps (n,) that it covers (see :func:`covered`)."""
     known = covered(trajectory.timestamps, frames, max_gap, tolerance)
-    return Trajectory(frames[known], interpolate_poses(trajectory, frames[known]))
+    poses = interpolate_poses(trajectory, frames[known])
+    return replace(trajectory, timestamps=frames[known], poses=poses)
 
 
 # --------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from fgslam.core.checks import require_flag
 from fgslam.core.errors import ConfigError
 from fgslam.core.geometry import inverse, transform_to_world
 from fgslam.core.log import LandmarkTruth, MeasurementLog
-from fgslam.core.sensors import LoopClosure
+from fgslam.core.sensors import CameraRig, LoopClosure, PoseFrame
 from fgslam.core.types import EgoMotionStatus, Estimate, LandmarkMap, Trajectory
 from fgslam.evaluation.statistics import (
     Alignment,
@@ -55,14 +55,29 @@ class Truth:
     """What is known to be true of a run; None where nothing is.
 
     Attributes:
-        trajectory: true poses of the reference camera or sensor.
+        trajectory: true poses of the reference camera or sensor, or of another frame of the rig.
         landmarks: true positions, in the same world.
         landmark_sigma_m: typical standard error of those positions; 0 where they are exact.
+        rig: where that other frame sits; None where the truth is the reference camera's.
     """
 
     trajectory: Trajectory | None = None
     landmarks: LandmarkTruth | None = None
     landmark_sigma_m: float | None = None
+    rig: CameraRig | None = None
+
+    def of_same_frame(self, path: Trajectory) -> Trajectory:
+        """Poses of the reference camera as those of the frame whose truth is known."""
+        known = self.trajectory
+        if known is None or self.rig is None or known.frame == path.frame:
+            return path
+        return path.of(known.frame, self.rig)
+
+    def of_camera(self) -> Truth:
+        """The same with true poses of the reference camera."""
+        if self.trajectory is None or self.rig is None:
+            return self
+        return replace(self, trajectory=self.trajectory.of("right", self.rig))
 
 
 class Replayed(Protocol):
@@ -169,14 +184,18 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
     """All numbers of one answer.
 
     ``ate_rmse_m`` and the RPE are after SE3 alignment; drift, end errors, NEES and landmark errors
-    have the first pose aligned.
+    have the first pose aligned. Errors of the path are those of the frame whose truth is known, as
+    its data set judges; NEES, which is the same for every frame, and landmarks the camera's.
     """
-    final = answer.estimate.trajectory
+    final = truth.of_same_frame(answer.estimate.trajectory)
+    online = truth.of_same_frame(answer.online)
     aligned = evaluate_trajectory(final, truth.trajectory, Alignment.SE3)
     first = evaluate_trajectory(final, truth.trajectory, Alignment.FIRST_POSE)
-    errors = _landmark_errors(answer.estimate, truth)
-    final_errors = _pose_errors(final, answer.estimate.covariances, truth)
-    online_errors = _pose_errors(answer.online, answer.online_covariances, truth)
+    of_camera = truth.of_camera()
+    errors = _landmark_errors(answer.estimate, of_camera)
+    estimate = answer.estimate
+    final_errors = _pose_errors(estimate.trajectory, estimate.covariances, of_camera)
+    online_errors = _pose_errors(answer.online, answer.online_covariances, of_camera)
     nees = {
         "pose": normalised(*final_errors),
         "online_pose": normalised(*online_errors),
@@ -207,7 +226,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "nees_pose": _as_json(judged["pose"]),
             "nees_landmark": _as_json(judged["landmark"]),
             "coverage": _coverage(*final_errors),
-            "online": _online(answer.online, truth, judged["online_pose"])
+            "online": _online(online, truth, judged["online_pose"])
             | {"coverage": _coverage(*online_errors)},
             "landmark_rmse_m": None if errors is None else errors.rmse_m,
             "landmark_median_m": None if errors is None else errors.median_m,
@@ -217,7 +236,7 @@ def judge_answer(answer: Answer, truth: Truth) -> Judgement:
             "update_growth": _as_json(time_growth(answer.update_ms)),
             **_claims(answer.estimate),
             # Se et al. (5) measure by it how well a loop closes.
-            "end_against_start": _as_json(end_pose(final)),
+            "end_against_start": _as_json(end_pose(answer.estimate.trajectory)),
             "noise_factor": answer.estimate.noise_factor,
             "remarks": list(answer.estimate.remarks),
         },
@@ -444,6 +463,9 @@ def compare(
     truth: Trajectory | None = None,
     landmark_truth: LandmarkTruth | None = None,
     full: bool = False,
+    *,
+    truth_of: PoseFrame | None = None,
+    rig: CameraRig | None = None,
 ) -> pandas.DataFrame:
     """Accuracy, consistency and speed of estimators on one recording, a row each.
 
@@ -466,22 +488,27 @@ def compare(
 
     Args:
         answers: results by the name that their row shall have.
-        truth: true poses of the reference camera, in any world frame.
+        truth: true poses, in any world frame.
         landmark_truth: true positions of landmarks, in the same world as ``truth``.
         full: all columns.
+        truth_of: what the truth's poses are of, `left`, `right` or `body`; None: of what its file
+            states, else of the right camera, as those of recordings that are opened.
+        rig: the cameras, where the truth is not the right one's.
 
     Raises:
         ConfigError: one of the answers is none, or they have no names, or the truth is no
-            trajectory, or ``full`` is neither true nor false.
+            trajectory or of a frame that needs the rig, or ``full`` is neither true nor false.
     """
-    require_named(answers, truth)
+    if truth_of is not None and isinstance(truth, Trajectory):
+        truth = replace(truth, frame=truth_of)
+    require_named(answers, truth, rig)
     if not isinstance(landmark_truth, LandmarkTruth | None):
         raise ConfigError(
             f"the landmarks' truth is a {type(landmark_truth).__name__}; give a LandmarkTruth, or "
             "None"
         )
     require_flag(full, "full")
-    known = Truth(truth, landmark_truth)
+    known = Truth(truth, landmark_truth, rig=rig)
     table = _frame({name: _judged(name, one, known) for name, one in answers.items()})
     if full:
         return table
@@ -489,8 +516,10 @@ def compare(
     return table[[*_MAIN, *failed]]
 
 
-def require_named(answers: Mapping[str, Comparable], truth: Trajectory | None) -> None:
-    """Raises ConfigError where the answers have no names, or the truth is no trajectory."""
+def require_named(
+    answers: Mapping[str, Comparable], truth: Trajectory | None, rig: CameraRig | None = None
+) -> None:
+    """Raises ConfigError where the answers have no names, or the truth cannot be their truth."""
     if not isinstance(answers, Mapping):
         raise ConfigError(
             f"the answers are a {type(answers).__name__}; give a dict of results by name: "
@@ -500,6 +529,11 @@ def require_named(answers: Mapping[str, Comparable], truth: Trajectory | None) -
         raise ConfigError(
             f"the truth is a {type(truth).__name__}; give a trajectory: "
             "fgslam.Trajectory.load(file)"
+        )
+    if truth is not None and truth.frame != "right" and not isinstance(rig, CameraRig):
+        raise ConfigError(
+            f"the truth is {truth.named}, the answers are the right camera's; give the rig, too: "
+            f"truth.of('right', rig), or compare(..., truth_of={truth.frame!r}, rig=slam.log.rig)"
         )
 
 

@@ -343,7 +343,7 @@ class MetricPoses:
     """Poses of path images, as SLAM on the same drive found them.
 
     Attributes:
-        poses: (n, 4, 4) ``wTc`` of the SLAM run's reference camera; NaN where not known.
+        poses: (n, 4, 4) ``wTc`` of a camera of the SLAM run; NaN where not known.
         covariances: (n, 6, 6) in the tangent space at them; NaN where not known.
     """
 

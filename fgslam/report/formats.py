@@ -6,9 +6,9 @@ import io
 import re
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,14 @@ import numpy.typing as npt
 from fgslam.core.arrays import BoolArray, ByteArray, FloatArray, IntArray, Rows
 from fgslam.core.errors import DatasetError, OutputError
 from fgslam.core.files import clear_output_errors, write_bytes, write_text
-from fgslam.core.geometry import congruence, inverse, quaternion_from_rotation
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    congruence,
+    inverse,
+    pose,
+    quaternion_from_rotation,
+    rotate_covariances,
+)
 from fgslam.core.sensors import CameraRig
 from fgslam.core.types import Trajectory, pose_rows
 
@@ -27,9 +34,18 @@ _PLY_TYPES = {"f8": "double", "f4": "float", "i4": "int", "u1": "uchar"}
 _PLY_FORMAT = "format binary_little_endian 1.0"
 _PLY_COMMENTS = (
     "comment fgslam landmark map 1",
-    "comment world = first reference camera: x right, y down, z forward, metres",
+    "comment world = first reference camera: {}, metres",
     "comment cxx .. czz: covariance of the position in the world, metres squared",
 )
+
+
+Axes: TypeAlias = Literal["camera", "ros"]
+_AXES: dict[Axes, str] = {
+    "camera": "x right, y down, z forward",
+    "ros": "x forward, y left, z up",  # REP 103
+}
+"""Of the world and of cameras."""
+_ROS_FROM_CAMERA = BODY_FORWARD_LEFT_UP_FROM_CAMERA[:3, :3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,13 +81,14 @@ class MapPoints(Rows):
                 raise ValueError(f"{each.name} has {len(values)} rows, not {len(self)}")
 
 
-def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
+def write_map(path: Path, points: MapPoints, remark: str = "", axes: Axes = "camera") -> None:
     """Writes a map in the format that the suffix names: `.ply` or `.pcd`.
 
     Args:
         path: the file to write, atomically.
-        points: the landmarks.
+        points: the landmarks, in the axes of cameras.
         remark: ASCII, put into a comment of the file.
+        axes: those to write them in.
 
     Raises:
         OutputError: the suffix is another one, a landmark is not finite, an id needs more than 31
@@ -83,15 +100,23 @@ def write_map(path: Path, points: MapPoints, remark: str = "") -> None:
         raise OutputError(
             f"cannot write {path}: unknown map format '{path.suffix}'; use .ply or .pcd"
         )
-    writer(path, points, remark)
+    if axes == "ros":
+        positions, normals = points.positions @ _ROS_FROM_CAMERA.T, points.normals
+        points = replace(
+            points,
+            positions=positions,
+            covariances=rotate_covariances(_ROS_FROM_CAMERA, points.covariances),
+            normals=None if normals is None else normals @ _ROS_FROM_CAMERA.T,
+        )
+    writer(path, points, remark, axes)
 
 
-def write_ply(path: Path, points: MapPoints, remark: str = "") -> None:
+def write_ply(path: Path, points: MapPoints, remark: str = "", axes: Axes = "camera") -> None:
     """Writes a binary little-endian .ply with every property of every landmark, exactly."""
     _require_finite(path, positions=points.positions, covariances=points.covariances)
     columns = dict(zip(("red", "green", "blue"), points.colours.T, strict=True))
     records = _records(path, points, _ply_type(points.normals is not None), columns)
-    lines = ["ply", _PLY_FORMAT, *_PLY_COMMENTS]
+    lines = ["ply", _PLY_FORMAT, *(line.format(_AXES[axes]) for line in _PLY_COMMENTS)]
     lines += [f"comment {remark}"] if remark else []
     lines += [f"element vertex {len(points)}", *_ply_properties(records.dtype), "end_header\n"]
     write_bytes(path, "\n".join(lines).encode("ascii") + records.tobytes())
@@ -158,7 +183,7 @@ def read_ply(path: Path) -> MapPoints:
     )
 
 
-def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
+def write_pcd(path: Path, points: MapPoints, remark: str = "", axes: Axes = "camera") -> None:
     """Writes a binary .pcd 0.7 (PCL, Open3D, CloudCompare).
 
     Single precision: PCL's point types are, and its tools do not know doubles as x, y, z.
@@ -172,6 +197,7 @@ def write_pcd(path: Path, points: MapPoints, remark: str = "") -> None:
     lines = [
         "# .PCD v0.7 - Point Cloud Data file format",
         *([f"# {remark}"] if remark else []),
+        f"# axes of the world: {_AXES[axes]}",
         "VERSION 0.7",
         f"FIELDS {' '.join(dtype.names or ())}",
         f"SIZE {' '.join(str(kind.itemsize) for kind in kinds)}",
@@ -436,19 +462,52 @@ TOPIC = "/fgslam/pose"
 FRAME = "map"
 _KIND = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
-# REP 103: x forward, y left, z up; the camera has x right, y down, z forward.
-_ROS_FROM_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+def write_trajectory(
+    path: Path,
+    trajectory: Trajectory,
+    covariances: FloatArray | None = None,
+    remark: str = "",
+    axes: Axes = "camera",
+) -> None:
+    """Writes poses in the format that the suffix names: `.tum`, `.kitti`, `.csv` or `.mcap`.
+
+    Args:
+        path: the file; of a bag the axes are always those of REP 103.
+        trajectory: of any frame, in the axes of cameras. A body has axes of its own, and only its
+            world's are changed.
+        covariances: for a bag, as :func:`write_mcap` takes them.
+        remark: put into a comment line.
+        axes: those to write them in.
+
+    Raises:
+        OutputError: the suffix is another one, a pose is not finite, or writing failed.
+    """
+    if path.suffix.lower() == MCAP_SUFFIX:
+        write_mcap(path, trajectory, covariances)
+        return
+    if axes == "ros":
+        turned = pose(_ROS_FROM_CAMERA, np.zeros(3)) @ trajectory.poses
+        turned[:, :3, :3] @= _own_axes(trajectory).T
+        trajectory = replace(trajectory, poses=turned)
+        remark = ", ".join(filter(None, (remark, f"axes of REP 103: {_AXES[axes]}")))
+    trajectory.save(path, remark)
+
+
+def _own_axes(trajectory: Trajectory) -> FloatArray:
+    """(3, 3) from the axes of what moves to those that it has in ROS."""
+    return np.eye(3) if trajectory.frame == "body" else _ROS_FROM_CAMERA
 
 
 def write_mcap(path: Path, trajectory: Trajectory, covariances: FloatArray | None) -> None:
-    """Writes `geometry_msgs/PoseWithCovarianceStamped` of the camera in :data:`FRAME`.
+    """Writes `geometry_msgs/PoseWithCovarianceStamped` of the moving frame in :data:`FRAME`.
 
     Position and orientation are in the axes of REP 103 of the first camera, for the world and for
-    the moving frame alike; the covariance is about the axes of the world.
+    a moving camera alike, a body's are its own; the covariance is about the axes of the world.
 
     Args:
         path: the .mcap file.
-        trajectory: poses ``wTc`` of the reference camera.
+        trajectory: poses in the axes of cameras.
         covariances: (n, 6, 6) in the tangent space at each pose, [rotation, translation]; None or
             NaN for unknown, which ROS writes as zeros.
 
@@ -461,6 +520,7 @@ def write_mcap(path: Path, trajectory: Trajectory, covariances: FloatArray | Non
     store = get_typestore(Stores.ROS2_HUMBLE)
     if covariances is None:
         covariances = np.zeros((len(trajectory), 6, 6))
+    own = _own_axes(trajectory)
     with tempfile.TemporaryDirectory() as folder, clear_output_errors(path):
         bag = Path(folder) / "bag"
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -468,13 +528,17 @@ def write_mcap(path: Path, trajectory: Trajectory, covariances: FloatArray | Non
             rows = zip(trajectory.timestamps, trajectory.poses, covariances, strict=True)
             for t, wTc, covariance in rows:
                 stamp = round(float(t) * 1e9)
-                message = pose_message(store.types, stamp, wTc, covariance)
+                message = pose_message(store.types, stamp, wTc, covariance, own)
                 writer.write(topic, stamp, store.serialize_cdr(message, _KIND))
         write_bytes(path, (bag / f"{bag.name}{MCAP_SUFFIX}").read_bytes())
 
 
 def pose_message(
-    types: Mapping[str, Any], stamp: int, wTc: FloatArray, covariance: FloatArray
+    types: Mapping[str, Any],
+    stamp: int,
+    wTc: FloatArray,
+    covariance: FloatArray,
+    own_axes: FloatArray = _ROS_FROM_CAMERA,
 ) -> Any:
     """A PoseWithCovarianceStamped, as :func:`write_mcap` writes it.
 
@@ -483,11 +547,12 @@ def pose_message(
         stamp: nanoseconds.
         wTc: (4, 4) pose of the reference camera.
         covariance: (6, 6) of it; NaN for unknown.
+        own_axes: (3, 3) from the camera's axes to those that it has in ROS.
     """
     covariance = np.nan_to_num(covariance)
     seconds, nanoseconds = divmod(stamp, 1_000_000_000)
     turned = _ROS_FROM_CAMERA @ wTc[:3, :3]
-    x, y, z, w = quaternion_from_rotation(turned @ _ROS_FROM_CAMERA.T).tolist()
+    x, y, z, w = quaternion_from_rotation(turned @ own_axes.T).tolist()
     to_world = np.zeros((6, 6))  # [translation, rotation] about the world's axes
     to_world[:3, 3:] = to_world[3:, :3] = turned
     time = types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=nanoseconds)

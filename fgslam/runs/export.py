@@ -19,16 +19,20 @@ from fgslam.core.log import MeasurementLog
 from fgslam.core.saved_map import SavedMap, load_map
 from fgslam.core.sensors import (
     CAMERA_NAMES,
+    CameraRig,
+    PoseFrame,
+    body_is_camera,
     pixel_model,
     vertical_to_horizontal,
 )
-from fgslam.core.types import Trajectory, read_covariances
+from fgslam.core.types import Estimate, Trajectory, read_covariances
 from fgslam.datasets.images import encoded_png
 from fgslam.datasets.opening import open_recording
 from fgslam.datasets.settings import MeasurementDatasetSettings, RenderedLabSettings
 from fgslam.report.content import read_metrics
 from fgslam.report.formats import (
     MCAP_SUFFIX,
+    Axes,
     ImageModel,
     MapPoints,
     PoseLandmarkGraph,
@@ -37,8 +41,9 @@ from fgslam.report.formats import (
     write_colmap,
     write_g2o,
     write_map,
-    write_mcap,
+    write_trajectory,
 )
+from fgslam.report.results import NO_LANDMARKS
 from fgslam.runs.config import ExperimentConfig, load_config, load_experiment, read_mapping
 from fgslam.runs.folder import LOG_FILE, RUN_MARKER, is_run_folder
 from fgslam.runs.opening import open_sequence
@@ -54,6 +59,9 @@ class Wanted:
         trajectory: poses, `.tum`, `.kitti`, `.csv` (EuRoC) or `.mcap` (ROS 2).
         graph: measurements, poses and landmarks, `.g2o`.
         images: folder for images with poses and points, for COLMAP.
+        frame: what the trajectory's poses are of; None: of what the recording's truth is, else of
+            the left camera.
+        axes: of trajectory and map; None for those of ROS next to an `.mcap`, else of cameras.
         estimator: whose; None for the one that steered.
         valid_only: only landmarks that were seen often enough to be trusted.
         colour: the map in the images' colours, with normals.
@@ -64,10 +72,22 @@ class Wanted:
     trajectory: Path | None = None
     graph: Path | None = None
     images: Path | None = None
+    frame: PoseFrame | None = None
+    axes: Axes | None = None
     estimator: str | None = None
     valid_only: bool = False
     colour: bool = False
     overwrite: bool = False
+
+    @property
+    def is_bag(self) -> bool:
+        """Whether the trajectory is for ROS 2."""
+        return self.trajectory is not None and self.trajectory.suffix.lower() == MCAP_SUFFIX
+
+    @property
+    def chosen_axes(self) -> Axes:
+        """Of trajectory and map, which lie in one world."""
+        return self.axes or ("ros" if self.is_bag else "camera")
 
 
 def export_run(run: Path, wanted: Wanted) -> list[str]:
@@ -78,6 +98,11 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
     Raises:
         FgslamError: nothing asked for, no run there, or an ending that is not known.
     """
+    if wanted.is_bag and wanted.axes == "camera":
+        raise ConfigError(
+            f"--axes camera: {wanted.trajectory} is for ROS, whose axes are those of REP 103; "
+            "leave --axes out, or give a .tum"
+        )
     inputs = sources_of(run)
     for path in filter(None, (wanted.map, wanted.trajectory, wanted.graph)):
         require_output(path, wanted.overwrite, inputs)
@@ -85,6 +110,8 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         require_output(wanted.images, wanted.overwrite, inputs, folder=True)
     asked = any((wanted.map, wanted.trajectory, wanted.graph, wanted.images))
     folder: Path | None = None  # of an estimator
+    log = cache(lambda: MeasurementLog.load(log_of(run)))
+    rig: Callable[[], CameraRig]
     if run.is_file():
         if wanted.colour or (wanted.graph, wanted.images, wanted.estimator) != (None, None, None):
             raise ConfigError(
@@ -94,7 +121,9 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         saved = load_map(run)
         if not asked:
             return describe_map(saved, run)
-        remark, trajectory, read = remark_of_map(saved), saved.trajectory, partial(points_of, saved)
+        remark, read, rig = remark_of_map(saved), partial(points_of, saved), lambda: saved.rig
+        known = [drive.get("truth_frame") for drive in drives_of(saved)]
+        trajectory = saved.trajectory.of((known and known[-1]) or "left", saved.rig)
     else:
         folder = run / results_folder(run, wanted.estimator)
         if not asked:
@@ -106,13 +135,15 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
             require_graph_suffix(wanted.graph)  # now, not after seconds of reading
         remark = read_metrics(run / "metrics.json").get("remark") or ""
         trajectory = Trajectory.load(folder / "final.tum")
-        read = partial(read_ply, folder / "map.ply")
+        read, rig = partial(read_ply, folder / "map.ply"), lambda: log().rig
     lines = [f"note: {remark}"] if remark else []
     if wanted.trajectory is not None:
-        lines.append(_save(wanted.trajectory, trajectory, folder, remark))
+        lines.append(_save(wanted.trajectory, wanted, trajectory, folder, rig, remark))
     if not (wanted.graph or wanted.colour or wanted.images or wanted.map):
         return lines
-    points, log = read(), cache(lambda: MeasurementLog.load(log_of(run)))
+    points = read()
+    if wanted.graph or wanted.colour or wanted.images:
+        trajectory = trajectory.of("right", rig())
     if wanted.graph is not None:
         lines.append(export_graph(wanted.graph, log(), trajectory, points, remark))
     points = points.select(points.valid) if wanted.valid_only else points
@@ -121,7 +152,7 @@ def export_run(run: Path, wanted: Wanted) -> list[str]:
         points, line = export_images(wanted.images, config, log(), trajectory, points)
         lines += [line] if line else []
     if wanted.map is not None:
-        write_map(wanted.map, points, remark)
+        write_map(wanted.map, points, remark, wanted.chosen_axes)
         lines.append(f"{wanted.map}: {len(points)} landmarks")
     return lines
 
@@ -133,14 +164,31 @@ def sources_of(run: Path) -> tuple[Path, ...]:
     return (run, *load_experiment(run / RUN_MARKER).inputs)
 
 
-def _save(path: Path, trajectory: Trajectory, folder: Path | None, remark: str) -> str:
-    """Writes a trajectory; of an estimator, with its folder, .mcap has covariances."""
-    if path.suffix.lower() == MCAP_SUFFIX:
-        known = None if folder is None else read_covariances(folder / "covariance.csv")[1]
-        write_mcap(path, trajectory, known)
-    else:
-        trajectory.save(path, remark)
-    return f"{path}: {len(trajectory)} poses"
+def _save(
+    path: Path,
+    wanted: Wanted,
+    trajectory: Trajectory,
+    folder: Path | None,
+    rig: Callable[[], CameraRig],
+    remark: str,
+) -> str:
+    """Writes a trajectory; of an estimator, with its folder, .mcap has covariances.
+
+    The rig is asked for where the poses are to be of another frame.
+    """
+    covariances = np.full((len(trajectory), 6, 6), np.nan)
+    if folder is not None and wanted.is_bag:
+        covariances = read_covariances(folder / "covariance.csv")[1]
+    found = Estimate(trajectory, covariances, NO_LANDMARKS)
+    if wanted.frame not in (None, trajectory.frame):
+        if wanted.frame == "body" and body_is_camera(rig().bTc):
+            raise ConfigError(
+                "--frame body: nothing states where the cameras sit on a body; give --frame left, "
+                "or run with dataset.camera_yaw_deg and dataset.lever_arm_m"
+            )
+        found = found.of(wanted.frame, rig())
+    write_trajectory(path, found.trajectory, found.covariances, remark, wanted.chosen_axes)
+    return f"{path}: {len(found.trajectory)} poses, {found.trajectory.named}"
 
 
 def log_of(run: Path) -> Path:

@@ -389,7 +389,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         f"odometry: {odometry}" if odometry else "",
         "interrupted" if metrics.get("status") == "interrupted" else "",
     )
-    share, map_of = metrics.get("located"), metrics["estimators"].get(live) or {}
+    share, steered = metrics.get("located"), next(iter(metrics["estimators"].values()), None)
     found = LocatedShare(share["frames"], share["of"], _LEAST_IN_MAP) if share else None
     notes = [metrics.get("remark"), *(metrics.get("notes") or ())]
     notes = [str(note) for note in (*notes, *(metrics.get("frame_problems") or ())) if note]
@@ -411,7 +411,7 @@ def load_report(folder: Path, run: Path | None = None) -> ReportData:
         },
         up=_up(find(LOG_FILE)),
         alignment="after SE3 alignment",
-        alarms=alarms(found, map_of.get("landmarks")),
+        alarms=alarms(found, (steered or {}).get("landmarks")),
         calibration=None if (file := find(CALIBRATION_FILE)) is None else _columns(file),
     )
 

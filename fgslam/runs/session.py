@@ -194,7 +194,7 @@ def drives_of(saved: SavedMap) -> list[dict[str, Any]]:
 
 _DRIVE = (
     *("name", "fgslam", "recording", "frames", "estimator", "valid_hits"),
-    *("remark", "remarks", "settings"),
+    *("truth_frame", "remark", "remarks", "settings"),
 )
 """What a map records of a drive, in this order."""
 

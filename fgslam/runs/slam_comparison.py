@@ -121,8 +121,11 @@ def perform(
     # The colours that the live front-end saw, where the run had images.
     colours = run / load_config(run / RUN_MARKER).estimator.title / "map.ply"
     look = read_ply(colours) if colours.is_file() else None
-    write_replay(out, result, log, config.remark, look)
-    return judge_replay(result, load_truth(run, log)).metrics
+    truth, live = load_truth(run, log), colours.parent / "final.tum"
+    known = Trajectory.load(live) if live.is_file() else truth.trajectory
+    frame = "left" if known is None else known.frame  # as the run's other files
+    write_replay(out, result, log, config.remark, look, frame)
+    return judge_replay(result, truth).metrics
 
 
 def write_comparison(
@@ -174,8 +177,8 @@ def load_truth(run: Path, log: MeasurementLog) -> Truth:
     path, landmark_path = run / GROUND_TRUTH_FILE, run / LANDMARK_TRUTH_FILE
     trajectory = Trajectory.load(path) if path.is_file() else None
     if not landmark_path.is_file():
-        return Truth(trajectory)
+        return Truth(trajectory, rig=log.rig)
     landmarks, sigma = read_landmark_truth(landmark_path)
     judged = seen_often(log, landmarks)
     own = sigma[np.isin(landmarks.ids, judged.ids)]
-    return Truth(trajectory, judged, float(np.median(own)) if len(own) else None)
+    return Truth(trajectory, judged, float(np.median(own)) if len(own) else None, log.rig)

@@ -19,6 +19,7 @@ from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.files import make_subfolder, write_text
 from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import PoseFrame
 from fgslam.core.types import Estimate, LandmarkMap, Trajectory, write_covariances
 from fgslam.evaluation.statistics import value_at
 from fgslam.report.content import Column, TextTable, write_csv
@@ -41,16 +42,24 @@ _VALID_HITS = 3  # Se et al. 6.1, where no front-end's own number is known
 def write_estimate(
     folder: Path, online: Trajectory, estimate: Estimate, points: MapPoints, remark: str
 ) -> None:
-    """Trajectories, covariances and map into an estimator's folder. Raises OutputError."""
+    """Trajectories, covariances and map into an estimator's folder. Raises OutputError.
+
+    Poses are written as those of the frame that they are given of; the map's world is theirs.
+    """
     online.save(folder / "online.tum", remark)
     estimate.trajectory.save(folder / "final.tum", remark)
-    stamps = estimate.trajectory.timestamps
-    write_covariances(folder / "covariance.csv", stamps, estimate.covariances, remark)
+    covariances = estimate.covariances
+    write_covariances(folder / "covariance.csv", estimate.trajectory, covariances, remark)
     write_ply(folder / "map.ply", points, remark)
 
 
 def write_replay(
-    run: Path, replay: Replay, log: MeasurementLog, remark: str, look: MapPoints | None
+    run: Path,
+    replay: Replay,
+    log: MeasurementLog,
+    remark: str,
+    look: MapPoints | None,
+    frame: PoseFrame,
 ) -> None:
     """All files of a replay into ``run/<title>/``.
 
@@ -61,10 +70,12 @@ def write_replay(
         remark: put into the files' comments.
         look: landmarks with the colours that the front-end saw, e.g. the live run's map; None
             where nothing was seen in colour.
+        frame: that the files' poses are of.
     """
     folder = make_subfolder(run, replay.title)
     points = points_from_log(replay.estimate.landmarks, log, look)
-    write_estimate(folder, replay.online, replay.estimate, points, remark)
+    online, estimate = replay.online.of(frame, log.rig), replay.estimate.of(frame, log.rig)
+    write_estimate(folder, online, estimate, points, remark)
     write_frames(folder / FRAMES_FILE, replay.online.timestamps, replay.rows)
     write_noise(folder / NOISE_TABLE, replay.online.timestamps, replay.noise)
 

@@ -32,6 +32,8 @@ from running import (
 )
 
 import fgslam
+from fgslam.core.geometry import transform_to_camera
+from fgslam.core.log import MeasurementLog
 from fgslam.core.types import Trajectory
 from fgslam.report.formats import read_ply
 from fgslam.runs.config import Experiment
@@ -233,6 +235,36 @@ def test_export_of_the_trajectory(finished: Finished, tmp_path: Path, monkeypatc
     np.testing.assert_allclose(read.poses_se3, truth.poses, rtol=0, atol=1e-11)
 
 
+def test_exports_of_a_frame_and_of_axes_overlay(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    """A landmark of the map is seen from the exported left camera where it was measured."""
+    tum, ply = tmp_path / "t.tum", tmp_path / "m.ply"
+    given = ("--trajectory", tum, "--map", ply, "--frame", "left", "--axes", "ros")
+    assert main(monkeypatch, "export", finished.folder, *given) == 0
+    assert "12 poses, wTl: pose of the left camera\n" in capfd.readouterr().out
+    assert "# wTl: pose of the left camera\n" in tum.read_text()
+    log, points = MeasurementLog.load(finished.folder / "measurements.npz"), read_ply(ply)
+    seen = log.increments[-1].kept
+    seen = seen.select(np.isin(seen.ids, points.ids))
+    places = points.positions[np.searchsorted(points.ids, seen.ids)]
+    ahead, left, up = transform_to_camera(Trajectory.load(tum).poses[-1], places).T
+    rig = log.rig
+    pixels = np.column_stack([rig.cx - rig.fx * left / ahead, rig.cy - rig.fy * up / ahead])
+    measured = seen.measurement[:, :2] + seen.measurement[:, 2:] * [1.0, 0.0]
+    assert np.median(np.linalg.norm(pixels - measured, axis=1)) < 1.0
+
+
+def test_axes_of_a_bag_are_those_of_ros(
+    finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
+) -> None:
+    bag, run = ("--trajectory", tmp_path / "t.mcap"), finished.folder
+    line = mistake(capfd, monkeypatch, "export", run, *bag, "--axes", "camera")
+    assert "leave --axes out" in line
+    assert not (tmp_path / "t.mcap").exists()
+    assert main(monkeypatch, "export", run, *bag, "--frame", "body") == 0
+
+
 def test_export_of_the_graph(
     finished: Finished, tmp_path: Path, monkeypatch: Patch, capfd: Capture
 ) -> None:
@@ -321,7 +353,7 @@ def test_export_of_an_interrupted_run(
 ) -> None:
     run = run_values(experiment(recording), tmp_path / "run", stopped=stop_after(5))
     assert main(monkeypatch, "export", run.folder, "--trajectory", tmp_path / "t.tum") == 0
-    assert capfd.readouterr().out.endswith("t.tum: 5 poses\n")
+    assert capfd.readouterr().out.endswith("t.tum: 5 poses, wTc: pose of the right camera\n")
 
 
 def test_mistakes_of_export(

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from evo.core import metrics, sync
+from evo.tools import file_interface
 
+import fgslam as fg
 from fgslam.core.arrays import FloatArray
 from fgslam.core.errors import DatasetError
 from fgslam.core.geometry import body_to_camera_motion, inverse, se3_log
@@ -23,6 +27,7 @@ from fgslam.datasets.settings import (
 )
 from fgslam.frontend.settings import FrontendSettings
 from fgslam.frontend.stereo import StereoMatcher
+from fgslam.runs.export import Wanted, export_run
 from fgslam.runs.findings import Level
 from fgslam.runs.inspect import check_sequence
 from fgslam.slam.build import make_extractor
@@ -233,3 +238,45 @@ def test_depth_is_found_again_as_the_disparity_that_it_says(shared_data: Path) -
     error = found.measurement[known, 2] - expected
     assert abs(np.median(error)) < 0.05
     assert np.median(np.abs(error)) < 0.2
+
+
+# ------------------------------------------------------------------------------------------
+# Results, held against the data sets' own files by evo
+
+
+def own_truth(file: Path) -> Any:
+    if file.suffix == ".csv":
+        return file_interface.read_euroc_csv_trajectory(str(file))
+    return file_interface.read_tum_trajectory_file(str(file))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "file", "frame"),
+    [
+        ("kitti06", "gt_left_cam.txt", "left camera"),
+        ("euroc_v101_raw", "mav0/state_groundtruth_estimate0/data.csv", "body"),
+        ("rgbd_fr1", "groundtruth.txt", "right camera"),
+    ],
+)
+def test_evo_finds_the_runs_own_error(
+    shared_data: Path, tmp_path: Path, name: str, file: str, frame: str
+) -> None:
+    """On final.tum and on what is exported, with the truth file as it is published."""
+    root, run = shared_data / name, tmp_path / "run"
+    if not root.is_dir():
+        pytest.skip(f"no recording {name} in {shared_data}: this test needs it")
+    result = fg.run(root, run, {"dataset.stop": 15, "output.report": False})
+    (kind, numbers), *_ = result.metrics["estimators"].items()
+    export_run(run, Wanted(trajectory=tmp_path / "exported.tum"))
+    for path in (run / kind / "final.tum", tmp_path / "exported.tum"):
+        assert f": pose of the {frame}" in path.read_text()
+        read = file_interface.read_tum_trajectory_file(str(path))
+        # Frames between poses of the truth have it interpolated; evo takes the nearest one.
+        truth, found = sync.associate_trajectories(own_truth(root / file), read)
+        assert found.num_poses == numbers["matched_poses"] == 15
+        found.align(truth)
+        ape = metrics.APE(metrics.PoseRelation.translation_part)
+        ape.process_data((truth, found))
+        rmse = ape.get_statistic(metrics.StatisticsType.rmse)
+        assert rmse == pytest.approx(numbers["ate_rmse_m"], abs=2e-3 if "rgbd" in name else 1e-6)

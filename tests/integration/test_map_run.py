@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from fgslam.core.errors import ConfigError, EstimatorError, FgslamError, MapErro
 from fgslam.core.saved_map import load_map, save_map
 from fgslam.core.types import Trajectory
 from fgslam.report.formats import read_ply
+from fgslam.runs.export import Wanted, export_run
 from fgslam.runs.tasks.slam_map_entry import arrival_of
 
 CUT = 7
@@ -271,6 +273,12 @@ def test_exported_as_of_a_run(
     assert path.read_bytes() == (run / "final.tum").read_bytes()
     assert main(monkeypatch, "export", map_file, "--map", cloud, "--valid-only", "--overwrite") == 0
     assert len(read_ply(cloud)) == int((saved.hits >= 3).sum()) < len(saved)
+    bare = tmp_path / "bare.fgmap"  # of cameras whose place on a body nothing states
+    save_map(replace(saved, rig=replace(saved.rig, bTc=np.eye(4))), bare)
+    with pytest.raises(ConfigError, match="nothing states where the cameras sit on a body"):
+        export_run(bare, Wanted(trajectory=tmp_path / "body.tum", frame="body"))
+    export_run(bare, Wanted(trajectory=tmp_path / "left.tum", frame="left"))
+    assert Trajectory.load(tmp_path / "left.tum").frame == "left"
 
 
 @pytest.mark.parametrize(

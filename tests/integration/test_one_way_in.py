@@ -28,12 +28,13 @@ FILES = {"trajectory": "final.tum", "map": "map.ply"}
 def pushed(experiment: str, overrides: dict[str, object], out: Path) -> Path:
     """Files of a session that was pushed frame by frame."""
     slam = fg.Slam.from_config(experiment, overrides)
-    for t, images, odometry in fg.open_recording(experiment, overrides):
+    recording = fg.open_recording(experiment, overrides)
+    for t, images, odometry in recording:
         slam.track(t, images, odometry)
     slam.close()
     result = slam.result()
     out.mkdir()
-    result.trajectory.save(out / "final.tum")
+    result.trajectory.of(recording.sequence.truth_frame, recording.rig).save(out / "final.tum")
     result.map.save(out / "map.ply")
     result.map.save(out / "map.fgmap")
     slam.log.save(out / "measurements.npz")

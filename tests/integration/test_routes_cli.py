@@ -18,7 +18,7 @@ from textured_room import SMALL_CAMERA_FILE, folder_of, seen_at
 
 import fgslam as fg
 from fgslam.core.sensors import CameraRig
-from fgslam.core.types import write_covariances
+from fgslam.core.types import Trajectory, write_covariances
 from fgslam.homing.route import PathMemory
 from fgslam.runs.bare import teaching
 from fgslam.runs.folder import RUN_MARKER
@@ -307,7 +307,8 @@ def test_poses_of_another_clock_or_without_times_are_refused(
     late.write_text("105 0 0 0 0 0 0 1\n106 1 0 0 0 0 0 1\n", encoding="utf-8")
     said = mistake(capfd, monkeypatch, "teach", data / "drive", *given, late)
     assert "from 105.000 to 106.000 s, but drive from 5.000 to 13.000 s" in said
-    write_covariances(tmp_path / "covariance.csv", np.arange(2.0), np.zeros((2, 6, 6)))
+    other = Trajectory(np.arange(2.0), np.tile(np.eye(4), (2, 1, 1)))
+    write_covariances(tmp_path / "covariance.csv", other, np.zeros((2, 6, 6)))
     said = mistake(capfd, monkeypatch, "teach", data / "drive", *given, late)
     assert "covariance.csv: not the poses' of late.tum" in said
     assert "no_such.tum" in mistake(

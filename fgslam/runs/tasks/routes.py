@@ -223,6 +223,11 @@ def metric_poses(path: Path, recording: OmniRecording) -> MetricPoses:
                 f"{file}: not the poses' of {path.name}; give the run's final.tum, or a copy of "
                 "the trajectory in a folder of its own"
             )
+    if trajectory.frame == "body":
+        raise DatasetError(
+            f"{path}: {trajectory.named}, whose axes are not known here; give a camera's, by "
+            "fgslam export RUN --frame right --trajectory FILE into a folder of its own"
+        )
     if not np.isfinite(times).all():
         raise DatasetError(
             f"{recording.name}: its images have no times, which poses are found by; put a list "

@@ -36,7 +36,7 @@ from fgslam.runs.folder import (
     write_config,
 )
 from fgslam.runs.opening import open_sequence
-from fgslam.runs.report import located, report_from_folder
+from fgslam.runs.report import alarms, report_from_folder
 from fgslam.runs.results import PICTURES
 from fgslam.runs.session import map_of
 from fgslam.runs.slam_comparison import judged_apart, named, replay_apart, with_odometry
@@ -279,7 +279,8 @@ def _result(
         notes=run_notes(outputs, live),
         particulars=(*((name, text) for name, text in files.items() if text), *particulars),
         reached=f"after {len(outputs.recorder)} frames",
-        located=located(outputs.recorder),
+        located=outputs.located,
+        alarms=alarms(outputs.located, live.landmarks),
         outputs=outputs,
         live=live,
         pictures=pictures,
@@ -298,6 +299,7 @@ def _leave_map(outputs: RunOutputs) -> str:
         None if outputs.given is None else outputs.given.saved,
         name=config.name,
         recording={"name": outputs.sequence.name, "identity": outputs.sequence.identity},
+        truth_frame=outputs.sequence.truth_frame,
         remark=outputs.remark,
         remarks=list(estimate.remarks),
         settings={

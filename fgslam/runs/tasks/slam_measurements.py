@@ -62,7 +62,8 @@ def write_log_and_truth(folder: Path, recording: MeasurementRecording) -> None:
     """The log, and what is known to be true. Raises OutputError."""
     recording.log.save(folder / LOG_FILE)
     if recording.ground_truth is not None:
-        recording.ground_truth.save(folder / GROUND_TRUTH_FILE)
+        truth = recording.ground_truth.of(recording.truth_frame, recording.log.rig)
+        truth.save(folder / GROUND_TRUTH_FILE)
     if recording.landmark_truth is not None:
         exact = np.zeros(len(recording.landmark_truth))
         write_landmark_truth(folder / LANDMARK_TRUTH_FILE, recording.landmark_truth, exact)

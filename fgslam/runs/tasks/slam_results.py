@@ -44,6 +44,7 @@ from fgslam.report.content import (
     write_timing,
 )
 from fgslam.runs.config import Experiment, ExperimentConfig, parse
+from fgslam.runs.engine import LocatedShare
 from fgslam.runs.folder import CALIBRATION_FILE, CAMERA_FILE, LOG_FILE, METRICS_FILE
 from fgslam.runs.opening import open_sequence
 from fgslam.runs.report import (
@@ -73,7 +74,7 @@ from fgslam.slam.pipeline import FrameReport, SlamPipeline
 from fgslam.slam.results import (
     STAGES,
     RunRecorder,
-    in_first_map,
+    located_frames,
     session_remarks,
 )
 from fgslam.slam.session import Session
@@ -528,6 +529,11 @@ class RunOutputs:
         return self.recorder.left_out + len(self.sequence)
 
     @property
+    def located(self) -> LocatedShare:
+        """Frames located in the map."""
+        return located(self.recorder, self.pipeline.tracker.parts)
+
+    @property
     def title(self) -> str:
         """The live estimator's label or kind, which names its folder."""
         return self.config.estimator.title
@@ -546,7 +552,9 @@ class RunOutputs:
         online_path = Trajectory(estimate.trajectory.timestamps, online)
         points = map_points(estimate.landmarks, self.pipeline.tracker.database)
         own = make_subfolder(self.folder, self.title)
-        write_estimate(own, online_path, estimate, points, self.remark)
+        frame, rig = self.sequence.truth_frame, self.sequence.rig
+        paths = online_path.of(frame, rig), estimate.of(frame, rig)
+        write_estimate(own, *paths, points, self.remark)
         write_frames(own / FRAMES_FILE, online_path.timestamps, frame_rows(self.recorder))
         write_noise(own / NOISE_TABLE, online_path.timestamps, self.recorder.noise)
         metrics = estimator_metrics(estimate, truth, self.recorder)
@@ -575,7 +583,7 @@ class RunOutputs:
             "status": status,
             "frames_in_recording": self.frames,
             "odometry": self.config.odometry.kind,
-            "located_in_first_map": in_first_map(self.recorder, self.pipeline.tracker.parts),
+            "located": {"frames": self.located.frames, "of": self.located.of},
             "landmarks_permanent": int(self.pipeline.tracker.database.permanent.sum()),
             "remark": self.remark or None,
             "notes": list(self.remarks()),
@@ -584,7 +592,7 @@ class RunOutputs:
         # Place recognition is asked for, or it joined parts of the map.
         taken = () if self.pipeline.places is None else self.pipeline.places.taken
         if self.config.frontend.loops or self.config.frontend.lost or taken:
-            truth = load_truth(self.folder, self.recorder.log).trajectory
+            truth = load_truth(self.folder, self.recorder.log).of_camera().trajectory
             closures = closures_of(self.recorder, taken, truth)
             write_closures(self.folder, self.recorder, closures)
             about["places"] = place_numbers(self.recorder, closures)
@@ -597,8 +605,9 @@ class RunOutputs:
 
         What is returned is read back: replays of the log are judged by the same digits.
         """
-        if self.sequence.ground_truth is not None:
-            self.sequence.ground_truth.save(self.folder / GROUND_TRUTH_FILE)
+        truth, frame = self.sequence.ground_truth, self.sequence.truth_frame
+        if truth is not None:
+            truth.of(frame, self.sequence.rig).save(self.folder / GROUND_TRUTH_FILE)
         found = (
             rendered_landmark_truth(self.sequence, self.recorder.log) if with_landmarks else None
         )
@@ -608,12 +617,9 @@ class RunOutputs:
 
     def remarks(self) -> tuple[str, ...]:
         """Notes on the recording, its cameras and its first images."""
-        share = located(self.recorder)
-        few = f"only {share} were located by landmarks; the rest of the path is predicted"
         return (
             *self.sequence.notes,
             *self.notes,
-            *(() if share.enough else (few,)),
             *map(sentence, session_remarks(self.pipeline, self.recorder)),
         )
 
@@ -625,8 +631,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     """The numbers of the live estimator; a table of names and values without headings."""
     recorder, more = outputs.recorder, metrics.more
     numbers: dict[str, Any] = run_numbers(recorder)
-    share = located(recorder)
-    first = in_first_map(recorder, outputs.pipeline.tracker.parts)
+    elsewhere = int(located_frames(recorder).sum()) - outputs.located.frames
     matches, nees = numbers["landmark_matches"], more.get("nees_pose")
     bias, start = more.get("gyroscope_bias_dps"), more.get("end_against_start")
     end = "unknown"
@@ -635,7 +640,7 @@ def summary_table(outputs: RunOutputs, metrics: EstimatorMetrics) -> TextTable:
     rpe = f"{_metres(metrics.rpe_trans_m)}, {_number('{:.3f} deg', metrics.rpe_rot_deg)}"
     rows = {
         "frames": f"{len(recorder)} of {outputs.frames}",
-        "located by landmarks": f"{share}" + f", {first} in the first map" * (first < share.frames),
+        "located in the map": f"{outputs.located}" + f", {elsewhere} elsewhere" * (elsewhere > 0),
         "pose found from": ", ".join(f"{k} {n}" for k, n in numbers["status_counts"].items()),
         "landmarks": str(metrics.landmarks),
         "landmarks matched, median (5 %)": "none"

@@ -25,7 +25,8 @@ from fgslam.core.types import Trajectory
 
 def test_arrays_are_shown_by_their_shapes() -> None:
     trajectory = Trajectory(np.arange(51.0), np.tile(np.eye(4), (51, 1, 1)))
-    assert repr(trajectory) == "Trajectory(timestamps=array(51), poses=array(51, 4, 4))"
+    shapes = "timestamps=array(51), poses=array(51, 4, 4), frame='right'"
+    assert repr(trajectory) == f"Trajectory({shapes})"
 
 
 # --------------------------------------------------------------------------------------------

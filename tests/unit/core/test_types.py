@@ -7,9 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.geometry import se3_exp
-from fgslam.core.types import Trajectory, read_covariances, write_covariances
+from fgslam.core.errors import ConfigError, DatasetError, OutputError
+from fgslam.core.geometry import inverse, se3_exp
+from fgslam.core.sensors import CameraRig, PoseFrame
+from fgslam.core.types import (
+    Estimate,
+    LandmarkMap,
+    Trajectory,
+    read_covariances,
+    write_covariances,
+)
+from fgslam.evaluation.statistics import pose_nees
 
 
 def trajectory(seed: int = 1, n: int = 50) -> Trajectory:
@@ -30,7 +38,9 @@ def test_tum_lines_are_in_the_formats_order(tmp_path: Path) -> None:
     turn = se3_exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
     turn[:3, 3] = [1.0, -2.0, 3.5]
     Trajectory(np.array([1403715273.262142976]), turn[None]).save(tmp_path / "a.tum")
-    fields = (tmp_path / "a.tum").read_text().split()
+    named, line = (tmp_path / "a.tum").read_text().splitlines()
+    assert named == "# wTc: pose of the right camera"
+    fields = line.split()
     assert fields[0] == "1403715273.262142897"  # the nearest double, nine decimals
     half = np.sqrt(0.5)
     np.testing.assert_allclose(np.array(fields[1:], float), [1, -2, 3.5, 0, half, 0, half])
@@ -124,14 +134,14 @@ def test_covariances_there_and_back(tmp_path: Path) -> None:
     covariances[4] = np.nan
     times = 0.5 * np.arange(20)
     path = tmp_path / "covariance.csv"
-    write_covariances(path, times, covariances)
+    write_covariances(path, Trajectory(times, np.tile(np.eye(4), (20, 1, 1))), covariances)
     read_times, read = read_covariances(path)
     np.testing.assert_array_equal(read_times, times)
     np.testing.assert_allclose(read, covariances, rtol=1e-9)
 
     comment, names, first = path.read_text().splitlines()[:3]
     assert "rotation, translation" in comment
-    assert "reference camera" in comment
+    assert "frame of the right camera" in comment
     columns = names.split(",")
     assert columns[:3] == ["timestamp", "c_rx_rx", "c_rx_ry"]
     assert columns[-1] == "c_tz_tz"
@@ -143,3 +153,62 @@ def test_broken_covariance_file(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("timestamp,c\n")
     with pytest.raises(DatasetError, match="line 1"):
         read_covariances(tmp_path / "a.txt")
+
+
+# ------------------------------------------------------------------------------------------
+# What the poses are of
+
+RIG = CameraRig(
+    *(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, None),
+    se3_exp(np.array([0.4, -0.3, 1.2, 0.1, 0.2, 0.3])),
+)
+
+
+def test_the_left_camera_is_a_baseline_to_the_left_of_the_right_one() -> None:
+    right = trajectory()
+    left = right.of("left", RIG)
+    np.testing.assert_allclose(left.poses[:, :3, :3], right.poses[:, :3, :3], atol=1e-12)
+    seen = np.array([(inverse(r) @ p)[:3, 3] for r, p in zip(right.poses, left.poses, strict=True)])
+    np.testing.assert_allclose(seen, np.tile([-0.1, 0.0, 0.0], (50, 1)), atol=1e-12)
+
+
+def test_the_body_carries_the_camera() -> None:
+    body = trajectory().of("body", RIG)
+    np.testing.assert_allclose(body.poses @ RIG.bTc, trajectory().poses, atol=1e-12)
+
+
+@pytest.mark.parametrize("frame", ["left", "right", "body"])
+def test_frames_are_named_in_files_and_lead_back(tmp_path: Path, frame: PoseFrame) -> None:
+    moved = trajectory().of(frame, RIG)
+    moved.save(tmp_path / "a.tum", "a remark")
+    read = Trajectory.load(tmp_path / "a.tum")
+    assert read.frame == frame
+    symbol = {"left": "wTl", "right": "wTc", "body": "wTb"}[frame]
+    assert f"# {symbol}: pose of the {frame}" in (tmp_path / "a.tum").read_text()
+    np.testing.assert_allclose(read.of("right", RIG).poses, trajectory().poses, atol=1e-10)
+    moved.save(tmp_path / "a.csv")
+    assert f"# {symbol}: pose of the" in (tmp_path / "a.csv").read_text()
+    write_covariances(tmp_path / "c.csv", moved, np.tile(np.eye(6), (50, 1, 1)))
+    assert f"covariance of xi in {symbol} = " in (tmp_path / "c.csv").read_text()
+    np.testing.assert_array_equal(read_covariances(tmp_path / "c.csv")[1][3], np.eye(6))
+
+
+def test_covariances_of_another_frame_state_the_same_errors(rng: np.random.Generator) -> None:
+    """The error squared, weighed by its covariance, is that of the right camera."""
+    right, root = trajectory(), rng.normal(size=(50, 6, 6))
+    covariances = root @ np.swapaxes(root, 1, 2)
+    nothing = LandmarkMap(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
+    estimate = Estimate(right, covariances, nothing)
+    noise = rng.normal(scale=0.1, size=(50, 6))
+    truth = Trajectory(right.timestamps, right.poses @ np.array([*map(se3_exp, noise)]))
+    expected = pose_nees(right.poses, covariances, truth.poses).values
+    for frame in ("left", "body"):
+        moved = estimate.of(frame, RIG)
+        true = truth.of(frame, RIG).poses
+        found = pose_nees(moved.trajectory.poses, moved.covariances, true).values
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_no_other_frame_is_known() -> None:
+    with pytest.raises(ConfigError, match="no frame 'top'; use one of left, right, body"):
+        trajectory().of("top", RIG)  # type: ignore[arg-type]

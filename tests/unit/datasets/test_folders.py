@@ -140,6 +140,39 @@ def test_truth_of_the_left_camera_becomes_the_right_ones(tmp_path: Path) -> None
     np.testing.assert_allclose(offset[:3, 3], [0.2, 0.0, 0.0], atol=1e-7)
 
 
+def test_truth_in_nanoseconds_is_that_in_seconds(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    write_tum(root / "gt_left_cam.txt", 0.1 * np.arange(6), curve(6))
+    expected = opened(root).ground_truth
+    write_tum(root / "gt_left_cam.txt", 1e8 * np.arange(6), curve(6))
+    recording = opened(root)
+    assert expected is not None
+    assert recording.ground_truth is not None
+    np.testing.assert_allclose(recording.ground_truth.timestamps, expected.timestamps, atol=1e-9)
+    np.testing.assert_allclose(recording.ground_truth.poses, expected.poses, atol=1e-12)
+    assert "are read as nanoseconds" in recording.notes[-1]
+
+
+def test_truth_of_another_clock_is_refused_with_both_spans(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    stamps = 1305031102.17 + 0.1 * np.arange(6)
+    write_tum(root / "gt_right_cam.txt", stamps, curve(6))
+    with pytest.raises(DatasetError) as refused:
+        opened(root)
+    spans = ("1305031102.170 to 1305031102.670 s", "the recording from 0.000 to 0.500 s")
+    assert_one_line(str(refused.value), "gt_right_cam.txt", *spans, "move the file elsewhere")
+    (root / "gt_right_cam.txt").rename(tmp_path / "kept.txt")  # as the message says
+    assert opened(root).ground_truth is None
+
+
+def test_frames_before_the_truth_begins_are_no_other_clock(tmp_path: Path) -> None:
+    root = image_folder(tmp_path)
+    write_tum(root / "gt_right_cam.txt", 0.1 * np.arange(3, 6), curve(3))
+    truth = opened(root, stop=2).ground_truth
+    assert truth is not None
+    assert len(truth) == 0
+
+
 def test_mounting_from_calibration_and_from_settings(tmp_path: Path) -> None:
     root = image_folder(tmp_path)
     np.testing.assert_array_equal(opened(root).rig.bTc, BODY_FORWARD_LEFT_UP_FROM_CAMERA)

@@ -107,6 +107,39 @@ def test_landmarks_are_compared_with_their_true_positions() -> None:
     assert table.loc["a", "landmark_rmse_m"] == pytest.approx(0.3)
 
 
+def test_truth_of_another_frame_is_judged_as_its_own_tools_do(tmp_path: Path) -> None:
+    """evo, on the exported left path and the data set's own file, gives the comparison's number."""
+    found = estimate(0.3)
+    turned = found.trajectory.poses @ se3_exp(np.array([0.0, 0.4, 0.1, 0.0, 0.0, 0.0]))
+    found = dataclasses.replace(found, trajectory=Trajectory(found.trajectory.timestamps, turned))
+    loop(40).of("left", RIG).save(tmp_path / "truth.tum")
+    found.trajectory.of("left", RIG).save(tmp_path / "left.tum")
+    truth = Trajectory.load(tmp_path / "truth.tum")
+    table = compare({"a": found}, truth, truth_of="left", rig=RIG)
+    assert table.loc["a", "ate_m"] == pytest.approx(evo_ape(tmp_path, "left.tum"), abs=1e-9)
+    found.trajectory.save(tmp_path / "right.tum")
+    assert abs(table.loc["a", "ate_m"] - evo_ape(tmp_path, "right.tum")) > 1e-3
+    assert table.loc["a", "nees"] == pytest.approx(compare({"a": found}, loop(40)).loc["a", "nees"])
+    # Its file states what it is of; a truth without rig is refused.
+    assert compare({"a": found}, truth, rig=RIG).equals(table)
+    with pytest.raises(
+        ConfigError, match=r"the truth is wTl: pose of the left camera.*give the rig"
+    ):
+        compare({"a": found}, truth)
+
+
+def evo_ape(folder: Path, name: str) -> float:
+    from evo.core import metrics, sync
+    from evo.tools import file_interface
+
+    files = (str(folder / one) for one in ("truth.tum", name))
+    truth, path = sync.associate_trajectories(*map(file_interface.read_tum_trajectory_file, files))
+    path.align(truth)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((truth, path))
+    return float(ape.get_statistic(metrics.StatisticsType.rmse))
+
+
 def test_what_is_no_result_is_refused_by_name() -> None:
     with pytest.raises(ConfigError, match="filter: int is no estimator's result; give what replay"):
         compare({"filter": 3}, loop(40))  # type: ignore[dict-item]

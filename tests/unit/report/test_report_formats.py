@@ -15,8 +15,16 @@ from simulated import Drive, simulate
 
 from fgslam.core.arrays import FloatArray, IntArray
 from fgslam.core.errors import DatasetError, OutputError
-from fgslam.core.geometry import inverse, pose, rotation_from_quaternion, se3_exp
+from fgslam.core.geometry import (
+    BODY_FORWARD_LEFT_UP_FROM_CAMERA,
+    inverse,
+    pose,
+    rotation_from_quaternion,
+    se3_exp,
+    transform_to_camera,
+)
 from fgslam.core.log import MeasurementLog
+from fgslam.core.sensors import CameraRig, PoseFrame
 from fgslam.core.types import Trajectory
 from fgslam.report.formats import (
     FRAME,
@@ -32,6 +40,7 @@ from fgslam.report.formats import (
     write_mcap,
     write_pcd,
     write_ply,
+    write_trajectory,
 )
 from fgslam.runs.export import Tints, build_graph, build_model, with_normals
 
@@ -432,3 +441,44 @@ def test_poses_are_in_the_axes_of_ros(tmp_path: Path) -> None:
         rtol=0,
         atol=1e-12,
     )
+
+
+RIG = CameraRig(
+    *(320, 240, 277.0, 277.0, 159.5, 119.5, 0.1, None), BODY_FORWARD_LEFT_UP_FROM_CAMERA
+)
+
+
+@pytest.mark.parametrize("frame", ["left", "right", "body"])
+def test_map_and_trajectory_in_the_axes_of_ros_overlay(tmp_path: Path, frame: PoseFrame) -> None:
+    """Landmarks lie before the camera where they did; a body that looks ahead has ROS's axes."""
+    turned = se3_exp(np.array([0.1, 0.3, -0.2, 0.5, -0.1, 1.0]))
+    moved = Trajectory(np.arange(2.0), np.array([np.eye(4), turned])).of(frame, RIG)
+    points = a_map(20)
+    write_trajectory(tmp_path / "t.tum", moved, axes="ros")
+    write_map(tmp_path / "m.ply", points, axes="ros")
+    assert "axes of REP 103: x forward, y left, z up" in (tmp_path / "t.tum").read_text()
+    assert b"x forward, y left, z up" in (tmp_path / "m.ply").read_bytes()
+    read, found = Trajectory.load(tmp_path / "t.tum"), read_ply(tmp_path / "m.ply")
+    assert read.frame == frame
+    local = transform_to_camera(moved.poses[1], points.positions)
+    if frame != "body":  # forward is the camera's z, left minus its x, up minus its y
+        local = local[:, [2, 0, 1]] * [1.0, -1.0, -1.0]
+    seen = transform_to_camera(read.poses[1], found.positions)
+    np.testing.assert_allclose(seen, local, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.eigvalsh(found.covariances), np.linalg.eigvalsh(points.covariances), atol=1e-12
+    )
+
+
+def test_a_bag_has_the_poses_of_a_body_in_its_own_axes(tmp_path: Path) -> None:
+    camera = Trajectory(np.arange(2.0), np.array([np.eye(4), se3_exp(np.full(6, 0.1))]))
+    body, covariances = camera.of("body", RIG), np.tile(np.eye(6), (2, 1, 1))
+    write_trajectory(tmp_path / "t.mcap", body, covariances)
+    write_trajectory(tmp_path / "t.tum", body, axes="ros")
+    expected = Trajectory.load(tmp_path / "t.tum").poses[1]
+    with AnyReader([tmp_path / "t.mcap"]) as bag:
+        read = [bag.deserialize(raw, c.msgtype).pose.pose for c, _, raw in bag.messages()]
+    place, turn = read[1].position, read[1].orientation
+    np.testing.assert_allclose([place.x, place.y, place.z], expected[:3, 3], atol=1e-9)
+    found = rotation_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w]))
+    np.testing.assert_allclose(found, expected[:3, :3], atol=1e-9)
